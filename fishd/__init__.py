@@ -1,0 +1,3 @@
+"""fishd: the daemon that runs a robotic fish, on the robot and on a simulated one."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,236 @@
+"""The configuration file: YAML in, one frozen `Config` out, or one line that says what is wrong.
+
+Each section is a struct of the part that it configures; this module only puts them together.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
+
+from fishd import strict_yaml
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.errors import ConfigError, ParameterError, UnknownController
+from fishd.estimators.lateral_force import EstimatorSettings
+from fishd.hardware.imperfections import SimulationSettings
+from fishd.plant.parameters import PlantParameters
+from fishd.schema import Problem, convert
+
+
+class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the fish does as soon as the daemon is up."""
+
+    controller: Annotated[
+        str | None, Meta(description="Controller to start with; null starts in mode idle.")
+    ] = None
+    parameters: Annotated[
+        dict[str, Any], Meta(description="Its parameters; those left out keep their defaults.")
+    ] = {}
+
+
+class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where telemetry is published."""
+
+    address: Annotated[
+        str,
+        Meta(
+            pattern="^(tcp://.+:[0-9]+|ipc://.+)$",
+            description="ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH. "
+            "Telemetry is not secret: tcp://0.0.0.0:9872 lets the whole network watch.",
+        ),
+    ] = "tcp://127.0.0.1:9872"
+
+
+class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where requests are taken."""
+
+    address: Annotated[
+        str | None,
+        Meta(
+            description="ZeroMQ address of the ROUTER socket: ipc://PATH or tcp://127.0.0.1:PORT. "
+            "null: a socket named control in $RUNTIME_DIRECTORY, else in $XDG_RUNTIME_DIR/fishd, "
+            "else in a private folder under /tmp. From another machine, use an ssh tunnel."
+        ),
+    ] = None
+
+
+class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How hard fishd tries to be on time; without the privilege it warns once and goes on."""
+
+    priority: Annotated[
+        int, Meta(ge=0, le=99, description="SCHED_FIFO priority; 0 keeps the normal scheduler.")
+    ] = 50
+    lock_memory: Annotated[bool, Meta(description="Keep fishd's memory from being paged out.")] = (
+        True
+    )
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Everything that can be configured; `Config()` is a simulated fish at rest."""
+
+    tick: Annotated[
+        float, Meta(ge=0.002, le=0.2, description="Period of the loop.", extra={"unit": "s"})
+    ] = 0.05
+    amplitude_limit: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1.57,
+            description="Φ: no instruction angle goes beyond ±Φ.",
+            extra={"unit": "rad"},
+        ),
+    ] = 0.42
+    slew_limit: Annotated[
+        Annotated[float, Meta(gt=0, le=10_000)] | None,
+        Meta(
+            description="Fastest change of the instruction angle. null allows one full reversal, "
+            "2Φ, in each tick and so leaves a square wave untouched.",
+            extra={"unit": "rad/s"},
+        ),
+    ] = None
+    fade_time: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=0.5,
+            description="Time to fade from Φ to neutral on stop, fault and exit.",
+            extra={"unit": "s"},
+        ),
+    ] = 0.4
+    start: Annotated[Start, Meta(description="What the fish does at once.")] = Start()
+    estimator: Annotated[
+        EstimatorSettings, Meta(description="Fin velocity from the lateral force.")
+    ] = EstimatorSettings()
+    plant: Annotated[PlantParameters, Meta(description="The simulated fish: physics.")] = (
+        PlantParameters()
+    )
+    simulation: Annotated[
+        SimulationSettings, Meta(description="The simulated fish: imperfections of the rig.")
+    ] = SimulationSettings()
+    telemetry: Annotated[TelemetrySettings, Meta(description="What is published, and where.")] = (
+        TelemetrySettings()
+    )
+    control: Annotated[ControlSettings, Meta(description="Where requests are taken.")] = (
+        ControlSettings()
+    )
+    realtime: Annotated[RealtimeSettings, Meta(description="Scheduling and memory.")] = (
+        RealtimeSettings()
+    )
+
+    @property
+    def limits(self) -> Limits:
+        """What controllers must respect."""
+        return Limits(amplitude=self.amplitude_limit, tick=self.tick)
+
+
+def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Read a configuration file and apply `KEY=VALUE` overrides, such as `plant.xi=0.9`.
+
+    Without a path the defaults apply. Raises `ConfigError` with one line that names the file, the
+    line, the key and what is permitted.
+    """
+    document = _read(path) if path else strict_yaml.Document({}, {})
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{path}:1: keys and values are needed, such as 'tick: 0.05'")
+    sources = {key: f"{path}:{line}" for key, line in document.lines.items()}
+    for override in overrides:
+        key = _override(document.data, override)
+        sources[key] = f"--set {override}"
+    try:
+        config = convert(document.data, Config)
+        _check_start(config)
+        _check_control(config)
+    except Problem as problem:
+        raise ConfigError(_located(problem, sources)) from None
+    return config
+
+
+def _read(path: Path) -> strict_yaml.Document:
+    try:
+        return strict_yaml.parse(path.read_text(encoding="utf-8"))
+    except strict_yaml.YamlProblem as problem:
+        raise ConfigError(f"{path}:{problem.line}: {problem}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path}: no such file; give the path of a YAML file, or none for the defaults"
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _override(data: dict[str, Any], override: str) -> tuple[str, ...]:
+    """Put one KEY=VALUE into the data; return the key as a path."""
+    dotted, equals, text = override.partition("=")
+    keys = tuple(dotted.strip().split("."))
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {override}: write KEY=VALUE, such as plant.omega0=10")
+    section = data
+    for key in keys[:-1]:
+        section = section.setdefault(key, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"--set {override}: {key} is a single value, not a section")
+    section[keys[-1]] = _value(text.strip(), override)
+    return keys
+
+
+def _value(text: str, override: str) -> Any:
+    """A value from the command line, where a plain `1e-3` is a number."""
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            continue
+    try:
+        return strict_yaml.parse(text).data if text else ""
+    except strict_yaml.YamlProblem as problem:
+        raise ConfigError(f"--set {override}: {problem}") from None
+
+
+def _check_start(config: Config) -> None:
+    start = config.start
+    if start.controller is None:
+        if start.parameters:
+            raise Problem(("start", "parameters"), "there is no start.controller to take these")
+        return
+    try:
+        registry.check(start.controller, start.parameters, config.limits)
+    except UnknownController as error:
+        raise Problem(("start", "controller"), str(error)) from None
+    except ParameterError as error:
+        raise Problem(("start", "parameters"), str(error)) from None
+
+
+def _check_control(config: Config) -> None:
+    address = config.control.address
+    local = ("ipc://", "tcp://127.", "tcp://[::1]:", "tcp://localhost:")
+    if address is not None and not address.startswith(local):
+        raise Problem(
+            ("control", "address"),
+            f"'{address}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
+            "who can send requests can move the fish, so they are taken from this machine only",
+        )
+
+
+def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:
+    """Name the place of the problem, or of the nearest section above it that was written down."""
+    path = problem.path
+    at = path
+    while at and at not in sources:
+        at = at[:-1]
+    where = sources.get(at)
+    name = ".".join(path)
+    return ": ".join(part for part in (where, name, str(problem)) if part)
+
+
+def to_yaml(config: Config) -> str:
+    """The whole configuration, defaults included, as YAML that `load` reads back."""
+    import yaml
+
+    return yaml.safe_dump(
+        msgspec.to_builtins(config), sort_keys=False, allow_unicode=True, default_flow_style=False
+    )

@@ -1,0 +1,74 @@
+"""What a controller is. docs/writing-a-controller.md works through an example."""
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, Generic, TypeVar
+
+from msgspec import Struct
+
+from fishd.errors import ParameterError
+from fishd.signals import Observation
+
+
+class Limits(Struct, frozen=True):
+    """What the loop grants a controller."""
+
+    amplitude: float
+    """Φ: commands beyond ±Φ are clamped by the guard [rad]."""
+    tick: float
+    """Period of the loop [s]."""
+
+
+P = TypeVar("P", bound=Struct)
+
+
+class Controller(ABC, Generic[P]):
+    """Chooses the instruction angle, once a tick.
+
+    A subclass names its `Parameters`, a frozen msgspec struct whose fields carry bounds, unit and
+    description: help texts, command-line options and documentation are made from it. Everything
+    slow (loading a file, warming up) belongs into `__init__`, which runs outside the tick.
+    """
+
+    Parameters: ClassVar[type[Struct]]
+
+    def __init__(self, parameters: P, limits: Limits) -> None:
+        """Raises `ParameterError` when the parameters do not fit the limits."""
+        self.check(parameters, limits)
+        self.parameters = parameters
+        self.limits = limits
+
+    @classmethod
+    def check(cls, parameters: Any, limits: Limits) -> None:
+        """Refuse parameters that are valid one by one but not on this robot.
+
+        Raises `ParameterError`. The default knows one such rule: no `amplitude` above Φ.
+        """
+        amplitude = getattr(parameters, "amplitude", None)
+        if amplitude is not None and amplitude > limits.amplitude:
+            raise ParameterError(
+                f"amplitude: {amplitude:g} rad is beyond the robot's amplitude_limit, "
+                f"{limits.amplitude:g} rad"
+            )
+
+    def activate(self, observation: Observation) -> None:
+        """Take over: called in the tick of the switch, just before the first `update`.
+
+        `observation.instruction_angle` is the angle in force; start from it where that makes sense.
+        """
+
+    def retune(self, parameters: P) -> None:
+        """Take new, already checked parameters while running; called between two updates."""
+        self.parameters = parameters
+
+    @abstractmethod
+    def update(self, observation: Observation) -> float:
+        """The instruction angle from now until the next tick [rad].
+
+        Called once a tick; must return within half a period, and never block.
+        """
+
+
+def amplitude_of(parameters: Any, limits: Limits) -> float:
+    """The amplitude in force: the parameter where it is given, else all that the robot grants."""
+    amplitude: float | None = getattr(parameters, "amplitude", None)
+    return limits.amplitude if amplitude is None else amplitude

@@ -1,0 +1,43 @@
+"""`hold`: one constant instruction angle."""
+
+import math
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from fishd.controllers.base import Controller, Limits
+from fishd.errors import ParameterError
+from fishd.signals import Observation
+
+
+class HoldParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Parameters of `hold`."""
+
+    angle: Annotated[
+        float,
+        Meta(
+            ge=-math.pi,
+            le=math.pi,
+            description="The instruction angle; 0 is neutral.",
+            extra={"unit": "rad"},
+        ),
+    ] = 0.0
+
+
+class Hold(Controller[HoldParameters]):
+    """Hold one instruction angle, neutral unless told otherwise."""
+
+    Parameters = HoldParameters
+
+    @classmethod
+    def check(cls, parameters: HoldParameters, limits: Limits) -> None:
+        """Refuse an angle beyond Φ."""
+        if abs(parameters.angle) > limits.amplitude:
+            raise ParameterError(
+                f"angle: {parameters.angle:g} rad is beyond the robot's amplitude_limit, "
+                f"±{limits.amplitude:g} rad"
+            )
+
+    def update(self, observation: Observation) -> float:
+        """The constant angle [rad]."""
+        return self.parameters.angle

@@ -1,0 +1,93 @@
+"""Finds controllers, built in and third-party, by the entry-point group `fishd.controllers`."""
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd.controllers.base import Controller, Limits
+from fishd.errors import ParameterError, UnknownController
+from fishd.schema import Field, Problem, convert, fields_of, nearest
+
+GROUP = "fishd.controllers"
+
+
+class ControllerInfo(Struct, frozen=True):
+    """A controller as a person or an option parser wants to know it."""
+
+    name: str
+    summary: str
+    parameters: tuple[Field, ...]
+
+
+@cache
+def _entries() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def names() -> list[str]:
+    """The names of all installed controllers."""
+    return sorted(_entries())
+
+
+@cache
+def find(name: str) -> type[Controller[Any]]:
+    """The class of the controller `name`.
+
+    Raises `UnknownController`, also where the package that offers it does not load.
+    """
+    if name not in _entries():
+        raise UnknownController(f"no controller is named '{name}'; {nearest(name, names())}")
+    entry = _entries()[name]
+    try:
+        found = entry.load()
+    except Exception as error:  # a third-party package may fail in any way
+        raise UnknownController(
+            f"controller '{name}' ({entry.value}) does not load: {type(error).__name__}: {error}"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, Controller)):
+        raise UnknownController(
+            f"controller '{name}' ({entry.value}) is no subclass of "
+            "fishd.controllers.base.Controller"
+        )
+    return found
+
+
+def describe(name: str) -> ControllerInfo:
+    """Name, summary and parameters of one controller; raises `UnknownController`."""
+    found = find(name)
+    summary = (found.__doc__ or "").strip().partition("\n")[0]
+    return ControllerInfo(name=name, summary=summary, parameters=fields_of(found.Parameters))
+
+
+def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
+    """Validated parameters for the controller `name`.
+
+    Raises `UnknownController` and `ParameterError`.
+    """
+    found = find(name)
+    try:
+        parameters = convert(dict(values), found.Parameters)
+    except Problem as problem:
+        raise ParameterError(
+            f"{name}: {'.'.join(problem.path) or 'parameters'}: {problem}"
+        ) from None
+    try:
+        found.check(parameters, limits)
+    except ParameterError as error:
+        raise ParameterError(f"{name}: {error}") from None
+    return parameters
+
+
+def create(name: str, values: Mapping[str, Any], limits: Limits) -> Controller[Any]:
+    """A new controller, ready to be swapped in; raises `UnknownController`, `ParameterError`."""
+    return find(name)(check(name, values, limits), limits)
+
+
+def merged(controller: Controller[Any], name: str, values: Mapping[str, Any]) -> Struct:
+    """The controller's parameters with `values` changed, checked; raises `ParameterError`."""
+    current = msgspec.structs.asdict(controller.parameters)
+    return check(name, {**current, **values}, controller.limits)

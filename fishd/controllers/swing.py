@@ -1,0 +1,77 @@
+"""`swing`: reverse when the fin slows down. The paper's model-free control (Fu et al.)."""
+
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from fishd.controllers.base import Controller, Limits, amplitude_of
+from fishd.signals import Observation
+
+REFRACTORY = 0.05
+"""Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
+
+
+class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Parameters of `swing`."""
+
+    C: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="Reverse when the fin's speed falls to C times its last maximum.",
+            extra={"unit": "1"},
+        ),
+    ] = 0.6
+    amplitude: Annotated[
+        Annotated[float, Meta(gt=0, le=3.1416)] | None,
+        Meta(
+            description="Instruction angle on either side; null: the robot's amplitude_limit.",
+            extra={"unit": "rad"},
+        ),
+    ] = None
+    longest_half_period: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=10,
+            description="Reverse after this time even if the fin shows no sign of slowing down.",
+            extra={"unit": "s"},
+        ),
+    ] = 1.0
+
+
+class Swing(Controller[SwingParameters]):
+    """Reverse the tail when the fin slows to a fraction C of its last top speed.
+
+    It knows nothing of the fish: only the shape of the fin velocity counts, so any positive scale
+    cancels. The square wave that results is close to the best there is.
+    """
+
+    Parameters = SwingParameters
+
+    def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
+        super().__init__(parameters, limits)
+        self._direction = 1.0
+        self._top_speed = 0.0
+        self._elapsed = 0.0
+
+    def activate(self, observation: Observation) -> None:
+        """Push on towards the side on which the angle in force is; from rest, towards plus."""
+        self._direction = 1.0 if observation.instruction_angle >= 0 else -1.0
+
+    def update(self, observation: Observation) -> float:
+        """Plus or minus the amplitude [rad]."""
+        self._elapsed += observation.dt
+        speed = self._direction * observation.fin_velocity
+        parameters = self.parameters
+        slowed = self._top_speed > 0.0 and speed <= parameters.C * self._top_speed
+        self._top_speed = max(self._top_speed, speed)
+        settled = self._elapsed > REFRACTORY * parameters.longest_half_period
+        # Half a tick early is nearer to the longest half period than half a tick late.
+        overdue = self._elapsed + 0.5 * self.limits.tick > parameters.longest_half_period
+        if (slowed and settled) or overdue:
+            self._direction = -self._direction
+            self._top_speed = 0.0
+            self._elapsed = 0.0
+        return self._direction * amplitude_of(parameters, self.limits)

@@ -1,0 +1,139 @@
+"""`square`, `sine` and `triangle`: periodic commands of a given frequency and amplitude.
+
+All keep their phase when the frequency changes. Sine and triangle start from the angle in force.
+"""
+
+import math
+from abc import abstractmethod
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from fishd.controllers.base import Controller, Limits, amplitude_of
+from fishd.signals import Observation
+
+
+class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Parameters of `square`, `sine` and `triangle`."""
+
+    frequency: Annotated[
+        float,
+        Meta(gt=0, le=10, description="Frequency of the waveform.", extra={"unit": "Hz"}),
+    ] = 1.8
+    amplitude: Annotated[
+        Annotated[float, Meta(gt=0, le=math.pi)] | None,
+        Meta(
+            description="Largest instruction angle; null: the robot's amplitude_limit.",
+            extra={"unit": "rad"},
+        ),
+    ] = None
+
+
+class Waveform(Controller[WaveformParameters]):
+    """A phase that advances with time, and a shape that turns it into an angle.
+
+    The phase runs from 0 to 1 over one period. Half periods that are no whole number of ticks are
+    dithered over the periods, so that the mean frequency is exact.
+    """
+
+    Parameters = WaveformParameters
+
+    def __init__(self, parameters: WaveformParameters, limits: Limits) -> None:
+        super().__init__(parameters, limits)
+        self._phase = 0.0
+        self._first = True
+
+    def update(self, observation: Observation) -> float:
+        """The waveform's angle at this tick [rad]."""
+        if self._first:
+            self._first = False
+        else:
+            self._phase = (self._phase + self.parameters.frequency * observation.dt) % 1.0
+        return self.amplitude * self.shape(self._phase)
+
+    @property
+    def amplitude(self) -> float:
+        """The amplitude in force [rad]."""
+        return amplitude_of(self.parameters, self.limits)
+
+    @abstractmethod
+    def shape(self, phase: float) -> float:
+        """The waveform between −1 and 1; `phase` in [0, 1)."""
+
+
+class Square(Waveform):
+    """A square wave between plus and minus the amplitude: the best waveform there is."""
+
+    def activate(self, observation: Observation) -> None:
+        """Start on the side on which the angle in force is."""
+        self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
+
+    def shape(self, phase: float) -> float:
+        """+1 in the first half of the period, −1 in the second."""
+        # A half period that is a whole number of ticks must not lose a tick to rounding.
+        return 1.0 if (phase + 1e-9) % 1.0 < 0.5 else -1.0
+
+
+class Smooth(Waveform):
+    """A waveform without jumps: on a switch or a new amplitude it goes on from the angle in force.
+
+    An angle that the new waveform never reaches is left at the waveform's own top speed.
+    """
+
+    TOP_SPEED: float
+    """Largest slope of the shape [1 / period]."""
+
+    def __init__(self, parameters: WaveformParameters, limits: Limits) -> None:
+        super().__init__(parameters, limits)
+        self._excess = 0.0
+
+    def activate(self, observation: Observation) -> None:
+        """Choose phase and excess such that the first angle is the one in force."""
+        angle = observation.instruction_angle
+        self._phase = self.phase_of(max(-1.0, min(1.0, angle / self.amplitude)))
+        self._excess = angle - self.amplitude * self.shape(self._phase)
+
+    def retune(self, parameters: WaveformParameters) -> None:
+        """Keep the phase; take a jump that a new amplitude would make into the excess."""
+        before = self.amplitude * self.shape(self._phase)
+        super().retune(parameters)
+        self._excess += before - self.amplitude * self.shape(self._phase)
+
+    def update(self, observation: Observation) -> float:
+        """The waveform's angle at this tick, plus what is left of the excess [rad]."""
+        if not self._first:
+            step = self.TOP_SPEED * self.amplitude * self.parameters.frequency * observation.dt
+            self._excess -= max(-step, min(step, self._excess))
+        return super().update(observation) + self._excess
+
+    @abstractmethod
+    def phase_of(self, level: float) -> float:
+        """The phase on the rising flank at which the shape has `level`, in −1 … 1."""
+
+
+class Sine(Smooth):
+    """A sine wave."""
+
+    TOP_SPEED = math.tau
+
+    def shape(self, phase: float) -> float:
+        """sin 2π·phase."""
+        return math.sin(math.tau * phase)
+
+    def phase_of(self, level: float) -> float:
+        """Inverse of the rising flank."""
+        return math.asin(level) / math.tau % 1.0
+
+
+class Triangle(Smooth):
+    """A triangle wave: constant speed between the two extremes."""
+
+    TOP_SPEED = 4.0
+
+    def shape(self, phase: float) -> float:
+        """Zero at phase 0, 1 at a quarter, −1 at three quarters."""
+        return 1.0 - 4.0 * abs((phase + 0.25) % 1.0 - 0.5)
+
+    def phase_of(self, level: float) -> float:
+        """Inverse of the rising flank."""
+        return level / 4.0 % 1.0

@@ -1,0 +1,62 @@
+"""The exceptions that fishd raises on purpose.
+
+    FishdError
+    ├── ConfigError      (ValueError)   the configuration file or a --set is wrong
+    ├── ParameterError   (ValueError)   a controller's parameter is wrong
+    ├── UnknownController (LookupError) no controller has that name
+    ├── StartupError     (RuntimeError) the daemon cannot start, such as address in use
+    ├── SensorError      (OSError)      the force sensor cannot be read
+    ├── ServoError       (OSError)      the servo cannot be driven
+    └── FishError                       raised by the client, `fishd.client`
+        ├── NoDaemon     (ConnectionError) nothing answers at the endpoint
+        └── Refused      (RuntimeError)    the daemon answered with an error; see its `code`
+
+Each message is one line that says what is wrong, where, and what would be right.
+"""
+
+
+class FishdError(Exception):
+    """Root of the tree."""
+
+
+class ConfigError(FishdError, ValueError):
+    """The configuration is wrong; the message names file, line and key."""
+
+
+class ParameterError(FishdError, ValueError):
+    """A controller's parameter is unknown, of the wrong type or out of range."""
+
+
+class UnknownController(FishdError, LookupError):
+    """No installed package offers a controller of that name."""
+
+
+class StartupError(FishdError, RuntimeError):
+    """The daemon cannot start on this machine as it is."""
+
+
+class SensorError(FishdError, OSError):
+    """The force sensor cannot be read."""
+
+
+class ServoError(FishdError, OSError):
+    """The servo cannot be driven."""
+
+
+class FishError(FishdError):
+    """A request to a daemon failed."""
+
+
+class NoDaemon(FishError, ConnectionError):
+    """Nothing answers at the endpoint."""
+
+
+class Refused(FishError, RuntimeError):
+    """The daemon refused the request.
+
+    `code` is the machine-readable reason, as listed in docs/protocol.md.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code

@@ -1,0 +1,1 @@
+"""The estimators: each turns measurements into the observation that controllers see."""

@@ -1,0 +1,45 @@
+"""The last word on what reaches the servo: finite, within ±Φ, and no faster than permitted."""
+
+import math
+
+
+class Guard:
+    """Limits the instruction angle. It keeps no state, so nothing can wind up."""
+
+    def __init__(
+        self, amplitude: float, tick: float, slew_limit: float | None, fade_time: float
+    ) -> None:
+        """
+        amplitude: Φ [rad]
+        tick: period of the loop [s]
+        slew_limit: fastest permitted change [rad/s]; None permits one full reversal a tick
+        fade_time: how long a fade from Φ to neutral takes [s]
+        """
+        self._amplitude = amplitude
+        full_reversal = 2 * amplitude
+        self.step = full_reversal if slew_limit is None else min(full_reversal, slew_limit * tick)
+        """Largest change per tick while a controller is in command [rad]."""
+        self.fade_step = min(self.step, amplitude * tick / fade_time)
+        """Largest change per tick while fading to neutral [rad]."""
+
+    def apply(self, command: float, previous: float) -> float:
+        """The instruction angle to send [rad].
+
+        command: what the controller wants [rad]
+        previous: the angle in force [rad]
+        Raises ValueError when the command is not a finite number.
+        """
+        if not math.isfinite(command):
+            raise ValueError(f"the command is {command}, not an angle")
+        wanted = max(-self._amplitude, min(self._amplitude, command))
+        return _towards(wanted, previous, self.step)
+
+    def fade(self, previous: float) -> float:
+        """The next instruction angle on the way to neutral [rad]."""
+        return _towards(0.0, previous, self.fade_step)
+
+
+def _towards(wanted: float, previous: float, step: float) -> float:
+    if abs(wanted - previous) <= step:
+        return wanted
+    return previous + math.copysign(step, wanted - previous)

@@ -1,0 +1,102 @@
+"""What a real rig does to the force before anyone sees it, as settings and as a function of time.
+
+A real sensor is turned against the fish, carries an offset that drifts slowly, and is noisy.
+"""
+
+import math
+import random
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+DRIFT_PERIOD = 60.0
+"""Period of the slow drift [s]: a few thousandths of the tail beat, as warming electronics do."""
+
+
+class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How imperfect the simulated rig is."""
+
+    noise: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="Noise of each force, rms of the mean over one tick.",
+            extra={"unit": "N"},
+        ),
+    ] = 1e-3
+    offset_x: Annotated[
+        float,
+        Meta(ge=-10, le=10, description="Constant offset on F_x.", extra={"unit": "N"}),
+    ] = 0.0
+    offset_y: Annotated[
+        float,
+        Meta(ge=-10, le=10, description="Constant offset on F_y.", extra={"unit": "N"}),
+    ] = 0.0
+    drift: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=10,
+            description="Amplitude of a slow drift of both offsets, a sine of 60 s "
+            "whose phase depends on the seed.",
+            extra={"unit": "N"},
+        ),
+    ] = 0.0
+    rotation: Annotated[
+        float,
+        Meta(
+            ge=-math.pi,
+            le=math.pi,
+            description="Angle by which the sensor's axes are turned against the fish.",
+            extra={"unit": "rad"},
+        ),
+    ] = 0.0
+    sample_rate: Annotated[
+        float,
+        Meta(
+            ge=1,
+            le=10_000,
+            description="Pairs of samples per second; a window's mean is the mean of the samples "
+            "that fall in it, at least one.",
+            extra={"unit": "1/s"},
+        ),
+    ] = 200.0
+    seed: Annotated[
+        int, Meta(ge=0, description="Same seed, same noise and drift, to the last bit.")
+    ] = 0
+
+
+class Imperfections:
+    """Turns true forces into those that the rig would show."""
+
+    def __init__(self, settings: SimulationSettings, tick: float) -> None:
+        """`tick` is the period that `settings.noise` refers to [s]."""
+        self._settings = settings
+        self._tick = tick
+        self._random = random.Random(settings.seed)
+        self._phase_x = self._random.uniform(0, math.tau)
+        self._phase_y = self._random.uniform(0, math.tau)
+        self._cos = math.cos(settings.rotation)
+        self._sin = math.sin(settings.rotation)
+
+    def apply(self, fx: float, fy: float, time: float, duration: float) -> tuple[float, float]:
+        """The forces as the rig shows them [N], for a window of `duration` that ends at `time` [s].
+
+        Noise of a longer window averages out as white noise does.
+        """
+        settings = self._settings
+        noise = settings.noise * math.sqrt(self._tick / duration)
+        angle = math.tau * time / DRIFT_PERIOD
+        return (
+            self._cos * fx
+            - self._sin * fy
+            + settings.offset_x
+            + settings.drift * math.sin(angle + self._phase_x)
+            + noise * self._random.gauss(0.0, 1.0),
+            self._sin * fx
+            + self._cos * fy
+            + settings.offset_y
+            + settings.drift * math.sin(angle + self._phase_y)
+            + noise * self._random.gauss(0.0, 1.0),
+        )

@@ -1,0 +1,60 @@
+"""The simulated fish behind the protocols of real hardware.
+
+It advances when it is read, by the time since the previous read, under the instruction angle that
+was last written. So it knows no clock and runs as well in real time as in virtual time.
+"""
+
+from fishd.hardware.base import Robot
+from fishd.hardware.imperfections import Imperfections, SimulationSettings
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.tethered import TetheredFish, Window
+from fishd.signals import Measurement, Truth
+
+
+class SimulatedFish:
+    """A force sensor and a servo with a tethered fish between them."""
+
+    def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
+        """`tick` is the period of the loop [s]; the first read covers one period."""
+        self.fish = TetheredFish(plant)
+        self.window: Window | None = None
+        """The latest window with its true mean forces; None before the first read."""
+        self._imperfections = Imperfections(settings, tick)
+        self._sample_rate = settings.sample_rate
+        self._tick = tick
+        self._time: float | None = None
+        self._angle: float | None = None
+
+    def read(self, now: float) -> Measurement:
+        """Swim until `now` [s] and measure the forces on the way."""
+        duration = self._tick if self._time is None else round(now - self._time, 9)
+        self._time = now
+        samples = max(1, round(self._sample_rate * duration))
+        self.window = window = self.fish.advance(self._angle, duration, samples)
+        fx, fy = self._imperfections.apply(
+            window.sampled_thrust, window.sampled_lateral_force, now, duration
+        )
+        return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
+
+    def write(self, angle: float) -> None:
+        """Set the instruction angle [rad] from the latest read onwards."""
+        self._angle = angle
+
+    def release(self) -> None:
+        """Stop the pulses: the wheel stays where it is."""
+        self._angle = None
+
+    def close(self) -> None:
+        """Release the servo."""
+        self.release()
+
+    def truth(self) -> Truth:
+        """The true state at the latest read."""
+        state = self.fish.state
+        return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
+
+
+def simulated_robot(plant: PlantParameters, settings: SimulationSettings, tick: float) -> Robot:
+    """A robot whose fish is simulated."""
+    fish = SimulatedFish(plant, settings, tick)
+    return Robot(name="simulated", sensor=fish, servo=fish, truth=fish.truth)

@@ -1,0 +1,279 @@
+"""The control loop: one synchronous function, `ControlLoop.tick`, that everything calls.
+
+The daemon calls it from asyncio every period, simulation and tests from a plain `for` on a virtual
+clock. It never raises: whatever goes wrong, the supervisor decides and the servo goes neutral.
+"""
+
+import logging
+from collections import deque
+from typing import Any
+
+from msgspec import Struct
+
+from fishd.changes import Change, ClearFault, Done, Retune, Stop, Switch
+from fishd.clock import Clock, Slot
+from fishd.controllers.base import Controller, Limits
+from fishd.controllers.hold import Hold, HoldParameters
+from fishd.errors import Refused
+from fishd.estimators.lateral_force import LateralForceEstimator
+from fishd.guard import Guard
+from fishd.hardware.base import Robot
+from fishd.reporting import Publisher, Reporter, why_overrun
+from fishd.signals import Measurement, Observation
+from fishd.statistics import Statistics
+from fishd.supervisor import Mode, Supervisor
+
+log = logging.getLogger(__name__)
+
+UPDATE_BUDGET = 0.5
+"""Share of the period that a controller's update may take."""
+STALE = 2.0
+"""A newest sample older than this many periods counts as a failed read."""
+MOST_PENDING = 16
+"""Changes that may wait for their tick; one is taken in each."""
+
+
+class ControlLoop:
+    """Reads the sensor, lets one controller choose the instruction angle, drives the servo."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        estimator: LateralForceEstimator,
+        guard: Guard,
+        limits: Limits,
+        clock: Clock,
+        publisher: Publisher,
+    ) -> None:
+        self.robot = robot
+        self.limits = limits
+        self.supervisor = Supervisor()
+        self.statistics = Statistics()
+        self.reporter = Reporter(clock, publisher)
+        self.seq = 0
+        """Number of the latest tick."""
+        self.applied = 0.0
+        """The instruction angle in force [rad]."""
+        self.servo_on = False
+        """False while the servo gets no pulses."""
+        self.observation: Observation | None = None
+        """What the latest tick observed."""
+        self.controller: Controller[Any]
+        self.controller_name: str
+        self._fresh: bool
+        self._estimator = estimator
+        self._guard = guard
+        self._now = clock.monotonic
+        self._changes: deque[tuple[Change, Done]] = deque()
+        self._measurement: Measurement | None = None
+        self._index = -1
+        self._overran = False
+        self._servo_problem = ""
+        self._rest()
+
+    def tick(self, slot: Slot) -> None:
+        """One turn of the loop."""
+        now = self._now
+        started = now()
+        self.seq += 1
+        dt = (slot.index - self._index) * self.limits.tick
+        self._index = slot.index
+        self.statistics.missed += slot.missed
+        self._swap()
+        measurement = self._read(slot)
+        read = now()
+        self.observation = observation = self._estimate(measurement, slot, dt)
+        estimated = now()
+        previous, self.applied = self.applied, self._update(observation)
+        updated = now()
+        self._write(neutral=self.applied == previous == 0.0)
+        written = now()
+        self._publish(slot, measurement, observation, written - started)
+        marks = (started, read, estimated, updated, written, now())
+        self.statistics.add(self.seq, slot.now - slot.deadline, marks)
+        self._check_overrun(slot, marks)
+
+    def submit(self, change: Change, done: Done = lambda _: None) -> None:
+        """Queue a change for one of the next ticks; `done` is called in that tick.
+
+        Raises `Refused` when too many are waiting.
+        """
+        if len(self._changes) >= MOST_PENDING:
+            raise Refused("busy", f"{MOST_PENDING} changes are waiting already; try again")
+        self._changes.append((change, done))
+
+    def estop(self, message: str) -> None:
+        """Stop the pulses now, without waiting for a tick."""
+        before = self.supervisor.mode
+        if self.supervisor.estop(message):
+            self._rest()
+            self._announce_mode(before, level="error")
+        self._write(neutral=False)
+
+    def _swap(self) -> None:
+        if not self._changes:
+            return
+        change, done = self._changes.popleft()
+        try:
+            self._apply(change)
+        except Refused as error:
+            done(error)
+        else:
+            done(None)
+
+    def _apply(self, change: Change) -> None:
+        before = self.supervisor.mode
+        match change:
+            case Switch(name=name, controller=controller):
+                self.supervisor.start()
+                self.controller_name, self.controller, self._fresh = name, controller, True
+                spelled = _spelled(controller.parameters)
+                self.reporter.event("controller", f"{name} takes over: {spelled}", controller=name)
+            case Retune(controller=controller, parameters=parameters):
+                if controller is not self.controller:
+                    raise Refused("changed", "the controller has changed meanwhile; try again")
+                controller.retune(parameters)
+                name = self.controller_name
+                spelled = _spelled(parameters)
+                self.reporter.event("parameters", f"{name}: {spelled}", controller=name)
+            case Stop():
+                self.supervisor.stop()
+                self._rest()
+            case ClearFault():
+                self.supervisor.clear()
+        if self.supervisor.mode is not before:
+            self._announce_mode(before)
+
+    def _rest(self) -> None:
+        """Put `hold` in command, at neutral."""
+        self.controller_name = "hold"
+        self.controller = Hold(HoldParameters(), self.limits)
+        self._fresh = False
+
+    def _read(self, slot: Slot) -> Measurement:
+        problem = None
+        try:
+            measurement = self.robot.sensor.read(slot.deadline)
+        except Exception as error:
+            problem = f"the force sensor cannot be read: {_named(error)}"
+            measurement = self._measurement or Measurement(slot.deadline, 0.0, 0.0, 0)
+        self._measurement = measurement
+        age = slot.now - measurement.time
+        if problem is None and age > STALE * self.limits.tick:
+            problem = f"the newest force sample is {age * 1e3:.0f} ms old"
+        if self.supervisor.sensor(problem):
+            self._fall()
+        if self.supervisor.clipped(measurement.clipped):
+            self._fall()
+        return measurement
+
+    def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
+        try:
+            return self._estimator.update(measurement, self.applied, slot.deadline, dt)
+        except Exception as error:
+            self._fail("estimate-error", "the estimator failed", error)
+            fx, fy = measurement.fx, measurement.fy
+            return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, self.applied, 0.0, 0.0)
+
+    def _update(self, observation: Observation) -> float:
+        """The angle to apply: the controller's after the guard, or the next step to neutral."""
+        mode = self.supervisor.mode
+        if mode is Mode.ESTOP:
+            return self.applied
+        if mode is not Mode.RUNNING:
+            return self._guard.fade(self.applied)
+        started = self._now()
+        try:
+            if self._fresh:
+                self.controller.activate(observation)
+                self._fresh = False
+            applied = self._guard.apply(self.controller.update(observation), self.applied)
+        except Exception as error:
+            self._fail("controller-error", f"controller {self.controller_name} failed", error)
+            return self._guard.fade(self.applied)
+        budget = UPDATE_BUDGET * self.limits.tick
+        if self.supervisor.update_time(self._now() - started, budget, self.controller_name):
+            self._fall()
+        return applied
+
+    def _write(self, neutral: bool) -> None:
+        """Drive the servo, or release it: at once in estop, once neutral in fault."""
+        mode = self.supervisor.mode
+        try:
+            if mode is Mode.ESTOP or (mode is Mode.FAULT and neutral):
+                if self.servo_on:
+                    self.robot.servo.release()
+                self.servo_on = False
+            else:
+                self.robot.servo.write(self.applied)
+                self.servo_on = True
+        except Exception as error:
+            problem = _named(error)
+            if problem != self._servo_problem:
+                self._fail("servo-link", "the servo cannot be driven", error)
+            self._servo_problem = problem
+        else:
+            self._servo_problem = ""
+
+    def _publish(
+        self, slot: Slot, measurement: Measurement, observation: Observation, busy: float
+    ) -> None:
+        try:
+            self.reporter.tick(
+                slot,
+                measurement,
+                observation,
+                self.robot.truth() if self.robot.truth else None,
+                seq=self.seq,
+                mode=self.supervisor.mode.value,
+                controller=self.controller_name,
+                phi_c=self.applied,
+                servo_on=self.servo_on,
+                busy_us=busy * 1e6,
+                missed=self.statistics.missed,
+            )
+        except Exception as error:
+            self._fail("publish-error", "telemetry cannot be published", error)
+
+    def _check_overrun(self, slot: Slot, marks: tuple[float, ...]) -> None:
+        """Report a tick that took too long, or slots that were lost for another reason."""
+        message = why_overrun(self.seq, marks, self.limits.tick)
+        if message:
+            self.statistics.overruns += 1
+        elif slot.missed and not self._overran:
+            message = (
+                f"{slot.missed} slots were skipped before tick {self.seq}: fishd was woken late, "
+                "the machine is overloaded or was suspended"
+            )
+        self._overran = message is not None
+        if message:
+            self.reporter.event("overrun", message, "warning", seq=self.seq, missed=slot.missed)
+        if self.supervisor.overrun(self._overran):
+            self._fall()
+
+    def _fail(self, code: str, what: str, error: Exception) -> None:
+        """Latch a fault; when one is latched already, the error is logged all the same."""
+        log.error("%s", what, exc_info=error)
+        if self.supervisor.fail(code, f"{what}: {_named(error)}"):
+            self._fall()
+
+    def _fall(self) -> None:
+        """The supervisor has just latched a fault: put `hold` in command and tell everyone."""
+        self._rest()
+        reason = self.supervisor.reason
+        assert reason is not None
+        self.reporter.event("fault", f"{reason.code}: {reason.message}", "error", code=reason.code)
+
+    def _announce_mode(self, before: Mode, level: str = "info") -> None:
+        mode, reason = self.supervisor.mode, self.supervisor.reason
+        message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
+        self.reporter.event("mode", message, level, before=before.value, mode=mode.value)
+
+
+def _spelled(parameters: Struct) -> str:
+    pairs = ((name, getattr(parameters, name)) for name in parameters.__struct_fields__)
+    return ", ".join(f"{name}={'default' if v is None else v}" for name, v in pairs) or "as it is"
+
+
+def _named(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

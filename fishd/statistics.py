@@ -1,0 +1,91 @@
+"""How well the loop keeps its time, in constant memory however long it runs."""
+
+from fishd.signals import Percentiles, Timing
+
+_STEPS = 3  # 2**3 buckets per octave: an error of at most 12 %
+_LONGEST = (1 << 40) - 1  # ns, 18 minutes; anything longer counts as this
+
+PHASES = ("read", "estimate", "update", "write", "publish")
+
+
+class Histogram:
+    """Counts durations in buckets whose width grows with the duration; keeps the worst exactly."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (_LONGEST.bit_length() << _STEPS)
+        self._total = 0
+        self._worst = 0.0
+        self._worst_seq = 0
+
+    def add(self, seconds: float, seq: int) -> None:
+        """Count a duration [s] that was measured in tick `seq`; a negative one counts as zero."""
+        self._total += 1
+        if seconds <= 0.0:  # all there is in virtual time
+            self._counts[0] += 1
+            return
+        nanoseconds = min(int(seconds * 1e9), _LONGEST)
+        octave = max(0, nanoseconds.bit_length() - _STEPS - 1)
+        self._counts[(octave << _STEPS) + (nanoseconds >> octave)] += 1
+        if seconds > self._worst:
+            self._worst = seconds
+            self._worst_seq = seq
+
+    def quantile(self, share: float) -> float:
+        """The duration that `share` of all counted ones do not exceed [s]; 0 without any."""
+        wanted = share * self._total
+        seen = 0
+        for bucket, count in enumerate(self._counts):
+            seen += count
+            if count and seen >= wanted:
+                return min(_upper_edge(bucket), self._worst)
+        return 0.0
+
+    def percentiles(self) -> Percentiles:
+        """Median, 99th percentile and worst [µs]."""
+        return Percentiles(
+            p50=self.quantile(0.50) * 1e6,
+            p99=self.quantile(0.99) * 1e6,
+            worst=self._worst * 1e6,
+            worst_seq=self._worst_seq,
+        )
+
+
+def _upper_edge(bucket: int) -> float:
+    """The longest duration that falls into a bucket [s]."""
+    octave = max(0, (bucket >> _STEPS) - 1)
+    return (((bucket - (octave << _STEPS)) + 1 << octave) - 1) * 1e-9
+
+
+class Statistics:
+    """Lateness, time per phase, missed slots and overruns since start."""
+
+    def __init__(self) -> None:
+        self.missed = 0
+        self.overruns = 0
+        self._lateness = Histogram()
+        self._busy = Histogram()
+        self._phases = tuple(Histogram() for _ in PHASES)
+
+    def add(self, seq: int, lateness: float, marks: tuple[float, ...]) -> None:
+        """Count one tick.
+
+        lateness: start after the deadline [s]
+        marks: times at the start of the tick and after each of PHASES [s]
+        """
+        self._lateness.add(lateness, seq)
+        before = marks[0]
+        for histogram, mark in zip(self._phases, marks[1:], strict=True):
+            histogram.add(mark - before, seq)
+            before = mark
+        self._busy.add(before - marks[0], seq)
+
+    def timing(self) -> Timing:
+        """The distributions so far."""
+        return Timing(
+            lateness=self._lateness.percentiles(),
+            busy=self._busy.percentiles(),
+            phases={
+                name: histogram.percentiles()
+                for name, histogram in zip(PHASES, self._phases, strict=True)
+            },
+        )
