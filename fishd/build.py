@@ -1,24 +1,23 @@
 """Puts the parts together: from a configuration to a loop that is ready to tick."""
 
-from fishd.changes import Switch
 from fishd.clock import Clock
 from fishd.config import Config
 from fishd.controllers import registry
 from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
-from fishd.hardware.simulated import simulated_robot
+from fishd.hardware.simulated import SimulatedFish
 from fishd.loop import ControlLoop
 from fishd.reporting import Publisher
 
 
 def build_robot(config: Config) -> Robot:
     """The robot that the configuration describes."""
-    return simulated_robot(config.plant, config.simulation, config.tick)
+    return SimulatedFish(config.plant, config.simulation, config.tick).robot()
 
 
 def build_loop(config: Config, robot: Robot, clock: Clock, publisher: Publisher) -> ControlLoop:
-    """A loop at rest whose first tick starts `config.start.controller`, if there is one.
+    """A loop in which `config.start.controller` is in command, if there is one.
 
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
@@ -33,5 +32,5 @@ def build_loop(config: Config, robot: Robot, clock: Clock, publisher: Publisher)
     start = config.start
     if start.controller is not None:
         controller = registry.create(start.controller, start.parameters, config.limits)
-        loop.submit(Switch(start.controller, controller))
+        loop.set_controller(start.controller, controller)
     return loop

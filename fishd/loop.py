@@ -2,19 +2,17 @@
 
 The daemon calls it from asyncio every period, simulation and tests from a plain `for` on a virtual
 clock. It never raises: whatever goes wrong, the supervisor decides and the servo goes neutral.
+Everything else here is called between two ticks, by the thread that ticks.
 """
 
 import logging
-from collections import deque
 from typing import Any
 
 from msgspec import Struct
 
-from fishd.changes import Change, ClearFault, Done, Retune, Stop, Switch
 from fishd.clock import Clock, Slot
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.hold import Hold, HoldParameters
-from fishd.errors import Refused
 from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
@@ -29,8 +27,6 @@ UPDATE_BUDGET = 0.5
 """Share of the period that a controller's update may take."""
 STALE = 2.0
 """A newest sample older than this many periods counts as a failed read."""
-MOST_PENDING = 16
-"""Changes that may wait for their tick; one is taken in each."""
 
 
 class ControlLoop:
@@ -64,7 +60,6 @@ class ControlLoop:
         self._estimator = estimator
         self._guard = guard
         self._now = clock.monotonic
-        self._changes: deque[tuple[Change, Done]] = deque()
         self._measurement: Measurement | None = None
         self._index = -1
         self._overran = False
@@ -79,7 +74,6 @@ class ControlLoop:
         dt = (slot.index - self._index) * self.limits.tick
         self._index = slot.index
         self.statistics.missed += slot.missed
-        self._swap()
         measurement = self._read(slot)
         read = now()
         self.observation = observation = self._estimate(measurement, slot, dt)
@@ -93,56 +87,44 @@ class ControlLoop:
         self.statistics.add(self.seq, slot.now - slot.deadline, marks)
         self._check_overrun(slot, marks)
 
-    def submit(self, change: Change, done: Done = lambda _: None) -> None:
-        """Queue a change for one of the next ticks; `done` is called in that tick.
+    def set_controller(self, name: str, controller: Controller[Any]) -> None:
+        """Put a ready-made controller in command from the next tick on.
 
-        Raises `Refused` when too many are waiting.
+        Raises `Refused` while a fault or an emergency stop is latched.
         """
-        if len(self._changes) >= MOST_PENDING:
-            raise Refused("busy", f"{MOST_PENDING} changes are waiting already; try again")
-        self._changes.append((change, done))
+        before = self.supervisor.mode
+        self.supervisor.start()
+        self.controller_name, self.controller, self._fresh = name, controller, True
+        spelled = _spelled(controller.parameters)
+        self.reporter.event("controller", f"{name} takes over: {spelled}", controller=name)
+        self._announce_mode(before)
+
+    def retune(self, parameters: Struct) -> None:
+        """Give the controller in command new, already checked parameters."""
+        self.controller.retune(parameters)
+        name, spelled = self.controller_name, _spelled(parameters)
+        self.reporter.event("parameters", f"{name}: {spelled}", controller=name)
+
+    def stop(self) -> None:
+        """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
+        before = self.supervisor.mode
+        self.supervisor.stop()
+        self._rest()
+        self._announce_mode(before)
+
+    def clear_fault(self) -> None:
+        """Leave mode fault or estop for idle: the servo gets pulses again."""
+        before = self.supervisor.mode
+        self.supervisor.clear()
+        self._announce_mode(before)
 
     def estop(self, message: str) -> None:
         """Stop the pulses now, without waiting for a tick."""
         before = self.supervisor.mode
-        if self.supervisor.estop(message):
-            self._rest()
-            self._announce_mode(before, level="error")
+        self.supervisor.estop(message)
+        self._rest()
+        self._announce_mode(before, level="error")
         self._write(neutral=False)
-
-    def _swap(self) -> None:
-        if not self._changes:
-            return
-        change, done = self._changes.popleft()
-        try:
-            self._apply(change)
-        except Refused as error:
-            done(error)
-        else:
-            done(None)
-
-    def _apply(self, change: Change) -> None:
-        before = self.supervisor.mode
-        match change:
-            case Switch(name=name, controller=controller):
-                self.supervisor.start()
-                self.controller_name, self.controller, self._fresh = name, controller, True
-                spelled = _spelled(controller.parameters)
-                self.reporter.event("controller", f"{name} takes over: {spelled}", controller=name)
-            case Retune(controller=controller, parameters=parameters):
-                if controller is not self.controller:
-                    raise Refused("changed", "the controller has changed meanwhile; try again")
-                controller.retune(parameters)
-                name = self.controller_name
-                spelled = _spelled(parameters)
-                self.reporter.event("parameters", f"{name}: {spelled}", controller=name)
-            case Stop():
-                self.supervisor.stop()
-                self._rest()
-            case ClearFault():
-                self.supervisor.clear()
-        if self.supervisor.mode is not before:
-            self._announce_mode(before)
 
     def _rest(self) -> None:
         """Put `hold` in command, at neutral."""
@@ -266,6 +248,8 @@ class ControlLoop:
 
     def _announce_mode(self, before: Mode, level: str = "info") -> None:
         mode, reason = self.supervisor.mode, self.supervisor.reason
+        if mode is before:
+            return
         message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
         self.reporter.event("mode", message, level, before=before.value, mode=mode.value)
 

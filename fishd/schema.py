@@ -7,7 +7,7 @@ description (`fields_of`) that help texts, command-line options and documentatio
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -83,11 +83,9 @@ def nearest(word: str, words: list[str]) -> str:
 
 def leaves(struct: type[Struct], prefix: str = "") -> list[str]:
     """Every key of `struct` and its sections in dotted form."""
-    keys: list[str] = []
-    for field in msgspec.structs.fields(struct):
-        keys.append(prefix + field.name)
-        if isinstance(field.type, type) and issubclass(field.type, Struct):
-            keys += leaves(field.type, f"{prefix}{field.name}.")
+    keys = [prefix + field.name for field in fields_of(struct)]
+    for name, section in _sections(struct):
+        keys += leaves(section, f"{prefix}{name}.")
     return keys
 
 
@@ -150,8 +148,16 @@ def _explain(
 
 def _struct_at(target: type[Struct], path: tuple[str, ...]) -> type[Struct]:
     for key in path:
-        target = next(f.type for f in msgspec.structs.fields(target) if f.name == key)
+        target = next(part for name, part in _sections(target) if name == key)
     return target
+
+
+def _sections(target: type[Struct]) -> Iterator[tuple[str, type[Struct]]]:
+    """The fields of a struct that are structs themselves."""
+    for field in cast(inspect.StructType, inspect.type_info(target)).fields:
+        kind = field.type.type if isinstance(field.type, inspect.Metadata) else field.type
+        if isinstance(kind, inspect.StructType):
+            yield field.name, kind.cls
 
 
 def _wanted(target: type[Struct], path: tuple[str, ...]) -> str:

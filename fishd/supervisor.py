@@ -42,14 +42,18 @@ class Supervisor:
         self._ticks = 0
         self._overruns: deque[int] = deque()  # in which of the latest ticks
 
-    def start(self) -> None:
-        """A controller takes over; raises `Refused` while a fault or estop is latched."""
+    def check_startable(self) -> None:
+        """Raises `Refused` while a fault or an emergency stop is latched."""
         if self.reason is not None:
             raise Refused(
-                self.mode,
+                self.mode.value,
                 f"fishd is in {self.mode}: {self.reason.message}; "
                 "mend the cause, then clear it with 'fishctl clear-fault'",
             )
+
+    def start(self) -> None:
+        """A controller takes over; raises `Refused` while a fault or estop is latched."""
+        self.check_startable()
         self.mode = Mode.RUNNING
 
     def stop(self) -> None:
@@ -65,23 +69,19 @@ class Supervisor:
         self.reason = Reason(code=code, message=message)
         return True
 
-    def estop(self, message: str) -> bool:
-        """Latch an emergency stop; False when there is one already."""
-        if self.mode is Mode.ESTOP:
-            return False
-        self.mode = Mode.ESTOP
-        self.reason = Reason(code="estop", message=message)
-        return True
+    def estop(self, message: str) -> None:
+        """Latch an emergency stop; the reason of an earlier one is kept."""
+        if self.mode is not Mode.ESTOP:
+            self.mode = Mode.ESTOP
+            self.reason = Reason(code="estop", message=message)
 
-    def clear(self) -> bool:
-        """Forget the latched reason and go to idle; False when there is nothing to clear."""
-        if self.reason is None:
-            return False
-        self.mode = Mode.IDLE
-        self.reason = None
-        self._bad_reads = self._clipped = self._slow_updates = 0
-        self._overruns.clear()
-        return True
+    def clear(self) -> None:
+        """Forget the latched reason, if there is one, and go to idle."""
+        if self.reason is not None:
+            self.mode = Mode.IDLE
+            self.reason = None
+            self._bad_reads = self._clipped = self._slow_updates = 0
+            self._overruns.clear()
 
     def sensor(self, problem: str | None) -> bool:
         """Count a read, good (None) or not; True when that latches the fault sensor-stale."""

@@ -17,8 +17,8 @@ class SimulatedFish:
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
         self.fish = TetheredFish(plant)
-        self.window: Window | None = None
-        """The latest window with its true mean forces; None before the first read."""
+        self.window: Window
+        """The latest window with its true mean forces; there is none before the first read."""
         self._imperfections = Imperfections(settings, tick)
         self._sample_rate = settings.sample_rate
         self._tick = tick
@@ -53,8 +53,6 @@ class SimulatedFish:
         state = self.fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
-
-def simulated_robot(plant: PlantParameters, settings: SimulationSettings, tick: float) -> Robot:
-    """A robot whose fish is simulated."""
-    fish = SimulatedFish(plant, settings, tick)
-    return Robot(name="simulated", sensor=fish, servo=fish, truth=fish.truth)
+    def robot(self) -> Robot:
+        """This fish as the loop sees it."""
+        return Robot(name="simulated", sensor=self, servo=self, truth=self.truth)

@@ -1,0 +1,5 @@
+"""`python -m fishd` is `fishd`."""
+
+from fishd.daemon import main
+
+main(prog_name="fishd")

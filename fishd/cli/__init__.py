@@ -1,0 +1,1 @@
+"""`fishctl`, the command line of fishd: one module per family of verbs."""

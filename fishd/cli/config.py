@@ -1,0 +1,65 @@
+"""Verbs about the configuration: check a file, show what is in force, print the schema."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from fishd.cli.options import json_option
+from fishd.cli.output import print_json
+from fishd.config import Config, load, to_yaml
+from fishd.errors import ConfigError
+
+set_option = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Override one key of the configuration, such as plant.omega0=10. Repeatable.",
+)
+
+EX_CONFIG = 78
+
+
+@click.group()
+def config() -> None:
+    """Check, show and explain the configuration."""
+
+
+@config.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@set_option
+def check(file: Path, overrides: tuple[str, ...]) -> None:
+    """Check a configuration file; exit status 78 when fishd would refuse it."""
+    load_or_exit(file, overrides)
+    click.echo(f"{file}: good")
+
+
+@config.command()
+@click.argument("file", type=click.Path(path_type=Path), required=False)
+@set_option
+@json_option
+def show(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Print every key with its value in FILE, or its default."""
+    loaded = load_or_exit(file, overrides)
+    if as_json:
+        print_json(loaded)
+    else:
+        click.echo(to_yaml(loaded), nl=False)
+
+
+@config.command()
+def schema() -> None:
+    """Print the JSON Schema of the configuration, for editors and other programs."""
+    import msgspec
+
+    print_json(msgspec.json.schema(Config))
+
+
+def load_or_exit(file: Path | None, overrides: tuple[str, ...]) -> Config:
+    """The configuration; one line and exit status 78 where it is wrong."""
+    try:
+        return load(file, overrides)
+    except ConfigError as error:
+        click.echo(f"fishctl: {error}", err=True)
+        sys.exit(EX_CONFIG)

@@ -1,0 +1,169 @@
+"""Verbs that talk to a running daemon: status, controllers, set-controller and so on."""
+
+import datetime
+from typing import Any
+
+import click
+
+from fishd.cli.options import (
+    ControllerGroup,
+    ParameterType,
+    describe,
+    endpoint_option,
+    json_option,
+)
+from fishd.cli.output import print_json, spelled
+from fishd.client import Fish
+from fishd.controllers import registry
+from fishd.errors import NoDaemon
+from fishd.protocol import State
+from fishd.signals import Percentiles, Status
+
+
+def daemon_options(function: Any) -> Any:
+    """`--endpoint` and `--json`."""
+    return endpoint_option(json_option(function))
+
+
+@click.command()
+@daemon_options
+def status(endpoint: str | None, as_json: bool) -> None:
+    """Show what the daemon is doing, and how well."""
+    with Fish(endpoint) as fish:
+        found = fish.status()
+    if as_json:
+        print_json(found)
+    else:
+        click.echo(_status_text(found))
+
+
+@click.command()
+@daemon_options
+def controllers(endpoint: str | None, as_json: bool) -> None:
+    """List the controllers that the daemon knows, and their parameters."""
+    try:
+        with Fish(endpoint) as fish:
+            known = fish.controllers()
+    except NoDaemon:
+        if endpoint:
+            raise
+        click.echo("fishctl: no fishd is running; these controllers are installed here", err=True)
+        known = [registry.describe(name) for name in registry.names()]
+    if as_json:
+        print_json(known)
+        return
+    for info in known:
+        click.echo(f"{click.style(info.name, bold=True)}  {info.summary}")
+        for field in info.parameters:
+            click.echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
+
+
+@click.group(cls=ControllerGroup, options=daemon_options)
+def set_controller() -> None:
+    """Put another controller in command; parameters left out take their defaults."""
+
+
+@set_controller.action
+def _set_controller(
+    name: str, parameters: dict[str, Any], endpoint: str | None, as_json: bool
+) -> None:
+    with Fish(endpoint) as fish:
+        _print_state(fish.set_controller(name, **parameters), as_json)
+
+
+@click.command()
+@click.argument("pairs", nargs=-1, required=True, metavar="NAME VALUE [NAME VALUE]...")
+@daemon_options
+def set_parameter(pairs: tuple[str, ...], endpoint: str | None, as_json: bool) -> None:
+    """Change parameters of the running controller while the fish swims, all or none of them."""
+    if len(pairs) % 2:
+        raise click.UsageError("every NAME needs a VALUE, such as: C 0.7")
+    with Fish(endpoint) as fish:
+        running = fish.status().controller
+        known = {
+            field.name: field
+            for i in fish.controllers()
+            if i.name == running
+            for field in i.parameters
+        }
+        values: dict[str, Any] = {}
+        for given, text in zip(pairs[::2], pairs[1::2], strict=True):
+            name = given.lstrip("-").replace("-", "_")
+            field = known.get(name)
+            # The daemon refuses a name that the controller does not have, and says which it has.
+            values[name] = ParameterType(field).convert(text, None, None) if field else text
+        _print_state(fish.set_parameters(**values), as_json)
+
+
+@click.command()
+@daemon_options
+def stop(endpoint: str | None, as_json: bool) -> None:
+    """Fade to neutral and stay there."""
+    with Fish(endpoint) as fish:
+        _print_state(fish.stop(), as_json)
+
+
+@click.command()
+@click.argument("message", default="requested with fishctl")
+@daemon_options
+def estop(message: str, endpoint: str | None, as_json: bool) -> None:
+    """Emergency stop: no more pulses, at once, until 'fishctl clear-fault'."""
+    with Fish(endpoint) as fish:
+        _print_state(fish.estop(message), as_json)
+
+
+@click.command()
+@daemon_options
+def clear_fault(endpoint: str | None, as_json: bool) -> None:
+    """Leave mode fault or estop; the servo gets pulses again and goes to neutral."""
+    with Fish(endpoint) as fish:
+        _print_state(fish.clear_fault(), as_json)
+
+
+@click.command()
+@click.argument("text")
+@daemon_options
+def mark(text: str, endpoint: str | None, as_json: bool) -> None:
+    """Put a mark in the event stream, such as what you just changed on the rig."""
+    with Fish(endpoint) as fish:
+        _print_state(fish.mark(text), as_json)
+
+
+def _print_state(state: State, as_json: bool) -> None:
+    if as_json:
+        print_json(state)
+        return
+    why = f" ({state.reason.code}: {state.reason.message})" if state.reason else ""
+    click.echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
+
+
+def _status_text(status: Status) -> str:
+    reason = f" ({status.reason.code}: {status.reason.message})" if status.reason else ""
+    timing = status.timing
+    scheduling = "real-time" if status.realtime else "normal"
+    uptime = datetime.timedelta(seconds=int(status.uptime))
+    rows = [
+        ("mode", status.mode + reason),
+        ("controller", f"{status.controller} {spelled(status.parameters)}"),
+        ("thrust", f"{status.thrust * 1e3:.2f} mN at {status.frequency:.2f} Hz"),
+        (
+            "servo",
+            f"{'on' if status.servo_on else 'no pulses'}, within ±{status.amplitude_limit:g} rad",
+        ),
+        ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling"),
+        ("", f"{status.missed} slots missed, {status.overruns} overruns"),
+        ("late", _percentiles(timing.lateness)),
+        ("busy", _percentiles(timing.busy)),
+        *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
+        ("robot", status.robot),
+        ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
+        ("telemetry", status.telemetry),
+    ]
+    return "\n".join(f"{name:<12}{text}" for name, text in rows)
+
+
+def _percentiles(times: Percentiles) -> str:
+    return (
+        f"p50 {times.p50:.0f} µs, p99 {times.p99:.0f} µs, "
+        f"worst {times.worst:.0f} µs in tick {times.worst_seq}"
+    )

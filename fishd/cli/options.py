@@ -1,0 +1,151 @@
+"""Options that verbs share, and options that are generated from the parameters of controllers."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import click
+
+from fishd.client import Fish
+from fishd.controllers import registry
+from fishd.controllers.registry import ControllerInfo
+from fishd.errors import FishError, UnknownController
+from fishd.schema import Field
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+
+def _remember(ctx: click.Context, _: click.Parameter, value: str | None) -> str | None:
+    return value or ctx.find_root().obj
+
+
+endpoint_option = click.option(
+    "--endpoint",
+    metavar="ADDRESS",
+    callback=_remember,
+    help="Control socket of the daemon; default: $FISHD_ENDPOINT, else the one on this machine.",
+)
+
+
+class ParameterType(click.ParamType[Any]):
+    """A value for one parameter of a controller; whether it is in range the daemon decides."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.name = field.kind
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Text from the command line to number, boolean or text."""
+        field = self.field
+        if value is None or not isinstance(value, str):
+            return value
+        if field.optional and value.lower() in ("null", "none", "default"):
+            return None
+        try:
+            return _PARSERS.get(field.kind, str)(value)
+        except ValueError:
+            within = f" in {field.interval}" if field.interval else ""
+            self.fail(f"'{value}' is not a {field.kind}{within}", param, ctx)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(text)
+    return number
+
+
+def _boolean(text: str) -> bool:
+    return {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}[
+        text.lower()
+    ]
+
+
+_PARSERS: dict[str, Callable[[str], Any]] = {"number": _finite, "integer": int, "boolean": _boolean}
+
+_PREFIX = "parameter_"
+
+
+def parameter_options(info: ControllerInfo) -> list[click.Parameter]:
+    """One option for each parameter of a controller, its case kept (`--C`)."""
+    return [
+        click.Option(
+            [_PREFIX + field.name, "--" + field.name.replace("_", "-")],
+            type=ParameterType(field),
+            metavar=field.kind.upper(),
+            help=describe(field),
+            default=None,
+        )
+        for field in info.parameters
+    ]
+
+
+def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str, Any]:
+    """Take the parameters out of a command's values; keep those from the command line."""
+    taken = {name: values.pop(name) for name in list(values) if name.startswith(_PREFIX)}
+    return {
+        name.removeprefix(_PREFIX): value
+        for name, value in taken.items()
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    }
+
+
+def describe(field: Field) -> str:
+    """Description, permitted values, unit and default of a parameter in one line."""
+    unit = "" if field.unit in ("", "1") else f" {field.unit}"
+    facts = [f"{field.interval}{unit}"] if field.interval or unit else []
+    facts.append(f"default {'null' if field.default is None else field.default}")
+    return f"{field.description}  [{'; '.join(fact.strip() for fact in facts)}]"
+
+
+class ControllerGroup(click.Group):
+    """A verb whose sub-commands are the controllers, each with its parameters as options.
+
+    Controllers that are installed here are known without a daemon; for any other name the daemon
+    is asked, which may run on a machine where more is installed.
+    """
+
+    def __init__(self, *args: Any, options: Callable[[F], F], **kwargs: Any) -> None:
+        """options: decorator that adds the verb's own options to each sub-command."""
+        super().__init__(*args, **kwargs)
+        self._options = options
+        self._action: Callable[..., Any] = lambda: None
+
+    def action(self, function: F) -> F:
+        """Decorator: call `function(name, parameters, **options)` for each sub-command."""
+        self._action = function
+        return function
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The controllers installed here."""
+        return registry.names()
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The sub-command of one controller."""
+        try:
+            info = registry.describe(cmd_name)
+        except UnknownController as error:
+            info = self._ask_daemon(ctx, cmd_name, error)
+
+        @click.pass_context
+        def callback(ctx: click.Context, /, **values: Any) -> Any:
+            return self._action(info.name, given_parameters(ctx, values), **values)
+
+        decorated = self._options(cast(Any, callback))
+        command = click.command(cmd_name, help=info.summary, short_help=info.summary)(decorated)
+        command.params = parameter_options(info) + command.params
+        return command
+
+    def _ask_daemon(
+        self, ctx: click.Context, name: str, unknown: UnknownController
+    ) -> ControllerInfo:
+        try:
+            with Fish(ctx.params.get("endpoint") or ctx.find_root().obj) as fish:
+                known = {info.name: info for info in fish.controllers()}
+        except FishError:
+            raise unknown from None
+        if name not in known:
+            raise unknown
+        return known[name]

@@ -1,0 +1,110 @@
+"""`AsyncFish`: the client for asyncio programs."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from contextlib import closing
+from typing import Any, Self, TypeVar
+
+import msgspec
+import zmq.asyncio
+
+from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
+from fishd.controllers.registry import ControllerInfo
+from fishd.protocol import State
+from fishd.signals import Event, Status, Tick
+
+T = TypeVar("T")
+
+
+class AsyncFish(Connection):
+    """`Fish` for asyncio: the same requests, to be awaited."""
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        timeout: float = TIMEOUT,
+        telemetry: str | None = None,
+    ) -> None:
+        """Takes the arguments of `Fish`."""
+        super().__init__(endpoint, timeout, telemetry)
+        self._context = zmq.asyncio.Context()
+        self._socket: zmq.asyncio.Socket | None = None
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+        self._context.destroy(linger=0)
+
+    async def status(self) -> Status:
+        """The daemon in one snapshot."""
+        return await self._call(Status, "status")
+
+    async def controllers(self) -> list[ControllerInfo]:
+        """The controllers that the daemon knows, with their parameters."""
+        return await self._call(list[ControllerInfo], "controllers")
+
+    async def set_controller(self, name: str, /, **parameters: Any) -> State:
+        """Put another controller in command; parameters left out take their defaults."""
+        return await self._call(State, "set-controller", name=name, parameters=parameters)
+
+    async def set_parameters(self, **parameters: Any) -> State:
+        """Change parameters of the running controller, all at once or none."""
+        return await self._call(State, "set-parameter", parameters=parameters)
+
+    async def stop(self) -> State:
+        """Fade to neutral and stay there."""
+        return await self._call(State, "stop")
+
+    async def estop(self, message: str = "requested by a client") -> State:
+        """Stop the servo's pulses at once."""
+        return await self._call(State, "estop", message=message)
+
+    async def clear_fault(self) -> State:
+        """Leave mode fault or estop."""
+        return await self._call(State, "clear-fault")
+
+    async def mark(self, text: str) -> State:
+        """Publish a mark in the event stream."""
+        return await self._call(State, "mark", text=text)
+
+    def ticks(self) -> AsyncIterator[Tick]:
+        """Every tick from now on; raises `NoDaemon` when none comes in time."""
+        return self._subscribe(b"tick", Tick)
+
+    def events(self) -> AsyncIterator[Event]:
+        """Every event from now on, however long it takes."""
+        return self._subscribe(b"event", Event)
+
+    async def _call(self, kind: type[T], op: str, **args: Any) -> T:
+        """One request at a time: tasks that share this object must take turns."""
+        if self._socket is None:
+            self.check_endpoint()
+            self._socket = dealer(self._context, self.endpoint)
+        identity, request = self.request(op, args)
+        deadline = time.monotonic() + self.timeout
+        try:
+            await asyncio.wait_for(self._socket.send(request), self.timeout)
+        except TimeoutError:
+            raise self.silent() from None
+        while await self._socket.poll(milliseconds_until(deadline)):
+            frames = await self._socket.recv_multipart()
+            result = self.result(frames[-1], identity, kind)
+            if result is not None:
+                return result
+        raise self.silent()
+
+    async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
+        address = self.telemetry_address or (await self.status()).telemetry
+        patience = -1 if kind is Event else int(self.timeout * 1e3)
+        decoder = msgspec.json.Decoder(kind)
+        with closing(subscriber(self._context, address, topic)) as socket:
+            while await socket.poll(patience):
+                yield decoder.decode((await socket.recv_multipart())[1])
+        raise self.telemetry_silent()

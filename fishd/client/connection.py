@@ -1,0 +1,102 @@
+"""What both clients share: sockets, the form of requests and replies, and complaints."""
+
+import itertools
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import zmq
+
+from fishd import protocol
+from fishd.addresses import find_control
+from fishd.errors import NoDaemon, ParameterError, Refused
+
+T = TypeVar("T")
+
+TIMEOUT = 2.0
+"""How long to wait for an answer [s]."""
+
+
+class Connection:
+    """What both clients share: addresses, the form of requests and replies, and complaints."""
+
+    def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
+        self.endpoint = endpoint or find_control()
+        self.timeout = timeout
+        self.telemetry_address = telemetry
+        self._ids = itertools.count(1)
+
+    def check_endpoint(self) -> None:
+        """Spare the wait where there is no socket to connect to."""
+        if self.endpoint.startswith("ipc://"):
+            path = Path(self.endpoint.removeprefix("ipc://"))
+            if not path.exists():
+                raise self._nobody("there is no such socket")
+
+    def _nobody(self, why: str) -> NoDaemon:
+        return NoDaemon(
+            f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or name another with "
+            "--endpoint or $FISHD_ENDPOINT"
+        )
+
+    def silent(self) -> NoDaemon:
+        return self._nobody(f"no answer within {self.timeout:g} s")
+
+    def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
+        identity = next(self._ids)
+        for name, value in args.get("parameters", {}).items():
+            if isinstance(value, float) and not math.isfinite(value):  # JSON would make it null
+                raise ParameterError(f"{name}: {value} is not a number that can be sent")
+        return identity, protocol.encode(
+            protocol.Request(v=protocol.VERSION, id=identity, op=op, args=dict(args))
+        )
+
+    @staticmethod
+    def result(payload: bytes, identity: int, kind: type[T]) -> T | None:
+        """The result in a reply; None when it answers an earlier request that timed out."""
+        reply = protocol.decode_reply(payload)
+        if reply.id != identity:
+            return None
+        if reply.error:
+            raise Refused(reply.error.code, reply.error.message)
+        assert reply.result
+        return msgspec.json.decode(reply.result, type=kind)
+
+    def telemetry_silent(self) -> NoDaemon:
+        return self._nobody(f"no telemetry within {self.timeout:g} s")
+
+
+S = TypeVar("S", bound="zmq.Socket[Any]")
+
+
+def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
+    socket = context.socket(zmq.DEALER)
+    socket.set(zmq.LINGER, 0)
+    socket.set(zmq.IMMEDIATE, 1)  # do not queue for a daemon that is not there
+    _connect(socket, endpoint)
+    return socket
+
+
+def subscriber(context: "zmq.Context[S]", address: str, topic: bytes) -> S:
+    socket = context.socket(zmq.SUB)
+    socket.set(zmq.SUBSCRIBE, topic)
+    _connect(socket, address)
+    return socket
+
+
+def _connect(socket: "zmq.Socket[Any]", address: str) -> None:
+    try:
+        socket.connect(address)
+    except zmq.ZMQError as error:
+        socket.close()
+        raise NoDaemon(
+            f"'{address}' is no address: {zmq.strerror(error.errno or 0)}; "
+            "write ipc://PATH or tcp://HOST:PORT"
+        ) from None
+
+
+def milliseconds_until(deadline: float) -> int:
+    return max(0, math.ceil((deadline - time.monotonic()) * 1e3))

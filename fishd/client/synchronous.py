@@ -1,0 +1,114 @@
+"""`Fish`: the client for ordinary programs."""
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any, Self, TypeVar
+
+import msgspec
+import zmq
+
+from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
+from fishd.controllers.registry import ControllerInfo
+from fishd.protocol import State
+from fishd.signals import Event, Status, Tick
+
+T = TypeVar("T")
+
+
+class Fish(Connection):
+    """A connection to a daemon; use it as a context manager, from one thread.
+
+    Every request raises `NoDaemon` when nobody answers in time, and `Refused` when the daemon
+    answers with an error.
+    """
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        timeout: float = TIMEOUT,
+        telemetry: str | None = None,
+    ) -> None:
+        """
+        endpoint: address of the control socket; None looks for the daemon of this machine
+        timeout: how long to wait for an answer or a tick [s]
+        telemetry: address of the telemetry socket; None asks the daemon
+        """
+        super().__init__(endpoint, timeout, telemetry)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+        self._context.destroy(linger=0)
+
+    def status(self) -> Status:
+        """The daemon in one snapshot."""
+        return self._call(Status, "status")
+
+    def controllers(self) -> list[ControllerInfo]:
+        """The controllers that the daemon knows, with their parameters."""
+        return self._call(list[ControllerInfo], "controllers")
+
+    def set_controller(self, name: str, /, **parameters: Any) -> State:
+        """Put another controller in command; parameters left out take their defaults."""
+        return self._call(State, "set-controller", name=name, parameters=parameters)
+
+    def set_parameters(self, **parameters: Any) -> State:
+        """Change parameters of the running controller, all at once or none."""
+        return self._call(State, "set-parameter", parameters=parameters)
+
+    def stop(self) -> State:
+        """Fade to neutral and stay there."""
+        return self._call(State, "stop")
+
+    def estop(self, message: str = "requested by a client") -> State:
+        """Stop the servo's pulses at once."""
+        return self._call(State, "estop", message=message)
+
+    def clear_fault(self) -> State:
+        """Leave mode fault or estop."""
+        return self._call(State, "clear-fault")
+
+    def mark(self, text: str) -> State:
+        """Publish a mark in the event stream, such as what you just changed on the rig."""
+        return self._call(State, "mark", text=text)
+
+    def ticks(self) -> Iterator[Tick]:
+        """Every tick from now on; raises `NoDaemon` when none comes in time."""
+        return self._subscribe(b"tick", Tick)
+
+    def events(self) -> Iterator[Event]:
+        """Every event from now on, however long it takes."""
+        return self._subscribe(b"event", Event)
+
+    def _call(self, kind: type[T], op: str, **args: Any) -> T:
+        if self._socket is None:
+            self.check_endpoint()
+            self._socket = dealer(self._context, self.endpoint)
+        identity, request = self.request(op, args)
+        deadline = time.monotonic() + self.timeout
+        if not self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
+            raise self.silent()
+        self._socket.send(request)
+        while self._socket.poll(milliseconds_until(deadline)):
+            result = self.result(self._socket.recv_multipart()[-1], identity, kind)
+            if result is not None:
+                return result
+        raise self.silent()
+
+    def _subscribe(self, topic: bytes, kind: type[T]) -> Iterator[T]:
+        address = self.telemetry_address or self.status().telemetry
+        patience = -1 if kind is Event else int(self.timeout * 1e3)
+        decoder = msgspec.json.Decoder(kind)
+        with closing(subscriber(self._context, address, topic)) as socket:
+            while socket.poll(patience):
+                yield decoder.decode(socket.recv_multipart()[1])
+        raise self.telemetry_silent()

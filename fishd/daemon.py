@@ -1,0 +1,175 @@
+"""The daemon: wiring and lifetimes, from a configuration to a fish that swims until it is told."""
+
+import asyncio
+import logging
+import signal
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+import zmq
+
+from fishd import __version__, addresses, build, realtime
+from fishd.clock import SystemClock, Ticker
+from fishd.config import Config, load
+from fishd.console import status_line
+from fishd.errors import ConfigError, StartupError
+from fishd.logs import LogWriter
+from fishd.operations import Operations
+from fishd.server import ControlServer
+from fishd.telemetry import Telemetry
+
+log = logging.getLogger(__name__)
+console = logging.getLogger("console")
+
+EX_CONFIG = 78
+FADE_LIMIT = 0.5
+"""Longest time from a signal to exit that fading to neutral may take [s]."""
+HOUSEKEEPING = 1.0
+"""Time between two status messages [s]."""
+
+
+class Daemon:
+    """Everything that lives as long as the process; use it as a context manager.
+
+    Raises `StartupError` when an address is in use. Whatever happens inside, leaving releases the
+    servo first and closes the sockets then, each even if another step fails.
+    """
+
+    def __init__(self, config: Config, print_status: bool) -> None:
+        self._config = config
+        self._print_status = print_status
+        self._clock = SystemClock()
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "Daemon":
+        with ExitStack() as stack:
+            config = self._config
+            address = config.control.address or addresses.control_address()
+            lock = addresses.claim(address)
+            if lock:
+                stack.enter_context(lock)
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            stack.callback(context.term)
+            self._telemetry = Telemetry(context, config.telemetry.address)
+            stack.callback(self._telemetry.close)
+            robot = build.build_robot(config)
+            stack.callback(robot.sensor.close)
+            stack.callback(robot.servo.close)
+            self._loop = build.build_loop(config, robot, self._clock, self._telemetry)
+            fifo = realtime.enter(config.realtime.priority, config.realtime.lock_memory)
+            self._operations = Operations(self._loop, self._clock, self._telemetry.address, fifo)
+            self._server = ControlServer(context, address, self._operations.perform)
+            stack.callback(self._server.close)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    async def run(self) -> None:
+        """Tick until SIGTERM or SIGINT, then fade to neutral."""
+        stopping = asyncio.Event()
+        events = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            events.add_signal_handler(number, stopping.set)
+        log.info(
+            "fishd %s drives the %s robot every %g ms; control %s, telemetry %s",
+            __version__,
+            self._loop.robot.name,
+            self._config.tick * 1e3,
+            self._server.address,
+            self._telemetry.address,
+        )
+        server = asyncio.create_task(self._server.run())
+        realtime.quiet_garbage_collector()
+        try:
+            await self._tick_until(stopping, server)
+        finally:
+            server.cancel()
+
+    async def _tick_until(self, stopping: asyncio.Event, server: asyncio.Task[None]) -> None:
+        ticker = Ticker(self._config.tick)
+        next_report = 0.0
+        try:
+            async for slot in ticker:
+                self._loop.tick(slot)
+                if slot.now >= next_report:
+                    next_report = slot.now + HOUSEKEEPING
+                    self._report()
+                if server.done():
+                    server.result()
+                if stopping.is_set():
+                    break
+            log.info("stopping: fading to neutral")
+            self._loop.stop()
+            deadline = self._clock.monotonic() + FADE_LIMIT
+            async for slot in ticker:
+                if self._loop.applied == 0.0 or slot.now > deadline:
+                    break
+                self._loop.tick(slot)
+        finally:
+            ticker.close()
+
+    def _report(self) -> None:
+        status = self._operations.status()
+        self._telemetry.status(status)
+        if self._print_status:
+            console.info("%s", status_line(status))
+        realtime.collect_garbage()
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--config",
+    "path",
+    type=click.Path(path_type=Path),
+    help="YAML file; without it, a simulated fish at rest.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Override one key of the configuration, such as plant.omega0=10. Repeatable.",
+)
+@click.option(
+    "--print-status/--no-print-status",
+    default=None,
+    help="Print a status line a second; by default when standard output is a terminal.",
+)
+@click.option(
+    "--log-format",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="How logs on standard error look.",
+)
+@click.version_option(__version__, prog_name="fishd")
+def main(
+    path: Path | None, overrides: tuple[str, ...], print_status: bool | None, log_format: str
+) -> None:
+    """Run the robotic fish until SIGINT (Ctrl-C) or SIGTERM.
+
+    Exit status: 0 after a clean stop, 1 when something failed, 78 when the configuration is wrong.
+    """
+    try:
+        config = load(path, overrides)
+    except ConfigError as error:
+        click.echo(f"fishd: {error}", err=True)
+        sys.exit(EX_CONFIG)
+    logs = LogWriter(log_format)
+    try:
+        with Daemon(
+            config, sys.stdout.isatty() if print_status is None else print_status
+        ) as daemon:
+            asyncio.run(daemon.run())
+    except StartupError as error:
+        log.critical("%s", error)
+        sys.exit(1)
+    except Exception:
+        log.critical("fishd failed; the servo is released", exc_info=True)
+        sys.exit(1)
+    finally:
+        logs.close()

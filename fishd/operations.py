@@ -1,0 +1,159 @@
+"""What can be asked of a running daemon: each operation of the control protocol, over one loop."""
+
+import asyncio
+import os
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd import __version__, protocol
+from fishd.clock import Clock
+from fishd.controllers import registry
+from fishd.controllers.registry import ControllerInfo
+from fishd.errors import ParameterError, Refused, UnknownController
+from fishd.loop import ControlLoop
+from fishd.protocol import State
+from fishd.schema import Problem, convert, nearest
+from fishd.signals import Status
+from fishd.supervisor import Mode
+
+
+class Operations:
+    """Answers requests from what the loop knows, and makes changes between its ticks."""
+
+    def __init__(self, loop: ControlLoop, clock: Clock, telemetry: str, realtime: bool) -> None:
+        """telemetry: the address that clients are told; realtime: is SCHED_FIFO in force?"""
+        self._loop = loop
+        self._clock = clock
+        self._telemetry = telemetry
+        self._realtime = realtime
+        self._started = clock.monotonic()
+        self._controllers = _describe_all()
+        self._operations: dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]] = {
+            "status": (protocol.NoArguments, self._status),
+            "controllers": (protocol.NoArguments, self._list_controllers),
+            "set-controller": (protocol.SetController, self._set_controller),
+            "set-parameter": (protocol.SetParameter, self._set_parameter),
+            "stop": (protocol.NoArguments, self._stop),
+            "estop": (protocol.Estop, self._estop),
+            "clear-fault": (protocol.NoArguments, self._clear_fault),
+            "mark": (protocol.Mark, self._mark),
+        }
+
+    async def perform(self, op: str, args: dict[str, Any]) -> Any:
+        """Do what a request asks for and return its result; raises `Refused`."""
+        if op not in self._operations:
+            raise Refused("unknown-op", f"no such op '{op}'; {nearest(op, list(self._operations))}")
+        expected, operation = self._operations[op]
+        try:
+            arguments: Any = convert(args, expected)
+        except Problem as problem:
+            path = ".".join(problem.path)
+            raise Refused("bad-arguments", f"{op}: {path}: {problem}") from None
+        return await operation(arguments)
+
+    def status(self) -> Status:
+        """The daemon in one snapshot."""
+        loop = self._loop
+        observation = loop.observation
+        return Status(
+            t=self._clock.wall(),
+            version=__version__,
+            pid=os.getpid(),
+            uptime=self._clock.monotonic() - self._started,
+            mode=loop.supervisor.mode.value,
+            reason=loop.supervisor.reason,
+            controller=loop.controller_name,
+            parameters=msgspec.structs.asdict(loop.controller.parameters),
+            servo_on=loop.servo_on,
+            thrust=observation.thrust if observation else 0.0,
+            frequency=observation.frequency if observation else 0.0,
+            tick=loop.limits.tick,
+            amplitude_limit=loop.limits.amplitude,
+            seq=loop.seq,
+            missed=loop.statistics.missed,
+            overruns=loop.statistics.overruns,
+            timing=loop.statistics.timing(),
+            robot=loop.robot.name,
+            realtime=self._realtime,
+            telemetry=self._telemetry,
+        )
+
+    async def _status(self, _: protocol.NoArguments) -> Status:
+        return self.status()
+
+    async def _list_controllers(self, _: protocol.NoArguments) -> list[ControllerInfo]:
+        return self._controllers
+
+    async def _set_controller(self, wanted: protocol.SetController) -> State:
+        self._loop.supervisor.check_startable()  # before it is loaded in vain
+        try:
+            # In a thread: a controller may load files and warm up, the tick must not wait for it.
+            controller = await asyncio.to_thread(
+                registry.create, wanted.name, wanted.parameters, self._loop.limits
+            )
+        except UnknownController as error:
+            raise Refused("unknown-controller", str(error)) from None
+        except ParameterError as error:
+            raise Refused("bad-parameter", str(error)) from None
+        except Exception as error:
+            what = f"controller '{wanted.name}' cannot start: {type(error).__name__}: {error}"
+            raise Refused("controller-error", what) from error
+        self._loop.set_controller(wanted.name, controller)
+        return self._state()
+
+    async def _set_parameter(self, wanted: protocol.SetParameter) -> State:
+        loop = self._loop
+        if loop.supervisor.mode is not Mode.RUNNING:
+            raise Refused(
+                "not-running",
+                f"no controller is running (mode {loop.supervisor.mode}); "
+                "start one with 'fishctl set-controller'",
+            )
+        try:
+            loop.retune(registry.merged(loop.controller, loop.controller_name, wanted.parameters))
+        except ParameterError as error:
+            raise Refused("bad-parameter", str(error)) from None
+        except Exception as error:
+            what = f"controller '{loop.controller_name}' refused: {type(error).__name__}: {error}"
+            raise Refused("controller-error", what) from error
+        return self._state()
+
+    async def _stop(self, _: protocol.NoArguments) -> State:
+        self._loop.stop()
+        return self._state()
+
+    async def _estop(self, wanted: protocol.Estop) -> State:
+        self._loop.estop(wanted.message)
+        return self._state()
+
+    async def _clear_fault(self, _: protocol.NoArguments) -> State:
+        self._loop.clear_fault()
+        return self._state()
+
+    async def _mark(self, wanted: protocol.Mark) -> State:
+        self._loop.reporter.event("mark", wanted.text)
+        return self._state()
+
+    def _state(self) -> State:
+        loop = self._loop
+        return State(
+            seq=loop.seq + 1,
+            mode=loop.supervisor.mode.value,
+            reason=loop.supervisor.reason,
+            controller=loop.controller_name,
+            parameters=msgspec.structs.asdict(loop.controller.parameters),
+        )
+
+
+def _describe_all() -> list[ControllerInfo]:
+    """All controllers that load; importing them now keeps that out of the running loop."""
+    described = []
+    for name in registry.names():
+        try:
+            described.append(registry.describe(name))
+        except UnknownController:
+            continue  # set-controller says why
+    return described

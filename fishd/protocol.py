@@ -1,0 +1,134 @@
+"""The control protocol: JSON requests and replies, shared by server and client.
+
+docs/protocol.md is its reference for clients in other languages.
+"""
+
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from fishd.errors import Refused
+from fishd.signals import Reason
+
+VERSION = 1
+MAX_MESSAGE = 65536
+"""Longer messages are not even received [bytes]."""
+
+RequestId = int | str | None
+
+
+class Request(Struct, forbid_unknown_fields=True):
+    """What a client asks for."""
+
+    v: int
+    op: str
+    id: RequestId = None
+    args: dict[str, Any] = {}
+
+
+class Failure(Struct, frozen=True):
+    """Why a request was refused."""
+
+    code: str
+    message: str
+
+
+class Reply(Struct, frozen=True):
+    """The answer: `result` where `ok`, else `error`."""
+
+    v: int
+    id: RequestId
+    ok: bool
+    result: msgspec.Raw | UnsetType = UNSET
+    error: Failure | UnsetType = UNSET
+
+
+class State(Struct, frozen=True):
+    """The answer to every request that changes something: what is in force from now on."""
+
+    seq: int
+    """The first tick that is affected."""
+    mode: str
+    reason: Reason | None
+    controller: str
+    parameters: dict[str, Any]
+
+
+class NoArguments(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of status, controllers, stop and clear-fault."""
+
+
+class SetController(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of set-controller."""
+
+    name: str
+    parameters: dict[str, Any] = {}
+
+
+class SetParameter(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of set-parameter."""
+
+    parameters: dict[str, Any]
+
+
+class Estop(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of estop."""
+
+    message: str = "requested by a client"
+
+
+class Mark(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of mark."""
+
+    text: str
+
+
+_request_decoder = msgspec.json.Decoder(Request)
+_reply_decoder = msgspec.json.Decoder(Reply)
+_encoder = msgspec.json.Encoder()
+
+
+def encode(message: Any) -> bytes:
+    """A message as JSON."""
+    return _encoder.encode(message)
+
+
+def decode_request(payload: bytes) -> Request:
+    """The request in `payload`; raises `Refused` with code `bad-request` or `version`."""
+    try:
+        request = _request_decoder.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Refused("bad-request", f"not a request: {error}") from None
+    if request.v != VERSION:
+        raise Refused(
+            "version", f"protocol version {request.v} is not spoken here; this is {VERSION}"
+        )
+    return request
+
+
+def request_id(payload: bytes) -> RequestId:
+    """The id of a request that may be broken otherwise; None where it cannot be told."""
+
+    class OnlyId(Struct):
+        id: RequestId = None
+
+    try:
+        return msgspec.json.decode(payload, type=OnlyId).id
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+
+
+def decode_reply(payload: bytes) -> Reply:
+    """The reply in `payload`; raises msgspec.DecodeError."""
+    return _reply_decoder.decode(payload)
+
+
+def success(identity: RequestId, result: Any) -> bytes:
+    """A reply with a result."""
+    return encode(Reply(v=VERSION, id=identity, ok=True, result=msgspec.Raw(encode(result))))
+
+
+def failure(identity: RequestId, error: Refused) -> bytes:
+    """A reply with an error."""
+    return encode(Reply(VERSION, identity, ok=False, error=Failure(error.code, str(error))))

@@ -1,0 +1,57 @@
+"""What the operating system and the interpreter can do for a loop that must be on time."""
+
+import ctypes
+import gc
+import logging
+import os
+import sys
+
+log = logging.getLogger(__name__)
+
+_PR_SET_TIMERSLACK = 29
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_SWITCH_INTERVAL = 2e-4
+"""How long another thread may keep the interpreter once the loop wants it [s]."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def enter(priority: int, lock_memory: bool) -> bool:
+    """Prepare this thread and process for the loop; True when real-time scheduling is in force.
+
+    What is not permitted is left out, with one warning for all of it. Call it once everything is
+    loaded, from the thread that ticks.
+    """
+    _libc.prctl(_PR_SET_TIMERSLACK, 1)  # wake up when asked, not up to 50 µs later
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    refused = []
+    if lock_memory and _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+        refused.append(f"memory is not locked ({os.strerror(ctypes.get_errno())})")
+    scheduled = False
+    if priority:
+        try:
+            # Threads that are started later, to load a controller say, must not inherit this.
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(0, policy, os.sched_param(priority))
+            scheduled = True
+        except OSError as error:
+            refused.append(f"no real-time scheduling ({error.strerror})")
+    if refused:
+        log.warning(
+            "%s: ticks will be late under load; run as the systemd service, or set "
+            "realtime.priority: 0 and realtime.lock_memory: false to accept that",
+            " and ".join(refused),
+        )
+    return scheduled
+
+
+def quiet_garbage_collector() -> None:
+    """Take everything that exists out of its sight, and let it run only in `collect_garbage`."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def collect_garbage() -> None:
+    """Collect what has come since; call it between ticks."""
+    gc.collect(1)

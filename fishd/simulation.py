@@ -1,0 +1,190 @@
+"""A whole run in virtual time: the loop of the robot, on a simulated fish, for its figures."""
+
+import itertools
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd.build import build_loop
+from fishd.clock import VirtualClock, VirtualTicker
+from fishd.config import Config
+from fishd.controllers import registry
+from fishd.controllers.base import amplitude_of
+from fishd.errors import ParameterError
+from fishd.hardware.simulated import SimulatedFish
+from fishd.plant.optimum import best_square_wave
+from fishd.signals import Event, Reason, Tick
+
+
+class Report(Struct, frozen=True):
+    """What a run came to. Forces are the plant's true ones, over whole beats once settled."""
+
+    controller: str
+    parameters: dict[str, Any]
+    amplitude: float
+    """Φ: that of the controller, and of the best square wave it is compared with [rad]."""
+    mean_thrust: float
+    """[N]"""
+    frequency: float
+    """Tail beats per second; 0 when the tail does not beat [Hz]."""
+    fin_amplitude: float
+    """Largest fin angle of each half beat, mean over half beats [rad]."""
+    efficiency: float
+    """`mean_thrust` over `best_square_thrust`."""
+    best_square_thrust: float
+    """What the best square wave at this amplitude gives [N]."""
+    best_square_frequency: float
+    """[Hz]"""
+    ticks: int
+    mode: str
+    """Mode at the end."""
+    reason: Reason | None
+    """Why, when that is fault."""
+    microseconds_per_tick: float
+    """What one turn of the loop took on this machine [µs]."""
+    real_time_factor: float
+    """Virtual seconds per second."""
+
+
+class Beats:
+    """Adds up what the plant truly did over whole beats, from upward reversal to upward reversal.
+
+    A run without a whole beat is judged over all its time.
+    """
+
+    def __init__(self) -> None:
+        self._whole = _Sums()
+        self._open = _Sums()
+        self._began = False
+        self._side = 0.0
+
+    def add(self, angle: float, thrust: float, fin_angle: float, duration: float) -> None:
+        """Add a window.
+
+        angle: instruction angle in force [rad]
+        thrust: true mean F_x [N]
+        fin_angle: largest |α| [rad]
+        duration: length of the window [s]
+        """
+        side = math.copysign(1.0, angle) if angle else self._side
+        if side != self._side and self._side:
+            self._open.close_half()
+            if side > 0.0:
+                if self._began:
+                    self._whole += self._open
+                self._began = True
+                self._open = _Sums()
+        self._side = side
+        self._open.add(thrust, fin_angle, duration)
+
+    def figures(self) -> tuple[float, float, float]:
+        """Mean thrust [N], frequency [Hz], fin amplitude [rad]."""
+        sums = self._whole
+        if not sums.halves:
+            sums = self._open
+            sums.close_half()
+            return sums.impulse / sums.duration, 0.0, sums.peaks / sums.halves
+        frequency = 0.5 * sums.halves / sums.duration
+        return sums.impulse / sums.duration, frequency, sums.peaks / sums.halves
+
+
+class _Sums:
+    def __init__(self) -> None:
+        self.duration = self.impulse = self.peaks = 0.0
+        self.halves = 0
+        self._peak = 0.0
+
+    def add(self, thrust: float, fin_angle: float, duration: float) -> None:
+        self.duration += duration
+        self.impulse += thrust * duration
+        self._peak = max(self._peak, fin_angle)
+
+    def close_half(self) -> None:
+        self.halves += 1
+        self.peaks += self._peak
+        self._peak = 0.0
+
+    def __iadd__(self, other: "_Sums") -> "_Sums":
+        self.duration += other.duration
+        self.impulse += other.impulse
+        self.peaks += other.peaks
+        self.halves += other.halves
+        return self
+
+
+class EncodingPublisher:
+    """Does the work of telemetry up to the socket, so that timing says what the robot would do."""
+
+    def __init__(self) -> None:
+        self._encode = msgspec.json.Encoder().encode
+
+    def tick(self, tick: Tick) -> None:
+        """Encode and drop."""
+        self._encode(tick)
+
+    def event(self, event: Event) -> None:
+        """Encode and drop."""
+        self._encode(event)
+
+
+def simulate(
+    config: Config,
+    name: str,
+    parameters: Mapping[str, Any],
+    seconds: float = 60.0,
+    settle: float = 10.0,
+) -> Report:
+    """Let a controller swim a simulated fish for `seconds`, and judge it after `settle` seconds.
+
+    Raises `UnknownController` and `ParameterError`.
+    """
+    ticks = round(seconds / config.tick)
+    first = math.ceil(settle / config.tick - 1e-9) + 1
+    if not 0 < first < ticks:
+        raise ParameterError(
+            f"nothing is left to judge: a run of {seconds:g} s must be longer than the "
+            f"{settle:g} s that it may take to settle"
+        )
+    clock = VirtualClock()
+    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    loop = build_loop(config, fish.robot(), clock, EncodingPublisher())
+    controller = registry.create(name, parameters, config.limits)
+    loop.set_controller(name, controller)
+
+    beats = Beats()
+    rate = 0.0
+    begun = time.perf_counter()
+    for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
+        angle = loop.applied
+        loop.tick(slot)
+        window, state = fish.window, fish.fish.state
+        if slot.index >= first:
+            peaked = rate * state.alpha_rate <= 0.0
+            fin_angle = window.fin_peak if peaked else abs(state.alpha)
+            beats.add(angle, window.thrust, fin_angle, window.duration)
+        rate = state.alpha_rate
+    elapsed = time.perf_counter() - begun
+
+    amplitude = amplitude_of(controller.parameters, config.limits)
+    best = best_square_wave(config.plant, amplitude)
+    mean_thrust, frequency, fin_amplitude = beats.figures()
+    return Report(
+        controller=name,
+        parameters=msgspec.structs.asdict(controller.parameters),
+        amplitude=amplitude,
+        mean_thrust=mean_thrust,
+        frequency=frequency,
+        fin_amplitude=fin_amplitude,
+        efficiency=mean_thrust / best.thrust,
+        best_square_thrust=best.thrust,
+        best_square_frequency=best.frequency,
+        ticks=ticks,
+        mode=loop.supervisor.mode.value,
+        reason=loop.supervisor.reason,
+        microseconds_per_tick=elapsed / ticks * 1e6,
+        real_time_factor=ticks * config.tick / elapsed,
+    )
