@@ -95,9 +95,10 @@ def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str
 def describe(field: Field) -> str:
     """Description, permitted values, unit and default of a parameter in one line."""
     unit = "" if field.unit in ("", "1") else f" {field.unit}"
-    facts = [f"{field.interval}{unit}"] if field.interval or unit else []
-    facts.append(f"default {'null' if field.default is None else field.default}")
-    return f"{field.description}  [{'; '.join(fact.strip() for fact in facts)}]"
+    default = "null" if field.default is None else f"{field.default}"
+    if field.interval:
+        return f"{field.description} In {field.interval}{unit}, default {default}."
+    return f"{field.description} Default {default}{unit}."
 
 
 class ControllerGroup(click.Group):

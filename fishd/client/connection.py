@@ -43,9 +43,11 @@ class Connection:
         )
 
     def silent(self) -> NoDaemon:
+        """What to raise when no answer comes in time."""
         return self._nobody(f"no answer within {self.timeout:g} s")
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
+        """A new id, and the request as JSON; raises `ParameterError` for NaN and infinity."""
         identity = next(self._ids)
         for name, value in args.get("parameters", {}).items():
             if isinstance(value, float) and not math.isfinite(value):  # JSON would make it null
@@ -66,6 +68,7 @@ class Connection:
         return msgspec.json.decode(reply.result, type=kind)
 
     def telemetry_silent(self) -> NoDaemon:
+        """What to raise when no telemetry comes in time."""
         return self._nobody(f"no telemetry within {self.timeout:g} s")
 
 
@@ -73,6 +76,7 @@ S = TypeVar("S", bound="zmq.Socket[Any]")
 
 
 def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
+    """A socket for requests; raises `NoDaemon` when the endpoint is no address."""
     socket = context.socket(zmq.DEALER)
     socket.set(zmq.LINGER, 0)
     socket.set(zmq.IMMEDIATE, 1)  # do not queue for a daemon that is not there
@@ -81,6 +85,7 @@ def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
 
 
 def subscriber(context: "zmq.Context[S]", address: str, topic: bytes) -> S:
+    """A socket for one topic of telemetry; raises `NoDaemon` when the address is none."""
     socket = context.socket(zmq.SUB)
     socket.set(zmq.SUBSCRIBE, topic)
     _connect(socket, address)
@@ -99,4 +104,5 @@ def _connect(socket: "zmq.Socket[Any]", address: str) -> None:
 
 
 def milliseconds_until(deadline: float) -> int:
+    """Time left until a deadline [s, monotonic], rounded up; 0 after it [ms]."""
     return max(0, math.ceil((deadline - time.monotonic()) * 1e3))
