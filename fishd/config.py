@@ -3,6 +3,7 @@
 Each section is a struct of the part that it configures; this module only puts them together.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +19,8 @@ from fishd.estimators.lateral_force import EstimatorSettings
 from fishd.hardware.imperfections import SimulationSettings
 from fishd.plant.parameters import PlantParameters
 from fishd.schema import Problem, convert
+
+_ADDRESS = re.compile(r"tcp://[^/\s]+:[0-9]+|ipc://\S+")
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -37,7 +40,6 @@ class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     address: Annotated[
         str,
         Meta(
-            pattern="^(tcp://.+:[0-9]+|ipc://.+)$",
             description="ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH. "
             "Telemetry is not secret: tcp://0.0.0.0:9872 lets the whole network watch.",
         ),
@@ -142,7 +144,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     try:
         config = convert(document.data, Config)
         _check_start(config)
-        _check_control(config)
+        _check_addresses(config)
     except Problem as problem:
         raise ConfigError(_located(problem, sources)) from None
     return config
@@ -205,10 +207,16 @@ def _check_start(config: Config) -> None:
         raise Problem(("start", "parameters"), str(error)) from None
 
 
-def _check_control(config: Config) -> None:
-    address = config.control.address
+def _check_addresses(config: Config) -> None:
+    address = config.telemetry.address
+    if not _ADDRESS.fullmatch(address):
+        raise Problem(
+            ("telemetry", "address"),
+            f"'{address}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
+        )
+    address = config.control.address or "ipc://default"
     local = ("ipc://", "tcp://127.", "tcp://[::1]:", "tcp://localhost:")
-    if address is not None and not address.startswith(local):
+    if not (_ADDRESS.fullmatch(address) and address.startswith(local)):
         raise Problem(
             ("control", "address"),
             f"'{address}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
@@ -217,14 +225,12 @@ def _check_control(config: Config) -> None:
 
 
 def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:
-    """Name the place of the problem, or of the nearest section above it that was written down."""
+    """Name the place of the problem: its own, one within it, or the nearest section above it."""
     path = problem.path
-    at = path
-    while at and at not in sources:
-        at = at[:-1]
-    where = sources.get(at)
-    name = ".".join(path)
-    return ": ".join(part for part in (where, name, str(problem)) if part)
+    within = [place for key, place in sources.items() if path and key[: len(path)] == path]
+    above = [sources[path[:n]] for n in range(len(path) + 1) if path[:n] in sources]
+    where = sources.get(path) or (within or above[::-1] or [""])[0]
+    return ": ".join(part for part in (where, ".".join(path), str(problem)) if part)
 
 
 def to_yaml(config: Config) -> str:

@@ -11,12 +11,11 @@ from msgspec import Struct
 from fishd import __version__, protocol
 from fishd.clock import Clock
 from fishd.controllers import registry
-from fishd.controllers.registry import ControllerInfo
 from fishd.errors import ParameterError, Refused, UnknownController
 from fishd.loop import ControlLoop
 from fishd.protocol import State
 from fishd.schema import Problem, convert, nearest
-from fishd.signals import Status
+from fishd.signals import ControllerInfo, Status
 from fishd.supervisor import Mode
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 from msgspec import UNSET, Struct, UnsetType
 
+from fishd.schema import Field
+
 
 class Measurement(Struct, frozen=True, gc=False):
     """What the force sensor says about the window since the previous read."""
@@ -116,6 +118,15 @@ class Event(Struct, frozen=True):
     """One line for people."""
     data: dict[str, Any] = {}
     """The same for programs."""
+
+
+class ControllerInfo(Struct, frozen=True):
+    """A controller as a person or an option parser wants to know it."""
+
+    name: str
+    summary: str
+    """One line that says what it does."""
+    parameters: tuple[Field, ...]
 
 
 class Reason(Struct, frozen=True):

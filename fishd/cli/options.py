@@ -8,9 +8,9 @@ import click
 
 from fishd.client import Fish
 from fishd.controllers import registry
-from fishd.controllers.registry import ControllerInfo
 from fishd.errors import FishError, UnknownController
 from fishd.schema import Field
+from fishd.signals import ControllerInfo
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -10,9 +10,8 @@ import msgspec
 import zmq.asyncio
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
-from fishd.controllers.registry import ControllerInfo
 from fishd.protocol import State
-from fishd.signals import Event, Status, Tick
+from fishd.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
 

@@ -10,17 +10,10 @@ from msgspec import Struct
 
 from fishd.controllers.base import Controller, Limits
 from fishd.errors import ParameterError, UnknownController
-from fishd.schema import Field, Problem, convert, fields_of, nearest
+from fishd.schema import Problem, convert, fields_of, nearest
+from fishd.signals import ControllerInfo
 
 GROUP = "fishd.controllers"
-
-
-class ControllerInfo(Struct, frozen=True):
-    """A controller as a person or an option parser wants to know it."""
-
-    name: str
-    summary: str
-    parameters: tuple[Field, ...]
 
 
 @cache

@@ -1,0 +1,48 @@
+# Everything runs from a virtual environment in this folder; `make clean` removes it.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: help run test lint docs bench clean
+
+help:  ## List what there is to make
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
+
+run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
+	$(BIN)/fishd --config config/simulated.yaml --print-status
+
+test: $(VENV)/installed-dev  ## Run the whole test suite
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+docs: $(VENV)/installed-dev  ## Write the generated parts of docs/ again
+	$(BIN)/python tools/config_reference.py
+	$(BIN)/python tools/efficiency_map.py
+
+bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine
+	$(BIN)/python tools/bench_tick.py
+
+clean:  ## Remove the virtual environment and caches
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "fishd needs Python 3.11 or later; name one with: make PYTHON=python3.11 ..."; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+	  { echo "no virtual environment could be made; on Debian: sudo apt install python3-venv"; \
+	    rm -rf $(VENV); exit 1; }
+	@$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/installed: pyproject.toml $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@ $(VENV)/installed

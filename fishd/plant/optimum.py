@@ -1,0 +1,120 @@
+"""The best periodic square wave, from the equations: the yardstick of every controller.
+
+The periodic state is solved for directly, so no transient is ever simulated.
+"""
+
+import cmath
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.servo import lag_after_reversal
+from fishd.plant.tethered import PlantState, TetheredFish, Window
+
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+_PRECISION = 1e-4  # of the best frequency, relative; the thrust is flat there
+
+# Far below ω₀ and the frequency Ω/4Φ at which the servo saturates, thrust grows as the frequency;
+# above ω₀ it falls. The heaviest damping allowed puts the best at 0.18 of the lower of the two.
+_SCAN_BELOW = 8.0
+_SCAN_ABOVE = 1.5
+_SCANNED = 32
+
+
+class SteadyState(NamedTuple):
+    """What a periodic command amounts to once transients have died out."""
+
+    frequency: float  # Hz
+    thrust: float  # mean of F_x over a period, N
+    fin_amplitude: float  # largest |α|, rad
+
+
+def fast_servo_thrust(parameters: PlantParameters, amplitude: float, frequency: float) -> float:
+    """Return the mean thrust (N) of a square wave that the wheel follows at once, φ = φ_c.
+
+    The closed form of Fu et al., for an amplitude in rad and a frequency in Hz, with numerator and
+    denominator both divided by exp(ξx) so that low frequencies do not overflow. Cable slack is
+    left out.
+    """
+    p = parameters
+    x = p.omega0 / (4.0 * frequency)
+    d = cmath.sqrt(p.xi**2 - 4.0)
+
+    def scaled(exponent: complex) -> complex:
+        return cmath.exp((exponent - p.xi) * x)
+
+    def sinh_over(k: complex) -> complex:
+        return (scaled(k) - scaled(-k)) / (2.0 * k) if k else x * scaled(0.0)
+
+    cosh_sum = (scaled(d) + scaled(-d) + scaled(p.xi) + scaled(-p.xi)) / 2.0
+    shape = (4.0 * frequency / p.omega0) * (sinh_over(p.xi) - sinh_over(d)) / cosh_sum
+    plateau = p.thrust_coefficient * (p.coupling * amplitude * p.omega0) ** 2
+    return plateau * shape.real
+
+
+def square_wave(parameters: PlantParameters, amplitude: float, frequency: float) -> SteadyState:
+    """Return the periodic regime of φ_c = ±amplitude (rad) reversed twice per period (Hz)."""
+    window = _half_period(parameters, amplitude, frequency)
+    return SteadyState(frequency, window.thrust, window.fin_peak)
+
+
+def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadyState:
+    """Return the square wave of this amplitude (rad) that thrusts most, over all frequencies.
+
+    Weak damping brings local maxima at odd fractions of ω₀/2π, hence a scan before the refinement,
+    and a maximum at ω₀/2π too narrow for a scan to meet by chance. Without any damping the thrust
+    there has no bound, and the answer is only as large as rounding lets it be.
+    """
+    p = parameters
+    resonance = p.omega0 / (2.0 * math.pi)
+    saturated = p.servo_speed / (4.0 * amplitude)
+    lowest = min(resonance, saturated) / _SCAN_BELOW
+    scan = sorted([resonance, *np.geomspace(lowest, _SCAN_ABOVE * resonance, _SCANNED).tolist()])
+
+    def thrust(log_frequency: float) -> float:
+        return _half_period(p, amplitude, math.exp(log_frequency)).thrust
+
+    logs = [math.log(frequency) for frequency in scan]
+    thrusts = [thrust(x) for x in logs]
+    best = min(max(thrusts.index(max(thrusts)), 1), len(logs) - 2)
+    return square_wave(p, amplitude, math.exp(_maximum(thrust, logs[best - 1], logs[best + 1])))
+
+
+def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> Window:
+    """Return the half period after a reversal to +amplitude, in the periodic regime.
+
+    Half a period is an affine map of (α, α̇); by antisymmetry the regime is what it negates.
+    """
+    p = parameters
+    half_period = 0.5 / frequency
+    lag = p.servo_lag * lag_after_reversal(
+        2.0 * amplitude / p.servo_lag, half_period * p.servo_speed / p.servo_lag
+    )
+    fish = TetheredFish(p, PlantState(phi=amplitude - lag))
+    from_rest = fish.advance(amplitude, half_period, samples=1)
+    forced = (fish.state.alpha, fish.state.alpha_rate)
+    free = np.eye(2)
+    for panel, _ in from_rest.course:
+        free = panel.free_motion @ free
+    alpha, rate = np.linalg.solve(free + np.eye(2), np.negative(forced)).tolist()
+    fish.state = PlantState(amplitude - lag, alpha, rate)
+    return fish.advance(amplitude, half_period, samples=1)
+
+
+def _maximum(function: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a function with one maximum in low … high has it, by golden sections."""
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = function(left), function(right)
+    while high - low > _PRECISION:
+        if at_left > at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = function(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = function(right)
+    return 0.5 * (low + high)

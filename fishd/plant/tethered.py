@@ -1,0 +1,182 @@
+"""The fish on its force sensor, advanced by whole windows of constant instruction angle.
+
+The simulated hardware and the theory of optimum controls both drive it. A window is integrated to
+about 1e-9 in one step: the servo in closed form, the fin by collocation on a few panels.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+
+from fishd.plant.panel import N, Panel, Vector
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.servo import log_sinh, relax, time_between
+
+# Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
+# the last it stands, both to the last digit; in between, panels shorten towards the transition.
+_TRANSITION = (-20, -10, -6, -4, -2.5, -1.5, -0.5, 0.5, 1.5, 3, 5, 8, 12, 20, 37)
+_GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer panels graded than equal
+_FIN_REACH = 3.0  # panel length, in units of the fin's shortest time, that N nodes resolve
+_LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all panel long
+_ROUNDING = 1e-9  # a window of exactly one servo time constant stays one panel
+
+
+class PlantState(NamedTuple):
+    """Everything the equations remember."""
+
+    phi: float = 0.0  # servo wheel angle, rad
+    alpha: float = 0.0  # fin angle, rad
+    alpha_rate: float = 0.0  # fin angular velocity, rad/s
+
+
+REST = PlantState()
+
+
+class Window(Struct, frozen=True, eq=False):
+    """What the force sensor feels during one window.
+
+    Attributes:
+        duration: s.
+        thrust: mean of F_x over the window, N.
+        lateral_force: mean of F_y over the window, N.
+        sampled_thrust: mean of F_x at the midpoints of equal parts of the window, N.
+        sampled_lateral_force: mean of F_y at the same instants, N.
+        course: the panels of the window and the fin's response in each, for `fin_peak`.
+    """
+
+    duration: float
+    thrust: float
+    lateral_force: float
+    sampled_thrust: float
+    sampled_lateral_force: float
+    course: Sequence[tuple[Panel, Vector]]
+
+    @property
+    def fin_peak(self) -> float:
+        """Largest |α| within the window, rad; worked out when asked for."""
+        return max(panel.peak(response) for panel, response in self.course)
+
+
+class TetheredFish:
+    """A fish in still water that cannot swim away; not safe for use from several threads.
+
+    Attributes:
+        parameters: constants of this fish.
+        state: where it is now; assign to it to put the fish elsewhere.
+    """
+
+    def __init__(self, parameters: PlantParameters, state: PlantState = REST) -> None:
+        self.parameters = parameters
+        self.state = state
+        self._servo_time = parameters.servo_lag / parameters.servo_speed
+        self._fin_panel = _FIN_REACH / (parameters.omega0 * max(1.0, parameters.xi))
+        self._panel = lru_cache(maxsize=512)(lambda *key: Panel(parameters, *key))
+        self._equal_panels = lru_cache(maxsize=64)(self._panels)
+        self._cause: Vector = np.zeros(N + 3)
+
+    def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
+        """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
+
+        None means no pulses: the servo then holds the wheel where it is. `samples` instants make
+        the sampled means, as an ADC that is read evenly within the window does.
+
+        Raises:
+            ValueError: `duration` or `samples` is not positive.
+        """
+        p = self.parameters
+        phi, alpha, rate = start = self.state
+        command = phi if instruction_angle is None else instruction_angle
+        lag = (command - phi) / p.servo_lag
+        cuts = self._cuts(command, phi, lag, duration) if lag else ()
+        panels = (
+            self._panels(duration, samples, cuts) if cuts else self._equal_panels(duration, samples)
+        )
+
+        cause = self._cause
+        course = []
+        thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
+        for panel in panels:
+            cause[0], cause[1] = alpha, rate
+            lag = self._drive(panel, command, lag)
+            response = panel.response.dot(cause)  # half the overhead of @
+            course.append((panel, response))
+            integral, total = panel.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
+            alpha, rate, total_acceleration, total_rate = response[3 * N :].tolist()
+            thrust -= integral
+            sampled_thrust -= total
+            sampled_acceleration += total_acceleration
+            sampled_rate += total_rate
+
+        self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
+        inertia, drag = p.thrust_coefficient, p.lateral_drag
+        return Window(
+            duration,
+            inertia * thrust / duration,
+            -(inertia * (rate - start.alpha_rate) + drag * (alpha - start.alpha)) / duration,
+            inertia * sampled_thrust / samples,
+            -(inertia * sampled_acceleration + drag * sampled_rate) / samples,
+            course,
+        )
+
+    def _drive(self, panel: Panel, command: float, lag: float) -> float:
+        """Write what drives the fin during the panel into the cause; return the lag at its end."""
+        p = self.parameters
+        cause = self._cause
+        nodes = cause[3:]
+        if abs(lag) < _LINEAR_LAG:
+            sinh = math.sinh(lag)
+            np.multiply(panel.node_decay, sinh, out=nodes)
+            np.arcsinh(nodes, out=nodes)
+            later = math.asinh(panel.decay * sinh)
+        else:
+            np.subtract(lag, math.copysign(1.0, lag) * panel.node_times, out=nodes)
+            later = relax(lag, panel.length / self._servo_time)
+        cause[2] = p.coupling * command
+        if p.cable_slack:
+            halfway = relax(lag, 0.5 * panel.length / self._servo_time)
+            phi = command - p.servo_lag * halfway
+            if abs(phi) <= p.cable_slack:
+                cause[2:] = 0.0
+            else:
+                cause[2] = p.coupling * (command - math.copysign(p.cable_slack, phi))
+        return later
+
+    def _cuts(self, command: float, phi: float, lag: float, duration: float) -> list[float]:
+        """Return the times (s) within the window at which no panel may go on."""
+        p, unit = self.parameters, self._servo_time
+        cuts = []
+        if duration > _GRADED_FROM * unit:
+            transition = log_sinh(lag)
+            cuts = [unit * (transition + time) for time in _TRANSITION]
+        if p.cable_slack:
+            for edge in (-p.cable_slack, p.cable_slack):
+                if min(phi, command) < edge < max(phi, command):
+                    cuts.append(unit * time_between(lag, (command - edge) / p.servo_lag))
+        return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
+
+    def _panels(
+        self, duration: float, samples: int, cuts: Sequence[float] = ()
+    ) -> tuple[Panel, ...]:
+        """Return the panels that make up the window, each with the sample instants in it."""
+        if not (duration > 0.0 and samples > 0):
+            raise ValueError(f"a window needs time and samples, not {duration} s and {samples}")
+        longest = self._fin_panel
+        if duration <= _GRADED_FROM * self._servo_time:
+            longest = min(longest, self._servo_time)
+        instants = [(i + 0.5) * duration / samples for i in range(samples)]
+        panels, taken = [], 0
+        for start, end in pairwise((0.0, *cuts, duration)):
+            count = max(1, math.ceil((end - start) / longest - _ROUNDING))
+            length = (end - start) / count
+            for k in range(count):
+                upto = bisect_left(instants, start + (k + 1) * length if k + 1 < count else end)
+                inside = tuple(t - (start + k * length) for t in instants[taken:upto])
+                panels.append(self._panel(length, inside))
+                taken = upto
+        return tuple(panels)

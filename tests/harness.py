@@ -1,0 +1,170 @@
+"""What tests are built from: the real loop on a simulated fish and a virtual clock."""
+
+from collections.abc import Callable
+from typing import Any
+
+from fishd.build import build_loop
+from fishd.clock import Slot, VirtualClock
+from fishd.config import Config, load
+from fishd.controllers import registry
+from fishd.controllers.base import Controller, Limits
+from fishd.hardware.base import Robot
+from fishd.hardware.simulated import SimulatedFish
+from fishd.loop import ControlLoop
+from fishd.signals import Event, Measurement, Observation, Tick
+
+
+class Recorder:
+    """A publisher that keeps everything."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+        self.events: list[Event] = []
+
+    def tick(self, tick: Tick) -> None:
+        self.ticks.append(tick)
+
+    def event(self, event: Event) -> None:
+        self.events.append(event)
+
+    def kinds(self) -> list[str]:
+        return [event.kind for event in self.events]
+
+
+class Rig:
+    """A loop on a virtual clock, and everything a test wants to look at or break."""
+
+    def __init__(self, *overrides: str, wrap: Callable[[Robot], Robot] = lambda r: r) -> None:
+        self.config: Config = load(None, overrides)
+        self.clock = VirtualClock()
+        self.fish = SimulatedFish(self.config.plant, self.config.simulation, self.config.tick)
+        self.recorder = Recorder()
+        robot = wrap(self.fish.robot())
+        self.loop: ControlLoop = build_loop(self.config, robot, self.clock, self.recorder)
+        self.index = 0
+
+    @property
+    def mode(self) -> str:
+        return self.loop.supervisor.mode.value
+
+    @property
+    def reason(self) -> str | None:
+        reason = self.loop.supervisor.reason
+        return reason.code if reason else None
+
+    def start(self, controller: str | Controller[Any], **parameters: Any) -> None:
+        if isinstance(controller, str):
+            name = controller
+            controller = registry.create(controller, parameters, self.config.limits)
+        else:
+            name = type(controller).__name__.lower()
+        self.loop.set_controller(name, controller)
+
+    def retune(self, **parameters: Any) -> None:
+        loop = self.loop
+        loop.retune(registry.merged(loop.controller, loop.controller_name, parameters))
+
+    def run(self, ticks: int = 1, *, missed: int = 0, lateness: float = 0.0) -> list[Tick]:
+        """Turn the loop; `missed` slots are skipped before the first of these ticks."""
+        for _ in range(ticks):
+            self.index += missed
+            deadline = self.index * self.config.tick
+            self.clock.now = max(self.clock.now, deadline + lateness)
+            self.loop.tick(Slot(self.index, deadline, self.clock.now, missed))
+            self.index += 1
+            missed = 0
+        return self.recorder.ticks[-ticks:]
+
+    def run_for(self, seconds: float) -> list[Tick]:
+        return self.run(round(seconds / self.config.tick))
+
+
+LIMITS = Limits(amplitude=0.42, tick=0.05)
+
+
+def observe(angle: float = 0.0, fin_velocity: float = 0.0, dt: float = 0.05) -> Observation:
+    """An observation in which only what controllers use is set."""
+    return Observation(
+        time=0.0,
+        dt=dt,
+        fx=0.0,
+        fy=0.0,
+        fy_rate=0.0,
+        fin_velocity=fin_velocity,
+        instruction_angle=angle,
+        thrust=0.0,
+        frequency=0.0,
+    )
+
+
+def commands(controller: Controller[Any], ticks: int, angle: float = 0.0) -> list[float]:
+    """What a freshly activated controller commands, with nothing else in between."""
+    controller.activate(observe(angle))
+    given = []
+    for _ in range(ticks):
+        angle = controller.update(observe(angle))
+        given.append(angle)
+    return given
+
+
+class Scripted(Controller[Any]):
+    """A controller that does what a test tells it to."""
+
+    Parameters = type(registry.create("hold", {}, LIMITS).parameters)
+
+    def __init__(self, act: Callable[[Observation], float]) -> None:
+        super().__init__(self.Parameters(), LIMITS)
+        self._act = act
+
+    def update(self, observation: Observation) -> float:
+        return self._act(observation)
+
+
+class Wrapped:
+    """A sensor and servo that pass everything on until a test makes one of them fail."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.read_error: Exception | None = None
+        self.write_error: Exception | None = None
+        self.release_error: Exception | None = None
+        self.clipped = False
+        self.delay = 0.0
+        """Age that is added to every measurement [s]."""
+        self.log: list[float | None] = []
+        """What reached the servo: angles, and None for a release."""
+
+    def robot(self) -> Robot:
+        return Robot(name="wrapped", sensor=self, servo=self, truth=self._robot.truth)
+
+    def read(self, now: float) -> Measurement:
+        if self.read_error:
+            raise self.read_error
+        m = self._robot.sensor.read(now)
+        return Measurement(m.time - self.delay, m.fx, m.fy, m.samples, self.clipped)
+
+    def write(self, angle: float) -> None:
+        if self.write_error:
+            raise self.write_error
+        self.log.append(angle)
+        self._robot.servo.write(angle)
+
+    def release(self) -> None:
+        if self.release_error:
+            raise self.release_error
+        self.log.append(None)
+        self._robot.servo.release()
+
+    def close(self) -> None:
+        self.release()
+
+
+def fragile_rig(*overrides: str) -> tuple[Rig, Wrapped]:
+    """A rig whose robot can be made to fail."""
+    made: list[Wrapped] = []
+
+    def wrap(robot: Robot) -> Robot:
+        made.append(Wrapped(robot))
+        return made[0].robot()
+
+    return Rig(*overrides, wrap=wrap), made[0]

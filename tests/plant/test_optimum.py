@@ -1,0 +1,96 @@
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fishd.plant.optimum import best_square_wave, fast_servo_thrust, square_wave
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.tethered import TetheredFish
+
+DEFAULT = PlantParameters()
+
+Reference = Callable[[str], list[dict[str, str]]]
+
+
+def sine(phase: float) -> float:
+    return math.sin(2.0 * math.pi * phase)
+
+
+def triangle(phase: float) -> float:
+    return 2.0 / math.pi * math.asin(sine(phase))
+
+
+def driven(
+    wave: Callable[[float], float], amplitude: float, frequency: float
+) -> tuple[float, float]:
+    """Drive the fish until its thrust repeats; return the thrust (N) and largest fin angle."""
+    fish = TetheredFish(DEFAULT)
+    steps = max(400, round(200 / frequency))
+    commands = [amplitude * wave((i + 0.5) / steps) for i in range(steps)]
+    before, thrust = math.inf, 0.0
+    while abs(thrust - before) > 1e-6 * thrust:
+        windows = [fish.advance(command, 1.0 / (steps * frequency), 1) for command in commands]
+        before, thrust = thrust, sum(window.thrust for window in windows) / steps
+    return thrust, max(window.fin_peak for window in windows)
+
+
+def test_square_waves_make_the_reference_thrust_at_every_frequency(reference: Reference) -> None:
+    for row in reference("thrust_vs_frequency"):
+        if row["waveform"] == "square":
+            steady = square_wave(DEFAULT, float(row["Phi_rad"]), float(row["frequency_Hz"]))
+            assert 1e3 * steady.thrust == pytest.approx(float(row["mean_thrust_mN"]), rel=1e-4), row
+            assert steady.fin_amplitude == pytest.approx(float(row["alpha_max_rad"]), rel=1e-4), row
+
+
+@pytest.mark.parametrize("wave", [sine, triangle])
+def test_smooth_waves_make_the_reference_thrust_at_every_frequency(
+    reference: Reference, wave: Callable[[float], float]
+) -> None:
+    rows = [r for r in reference("thrust_vs_frequency") if r["waveform"] == wave.__name__]
+    assert len(rows) == 20
+    for row in rows:
+        thrust, peak = driven(wave, float(row["Phi_rad"]), float(row["frequency_Hz"]))
+        assert 1e3 * thrust == pytest.approx(float(row["mean_thrust_mN"]), rel=1e-4), row
+        assert peak == pytest.approx(float(row["alpha_max_rad"]), rel=1e-4), row
+
+
+def test_the_best_square_wave_is_the_reference_one_at_every_amplitude(reference: Reference) -> None:
+    for row in reference("optimum_vs_amplitude"):
+        best = best_square_wave(DEFAULT, float(row["Phi_rad"]))
+        assert best.frequency == pytest.approx(float(row["best_frequency_Hz"]), abs=0.005), row
+        assert 1e3 * best.thrust == pytest.approx(float(row["mean_thrust_mN"]), rel=1e-4), row
+        assert best.fin_amplitude == pytest.approx(float(row["alpha_max_rad"]), rel=1e-4), row
+
+
+@pytest.mark.parametrize("xi", [0.01, 1.2, 20.0])
+@pytest.mark.parametrize("amplitude", [0.05, 3.0])
+@pytest.mark.parametrize("slack", [0.0, 0.04])
+def test_no_frequency_beats_the_best_square_wave(xi: float, amplitude: float, slack: float) -> None:
+    p = PlantParameters(xi=xi, cable_slack=slack)
+    best = best_square_wave(p, amplitude)
+    for frequency in (1.99, *np.geomspace(0.1, 6.0, 40).tolist()):
+        assert square_wave(p, amplitude, frequency).thrust <= best.thrust
+
+
+@pytest.mark.parametrize("xi", [0.0, 0.3, 1.2, 2.0, 8.0])
+def test_a_servo_that_follows_at_once_makes_the_closed_form_thrust(xi: float) -> None:
+    p = PlantParameters(xi=xi, servo_speed=1e4, servo_lag=1e-4)
+    for frequency in (0.05, 0.5, 1.9, 3.0, 6.0):
+        expected = fast_servo_thrust(p, 0.05, frequency)
+        assert square_wave(p, 0.05, frequency).thrust == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_closed_form_does_not_overflow_at_low_frequencies() -> None:
+    slow, slower = (fast_servo_thrust(DEFAULT, 0.4, frequency) for frequency in (2e-3, 1e-3))
+    assert slow == pytest.approx(2.0 * slower, rel=1e-9)
+
+
+def test_the_periodic_state_is_where_a_square_wave_ends_up_from_rest() -> None:
+    fish = TetheredFish(DEFAULT)
+    for _ in range(30):
+        fish.advance(0.42, 0.3, 1)
+        window = fish.advance(-0.42, 0.3, 1)
+    steady = square_wave(DEFAULT, 0.42, 1.0 / 0.6)
+    assert window.thrust == pytest.approx(steady.thrust, rel=1e-9)
+    assert window.fin_peak == pytest.approx(steady.fin_amplitude, rel=1e-9)

@@ -1,0 +1,36 @@
+import subprocess
+import sys
+from typing import get_type_hints
+
+import msgspec
+import pytest
+
+from fishd.plant.parameters import PlantParameters
+
+
+def test_reading_parameters_costs_no_numpy() -> None:
+    program = "import sys, fishd.plant.parameters; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_every_parameter_has_bounds_a_unit_and_a_description() -> None:
+    hints = get_type_hints(PlantParameters, include_extras=True)
+    for name in PlantParameters.__struct_fields__:
+        (meta,) = hints[name].__metadata__
+        assert meta.description.endswith("."), name
+        assert meta.extra["unit"], name
+        assert meta.le is not None, name
+        assert meta.ge is not None or meta.gt is not None, name
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"xi": -0.1}, {"servo_lag": 0.0}, {"omega0": "fast"}, {"xi": 21.0}, {"damping": 1.0}],
+)
+def test_a_fish_that_cannot_exist_is_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(wrong, PlantParameters)
+
+
+def test_a_fish_may_have_no_damping_at_all() -> None:
+    assert msgspec.convert({"xi": 0.0}, PlantParameters).xi == 0.0

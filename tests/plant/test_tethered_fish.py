@@ -1,0 +1,212 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.tethered import REST, PlantState, TetheredFish, Window
+
+FISHES = {
+    "default": PlantParameters(),
+    "slack cables": PlantParameters(cable_slack=0.08),
+    "fast servo": PlantParameters(servo_speed=200.0, servo_lag=0.05),
+    "very fast servo, slack cables": PlantParameters(
+        servo_speed=1000.0, servo_lag=0.02, cable_slack=0.05
+    ),
+    "slow servo": PlantParameters(servo_speed=1.0, servo_lag=0.002),
+    "slow servo, very slack cables": PlantParameters(
+        servo_speed=2.0, servo_lag=0.02, cable_slack=0.3
+    ),
+    "no damping": PlantParameters(xi=0.0),
+    "little damping": PlantParameters(xi=0.02),
+    "heavy damping": PlantParameters(xi=15.0),
+    "stiff fin": PlantParameters(omega0=60.0, xi=4.0),
+    "slow fin": PlantParameters(omega0=3.0, servo_speed=30.0, servo_lag=0.3),
+}
+
+angles = st.floats(-1.5, 1.5)
+states = st.builds(PlantState, angles, st.floats(-0.5, 0.5), st.floats(-5.0, 5.0))
+fishes = st.sampled_from(list(FISHES.values()))
+durations = st.floats(0.002, 0.2)
+instructions = st.one_of(st.none(), angles)
+
+
+def dead_band(angle: float, slack: float) -> float:
+    return float(np.sign(angle)) * max(abs(angle) - slack, 0.0)
+
+
+def integrate(
+    p: PlantParameters, state: PlantState, command: float | None, duration: float, samples: int
+) -> tuple[PlantState, Window]:
+    """The equations as they stand, given to an adaptive solver."""
+
+    def acceleration(phi: float, alpha: float, rate: float) -> float:
+        drive = p.coupling * dead_band(phi, p.cable_slack)
+        return -p.xi * p.omega0 * rate - p.omega0**2 * (alpha - drive)
+
+    def forces(phi: float, alpha: float, rate: float) -> tuple[float, float]:
+        a = acceleration(phi, alpha, rate)
+        return -p.thrust_coefficient * alpha * a, -p.thrust_coefficient * a - p.lateral_drag * rate
+
+    def derivative(_: float, y: np.ndarray) -> list[float]:
+        phi, alpha, rate = y[:3]
+        turn = 0.0 if command is None else np.tanh((command - phi) / p.servo_lag) * p.servo_speed
+        return [turn, rate, acceleration(phi, alpha, rate), *forces(phi, alpha, rate)]
+
+    solution = solve_ivp(
+        derivative,
+        (0.0, duration),
+        [*state, 0.0, 0.0],
+        method="DOP853",
+        dense_output=True,
+        rtol=1e-12,
+        atol=1e-13,
+        max_step=duration / 60.0,
+    )
+    phi, alpha, rate, thrust, lateral_force = solution.y[:, -1]
+    instants = (np.arange(samples) + 0.5) * duration / samples
+    sampled = np.mean([forces(*solution.sol(t)[:3]) for t in instants], axis=0).tolist()
+    window = Window(
+        duration, thrust / duration, lateral_force / duration, sampled[0], sampled[1], course=()
+    )
+    return PlantState(phi, alpha, rate), window
+
+
+def natural_scales(p: PlantParameters) -> tuple[list[float], list[float]]:
+    """What φ, α, α̇ and what F_x, F_y, sampled F_x, sampled F_y are small or large against."""
+    alpha, rate = 0.5, max(4.0, 0.5 * p.omega0)
+    acceleration = p.xi * p.omega0 * rate + p.omega0**2 * alpha
+    thrust = p.thrust_coefficient * alpha * acceleration
+    lateral_force = p.thrust_coefficient * acceleration + p.lateral_drag * rate
+    return [1.0, alpha, rate], [thrust, lateral_force] * 2
+
+
+def means(window: Window) -> list[float]:
+    return [
+        window.thrust,
+        window.lateral_force,
+        window.sampled_thrust,
+        window.sampled_lateral_force,
+    ]
+
+
+@pytest.mark.parametrize("name", FISHES)
+def test_every_window_agrees_with_an_adaptive_solver(name: str) -> None:
+    p = FISHES[name]
+    state_scale, force_scale = natural_scales(p)
+    random = np.random.default_rng(sum(map(ord, name)))
+    durations = [0.002, 0.2, *np.geomspace(0.003, 0.18, 8).tolist()]
+    for k, duration in enumerate(durations):
+        state = PlantState(random.uniform(-1, 1), random.uniform(-0.5, 0.5), random.uniform(-4, 4))
+        command = None if k == 5 else random.uniform(-1, 1)
+        fish = TetheredFish(p, state)
+        window = fish.advance(command, duration, samples=1 + k)
+        expected_state, expected = integrate(p, state, command, duration, samples=1 + k)
+        error = np.subtract(fish.state, expected_state) / state_scale
+        assert np.abs(error).max() < 1e-7, (duration, command)
+        error = np.subtract(means(window), means(expected)) / force_scale
+        assert np.abs(error).max() < 1e-7, (duration, command)
+
+
+@settings(deadline=None)
+@given(fishes, states, instructions, durations, st.floats(0.01, 0.99))
+def test_a_window_in_two_parts_leads_to_the_same_state_and_forces(
+    p: PlantParameters, state: PlantState, command: float | None, duration: float, part: float
+) -> None:
+    whole, halves = TetheredFish(p, state), TetheredFish(p, state)
+    window = whole.advance(command, duration, samples=1)
+    first = halves.advance(command, part * duration, samples=1)
+    second = halves.advance(command, duration - part * duration, samples=1)
+    state_scale, force_scale = natural_scales(p)
+    assert np.abs(np.subtract(whole.state, halves.state) / state_scale).max() < 1e-8
+    together = part * np.array(means(first)) + (1.0 - part) * np.array(means(second))
+    assert np.abs((together - means(window)) / force_scale)[:2].max() < 1e-8
+
+
+@settings(deadline=None)
+@given(fishes, states, angles, durations)
+def test_a_mirrored_fish_makes_the_same_thrust_and_the_opposite_lateral_force(
+    p: PlantParameters, state: PlantState, command: float, duration: float
+) -> None:
+    fish = TetheredFish(p, state)
+    mirrored = TetheredFish(p, PlantState(*np.negative(state).tolist()))
+    window = fish.advance(command, duration, samples=7)
+    mirror = mirrored.advance(-command, duration, samples=7)
+    assert mirrored.state == pytest.approx(np.negative(fish.state), abs=1e-12)
+    assert mirror.thrust == pytest.approx(window.thrust, abs=1e-12)
+    assert mirror.lateral_force == pytest.approx(-window.lateral_force, abs=1e-12)
+
+
+def test_a_fish_at_rest_stays_at_rest_and_feels_nothing() -> None:
+    fish = TetheredFish(PlantParameters())
+    window = fish.advance(0.0, 0.05, samples=10)
+    assert fish.state == REST
+    assert means(window) == [0.0] * 4
+    assert window.fin_peak == 0.0
+
+
+def test_without_pulses_the_wheel_keeps_its_angle_and_the_fin_settles_there() -> None:
+    p = PlantParameters()
+    fish = TetheredFish(p, PlantState(phi=0.3))
+    for _ in range(100):
+        fish.advance(None, 0.05, samples=1)
+    assert fish.state == pytest.approx((0.3, 0.3 * p.coupling, 0.0), abs=1e-12)
+
+
+def test_cable_slack_lets_the_wheel_turn_without_moving_the_fin() -> None:
+    fish = TetheredFish(PlantParameters(cable_slack=0.1))
+    fish.advance(0.099, 0.2, samples=1)
+    assert fish.state.phi > 0.09
+    assert fish.state.alpha == 0.0
+    fish.advance(0.3, 5.0, samples=1)
+    assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
+
+
+def test_an_instruction_far_beyond_the_servo_lag_does_not_overflow() -> None:
+    fish = TetheredFish(PlantParameters(servo_speed=5.0, servo_lag=1e-4))
+    fish.advance(1.5, 0.05, samples=1)
+    assert fish.state.phi == pytest.approx(0.25, rel=1e-12)
+
+
+def test_many_samples_average_to_the_exact_mean() -> None:
+    fish = TetheredFish(PlantParameters(), PlantState(-0.4, -0.1, 1.0))
+    window = fish.advance(0.4, 0.2, samples=2000)
+    assert window.sampled_thrust == pytest.approx(window.thrust, rel=1e-5)
+    assert window.sampled_lateral_force == pytest.approx(window.lateral_force, rel=1e-5)
+
+
+@settings(deadline=None, max_examples=30)
+@given(fishes, states, angles, durations)
+def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
+    p: PlantParameters, state: PlantState, command: float, duration: float
+) -> None:
+    fish, slow_motion = TetheredFish(p, state), TetheredFish(p, state)
+    peak = fish.advance(command, duration, samples=1).fin_peak
+    seen = [abs(state.alpha)]
+    for _ in range(500):
+        slow_motion.advance(command, duration / 500, samples=1)
+        seen.append(abs(slow_motion.state.alpha))
+    assert peak == pytest.approx(max(seen), rel=2e-5, abs=1e-7)
+    assert peak >= (1.0 - 1e-6) * max(seen)
+
+
+def test_the_thrust_of_a_periodic_motion_is_the_mean_square_fin_velocity() -> None:
+    p = PlantParameters()
+    fish = TetheredFish(p)
+    times = np.linspace(0.0, 0.5, 401)
+    for _ in range(20):
+        rates, thrust = [], 0.0
+        for start, end in pairwise(times):
+            rates.append(fish.state.alpha_rate)
+            command = 0.42 * np.sin(2.0 * np.pi * (start + end) / (2.0 * 0.5))
+            thrust += fish.advance(command, 0.5 / 400, samples=1).thrust / 400
+    assert thrust == pytest.approx(p.thrust_coefficient * np.mean(np.square(rates)), rel=1e-4)
+
+
+@pytest.mark.parametrize(("duration", "samples"), [(0.0, 10), (-0.1, 10), (0.05, 0)])
+def test_a_window_without_time_or_samples_is_refused(duration: float, samples: int) -> None:
+    with pytest.raises(ValueError, match="needs time and samples"):
+        TetheredFish(PlantParameters()).advance(0.1, duration, samples)

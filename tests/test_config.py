@@ -1,0 +1,164 @@
+"""The configuration: what is accepted, and what is said about what is not."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd.config import Config, load, to_yaml
+from fishd.errors import ConfigError
+from fishd.strict_yaml import YamlProblem, parse
+
+
+def complaint(text: str, tmp_path: Path) -> str:
+    file = tmp_path / "fish.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message.replace(str(tmp_path) + "/", "")
+
+
+def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("")
+    assert load(file) == Config() == load()
+
+
+def test_the_shipped_configuration_is_good() -> None:
+    config = load(Path(__file__).parent.parent / "config" / "simulated.yaml")
+    assert config.start.controller == "swing"
+
+
+def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    original = load(None, ["plant.xi=0.7", "start.controller=swing", "start.parameters.C=0.3"])
+    file.write_text(to_yaml(original), encoding="utf-8")
+    assert load(file) == original
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "tick: 0.05\nplant:\n  omega: 3\n",
+            "fish.yaml:3: plant.omega: unknown key; did you mean 'omega0'?",
+        ),
+        ("noise: 0.1\n", "fish.yaml:1: noise: unknown key; did you mean 'simulation.noise'?"),
+        (
+            "plant:\n  xi: soft\n",
+            "fish.yaml:2: plant.xi: 'soft' is not valid: a number in [0, 20] is needed",
+        ),
+        ("\ntick: 1\n", "fish.yaml:2: tick: 1 is not valid: a number in [0.002, 0.2] s is needed"),
+        (
+            "tick: .nan\n",
+            "fish.yaml:1: tick: nan is not valid: a number in [0.002, 0.2] s is needed",
+        ),
+        (
+            "tick: true\n",
+            "fish.yaml:1: tick: true is not valid: a number in [0.002, 0.2] s is needed",
+        ),
+        (
+            "realtime: {priority: 50.5}\n",
+            "fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99] is needed",
+        ),
+        (
+            "tick: 0.05\ntick: 0.1\n",
+            "fish.yaml:2: tick: duplicate key, first given on line 1; keep one",
+        ),
+        (
+            "realtime:\n  lock_memory: on\n",
+            "fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true",
+        ),
+        (
+            "simulation:\n  seed: 1e2\n",
+            "fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 1.0e+2",
+        ),
+        (
+            "plant: 3\n",
+            "fish.yaml:1: plant: 3 is not valid: a section (a mapping of keys to values)",
+        ),
+        ("- 1\n", "fish.yaml:1: keys and values are needed, such as 'tick: 0.05'"),
+        ("tick: [\n", "fish.yaml:2: not valid YAML"),
+        ("tick: 1:30\n", "fish.yaml:1: tick: '1:30' counts in sixties in YAML"),
+        ("a: &a [*a]\n", "nested too deeply"),
+        (
+            "start: {controller: swim}\n",
+            "fish.yaml:1: start.controller: no controller is named 'swim'; did you mean 'swing'?",
+        ),
+        (
+            "start:\n  controller: swing\n  parameters:\n    c: 0.5\n",
+            "fish.yaml:3: start.parameters: swing: c: unknown key; valid: C, amplitude",
+        ),
+        (
+            "start:\n  controller: swing\n  parameters:\n    amplitude: 0.5\n",
+            "amplitude: 0.5 rad is beyond the robot's amplitude_limit, 0.42 rad",
+        ),
+        ("start: {parameters: {C: 1}}\n", "there is no start.controller to take these"),
+        (
+            "control: {address: 'tcp://0.0.0.0:5000'}\n",
+            "fish.yaml:1: control.address: 'tcp://0.0.0.0:5000' is not valid",
+        ),
+        (
+            "telemetry: {address: localhost}\n",
+            "fish.yaml:1: telemetry.address: 'localhost' is not valid: "
+            "tcp://HOST:PORT or ipc://PATH is needed",
+        ),
+    ],
+)
+def test_a_bad_file_gets_one_line_that_names_place_and_remedy(
+    text: str, message: str, tmp_path: Path
+) -> None:
+    assert message in complaint(text, tmp_path)
+
+
+def test_a_missing_file_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file"):
+        load(Path("nowhere.yaml"))
+
+
+def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        load(tmp_path)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_bytes(b"tick: \xff\xfe")
+    with pytest.raises(ConfigError, match="not a text file in UTF-8"):
+        load(file)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("plant.omega=3", "--set plant.omega=3: plant.omega: unknown key; did you mean 'omega0'?"),
+        ("tick", "--set tick: write KEY=VALUE"),
+        ("=3", "--set =3: write KEY=VALUE"),
+        ("tick.x=3", "--set tick.x=3: "),
+        ("tick=soon", "--set tick=soon: tick: 'soon' is not valid: a number in [0.002, 0.2] s"),
+        ("tick=", "--set tick=: tick: '' is not valid"),
+        ("realtime.lock_memory=on", "'on' is true in YAML; write true"),
+    ],
+)
+def test_a_bad_override_is_named_as_it_was_written(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(None, [override])
+    assert message in str(caught.value)
+
+
+def test_overrides_take_numbers_as_people_write_them() -> None:
+    config = load(None, ["simulation.noise=1e-3", "slew_limit=null", "tick=0.1", "tick=0.02"])
+    assert config.simulation.noise == 1e-3
+    assert config.tick == 0.02
+
+
+@given(st.text(max_size=60))
+def test_no_text_gets_anything_but_values_or_a_line_number(text: str) -> None:
+    try:
+        parse(text)
+    except YamlProblem as problem:
+        assert problem.line >= 1
+        assert "\n" not in str(problem)
