@@ -40,6 +40,6 @@ class Guard:
 
 
 def _towards(wanted: float, previous: float, step: float) -> float:
-    if abs(wanted - previous) <= step:
+    if abs(wanted - previous) <= step * (1.0 + 1e-9):  # rounding must not cost another tick
         return wanted
     return previous + math.copysign(step, wanted - previous)

@@ -140,6 +140,10 @@ def _explain(
             elsewhere = nearest(key, everywhere)
             hint = elsewhere if elsewhere.startswith("did") else hint
         return (*path, key), f"unknown key; {hint}"
+    missing = re.search(r"missing required field `(.*)`", complaint)
+    if missing:
+        key = missing.group(1)
+        return (*path, key), f"is missing: {_wanted(target, (*path, key))}"
     value = data
     for key in path:
         value = value[key] if isinstance(value, Mapping) else value

@@ -62,7 +62,7 @@ def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
         ),
         (
             "realtime: {priority: 50.5}\n",
-            "fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99] is needed",
+            "fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99]",
         ),
         (
             "tick: 0.05\ntick: 0.1\n",
@@ -156,9 +156,10 @@ def test_overrides_take_numbers_as_people_write_them() -> None:
 
 
 @given(st.text(max_size=60))
-def test_no_text_gets_anything_but_values_or_a_line_number(text: str) -> None:
+def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> None:
+    problem = None
     try:
         parse(text)
-    except YamlProblem as problem:
-        assert problem.line >= 1
-        assert "\n" not in str(problem)
+    except YamlProblem as error:
+        problem = error
+    assert problem is None or (problem.line >= 1 and "\n" not in str(problem))

@@ -58,7 +58,7 @@ def controllers(endpoint: str | None, as_json: bool) -> None:
             click.echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
 
 
-@click.group(cls=ControllerGroup, options=daemon_options)
+@click.group(cls=ControllerGroup, options=daemon_options, remote=True)
 def set_controller() -> None:
     """Put another controller in command; parameters left out take their defaults."""
 
@@ -71,7 +71,7 @@ def _set_controller(
         _print_state(fish.set_controller(name, **parameters), as_json)
 
 
-@click.command()
+@click.command(context_settings={"ignore_unknown_options": True})  # -1 is a value
 @click.argument("pairs", nargs=-1, required=True, metavar="NAME VALUE [NAME VALUE]...")
 @daemon_options
 def set_parameter(pairs: tuple[str, ...], endpoint: str | None, as_json: bool) -> None:

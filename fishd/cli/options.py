@@ -104,14 +104,17 @@ def describe(field: Field) -> str:
 class ControllerGroup(click.Group):
     """A verb whose sub-commands are the controllers, each with its parameters as options.
 
-    Controllers that are installed here are known without a daemon; for any other name the daemon
-    is asked, which may run on a machine where more is installed.
+    Controllers that are installed here are known without a daemon. For any other name a verb that
+    is `remote` asks the daemon, which may run on a machine where more is installed.
     """
 
-    def __init__(self, *args: Any, options: Callable[[F], F], **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, options: Callable[[F], F], remote: bool = False, **kwargs: Any
+    ) -> None:
         """options: decorator that adds the verb's own options to each sub-command."""
         super().__init__(*args, **kwargs)
         self._options = options
+        self._remote = remote
         self._action: Callable[..., Any] = lambda: None
 
     def action(self, function: F) -> F:
@@ -128,6 +131,8 @@ class ControllerGroup(click.Group):
         try:
             info = registry.describe(cmd_name)
         except UnknownController as error:
+            if not self._remote:
+                raise
             info = self._ask_daemon(ctx, cmd_name, error)
 
         @click.pass_context

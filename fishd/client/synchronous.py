@@ -107,7 +107,12 @@ class Fish(Connection):
         address = self.telemetry_address or self.status().telemetry
         patience = -1 if kind is Event else int(self.timeout * 1e3)
         decoder = msgspec.json.Decoder(kind)
-        with closing(subscriber(self._context, address, topic)) as socket:
-            while socket.poll(patience):
-                yield decoder.decode(socket.recv_multipart()[1])
-        raise self.telemetry_silent()
+        socket = subscriber(self._context, address, topic)
+
+        def messages() -> Iterator[T]:
+            with closing(socket):
+                while socket.poll(patience):
+                    yield decoder.decode(socket.recv_multipart()[1])
+            raise self.telemetry_silent()
+
+        return messages()

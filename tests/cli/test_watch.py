@@ -1,0 +1,219 @@
+import fcntl
+import io
+import json
+import os
+import pty
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from rich.console import Console
+from rich.screen import Screen
+
+from fishd.cli.watch import View
+from fishd.client import Fish, NoDaemon
+from fishd.signals import Reason, Tick
+
+BIN = Path(sys.executable).parent
+PATIENCE = 30.0
+"""Longest wait for anything [s]; only a broken test takes that long."""
+
+ENTER_SCREEN, LEAVE_SCREEN = "\x1b[?1049h", "\x1b[?1049l"
+HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
+COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
+BRAILLE = re.compile("[\u2801-\u28ff]")
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    with running(tmp_path, "--set", "start.controller=swing") as daemon:
+        yield daemon
+
+
+class Terminal:
+    """`fishctl watch` under a terminal, and all that it wrote there."""
+
+    def __init__(self, command: list[str], size: tuple[int, int] = (80, 24), **env: str) -> None:
+        self._master, self._slave = pty.openpty()
+        self.resize(*size)
+        self.settings = termios.tcgetattr(self._slave)
+        plain = {name: os.environ[name] for name in os.environ if name != "NO_COLOR"}
+        self._process = subprocess.Popen(
+            command,
+            stdin=self._slave,
+            stdout=self._slave,
+            stderr=self._slave,
+            env=plain | {"TERM": "xterm-256color"} | env,
+            start_new_session=True,
+        )
+        os.set_blocking(self._master, False)
+        self.text = ""
+
+    def resize(self, columns: int, rows: int) -> None:
+        fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+
+    def wait_for(self, pattern: str) -> None:
+        """Read until `pattern` turns up in what is new."""
+        deadline = time.monotonic() + PATIENCE
+        start = len(self.text)
+        while not re.search(pattern, self.text[start:]):
+            assert time.monotonic() < deadline, self.text
+            self._read()
+            time.sleep(0.02)
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    def finish(self) -> int:
+        """Wait for the end; returns the exit status."""
+        deadline = time.monotonic() + PATIENCE
+        while self._process.poll() is None:
+            assert time.monotonic() < deadline, self.text
+            self._read()
+            time.sleep(0.02)
+        self._read()
+        assert termios.tcgetattr(self._slave) == self.settings
+        os.close(self._master)
+        os.close(self._slave)
+        return self._process.returncode
+
+    def _read(self) -> None:
+        try:
+            while chunk := os.read(self._master, 65536):
+                self.text += chunk.decode(errors="replace")
+        except BlockingIOError:
+            return
+
+    @property
+    def restored(self) -> bool:
+        """True when the screen of before is shown again, with its cursor."""
+        return self.text.rfind(LEAVE_SCREEN) > self.text.rfind(ENTER_SCREEN) and self.text.rfind(
+            SHOW_CURSOR
+        ) > self.text.rfind(HIDE_CURSOR)
+
+
+def run(command: list[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+
+
+def test_json_streams_every_tick_as_one_line(daemon: Daemon) -> None:
+    ended = run(daemon.watch("--json", "--seconds", "1.5"))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    ticks = [json.loads(line) for line in ended.stdout.splitlines()]
+    first = ticks[0]["seq"]
+    assert len(ticks) > 3
+    assert [tick["seq"] for tick in ticks] == list(range(first, first + len(ticks)))
+    assert {tick["controller"] for tick in ticks} == {"swing"}
+    assert ticks[0]["phi_c"] in (-0.42, 0.42)
+
+
+def test_json_lines_are_not_held_back_and_ctrl_c_is_a_clean_end(daemon: Daemon) -> None:
+    with subprocess.Popen(
+        daemon.watch("--json"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout
+        assert process.stderr
+        assert json.loads(process.stdout.readline())["mode"] == "running"
+        process.send_signal(signal.SIGINT)
+        process.stdout.read()
+        assert process.stderr.read() == ""
+        assert process.wait(PATIENCE) == 0
+
+
+def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) -> None:
+    ended = run(daemon.watch("--seconds", "2.5"))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    lines = ended.stdout.splitlines()
+    assert 1 <= len(lines) <= 3
+    assert all(re.fullmatch(r"\d\d:\d\d:\d\d  running swing .* ticks", line) for line in lines)
+
+
+def test_on_a_terminal_it_draws_and_leaves_the_terminal_as_it_was(daemon: Daemon) -> None:
+    terminal = Terminal(daemon.watch("--seconds", "3"))
+    terminal.wait_for("RUNNING")
+    assert terminal.finish() == 0
+    assert terminal.restored
+    assert COLOUR.search(terminal.text)
+    assert BRAILLE.search(terminal.text)
+    for word in ("swing", "thrust", "tail beat", "late", "busy", "missed", "lost"):
+        assert word in terminal.text
+    for trace in ("fx mN", "fy mN", "phi_c rad"):
+        assert trace in terminal.text
+    assert terminal.text.endswith((LEAVE_SCREEN, SHOW_CURSOR))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_a_clean_end_and_restores_the_terminal(daemon: Daemon, number: int) -> None:
+    terminal = Terminal(daemon.watch())
+    terminal.wait_for("RUNNING")
+    terminal.signal(number)
+    assert terminal.finish() == 0
+    assert terminal.restored
+    assert "Traceback" not in terminal.text
+
+
+def test_the_death_of_the_daemon_is_one_line_on_a_restored_terminal(daemon: Daemon) -> None:
+    terminal = Terminal(daemon.watch())
+    terminal.wait_for("RUNNING")
+    daemon.process.kill()
+    assert terminal.finish() == 1
+    assert terminal.restored
+    after = terminal.text.rpartition(LEAVE_SCREEN)[2].replace(SHOW_CURSOR, "")
+    assert re.fullmatch(r"\s*fishctl: no fishd at [^\n]*\n", after)
+
+
+def test_it_follows_the_terminal_through_any_size_without_colour_if_asked(daemon: Daemon) -> None:
+    terminal = Terminal(daemon.watch(), NO_COLOR="1")
+    terminal.wait_for("lost")
+    for size in ((3, 1), (20, 5), (60, 15), (200, 60)):
+        terminal.resize(*size)
+        terminal.wait_for("\x1b\\[H")
+    terminal.wait_for(f"[\u2500-\u28ff ]{{{150}}}")
+    terminal.signal(signal.SIGINT)
+    assert terminal.finish() == 0
+    assert not COLOUR.search(terminal.text)
+
+
+def test_an_event_is_shown_when_it_happens(daemon: Daemon) -> None:
+    terminal = Terminal(daemon.watch())
+    terminal.wait_for("RUNNING")
+    with Fish(daemon.endpoint) as fish:
+        fish.mark("a weight on the sensor")
+        terminal.wait_for("mark: a weight on the sensor")
+        fish.estop("the net")
+    terminal.wait_for("estop: the net")
+    terminal.signal(signal.SIGINT)
+    assert terminal.finish() == 0
+
+
+def tick(seq: int, t: float | None = None, **fields: Any) -> Tick:
+    """The tick of a loop of 50 ms, with a wave on both forces."""
+    numbers = {name: 0.0 for name in Tick.__struct_fields__ if name not in ("alpha", "phi")}
+    wave = {"fx": 0.02 + 0.02 * math.sin(0.5 * seq), "fy": 0.2 * math.sin(0.25 * seq)}
+    what = {"seq": seq, "mode": "running", "controller": "swing", "servo_on": True, "missed": 0}
+    return Tick(**numbers | what | wave | {"t": 0.05 * seq if t is None else t} | fields)
+
+
+def status(**fields: Any) -> Status:
+    none = Percentiles(0.0, 0.0, 0.0, 0)
+    timing = Timing(none, none, {})
+    return Status(
+        **dict.fromkeys(Status.__struct_fields__, 0)
+        | {"mode": "running", "reason": None, "controller": "swing", "parameters": {"C": 0.6}}
+        | {"timing": timing, "tick": 0.05}
+        | fields
+    )
+
+
+def shown(view: View, width: int = 80, height: int = 24) -> list[str]:
+    console = Console(file=io.StringIO(), width=width, height=height)
+    lines = console.render_lines(Screen(view))
+    return ["".join(segment.text for segment in line).rstrip() for line in lines]

@@ -1,0 +1,157 @@
+"""The control socket under fire: an error reply or silence, and never a missed tick."""
+
+import json
+import os
+import threading
+import time
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from processes import PATIENCE, Daemon, Subscriber
+
+
+def socket_of(daemon: Daemon, kind: int) -> "zmq.Socket[bytes]":
+    socket = zmq.Context.instance().socket(kind)
+    socket.set(zmq.LINGER, 0)
+    socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
+    socket.connect(daemon.endpoint)
+    return socket
+
+
+def ask(socket: "zmq.Socket[bytes]", payload: bytes) -> dict[str, Any]:
+    socket.send(payload)
+    reply: dict[str, Any] = json.loads(socket.recv_multipart()[-1])
+    return reply
+
+
+@pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
+def test_both_kinds_of_socket_get_an_answer_with_their_id(daemon: Daemon, kind: int) -> None:
+    with socket_of(daemon, kind) as socket:
+        reply = ask(socket, b'{"v":1,"id":"a1","op":"status","args":{}}')
+    assert (reply["v"], reply["id"], reply["ok"]) == (1, "a1", True)
+    assert reply["result"]["mode"] == "idle"
+
+
+def test_many_requests_sent_at_once_are_all_answered(daemon: Daemon) -> None:
+    with socket_of(daemon, zmq.DEALER) as socket:
+        for number in range(60):
+            socket.send(b'{"v":1,"id":%d,"op":"stop"}' % number)
+        answered = {json.loads(socket.recv())["id"] for _ in range(60)}
+    assert answered == set(range(60))
+
+
+@pytest.mark.parametrize(
+    ("request_", "code", "message"),
+    [
+        (b'{"v":2,"id":1,"op":"status"}', "version", "protocol version 2 is not spoken here"),
+        (b'{"v":1,"id":1,"op":"statsu"}', "unknown-op", "did you mean 'status'?"),
+        (b'{"v":1,"id":1,"op":"set-controller"}', "bad-arguments", "name: is missing"),
+        (b'{"v":1,"id":1,"op":"set-controller","args":{"nam":"x"}}', "bad-arguments", "nam"),
+        (b'{"v":1,"id":1,"op":"set-controller","args":{"name":3}}', "bad-arguments", "name: 3 is"),
+        (b'{"v":1,"id":1,"op":"set-controller","args":{"name":"x"}}', "unknown-controller", "'x'"),
+        (
+            b'{"v":1,"id":1,"op":"set-controller","args":{"name":"swing","parameters":{"C":7}}}',
+            "bad-parameter",
+            "swing: C: 7 is not valid",
+        ),
+        (b'{"v":1,"id":1,"op":"mark","args":{}}', "bad-arguments", "text: is missing"),
+        (b'{"v":1,"id":1,"op":"stop","args":{"now":true}}', "bad-arguments", "now: unknown key"),
+        (b'{"v":1,"id":1}', "bad-request", "missing required field `op`"),
+        (b'{"v":1,"id":1,"op":"set-parameter","args":{"parameters":{}}}', "not-running", "idle"),
+    ],
+)
+def test_a_bad_request_gets_an_error_that_says_what_is_wrong(
+    daemon: Daemon, request_: bytes, code: str, message: str
+) -> None:
+    with socket_of(daemon, zmq.DEALER) as socket:
+        reply = ask(socket, request_)
+    assert (reply["ok"], reply["id"], reply["error"]["code"]) == (False, 1, code)
+    assert message in reply["error"]["message"]
+    assert "result" not in reply
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"v":1,"id":1,"op":"set-controller","args":{"name":"swing","parameters":{"C":NaN}}}',
+        b"",
+        b"hello",
+        b"\xff\xfe\x00",
+    ],
+)
+def test_what_is_no_json_gets_an_error_without_an_id(daemon: Daemon, payload: bytes) -> None:
+    with socket_of(daemon, zmq.DEALER) as socket:
+        reply = ask(socket, payload)
+    assert (reply["ok"], reply["id"], reply["error"]["code"]) == (False, None, "bad-request")
+
+
+def shoot(daemon: Daemon, seconds: float) -> None:
+    """Everything a broken or hostile peer may send, as fast as it can, for a bounded time."""
+    garbage: list[list[bytes]] = [
+        [b""],
+        [b"", b""],
+        [b"", b"", b""],
+        [b"x"] * 50,
+        [os.urandom(1000)],
+        [os.urandom(1_000_000)],
+        [b"{" * 60_000],
+        [b'{"v":1,"id":1,"op":"status"}'],
+        [b"", b'{"v":1,"id":1,"op":"controllers"}'],
+        [b'{"v":1,"id":1,"op":"set-controller","args":{"name":"swing","parameters":{"C":0.5}}}'],
+        [b'{"v":1,"id":1,"op":"set-controller","args":{"name":"nobody"}}'],
+    ]
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        with context.socket(zmq.DEALER) as socket:
+            socket.set(zmq.LINGER, 0)
+            socket.connect(daemon.endpoint)
+            for _ in range(20):
+                for frames in garbage:
+                    try:
+                        socket.send_multipart(frames, zmq.DONTWAIT)
+                    except zmq.Again:
+                        break
+            socket.send(b"half a message", zmq.SNDMORE | zmq.DONTWAIT)
+    context.destroy(linger=0)
+
+
+def test_a_flood_of_requests_and_garbage_costs_no_tick(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+        before = subscriber.message()
+        shooter = threading.Thread(target=shoot, args=(daemon, 3.0))
+        shooter.start()
+        while shooter.is_alive():
+            during = subscriber.message()
+        shooter.join()
+    assert during["missed"] == before["missed"]
+    assert during["seq"] - before["seq"] >= 40
+    done = daemon.fishctl("status")
+    assert done.returncode == 0, done.stderr
+    _, _, errors = daemon.end()
+    assert "Traceback" not in errors
+
+
+def test_a_subscriber_that_stops_reading_slows_no_tick(daemon: Daemon) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    stalled = context.socket(zmq.SUB)
+    stalled.set(zmq.RCVHWM, 1)
+    stalled.set(zmq.RCVBUF, 1024)
+    stalled.set(zmq.SUBSCRIBE, b"")
+    stalled.connect(daemon.telemetry)
+    with Subscriber(daemon.telemetry, b"tick") as healthy:
+        ticks = [healthy.message() for _ in range(60)]
+    assert [t["seq"] for t in ticks] == list(range(ticks[0]["seq"], ticks[0]["seq"] + 60))
+    assert ticks[-1]["missed"] == ticks[0]["missed"]
+    context.destroy(linger=0)
+
+
+def test_a_client_that_never_reads_its_answers_harms_nobody(daemon: Daemon) -> None:
+    with socket_of(daemon, zmq.DEALER) as deaf, socket_of(daemon, zmq.DEALER) as healthy:
+        deaf.set(zmq.RCVHWM, 1)
+        for number in range(5000):
+            deaf.send(msgspec.json.encode({"v": 1, "id": number, "op": "status"}))
+        reply = ask(healthy, b'{"v":1,"id":5,"op":"stop"}')
+    assert reply["ok"]

@@ -1,0 +1,114 @@
+"""The Python client, synchronous and asyncio, against the real daemon."""
+
+import asyncio
+import math
+import threading
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from processes import Daemon
+
+from fishd.client import AsyncFish, Fish, NoDaemon, Refused
+from fishd.errors import ParameterError
+
+
+def test_the_example_of_the_readme_works(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        state = fish.set_controller("swing", C=0.6)
+        assert (state.mode, state.parameters["C"]) == ("running", 0.6)
+        ticks = list(islice(fish.ticks(), 5))
+        assert [tick.seq for tick in ticks] == list(range(ticks[0].seq, ticks[0].seq + 5))
+        assert {tick.mode for tick in ticks} == {"running"}
+        assert isinstance(ticks[0].alpha, float)
+
+
+def test_every_request_has_a_typed_answer(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        assert fish.status().robot == "simulated"
+        assert "square" in [info.name for info in fish.controllers()]
+        fish.set_controller("square", frequency=2.0)
+        assert fish.set_parameters(frequency=1.5).parameters["frequency"] == 1.5
+        assert fish.stop().mode == "idle"
+        state = fish.estop("enough")
+        assert state.reason is not None
+        assert (state.mode, state.reason.message) == ("estop", "enough")
+        assert fish.clear_fault().mode == "idle"
+
+
+def test_events_arrive_as_they_happen(daemon: Daemon) -> None:
+    seen: list[str] = []
+    with Fish(daemon.endpoint) as listener, Fish(daemon.endpoint) as other:
+        events = listener.events()
+        reader = threading.Thread(
+            target=lambda: seen.append(next(e.message for e in events if e.kind == "mark"))
+        )
+        reader.start()
+        for _ in range(100):  # until the subscription is through
+            other.mark("a wave in the tank")
+            next(other.ticks())
+            if seen:
+                break
+        reader.join()
+    assert seen == ["a wave in the tank"]
+
+
+def test_a_refusal_carries_its_code(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        with pytest.raises(Refused, match="did you mean 'swing'") as caught:
+            fish.set_controller("swng")
+        assert caught.value.code == "unknown-controller"
+        with pytest.raises(ParameterError, match="C: nan is not a number that can be sent"):
+            fish.set_controller("swing", C=math.nan)
+        assert fish.status().mode == "idle"
+
+
+def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> None:
+    with Fish(f"ipc://{tmp_path}/nobody") as fish, pytest.raises(NoDaemon, match="no such socket"):
+        fish.status()
+    with (
+        Fish("tcp://127.0.0.1:9", timeout=0.05) as fish,
+        pytest.raises(NoDaemon, match=r"no answer within 0\.05 s"),
+    ):
+        fish.status()
+
+
+def test_telemetry_that_ends_is_noticed(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint, timeout=1.0) as fish:
+        ticks = fish.ticks()
+        next(ticks)
+        daemon.end()
+        with pytest.raises(NoDaemon, match="no telemetry within 1 s"):
+            list(ticks)
+
+
+def test_asyncio_programs_get_the_same(daemon: Daemon) -> None:
+    async def swim() -> None:
+        async with AsyncFish(daemon.endpoint) as fish:
+            assert (await fish.set_controller("swing", C=0.5)).controller == "swing"
+            assert (await fish.set_parameters(C=0.7)).parameters["C"] == 0.7
+            seen = []
+            async for tick in fish.ticks():
+                seen.append(tick.seq)
+                if len(seen) == 5:
+                    break
+            assert seen == list(range(seen[0], seen[0] + 5))
+            assert (await fish.status()).controller == "swing"
+            assert "hold" in [info.name for info in await fish.controllers()]
+            with pytest.raises(Refused, match="did you mean 'swing'"):
+                await fish.set_controller("swung")
+            assert (await fish.estop()).mode == "estop"
+            assert (await fish.clear_fault()).mode == "idle"
+            assert (await fish.mark("done")).mode == "idle"
+            assert (await fish.stop()).mode == "idle"
+
+    asyncio.run(swim())
+
+
+def test_asyncio_programs_are_told_when_nobody_answers() -> None:
+    async def call() -> None:
+        async with AsyncFish("tcp://127.0.0.1:9", timeout=0.05) as fish:
+            await fish.status()
+
+    with pytest.raises(NoDaemon, match="no answer"):
+        asyncio.run(call())

@@ -1,0 +1,137 @@
+"""The real fishctl with the real daemon: every verb, and what it says when something is wrong."""
+
+import json
+
+import pytest
+from processes import Daemon, Subscriber
+
+
+def test_the_command_of_the_mission_works(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+        done = daemon.fishctl("set-controller", "swing", "--C", "0.6")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "running: swing C=0.6" in done.stdout
+        tick = subscriber.until(controller="swing", mode="running")
+        assert abs(tick["phi_c"]) == 0.42
+
+
+def test_a_change_is_in_force_from_the_tick_that_the_reply_names(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+        subscriber.message()
+        state = json.loads(daemon.fishctl("set-controller", "square", "--json").stdout)
+        while (tick := subscriber.message())["seq"] < state["seq"]:
+            assert tick["controller"] == "hold"
+    assert (tick["seq"], tick["controller"]) == (state["seq"], "square")
+
+
+def test_parameters_change_together_or_not_at_all(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "swing", "--C", "0.6")
+    done = daemon.fishctl("set-parameter", "C", "0.4", "longest-half-period", "0.8")
+    assert "C=0.4 amplitude=default longest_half_period=0.8" in done.stdout
+    done = daemon.fishctl("set-parameter", "C", "0.2", "longest_half_period", "-1")
+    assert done.returncode == 1
+    assert "longest_half_period: -1.0 is not valid: a number in (0, 10] s is needed" in done.stderr
+    status = json.loads(daemon.fishctl("status", "--json").stdout)
+    assert status["parameters"]["C"] == 0.4
+
+
+def test_stop_estop_and_clear_fault_do_what_they_say(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "square")
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+        assert daemon.fishctl("stop").stdout.startswith("idle: hold")
+        subscriber.until(mode="idle", phi_c=0.0, servo_on=True)
+        assert "estop (estop: leak)" in daemon.fishctl("estop", "leak").stdout
+        subscriber.until(mode="estop", servo_on=False)
+        refused = daemon.fishctl("set-controller", "square")
+        assert refused.returncode == 1
+        assert refused.stderr == (
+            "fishctl: fishd is in estop: leak; mend the cause, then clear it with "
+            "'fishctl clear-fault' [estop]\n"
+        )
+        assert daemon.fishctl("clear-fault").stdout.startswith("idle: hold")
+        subscriber.until(mode="idle", servo_on=True)
+
+
+def test_a_mark_arrives_as_an_event(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry) as subscriber:
+        subscriber.message()
+        daemon.fishctl("mark", "changed the fin")
+        event = subscriber.until(kind="mark")
+    assert (event["message"], event["level"]) == ("changed the fin", "info")
+
+
+def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon: Daemon) -> None:
+    text = daemon.fishctl("controllers").stdout
+    assert "swing  Reverse the tail" in text
+    assert "--longest-half-period" in text
+    assert "In (0, 10] s, default 1.0." in text
+    known = {
+        info["name"]: info for info in json.loads(daemon.fishctl("controllers", "--json").stdout)
+    }
+    assert {"hold", "square", "sine", "triangle", "swing"} <= set(known)
+    assert known["swing"]["parameters"][0] == {
+        "name": "C",
+        "kind": "number",
+        "unit": "1",
+        "description": "Reverse when the fin's speed falls to C times its last maximum.",
+        "default": 0.6,
+        "interval": "[0, 1]",
+        "optional": False,
+    }
+
+
+def test_the_status_says_what_runs_and_how_well(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "sine", "--frequency", "1.5")
+    text = daemon.fishctl("status").stdout
+    for word in ("running", "sine frequency=1.5", "late", "busy", "estimate", "simulated"):
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("set-controller", "swin"), "no controller is named 'swin'; did you mean 'swing'?"),
+        (("set-controller", "swing", "--C", "2"), "swing: C: 2.0 is not valid: a number in [0, 1]"),
+        (("set-controller", "swing", "--C", "nan"), "'nan' is not a number in [0, 1]"),
+        (
+            ("set-controller", "sine", "--amplitude", "1"),
+            "beyond the robot's amplitude_limit, 0.42",
+        ),
+        (("set-controller", "sine", "--speed", "1"), "No such option"),
+        (("set-parameter", "C", "0.4"), "no controller is running (mode idle)"),
+        (("set-parameter", "C"), "every NAME needs a VALUE"),
+        (("status", "--endpoint", "nonsense"), "'nonsense' is no address"),
+        (("stat",), "No such command 'stat'"),
+        (("mark",), "Missing argument 'TEXT'"),
+    ],
+)
+def test_a_mistake_gets_one_line_that_says_what_to_do(
+    daemon: Daemon, arguments: tuple[str, ...], message: str
+) -> None:
+    done = daemon.fishctl(*arguments)
+    assert done.returncode in (1, 2)
+    assert message in done.stderr
+    assert done.stderr.startswith("fishctl: ")
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+
+
+def test_a_parameter_that_the_controller_lacks_is_refused_by_name(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "swing")
+    done = daemon.fishctl("set-parameter", "frequency", "2")
+    assert "swing: frequency: unknown key; valid: C, amplitude, longest_half_period" in done.stderr
+
+
+def test_the_configuration_can_be_checked_shown_and_explained(daemon: Daemon) -> None:
+    shown = daemon.fishctl("config", "show", "--set", "plant.xi=0.5").stdout
+    assert "  xi: 0.5" in shown
+    schema = json.loads(daemon.fishctl("config", "schema").stdout)
+    assert "tick" in schema["$defs"]["Config"]["properties"]
+    done = daemon.fishctl("config", "check", "nowhere.yaml")
+    assert (done.returncode, done.stderr[:30]) == (78, "fishctl: nowhere.yaml: no such")
+
+
+def test_help_and_completion_need_no_daemon(daemon: Daemon) -> None:
+    assert "--C NUMBER" in daemon.fishctl("set-controller", "swing", "--help").stdout
+    assert "_fishctl_completion" in daemon.fishctl("completion", "bash").stdout
+    assert "set-controller" in daemon.fishctl("--help").stdout

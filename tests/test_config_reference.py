@@ -1,0 +1,48 @@
+"""The configuration reference in docs/ and the program that writes it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fishd.config import Config, load
+from fishd.errors import ConfigError
+from fishd.schema import leaves
+
+ROOT = Path(__file__).parent.parent
+REFERENCE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+
+
+def test_the_committed_configuration_reference_is_what_the_schema_says() -> None:
+    program = [sys.executable, str(ROOT / "tools" / "config_reference.py"), "--check"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_configuration_reference_names_every_key() -> None:
+    missing = [key for key in leaves(Config) if f"`{key}`" not in REFERENCE]
+    assert not missing
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("plant:\n  omega: 12\n", "fish.yaml:2: plant.omega: unknown key; did you mean 'omega0'?"),
+        ("tick: 1\n", "fish.yaml:1: tick: 1 is not valid: a number in [0.002, 0.2] s is needed"),
+        (
+            "start:\n  controller: swing\n  parameters:\n    C: 3\n",
+            "fish.yaml:3: start.parameters: swing: C: 3 is not valid: a number in [0, 1] is needed",
+        ),
+    ],
+    ids=["unknown key", "out of bounds", "parameter of a controller"],
+)
+def test_the_complaints_in_the_configuration_reference_are_those_of_fishd(
+    text: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("fish.yaml").write_text(text)
+    with pytest.raises(ConfigError) as refusal:
+        load(Path("fish.yaml"))
+    assert str(refusal.value) == line
+    assert f"fishd: {line}\n" in REFERENCE

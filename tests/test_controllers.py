@@ -1,0 +1,142 @@
+"""The controllers: waveforms, take-over without a bump, and how they are found."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from harness import LIMITS, commands, observe
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.errors import ParameterError, UnknownController
+
+frequencies = st.floats(0.1, 5.0)
+in_force = st.floats(-0.42, 0.42)
+smooth = st.sampled_from(["sine", "triangle"])
+
+
+def made(name: str, limits: Limits = LIMITS, **parameters: object) -> registry.Controller:
+    return registry.create(name, parameters, limits)
+
+
+def test_hold_holds() -> None:
+    assert commands(made("hold", angle=0.2), 3) == [0.2] * 3
+
+
+def test_a_square_wave_spends_half_its_period_on_either_side() -> None:
+    assert commands(made("square", frequency=2.5), 9) == [0.42] * 4 + [-0.42] * 4 + [0.42]
+
+
+@given(frequencies)
+def test_a_frequency_off_the_grid_is_right_on_average(frequency: float) -> None:
+    given_ = commands(made("square", frequency=frequency), 4000)
+    reversals = sum(a != b for a, b in pairwise(given_))
+    assert reversals / 2 / (3999 * 0.05) == pytest.approx(frequency, abs=0.5 / (3999 * 0.05))
+
+
+def test_sine_and_triangle_have_the_shapes_of_their_names() -> None:
+    limits = Limits(amplitude=0.4, tick=0.01)
+    sine = made("sine", limits, frequency=1.0)
+    triangle = made("triangle", limits, frequency=1.0)
+    for controller in (sine, triangle):
+        controller.activate(observe(dt=0.01))
+    for k in range(200):
+        phase = k * 0.01
+        observed = observe(dt=0.01)
+        assert sine.update(observed) == pytest.approx(0.4 * math.sin(math.tau * phase), abs=1e-9)
+        expected = 0.4 * (2 / math.pi) * math.asin(math.sin(math.tau * phase))
+        assert triangle.update(observed) == pytest.approx(expected, abs=1e-9)
+
+
+@given(smooth, frequencies, in_force, st.floats(0.01, 0.42))
+def test_sine_and_triangle_begin_with_the_angle_in_force(
+    name: str, frequency: float, angle: float, amplitude: float
+) -> None:
+    controller = made(name, frequency=frequency, amplitude=amplitude)
+    assert commands(controller, 1, angle)[0] == pytest.approx(angle, abs=1e-12)
+
+
+@given(smooth, st.floats(0.1, 3.0), in_force, st.floats(0.01, 0.42))
+def test_after_a_start_beyond_their_amplitude_they_return_into_it_without_a_jump(
+    name: str, frequency: float, angle: float, amplitude: float
+) -> None:
+    controller = made(name, frequency=frequency, amplitude=amplitude)
+    given_ = commands(controller, 2000, angle)
+    top_speed = math.tau * frequency * amplitude * 0.05
+    assert all(abs(b - a) <= 2 * top_speed + 1e-9 for a, b in pairwise(given_))
+    assert abs(given_[-1]) <= amplitude + 1e-9 or frequency * amplitude < 0.01
+
+
+@given(
+    st.sampled_from(["square", "sine", "triangle"]), frequencies, frequencies, st.integers(1, 99)
+)
+def test_a_change_of_frequency_keeps_the_phase(
+    name: str, before: float, after: float, ticks: int
+) -> None:
+    changed, steady = made(name, frequency=before), made(name, frequency=before)
+    commands(changed, ticks)
+    commands(steady, ticks)
+    changed.retune(type(changed.parameters)(frequency=after))
+    steady_next, changed_next = steady.update(observe(dt=1e-9)), changed.update(observe(dt=1e-9))
+    assert changed_next == pytest.approx(steady_next, abs=1e-6)
+
+
+@given(smooth, st.floats(0.05, 0.42), st.floats(0.05, 0.42), st.integers(1, 99))
+def test_a_change_of_amplitude_makes_no_jump(
+    name: str, before: float, after: float, ticks: int
+) -> None:
+    controller = made(name, frequency=1.0, amplitude=before)
+    last = commands(controller, ticks)[-1]
+    controller.retune(type(controller.parameters)(frequency=1.0, amplitude=after))
+    assert controller.update(observe(dt=1e-9)) == pytest.approx(last, abs=1e-6)
+
+
+def test_after_missed_slots_a_waveform_is_where_it_would_have_been() -> None:
+    steady, late = made("sine", frequency=1.3), made("sine", frequency=1.3)
+    expected = commands(steady, 5)[-1]
+    commands(late, 2)
+    assert late.update(observe(dt=0.15)) == pytest.approx(expected)
+
+
+def test_an_amplitude_beyond_the_robots_limit_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"square: amplitude: 0\.5 rad is beyond .* 0\.42 rad"):
+        made("square", amplitude=0.5)
+    with pytest.raises(ParameterError, match=r"hold: angle: -0\.5 rad is beyond"):
+        made("hold", angle=-0.5)
+
+
+def test_a_wrong_name_gets_the_nearest_right_one() -> None:
+    with pytest.raises(
+        UnknownController, match=r"no controller is named 'squre'; did you mean 'sq"
+    ):
+        made("squre")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"C": 1.5}, r"swing: C: 1\.5 is not valid: a number in \[0, 1\] is needed"),
+        ({"C": math.nan}, r"swing: C: nan is not valid: a number in \[0, 1\] is needed"),
+        ({"C": "0.6"}, r"swing: C: '0\.6' is not valid: a number in \[0, 1\] is needed"),
+        ({"c": 0.6}, "swing: c: unknown key; valid: C, amplitude, longest_half_period"),
+        ({"amplitud": 0.2}, "swing: amplitud: unknown key; did you mean 'amplitude'"),
+    ],
+)
+def test_a_wrong_parameter_is_named_with_what_is_right(
+    values: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ParameterError, match=message):
+        made("swing", **values)
+
+
+def test_every_installed_controller_describes_itself_and_its_parameters() -> None:
+    assert {"hold", "square", "sine", "triangle", "swing"} <= set(registry.names())
+    for name in registry.names():
+        info = registry.describe(name)
+        assert info.summary.endswith(".")
+        for field in info.parameters:
+            assert field.description.endswith(".")
+            assert field.unit
+            assert field.interval

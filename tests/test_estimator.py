@@ -1,0 +1,111 @@
+"""The estimator: fin velocity from the lateral force, tail beats from the reversals."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from harness import Rig
+
+from fishd.estimators.lateral_force import EstimatorSettings, LateralForceEstimator
+from fishd.estimators.tail_beat import TailBeat
+from fishd.signals import Measurement
+
+DT = 0.05
+
+
+def correlation(rig: Rig, seconds: float) -> float:
+    """How well the estimated fin velocity follows the true one, whatever its scale."""
+    ticks = rig.run_for(seconds)
+    estimated = [tick.fin_velocity for tick in ticks]
+    true = [tick.alpha_rate for tick in ticks]
+    return float(np.corrcoef(estimated, true)[0, 1])
+
+
+@pytest.mark.parametrize("frequency", [1.0, 1.7, 2.5])
+def test_the_fin_velocity_follows_the_true_one(frequency: float) -> None:
+    rig = Rig()
+    rig.start("square", frequency=frequency)
+    rig.run_for(10)
+    assert correlation(rig, 20) > 0.97
+
+
+def test_an_offset_of_the_sensor_is_found_and_taken_off() -> None:
+    rig = Rig("simulation.offset_y=0.05", "simulation.drift=0.02")
+    rig.start("square", frequency=1.7)
+    rig.run_for(10)
+    ticks = rig.run_for(20)
+    mean = sum(tick.fin_velocity for tick in ticks) / len(ticks)
+    top = max(abs(tick.fin_velocity) for tick in ticks)
+    assert abs(mean) < 0.05 * top
+
+
+def test_the_force_rate_is_the_change_over_the_time_between_ticks() -> None:
+    estimator = LateralForceEstimator(EstimatorSettings())
+    estimator.update(Measurement(0.0, 0.0, 0.010, 10), 0.0, 0.0, DT)
+    observation = estimator.update(Measurement(0.1, 0.0, 0.016, 20), 0.0, 0.1, 2 * DT)
+    assert observation.fy_rate == pytest.approx(0.06)
+
+
+def test_nothing_but_the_measurement_and_the_own_command_goes_in() -> None:
+    """Two fishes that differ only in what the sensor does not see give the same estimate."""
+    here, there = Rig(), Rig()
+    there.fish.truth = lambda: 1 / 0  # type: ignore[assignment]
+    for rig in (here, there):
+        rig.start("swing")
+    there.loop.robot = type(there.loop.robot)("blind", there.fish, there.fish)
+    for a, b in zip(here.run(200), there.run(200), strict=True):
+        assert (a.phi_c, a.fin_velocity) == (b.phi_c, b.fin_velocity)
+
+
+def beats(half_periods: list[int], force: float = 0.02) -> TailBeat:
+    beat = TailBeat()
+    side = 1.0
+    for ticks in half_periods:
+        for _ in range(ticks):
+            beat.update(side * 0.4, force, DT)
+        side = -side
+    return beat
+
+
+def test_frequency_and_thrust_cover_whole_beats_only() -> None:
+    beat = TailBeat()
+    forces = []
+    for k in range(200):
+        side = 1.0 if k % 12 < 6 else -1.0
+        forces.append(0.02 + 0.5 * math.sin(k * math.tau / 6))  # ripples twice a beat
+        beat.update(side, forces[-1], DT)
+    assert beat.frequency == pytest.approx(1 / 0.6)
+    assert beat.thrust == pytest.approx(0.02)
+
+
+def test_before_the_first_whole_beat_there_is_no_frequency() -> None:
+    assert beats([30, 5, 1]).frequency == 0.0
+    assert beats([30, 5, 5, 1]).frequency == pytest.approx(2.0)
+
+
+def test_a_tail_that_stops_is_noticed_after_twice_its_longest_half_beat() -> None:
+    assert beats([5] * 10 + [11]).frequency > 0.0
+    assert beats([5] * 10 + [14]).frequency == 0.0
+
+
+def test_a_new_frequency_is_followed() -> None:
+    slow = beats([5] * 20 + [8] * 30)
+    assert slow.frequency == pytest.approx(1 / 0.8)
+
+
+def test_neutral_between_two_sides_is_no_reversal() -> None:
+    beat = TailBeat()
+    for angle in ([0.4] * 5 + [0.0] + [0.4] * 5 + [-0.4] * 5 + [0.0] * 6) * 8:
+        beat.update(angle, 0.02, DT)
+    assert beat.frequency == pytest.approx(1 / (22 * DT))
+
+
+def test_while_the_tail_rests_the_thrust_is_a_slow_average() -> None:
+    beat = TailBeat()
+    values = []
+    for _ in range(200):
+        beat.update(0.0, 0.01, DT)
+        values.append(beat.thrust)
+    assert all(b >= a for a, b in pairwise(values))
+    assert values[-1] == pytest.approx(0.01, rel=1e-3)

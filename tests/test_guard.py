@@ -1,0 +1,62 @@
+"""The guard: nothing that is not finite, within ±Φ and slow enough reaches the servo."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd.guard import Guard
+
+angles = st.floats(-10, 10)
+amplitudes = st.floats(1e-3, 1.5)
+ticks = st.floats(0.002, 0.2)
+slews = st.none() | st.floats(0.01, 100)
+
+
+@given(amplitudes, ticks, slews, st.lists(st.floats(allow_nan=False, allow_infinity=False)))
+def test_no_series_of_commands_passes_the_limits(
+    amplitude: float, tick: float, slew: float | None, commands: list[float]
+) -> None:
+    guard = Guard(amplitude, tick, slew, fade_time=0.4)
+    angle = 0.0
+    for command in commands:
+        previous, angle = angle, guard.apply(command, angle)
+        assert abs(angle) <= amplitude
+        assert abs(angle - previous) <= guard.step * (1 + 1e-8)
+
+
+@given(amplitudes, ticks, slews, st.floats(0.01, 0.5))
+def test_a_fade_reaches_neutral_and_stays_there(
+    amplitude: float, tick: float, slew: float | None, fade_time: float
+) -> None:
+    guard = Guard(amplitude, tick, slew, fade_time)
+    angle = amplitude
+    for _ in range(math.ceil(amplitude / guard.fade_step) + 1):
+        previous, angle = angle, guard.fade(angle)
+        assert 0.0 <= angle <= previous
+        assert previous - angle <= guard.fade_step * (1 + 1e-8)
+    assert angle == guard.fade(angle) == 0.0
+
+
+@given(amplitudes, ticks)
+def test_the_default_slew_limit_leaves_a_full_square_wave_untouched(
+    amplitude: float, tick: float
+) -> None:
+    guard = Guard(amplitude, tick, None, fade_time=0.4)
+    assert guard.apply(-amplitude, amplitude) == -amplitude
+    assert guard.apply(amplitude, -amplitude) == amplitude
+
+
+def test_a_fade_takes_the_fade_time_from_the_limit_to_neutral() -> None:
+    guard = Guard(amplitude=0.4, tick=0.05, slew_limit=None, fade_time=0.4)
+    angle, steps = 0.4, 0
+    while angle:
+        angle, steps = guard.fade(angle), steps + 1
+    assert steps == 8
+
+
+@given(st.sampled_from([math.nan, math.inf, -math.inf]), angles)
+def test_a_command_that_is_no_number_is_refused(command: float, previous: float) -> None:
+    with pytest.raises(ValueError, match="not an angle"):
+        Guard(0.42, 0.05, None, 0.4).apply(command, previous)

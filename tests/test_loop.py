@@ -1,0 +1,287 @@
+"""One tick: what goes in, what comes out, and what happens when a part of it fails."""
+
+import math
+from typing import Any
+
+import pytest
+from harness import Rig, Scripted, fragile_rig
+
+from fishd.errors import Refused, SensorError, ServoError
+from fishd.signals import Observation
+
+
+def test_at_rest_the_servo_is_held_at_neutral() -> None:
+    rig, robot = fragile_rig()
+    tick = rig.run(3)[-1]
+    assert (tick.mode, tick.controller, tick.phi_c, tick.servo_on) == ("idle", "hold", 0.0, True)
+    assert robot.log == [0.0, 0.0, 0.0]
+
+
+def test_ticks_are_numbered_from_one_and_stamped_with_the_clock() -> None:
+    rig = Rig()
+    assert [(tick.seq, round(tick.t, 9)) for tick in rig.run(3)] == [(1, 0.0), (2, 0.05), (3, 0.1)]
+
+
+def test_a_tick_shows_what_was_sent_not_what_was_wanted() -> None:
+    rig = Rig("slew_limit=2")
+    rig.start(Scripted(lambda _: 99.0))
+    assert [round(tick.phi_c, 9) for tick in rig.run(6)] == [0.1, 0.2, 0.3, 0.4, 0.42, 0.42]
+
+
+def test_missed_slots_are_counted_and_the_next_observation_covers_them() -> None:
+    seen: list[float] = []
+
+    def note(observation: Observation) -> float:
+        seen.append(round(observation.dt, 9))
+        return 0.0
+
+    rig = Rig()
+    rig.start(Scripted(note))
+    rig.run(2)
+    tick = rig.run(missed=3)[0]
+    assert seen == [0.05, 0.05, 0.2]
+    assert tick.missed == 3
+    assert tick.samples == 40
+    assert rig.recorder.kinds().count("overrun") == 1
+
+
+def test_the_simulated_fish_tells_its_truth_in_the_tick() -> None:
+    rig = Rig()
+    rig.start("square")
+    tick = rig.run(5)[-1]
+    assert (tick.alpha, tick.alpha_rate, tick.phi) == (
+        rig.fish.fish.state.alpha,
+        rig.fish.fish.state.alpha_rate,
+        rig.fish.fish.state.phi,
+    )
+
+
+def test_stopping_fades_to_neutral_within_the_fade_time() -> None:
+    rig = Rig()
+    rig.start("hold", angle=0.42)
+    rig.run(2)
+    rig.loop.stop()
+    angles = [tick.phi_c for tick in rig.run(8)]
+    assert angles == sorted(angles, reverse=True)
+    assert max(a - b for a, b in zip([0.42, *angles], angles, strict=False)) <= 0.0526
+    assert angles[-1] == 0.0
+    assert rig.mode == "idle"
+    assert rig.recorder.ticks[-1].servo_on
+
+
+def test_an_emergency_stop_ends_the_pulses_before_the_next_tick() -> None:
+    rig, robot = fragile_rig()
+    rig.start("square")
+    rig.run(3)
+    rig.loop.estop("the tank leaks")
+    assert robot.log[-1] is None
+    assert rig.mode == "estop"
+    sent = len(robot.log)
+    assert not rig.run(5)[-1].servo_on
+    assert len(robot.log) == sent
+    assert rig.recorder.events[-1].message == "running → estop: the tank leaks"
+
+
+def test_after_an_emergency_stop_the_way_back_is_clear_and_gentle() -> None:
+    rig = Rig()
+    rig.start("hold", angle=0.42)
+    rig.run(2)
+    rig.loop.estop("test")
+    rig.run(2)
+    with pytest.raises(Refused, match="clear-fault"):
+        rig.start("square")
+    rig.loop.clear_fault()
+    angles = [tick.phi_c for tick in rig.run(9)]
+    assert angles[0] == pytest.approx(0.42 - 0.0525)
+    assert angles[-1] == 0.0
+    rig.start("square")
+    assert rig.mode == "running"
+
+
+def test_a_stop_does_not_clear_a_fault() -> None:
+    rig = Rig()
+    rig.start(Scripted(lambda _: math.nan))
+    rig.run()
+    rig.loop.stop()
+    assert rig.mode == "fault"
+
+
+def boom(_: Observation) -> float:
+    raise RuntimeError("my bug")
+
+
+@pytest.mark.parametrize("act", [boom, lambda _: math.nan, lambda _: math.inf, lambda _: "left"])
+def test_a_controller_that_fails_is_replaced_and_the_fish_goes_neutral_then_limp(act: Any) -> None:
+    rig, robot = fragile_rig()
+    rig.start("hold", angle=0.42)
+    rig.run(2)
+    rig.start(Scripted(act))
+    ticks = rig.run(12)
+    assert ticks[0].mode == "fault"
+    assert ticks[0].controller == "hold"
+    assert rig.reason == "controller-error"
+    assert robot.log[-1] is None
+    assert 0.0 in robot.log
+    assert not ticks[-1].servo_on
+    assert rig.recorder.kinds().count("fault") == 1
+
+
+def test_a_controller_that_is_too_slow_three_times_in_a_row_is_a_fault() -> None:
+    rig = Rig()
+
+    def dawdle(_: Observation) -> float:
+        rig.clock.now += 0.03
+        return 0.1
+
+    rig.start(Scripted(dawdle))
+    assert [tick.mode for tick in rig.run(3)] == ["running", "running", "fault"]
+    assert rig.reason == "controller-slow"
+
+
+def test_a_tick_that_takes_longer_than_a_period_is_blamed_on_its_slowest_phase() -> None:
+    rig = Rig()
+
+    def doze(_: Observation) -> float:
+        rig.clock.now += 0.06
+        return 0.0
+
+    rig.start(Scripted(doze))
+    rig.run()
+    assert rig.loop.statistics.overruns == 1
+    event = rig.recorder.events[-1]
+    assert event.kind == "overrun"
+    assert event.message == "tick 1 took 60.0 ms of its 50 ms, 60.0 ms of it in update"
+
+
+def test_the_slots_that_a_long_tick_cost_are_not_reported_twice() -> None:
+    rig = Rig()
+    naps = iter([0.12])
+
+    def doze(_: Observation) -> float:
+        rig.clock.now += next(naps, 0.0)
+        return 0.0
+
+    rig.start(Scripted(doze))
+    rig.run()
+    rig.run(missed=2)
+    assert rig.recorder.kinds().count("overrun") == 1
+    assert rig.recorder.ticks[-1].missed == 2
+
+
+def test_one_or_two_failed_reads_are_bridged_with_the_last_measurement() -> None:
+    rig, robot = fragile_rig()
+    rig.start("swing")
+    good = rig.run(10)[-1]
+    robot.read_error = SensorError("no acknowledge")
+    assert [tick.fy for tick in rig.run(2)] == [good.fy] * 2
+    robot.read_error = None
+    rig.run(2)
+    assert rig.mode == "running"
+
+
+@pytest.mark.parametrize(
+    ("breakage", "reason"),
+    [
+        ({"read_error": SensorError("no acknowledge")}, "sensor-stale"),
+        ({"read_error": ZeroDivisionError()}, "sensor-stale"),
+        ({"delay": 0.11}, "sensor-stale"),
+        ({"clipped": True}, "sensor-range"),
+        ({"write_error": ServoError("pigpiod is gone")}, "servo-link"),
+        ({"write_error": TypeError("my bug")}, "servo-link"),
+    ],
+)
+def test_broken_hardware_is_a_fault_with_its_reason_and_one_event(
+    breakage: dict[str, Any], reason: str
+) -> None:
+    rig, robot = fragile_rig()
+    rig.start("swing")
+    rig.run(20)
+    for name, value in breakage.items():
+        setattr(robot, name, value)
+    rig.run(20)
+    assert (rig.mode, rig.reason) == ("fault", reason)
+    assert rig.recorder.kinds().count("fault") == 1
+    assert rig.loop.controller_name == "hold"
+
+
+def test_a_sensor_that_recovers_does_not_clear_the_fault_by_itself() -> None:
+    rig, robot = fragile_rig()
+    rig.start("swing")
+    robot.read_error = SensorError("unplugged")
+    rig.run(5)
+    robot.read_error = None
+    rig.run(20)
+    assert rig.mode == "fault"
+    rig.loop.clear_fault()
+    rig.run(1)
+    assert rig.mode == "idle"
+    assert rig.recorder.ticks[-1].servo_on
+
+
+def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
+    rig, robot = fragile_rig()
+    rig.start("square")
+    rig.run(2)
+    robot.release_error = ServoError("stuck")
+    rig.loop.estop("test")
+    assert rig.run(3)[-1].servo_on
+    robot.release_error = None
+    assert not rig.run(1)[-1].servo_on
+    assert robot.log[-1] is None
+
+
+def test_telemetry_that_fails_stops_the_fish_and_not_the_loop(monkeypatch: Any) -> None:
+    rig = Rig()
+    rig.start("square")
+    rig.run(3)
+    monkeypatch.setattr(rig.recorder, "tick", lambda _: 1 / 0)
+    rig.run(2)
+    assert (rig.mode, rig.reason) == ("fault", "publish-error")
+    assert rig.loop.applied < 0.42
+
+
+def test_an_estimator_that_fails_stops_the_fish_and_not_the_loop(monkeypatch: Any) -> None:
+    rig = Rig()
+    rig.start("square")
+    rig.run(3)
+    monkeypatch.setattr(rig.loop._estimator, "update", lambda *_: 1 / 0)
+    rig.run(12)
+    assert (rig.mode, rig.reason) == ("fault", "estimate-error")
+    assert not rig.loop.servo_on
+
+
+def test_more_than_a_fifth_of_overruns_is_a_fault() -> None:
+    rig = Rig()
+    rig.start("square")
+    for _ in range(21):
+        rig.run(1, missed=1)
+        rig.run(1)
+    assert rig.reason == "overrun"
+
+
+def test_parameters_change_while_running_and_are_announced() -> None:
+    rig = Rig()
+    rig.start("swing", C=0.6)
+    rig.run(3)
+    rig.retune(C=0.3)
+    assert rig.loop.controller.parameters.C == 0.3
+    assert rig.recorder.events[-1].kind == "parameters"
+    assert "C=0.3" in rig.recorder.events[-1].message
+
+
+def test_every_change_of_mode_and_controller_is_an_event() -> None:
+    rig = Rig()
+    rig.start("square")
+    rig.run()
+    rig.start("sine")
+    rig.loop.stop()
+    rig.loop.stop()
+    assert rig.recorder.kinds() == ["controller", "mode", "controller", "mode"]
+
+
+def test_the_wrapped_robot_of_these_tests_changes_nothing() -> None:
+    plain, (wrapped, _) = Rig(), fragile_rig()
+    for rig in (plain, wrapped):
+        rig.start("swing")
+        rig.run(50)
+    assert plain.recorder.ticks == wrapped.recorder.ticks

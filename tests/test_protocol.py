@@ -1,0 +1,82 @@
+"""The decoder of requests: whatever arrives becomes a request or a refusal."""
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd import protocol
+from fishd.errors import Refused
+
+json_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=10,
+)
+
+
+def decoded(payload: bytes) -> protocol.Request | Refused:
+    try:
+        return protocol.decode_request(payload)
+    except Refused as refusal:
+        return refusal
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_become_a_request_or_a_refusal(payload: bytes) -> None:
+    assert isinstance(decoded(payload), protocol.Request | Refused)
+    protocol.request_id(payload)
+
+
+@given(json_values)
+def test_any_json_becomes_a_request_or_a_refusal(value: object) -> None:
+    assert isinstance(decoded(msgspec.json.encode(value)), protocol.Request | Refused)
+
+
+@given(
+    st.text(),
+    st.integers(-(2**63), 2**63 - 1) | st.text(),
+    st.dictionaries(st.text(), json_values, max_size=3),
+)
+def test_a_well_formed_request_arrives_as_it_was_sent(
+    op: str, identity: int | str, args: dict[str, object]
+) -> None:
+    wire = {"v": 1, "op": op, "id": identity, "args": args}
+    request = protocol.decode_request(msgspec.json.encode(wire))
+    assert (request.op, request.id, request.args) == (op, identity, args)
+
+
+def test_another_version_is_refused_by_name() -> None:
+    with pytest.raises(Refused, match="version 2 is not spoken here; this is 1") as caught:
+        protocol.decode_request(b'{"v":2,"op":"status"}')
+    assert caught.value.code == "version"
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"NaN",
+        b"[]",
+        b'{"v":1}',
+        b'{"v":1,"op":7}',
+        b'{"v":1,"op":"status","args":[]}',
+        b'{"v":1,"op":"status","speed":3}',
+        b'{"v":1,"op":"set-controller","args":{"name":"swing","parameters":{"C":NaN}}}',
+        b"[" * 60_000,
+    ],
+)
+def test_a_malformed_request_is_refused_as_such(payload: bytes) -> None:
+    with pytest.raises(Refused) as caught:
+        protocol.decode_request(payload)
+    assert caught.value.code == "bad-request"
+
+
+def test_the_id_of_a_broken_request_is_found_where_there_is_one() -> None:
+    assert protocol.request_id(b'{"id": 7, "op": 3}') == 7
+    assert protocol.request_id(b'{"id": [7]}') is None
+    assert protocol.request_id(b"\x00") is None
