@@ -48,7 +48,7 @@ def test_deadlines_are_whole_periods_apart_for_ever() -> None:
 
 def test_a_long_turn_costs_whole_slots_which_are_counted_and_not_caught_up() -> None:
     found = asyncio.run(slots(10, nap_before={4: 3.5 * PERIOD}))
-    assert found[4].missed >= 3
+    assert found[4].missed >= 2
     for before, after in pairwise(found):
         assert after.index - before.index == after.missed + 1
         assert after.now - after.deadline < PERIOD

@@ -1,30 +1,29 @@
+"""`fishctl watch`, as real processes under pipes and terminals, and its screen by itself."""
+
 import fcntl
 import io
 import json
+import math
 import os
 import pty
 import re
 import signal
 import struct
 import subprocess
-import sys
 import termios
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import pytest
+from processes import FISHCTL, PATIENCE, Daemon, running
 from rich.console import Console
 from rich.screen import Screen
 
 from fishd.cli.watch import View
-from fishd.client import Fish, NoDaemon
-from fishd.signals import Reason, Tick
-
-BIN = Path(sys.executable).parent
-PATIENCE = 30.0
-"""Longest wait for anything [s]; only a broken test takes that long."""
+from fishd.client import Fish
+from fishd.signals import Percentiles, Reason, Status, Tick, Timing
 
 ENTER_SCREEN, LEAVE_SCREEN = "\x1b[?1049h", "\x1b[?1049l"
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
@@ -41,13 +40,13 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
 class Terminal:
     """`fishctl watch` under a terminal, and all that it wrote there."""
 
-    def __init__(self, command: list[str], size: tuple[int, int] = (80, 24), **env: str) -> None:
+    def __init__(self, daemon: Daemon, *options: str, **env: str) -> None:
         self._master, self._slave = pty.openpty()
-        self.resize(*size)
-        self.settings = termios.tcgetattr(self._slave)
+        self.resize(80, 24)
+        self._settings = termios.tcgetattr(self._slave)
         plain = {name: os.environ[name] for name in os.environ if name != "NO_COLOR"}
         self._process = subprocess.Popen(
-            command,
+            [FISHCTL, "--endpoint", daemon.endpoint, "watch", *options],
             stdin=self._slave,
             stdout=self._slave,
             stderr=self._slave,
@@ -80,7 +79,7 @@ class Terminal:
             self._read()
             time.sleep(0.02)
         self._read()
-        assert termios.tcgetattr(self._slave) == self.settings
+        assert termios.tcgetattr(self._slave) == self._settings
         os.close(self._master)
         os.close(self._slave)
         return self._process.returncode
@@ -100,12 +99,8 @@ class Terminal:
         ) > self.text.rfind(HIDE_CURSOR)
 
 
-def run(command: list[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-
-
 def test_json_streams_every_tick_as_one_line(daemon: Daemon) -> None:
-    ended = run(daemon.watch("--json", "--seconds", "1.5"))
+    ended = daemon.fishctl("watch", "--json", "--seconds", "1.5")
     assert (ended.returncode, ended.stderr) == (0, "")
     ticks = [json.loads(line) for line in ended.stdout.splitlines()]
     first = ticks[0]["seq"]
@@ -117,7 +112,10 @@ def test_json_streams_every_tick_as_one_line(daemon: Daemon) -> None:
 
 def test_json_lines_are_not_held_back_and_ctrl_c_is_a_clean_end(daemon: Daemon) -> None:
     with subprocess.Popen(
-        daemon.watch("--json"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [FISHCTL, "--endpoint", daemon.endpoint, "watch", "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         assert process.stdout
         assert process.stderr
@@ -129,7 +127,7 @@ def test_json_lines_are_not_held_back_and_ctrl_c_is_a_clean_end(daemon: Daemon) 
 
 
 def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) -> None:
-    ended = run(daemon.watch("--seconds", "2.5"))
+    ended = daemon.fishctl("watch", "--seconds", "2.5")
     assert (ended.returncode, ended.stderr) == (0, "")
     lines = ended.stdout.splitlines()
     assert 1 <= len(lines) <= 3
@@ -137,7 +135,7 @@ def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) 
 
 
 def test_on_a_terminal_it_draws_and_leaves_the_terminal_as_it_was(daemon: Daemon) -> None:
-    terminal = Terminal(daemon.watch("--seconds", "3"))
+    terminal = Terminal(daemon, "--seconds", "3")
     terminal.wait_for("RUNNING")
     assert terminal.finish() == 0
     assert terminal.restored
@@ -152,7 +150,7 @@ def test_on_a_terminal_it_draws_and_leaves_the_terminal_as_it_was(daemon: Daemon
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_a_clean_end_and_restores_the_terminal(daemon: Daemon, number: int) -> None:
-    terminal = Terminal(daemon.watch())
+    terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
     terminal.signal(number)
     assert terminal.finish() == 0
@@ -161,7 +159,7 @@ def test_a_signal_is_a_clean_end_and_restores_the_terminal(daemon: Daemon, numbe
 
 
 def test_the_death_of_the_daemon_is_one_line_on_a_restored_terminal(daemon: Daemon) -> None:
-    terminal = Terminal(daemon.watch())
+    terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
     daemon.process.kill()
     assert terminal.finish() == 1
@@ -171,7 +169,7 @@ def test_the_death_of_the_daemon_is_one_line_on_a_restored_terminal(daemon: Daem
 
 
 def test_it_follows_the_terminal_through_any_size_without_colour_if_asked(daemon: Daemon) -> None:
-    terminal = Terminal(daemon.watch(), NO_COLOR="1")
+    terminal = Terminal(daemon, NO_COLOR="1")
     terminal.wait_for("lost")
     for size in ((3, 1), (20, 5), (60, 15), (200, 60)):
         terminal.resize(*size)
@@ -183,7 +181,7 @@ def test_it_follows_the_terminal_through_any_size_without_colour_if_asked(daemon
 
 
 def test_an_event_is_shown_when_it_happens(daemon: Daemon) -> None:
-    terminal = Terminal(daemon.watch())
+    terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
     with Fish(daemon.endpoint) as fish:
         fish.mark("a weight on the sensor")
@@ -217,3 +215,71 @@ def shown(view: View, width: int = 80, height: int = 24) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height)
     lines = console.render_lines(Screen(view))
     return ["".join(segment.text for segment in line).rstrip() for line in lines]
+
+
+def view_of(ticks: Iterable[Tick], **fields: Any) -> View:
+    view = View(status(**fields))
+    for each in ticks:
+        view.add(each)
+    return view
+
+
+def test_lost_ticks_are_counted_and_leave_a_gap_in_the_traces() -> None:
+    whole = shown(view_of(map(tick, range(1, 101))))
+    holed = shown(view_of(tick(seq) for seq in range(1, 101) if not 40 <= seq < 60))
+    assert whole[2].split()[-1] == "0"
+    assert holed[2].split()[-1] == "20"
+    for row in whole, holed:
+        assert row[3].startswith("fx mN")
+    phi_c = [next(row for row in rows if "0\u2524" in row) for rows in (whole, holed)]
+    assert re.search("[\u2801-\u28ff] {8,}[\u2801-\u28ff]", phi_c[1])
+    assert not re.search("[\u2801-\u28ff] {8,}[\u2801-\u28ff]", phi_c[0])
+
+
+def test_a_daemon_that_was_restarted_is_not_a_loss() -> None:
+    before = (tick(seq) for seq in range(1000, 1050))
+    after = (tick(seq, t=60.0 + 0.05 * seq) for seq in range(1, 50))
+    assert shown(view_of([*before, *after]))[2].split()[-1] == "0"
+
+
+def test_late_and_busy_are_the_worst_of_what_is_shown() -> None:
+    early = tick(1, lateness_us=9999.0)
+    bad = tick(150, lateness_us=777.0, busy_us=888.0)
+    late = shown(view_of([early, *map(tick, range(2, 150)), bad, *map(tick, range(151, 200))]))
+    assert "777 µs" in late[2]
+    assert "888 µs" in late[2]
+
+
+def test_a_fault_is_explained_in_full_however_narrow_the_screen() -> None:
+    message = "no force sample for 0.15 s: is the sensor's cable plugged in at both of its ends?"
+    faulty = view_of(
+        [tick(1, mode="fault", servo_on=False)],
+        mode="fault",
+        reason=Reason("sensor-stale", message),
+    )
+    screen = shown(faulty, width=30, height=24)
+    assert screen[0].startswith(" FAULT ")
+    assert message in " ".join(screen)
+    assert "no pulses" in shown(faulty)[0]
+
+
+def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_change() -> None:
+    assert not view_of([tick(1, t=100.5)], t=100.0).outdated
+    assert view_of([tick(1, t=101.0)], t=100.0).outdated
+    assert view_of([tick(1, t=100.5, mode="estop")], t=100.0).outdated
+    assert view_of([tick(1, t=100.5, controller="sine")], t=100.0).outdated
+
+
+def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
+    view = view_of(map(tick, range(1, 101)), reason=Reason("servo-link", "the cable is off"))
+    for width in (1, 10, 27, 28, 60, 250):
+        for height in (1, 2, 5, 9, 15, 60):
+            screen = shown(view, width, height)
+            assert len(screen) == height
+            assert max(map(len, screen)) <= width
+
+
+def test_a_fast_loop_is_drawn_like_a_slow_one() -> None:
+    slow = shown(view_of(map(tick, range(1, 101))))
+    fast = shown(view_of((tick(seq, t=0.002 * seq) for seq in range(1, 2501)), tick=0.002))
+    assert fast[-4] == slow[-4]
