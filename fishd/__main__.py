@@ -2,4 +2,4 @@
 
 from fishd.daemon import main
 
-main(prog_name="fishd")
+main()

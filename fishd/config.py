@@ -18,9 +18,9 @@ from fishd.errors import ConfigError, ParameterError, UnknownController
 from fishd.estimators.lateral_force import EstimatorSettings
 from fishd.hardware.imperfections import SimulationSettings
 from fishd.plant.parameters import PlantParameters
-from fishd.schema import Problem, convert
+from fishd.schema import Problem, convert, without_empty_sections
 
-_ADDRESS = re.compile(r"tcp://[^/\s]+:[0-9]+|ipc://\S+")
+_ADDRESS = re.compile(r"tcp://[^/\s]+:[0-9]+|ipc://[^@\s]\S*")
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -74,7 +74,8 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Everything that can be configured; `Config()` is a simulated fish at rest."""
 
     tick: Annotated[
-        float, Meta(ge=0.002, le=0.2, description="Period of the loop.", extra={"unit": "s"})
+        float,
+        Meta(ge=0.002, le=0.2, description="Period of the loop.", extra_json_schema={"unit": "s"}),
     ] = 0.05
     amplitude_limit: Annotated[
         float,
@@ -82,7 +83,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             gt=0,
             le=1.57,
             description="Φ: no instruction angle goes beyond ±Φ.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = 0.42
     slew_limit: Annotated[
@@ -90,7 +91,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Meta(
             description="Fastest change of the instruction angle. null allows one full reversal, "
             "2Φ, in each tick and so leaves a square wave untouched.",
-            extra={"unit": "rad/s"},
+            extra_json_schema={"unit": "rad/s"},
         ),
     ] = None
     fade_time: Annotated[
@@ -99,7 +100,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             gt=0,
             le=0.5,
             description="Time to fade from Φ to neutral on stop, fault and exit.",
-            extra={"unit": "s"},
+            extra_json_schema={"unit": "s"},
         ),
     ] = 0.4
     start: Annotated[Start, Meta(description="What the fish does at once.")] = Start()
@@ -142,7 +143,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
         key = _override(document.data, override)
         sources[key] = f"--set {override}"
     try:
-        config = convert(document.data, Config)
+        config = convert(without_empty_sections(document.data, Config), Config)
         _check_start(config)
         _check_addresses(config)
     except Problem as problem:
@@ -176,11 +177,11 @@ def _override(data: dict[str, Any], override: str) -> tuple[str, ...]:
         section = section.setdefault(key, {})
         if not isinstance(section, dict):
             raise ConfigError(f"--set {override}: {key} is a single value, not a section")
-    section[keys[-1]] = _value(text.strip(), override)
+    section[keys[-1]] = _value(text.strip(), dotted, override)
     return keys
 
 
-def _value(text: str, override: str) -> Any:
+def _value(text: str, dotted: str, override: str) -> Any:
     """A value from the command line, where a plain `1e-3` is a number."""
     for number in (int, float):
         try:
@@ -188,7 +189,7 @@ def _value(text: str, override: str) -> Any:
         except ValueError:
             continue
     try:
-        return strict_yaml.parse(text).data if text else ""
+        return strict_yaml.parse(text, name=dotted).data if text else ""
     except strict_yaml.YamlProblem as problem:
         raise ConfigError(f"--set {override}: {problem}") from None
 
@@ -215,7 +216,7 @@ def _check_addresses(config: Config) -> None:
             f"'{address}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
         )
     address = config.control.address or "ipc://default"
-    local = ("ipc://", "tcp://127.", "tcp://[::1]:", "tcp://localhost:")
+    local = ("ipc://", "tcp://127.", "tcp://localhost:")
     if not (_ADDRESS.fullmatch(address) and address.startswith(local)):
         raise Problem(
             ("control", "address"),

@@ -1,4 +1,9 @@
-"""One line a second for whoever runs `fishd` in a terminal."""
+"""What `fishd` and `fishctl` say in a terminal: one line a second, and one line for a mistake."""
+
+import sys
+from typing import NoReturn
+
+import click
 
 from fishd.signals import Status
 
@@ -13,3 +18,26 @@ def status_line(status: Status) -> str:
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed} of {status.seq + status.missed} ticks"
     )
+
+
+def run(command: click.Command, name: str) -> int:
+    """Run a command whose wrong use gets one line and exit status 2; return its exit status."""
+    try:
+        status = command(prog_name=name, standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        sys.exit(2)
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx else name
+        complain(name, f"{error.format_message().rstrip('.')}; see '{path} --help'", 2)
+    except click.ClickException as error:
+        complain(name, error.format_message(), 1)
+    except click.Abort:
+        sys.exit(130)
+    return status if isinstance(status, int) else 0
+
+
+def complain(name: str, message: str, status: int) -> NoReturn:
+    """Say one line on standard error and exit."""
+    click.echo(f"{name}: " + " ".join(message.split()), err=True)
+    sys.exit(status)

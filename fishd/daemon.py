@@ -13,7 +13,7 @@ import zmq
 from fishd import __version__, addresses, build, realtime
 from fishd.clock import SystemClock, Ticker
 from fishd.config import Config, load
-from fishd.console import status_line
+from fishd.console import complain, run, status_line
 from fishd.errors import ConfigError, StartupError
 from fishd.logs import LogWriter
 from fishd.operations import Operations
@@ -147,18 +147,18 @@ class Daemon:
     help="How logs on standard error look.",
 )
 @click.version_option(__version__, prog_name="fishd")
-def main(
+def fishd(
     path: Path | None, overrides: tuple[str, ...], print_status: bool | None, log_format: str
 ) -> None:
     """Run the robotic fish until SIGINT (Ctrl-C) or SIGTERM.
 
-    Exit status: 0 after a clean stop, 1 when something failed, 78 when the configuration is wrong.
+    Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 78 when the
+    configuration is wrong.
     """
     try:
         config = load(path, overrides)
     except ConfigError as error:
-        click.echo(f"fishd: {error}", err=True)
-        sys.exit(EX_CONFIG)
+        complain("fishd", str(error), EX_CONFIG)
     logs = LogWriter(log_format)
     try:
         with Daemon(
@@ -173,3 +173,8 @@ def main(
         sys.exit(1)
     finally:
         logs.close()
+
+
+def main() -> None:
+    """The `fishd` command."""
+    sys.exit(run(fishd, "fishd"))

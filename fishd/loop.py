@@ -8,7 +8,7 @@ Everything else here is called between two ticks, by the thread that ticks.
 import logging
 from typing import Any
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from fishd.clock import Clock, Slot
 from fishd.controllers.base import Controller, Limits
@@ -63,7 +63,7 @@ class ControlLoop:
         self._measurement: Measurement | None = None
         self._index = -1
         self._overran = False
-        self._servo_problem = ""
+        self._latest_problem = ""
         self._rest()
 
     def tick(self, slot: Slot) -> None:
@@ -95,15 +95,13 @@ class ControlLoop:
         before = self.supervisor.mode
         self.supervisor.start()
         self.controller_name, self.controller, self._fresh = name, controller, True
-        spelled = _spelled(controller.parameters)
-        self.reporter.event("controller", f"{name} takes over: {spelled}", controller=name)
+        self._announce_controller("controller", "takes over with")
         self._announce_mode(before)
 
     def retune(self, parameters: Struct) -> None:
         """Give the controller in command new, already checked parameters."""
         self.controller.retune(parameters)
-        name, spelled = self.controller_name, _spelled(parameters)
-        self.reporter.event("parameters", f"{name}: {spelled}", controller=name)
+        self._announce_controller("parameters", "goes on with")
 
     def stop(self) -> None:
         """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
@@ -115,6 +113,7 @@ class ControlLoop:
     def clear_fault(self) -> None:
         """Leave mode fault or estop for idle: the servo gets pulses again."""
         before = self.supervisor.mode
+        self._latest_problem = ""
         self.supervisor.clear()
         self._announce_mode(before)
 
@@ -136,6 +135,8 @@ class ControlLoop:
         problem = None
         try:
             measurement = self.robot.sensor.read(slot.deadline)
+            if self.supervisor.clipped(measurement.clipped):
+                self._fall()
         except Exception as error:
             problem = f"the force sensor cannot be read: {_named(error)}"
             measurement = self._measurement or Measurement(slot.deadline, 0.0, 0.0, 0)
@@ -144,8 +145,6 @@ class ControlLoop:
         if problem is None and age > STALE * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
         if self.supervisor.sensor(problem):
-            self._fall()
-        if self.supervisor.clipped(measurement.clipped):
             self._fall()
         return measurement
 
@@ -190,12 +189,7 @@ class ControlLoop:
                 self.robot.servo.write(self.applied)
                 self.servo_on = True
         except Exception as error:
-            problem = _named(error)
-            if problem != self._servo_problem:
-                self._fail("servo-link", "the servo cannot be driven", error)
-            self._servo_problem = problem
-        else:
-            self._servo_problem = ""
+            self._fail("servo-link", "the servo cannot be driven", error)
 
     def _publish(
         self, slot: Slot, measurement: Measurement, observation: Observation, busy: float
@@ -234,9 +228,12 @@ class ControlLoop:
             self._fall()
 
     def _fail(self, code: str, what: str, error: Exception) -> None:
-        """Latch a fault; when one is latched already, the error is logged all the same."""
-        log.error("%s", what, exc_info=error)
-        if self.supervisor.fail(code, f"{what}: {_named(error)}"):
+        """Latch a fault; an error while one is latched is logged all the same, once."""
+        problem = f"{what}: {_named(error)}"
+        if problem != self._latest_problem:
+            log.error("%s", what, exc_info=error)
+        self._latest_problem = problem
+        if self.supervisor.fail(code, problem):
             self._fall()
 
     def _fall(self) -> None:
@@ -244,7 +241,15 @@ class ControlLoop:
         self._rest()
         reason = self.supervisor.reason
         assert reason is not None
-        self.reporter.event("fault", f"{reason.code}: {reason.message}", "error", code=reason.code)
+        message = f"{reason.code}: {reason.message}"
+        mode = self.supervisor.mode.value
+        self.reporter.event("fault", message, "error", code=reason.code, mode=mode)
+
+    def _announce_controller(self, kind: str, does: str) -> None:
+        name, parameters = self.controller_name, structs.asdict(self.controller.parameters)
+        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in parameters.items())
+        message = f"{name} {does} {spelled or 'no parameters'}"
+        self.reporter.event(kind, message, controller=name, parameters=parameters)
 
     def _announce_mode(self, before: Mode, level: str = "info") -> None:
         mode, reason = self.supervisor.mode, self.supervisor.reason
@@ -252,11 +257,6 @@ class ControlLoop:
             return
         message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
         self.reporter.event("mode", message, level, before=before.value, mode=mode.value)
-
-
-def _spelled(parameters: Struct) -> str:
-    pairs = ((name, getattr(parameters, name)) for name in parameters.__struct_fields__)
-    return ", ".join(f"{name}={'default' if v is None else v}" for name, v in pairs) or "as it is"
 
 
 def _named(error: Exception) -> str:

@@ -18,6 +18,9 @@ from fishd.schema import Problem, convert, nearest
 from fishd.signals import ControllerInfo, Status
 from fishd.supervisor import Mode
 
+MOST_LOADING = 4
+"""Controllers that may be on their way into memory at once."""
+
 
 class Operations:
     """Answers requests from what the loop knows, and makes changes between its ticks."""
@@ -29,7 +32,9 @@ class Operations:
         self._telemetry = telemetry
         self._realtime = realtime
         self._started = clock.monotonic()
-        self._controllers = _describe_all()
+        self._decisions = 0
+        self._loading = 0
+        self._controllers = registry.describe_all()
         self._operations: dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]] = {
             "status": (protocol.NoArguments, self._status),
             "controllers": (protocol.NoArguments, self._list_controllers),
@@ -88,6 +93,10 @@ class Operations:
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
+        if self._loading >= MOST_LOADING:
+            raise Refused("busy", f"{self._loading} controllers are being loaded; try again")
+        decision = self._decide()
+        self._loading += 1
         try:
             # In a thread: a controller may load files and warm up, the tick must not wait for it.
             controller = await asyncio.to_thread(
@@ -100,6 +109,12 @@ class Operations:
         except Exception as error:
             what = f"controller '{wanted.name}' cannot start: {type(error).__name__}: {error}"
             raise Refused("controller-error", what) from error
+        finally:
+            self._loading -= 1
+        if decision != self._decisions:
+            raise Refused(
+                "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
+            )
         self._loop.set_controller(wanted.name, controller)
         return self._state()
 
@@ -121,10 +136,12 @@ class Operations:
         return self._state()
 
     async def _stop(self, _: protocol.NoArguments) -> State:
+        self._decide()
         self._loop.stop()
         return self._state()
 
     async def _estop(self, wanted: protocol.Estop) -> State:
+        self._decide()
         self._loop.estop(wanted.message)
         return self._state()
 
@@ -136,6 +153,11 @@ class Operations:
         self._loop.reporter.event("mark", wanted.text)
         return self._state()
 
+    def _decide(self) -> int:
+        """Count a decision on who is in command; one that loads slowly must not undo a newer."""
+        self._decisions += 1
+        return self._decisions
+
     def _state(self) -> State:
         loop = self._loop
         return State(
@@ -145,14 +167,3 @@ class Operations:
             controller=loop.controller_name,
             parameters=msgspec.structs.asdict(loop.controller.parameters),
         )
-
-
-def _describe_all() -> list[ControllerInfo]:
-    """All controllers that load; importing them now keeps that out of the running loop."""
-    described = []
-    for name in registry.names():
-        try:
-            described.append(registry.describe(name))
-        except UnknownController:
-            continue  # set-controller says why
-    return described

@@ -52,6 +52,17 @@ _KINDS: dict[type[inspect.Type], str] = {
 }
 
 
+def without_empty_sections(data: Mapping[str, Any], target: type[Struct]) -> dict[str, Any]:
+    """`data` less the sections below which nothing is written, so that they take their defaults."""
+    kept = dict(data)
+    for name, section in _sections(target):
+        if isinstance(kept.get(name), Mapping):
+            kept[name] = without_empty_sections(kept[name], section)
+        elif name in kept and kept[name] is None:
+            del kept[name]
+    return kept
+
+
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """The fields of a parameter struct, in the order in which they are declared."""
     info = cast(inspect.StructType, inspect.type_info(struct))
@@ -69,6 +80,22 @@ def convert(data: Any, target: type[T], *, prefix: tuple[str, ...] = ()) -> T:
     except msgspec.ValidationError as error:
         path, message = _explain(error, data, cast(type[Struct], target))
         raise Problem(prefix + path, message) from None
+
+
+def wanted(field: Field) -> str:
+    """What a field takes, in words: `a number in [0, 1] rad (or null)`."""
+    kind = {
+        "number": "a number",
+        "integer": "a whole number",
+        "text": "a text",
+        "boolean": "true or false",
+        "choice": "one of",
+        "section": "a section (a mapping of keys to values)",
+    }[field.kind]
+    within = field.interval if field.kind == "choice" else f"in {field.interval}"
+    unit = "" if field.unit in ("", "1") else field.unit
+    words = " ".join(word for word in (kind, within if field.interval else "", unit) if word)
+    return words + (" (or null)" if field.optional else "")
 
 
 def nearest(word: str, words: list[str]) -> str:
@@ -93,7 +120,7 @@ def _describe(field: inspect.Field) -> Field:
     about, unit, kind, optional = "", "", field.type, False
     if isinstance(kind, inspect.Metadata):
         about = (kind.extra_json_schema or {}).get("description", "")
-        unit = (kind.extra or {}).get("unit", "")
+        unit = (kind.extra_json_schema or {}).get("unit", "")
         kind = kind.type
     if isinstance(kind, inspect.UnionType):
         optional = True
@@ -167,26 +194,20 @@ def _sections(target: type[Struct]) -> Iterator[tuple[str, type[Struct]]]:
 def _wanted(target: type[Struct], path: tuple[str, ...]) -> str:
     if not path:
         return "a mapping of keys to values is needed"
-    field = next(f for f in fields_of(_struct_at(target, path[:-1])) if f.name == path[-1])
-    article = {
-        "number": "a number",
-        "integer": "a whole number",
-        "text": "a text",
-        "boolean": "true or false",
-        "choice": "one",
-        "section": "a section (a mapping of keys to values)",
-    }[field.kind]
-    preposition = "of" if field.kind == "choice" else "in"
-    within = f" {preposition} {field.interval}" if field.interval else ""
-    unit = f" {field.unit}" if field.unit not in ("", "1") else ""
-    return f"{article}{within}{unit} is needed" + (" (or null)" if field.optional else "")
+    fields = fields_of(_struct_at(target, path[:-1]))
+    field = next(field for field in fields if field.name == path[-1])
+    return f"{wanted(field)} is needed"
 
 
 def _shown(value: Any) -> str:
-    text = {True: "true", False: "false", None: "null"}.get(value) if _is_word(value) else None
-    text = text or repr(value)
+    text = spelled(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _is_word(value: Any) -> bool:
-    return value is None or isinstance(value, bool)
+def spelled(value: Any) -> str:
+    """A value as it would be written in YAML or JSON."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value)

@@ -17,9 +17,6 @@ log = logging.getLogger(__name__)
 
 Perform = Callable[[str, dict[str, Any]], Awaitable[Any]]
 
-MOST_AT_ONCE = 32
-"""Requests that may be in progress; more are refused."""
-
 
 class ControlServer:
     """Takes `[id, "", json]` from REQ sockets and `[id, json]` from DEALER sockets."""
@@ -61,8 +58,6 @@ class ControlServer:
     async def _answer(self, envelope: list[bytes], payload: bytes) -> None:
         identity: protocol.RequestId = None
         try:
-            if len(self._tasks) > MOST_AT_ONCE:
-                raise Refused("busy", "too many requests are in progress; try again")
             request = protocol.decode_request(payload)
             identity = request.id
             reply = protocol.success(identity, await self._perform(request.op, request.args))

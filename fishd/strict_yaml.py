@@ -34,8 +34,8 @@ _DEEPEST = 20
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
-def parse(text: str) -> Document:
-    """Parse `text`; raises `YamlProblem`."""
+def parse(text: str, name: str = "the document") -> Document:
+    """Parse `text`; raises `YamlProblem`. A lone value is called `name` in complaints."""
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
@@ -45,10 +45,10 @@ def parse(text: str) -> Document:
     except yaml.YAMLError as error:
         raise YamlProblem(1, f"not valid YAML: {' '.join(str(error).split())}") from None
     lines: dict[Path, int] = {}
-    return Document({} if root is None else _build(root, (), lines), lines)
+    return Document({} if root is None else _build(root, (), lines, name), lines)
 
 
-def _build(node: yaml.Node, path: Path, lines: dict[Path, int]) -> Any:
+def _build(node: yaml.Node, path: Path, lines: dict[Path, int], name: str = "") -> Any:
     line = node.start_mark.line + 1
     if len(path) > _DEEPEST:  # an alias of itself has no end
         raise YamlProblem(line, f"{'.'.join(path[:3])}...: nested too deeply")
@@ -57,7 +57,7 @@ def _build(node: yaml.Node, path: Path, lines: dict[Path, int]) -> Any:
         return _build_mapping(node, path, lines)
     if isinstance(node, yaml.SequenceNode):
         return [_build(item, (*path, str(i)), lines) for i, item in enumerate(node.value)]
-    return _scalar(node, ".".join(path) or "the document", line)
+    return _scalar(node, ".".join(path) or name, line)
 
 
 def _build_mapping(node: yaml.MappingNode, path: Path, lines: dict[Path, int]) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def _surprise(text: str, tag: str) -> str | None:
     """What YAML 1.1 takes a plain scalar for that people do not, and what to write instead."""
     if text.lower() in _WORDS:
         meant = _WORDS[text.lower()]
-        return f"is {meant} in YAML; write {meant}"
+        return f"is {meant} in YAML; write {meant}, or quote it where a text is meant"
     if tag.endswith(":str") and _BARE_EXPONENT.fullmatch(text):
         return f"is a text in YAML, not a number; write {_dotted(text)}"
     if tag.endswith((":int", ":float")) and _SEXAGESIMAL.fullmatch(text):

@@ -32,6 +32,12 @@ def test_the_shipped_configuration_is_good() -> None:
     assert config.start.controller == "swing"
 
 
+def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("plant:\n#  xi: 0.7\nstart: {controller: null, parameters: {}}\n")
+    assert load(file) == Config()
+
+
 def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     original = load(None, ["plant.xi=0.7", "start.controller=swing", "start.parameters.C=0.3"])
@@ -70,7 +76,7 @@ def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
         ),
         (
             "realtime:\n  lock_memory: on\n",
-            "fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true",
+            "fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true, or quote it",
         ),
         (
             "simulation:\n  seed: 1e2\n",
@@ -140,7 +146,9 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
         ("tick.x=3", "--set tick.x=3: "),
         ("tick=soon", "--set tick=soon: tick: 'soon' is not valid: a number in [0.002, 0.2] s"),
         ("tick=", "--set tick=: tick: '' is not valid"),
-        ("realtime.lock_memory=on", "'on' is true in YAML; write true"),
+        ("realtime.lock_memory=on", "realtime.lock_memory: 'on' is true in YAML; write true"),
+        ("control.address=ipc://@abstract", "'ipc://@abstract' is not valid: ipc://PATH"),
+        ("control.address=tcp://[::1]:5000", "is not valid: ipc://PATH or tcp://127.0.0.1:PORT"),
     ],
 )
 def test_a_bad_override_is_named_as_it_was_written(override: str, message: str) -> None:

@@ -218,6 +218,26 @@ def test_a_sensor_that_recovers_does_not_clear_the_fault_by_itself() -> None:
     assert rig.recorder.ticks[-1].servo_on
 
 
+def test_clearing_a_fault_that_is_still_there_latches_it_again() -> None:
+    rig, robot = fragile_rig()
+    robot.write_error = ServoError("pigpiod is gone")
+    for _ in range(2):
+        rig.run(3)
+        assert (rig.mode, rig.reason) == ("fault", "servo-link")
+        rig.loop.clear_fault()
+    assert rig.recorder.kinds().count("fault") == 2
+
+
+def test_one_clipped_window_and_failed_reads_are_not_three_clipped_windows() -> None:
+    rig, robot = fragile_rig()
+    rig.run(3)
+    robot.clipped = True
+    rig.run(1)
+    robot.read_error = SensorError("no acknowledge")
+    rig.run(2)
+    assert rig.mode == "idle"
+
+
 def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
     rig, robot = fragile_rig()
     rig.start("square")

@@ -53,7 +53,8 @@ def schema() -> None:
     """Print the JSON Schema of the configuration, for editors and other programs."""
     import msgspec
 
-    print_json(msgspec.json.schema(Config))
+    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    print_json(dialect | msgspec.json.schema(Config))
 
 
 def load_or_exit(file: Path | None, overrides: tuple[str, ...]) -> Config:

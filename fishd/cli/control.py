@@ -1,10 +1,12 @@
 """Verbs that talk to a running daemon: status, controllers, set-controller and so on."""
 
 import datetime
+import os
 from typing import Any
 
 import click
 
+from fishd.addresses import ENDPOINT_VARIABLE
 from fishd.cli.options import (
     ControllerGroup,
     ParameterType,
@@ -17,7 +19,7 @@ from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.errors import NoDaemon
 from fishd.protocol import State
-from fishd.signals import Percentiles, Status
+from fishd.signals import Percentiles, Reason, Status
 
 
 def daemon_options(function: Any) -> Any:
@@ -45,10 +47,10 @@ def controllers(endpoint: str | None, as_json: bool) -> None:
         with Fish(endpoint) as fish:
             known = fish.controllers()
     except NoDaemon:
-        if endpoint:
+        if endpoint or os.environ.get(ENDPOINT_VARIABLE):
             raise
         click.echo("fishctl: no fishd is running; these controllers are installed here", err=True)
-        known = [registry.describe(name) for name in registry.names()]
+        known = registry.describe_all()
     if as_json:
         print_json(known)
         return
@@ -126,19 +128,23 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 def mark(text: str, endpoint: str | None, as_json: bool) -> None:
     """Put a mark in the event stream, such as what you just changed on the rig."""
     with Fish(endpoint) as fish:
-        _print_state(fish.mark(text), as_json)
+        state = fish.mark(text)
+    if as_json:
+        print_json(state)
+    else:
+        click.echo(f"marked before tick {state.seq}: {text}")
 
 
 def _print_state(state: State, as_json: bool) -> None:
     if as_json:
         print_json(state)
         return
-    why = f" ({state.reason.code}: {state.reason.message})" if state.reason else ""
+    why = f" ({_why(state.reason)})" if state.reason else ""
     click.echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
 
 
 def _status_text(status: Status) -> str:
-    reason = f" ({status.reason.code}: {status.reason.message})" if status.reason else ""
+    reason = f" ({_why(status.reason)})" if status.reason else ""
     timing = status.timing
     scheduling = "real-time" if status.realtime else "normal"
     uptime = datetime.timedelta(seconds=int(status.uptime))
@@ -160,6 +166,10 @@ def _status_text(status: Status) -> str:
         ("telemetry", status.telemetry),
     ]
     return "\n".join(f"{name:<12}{text}" for name, text in rows)
+
+
+def _why(reason: Reason) -> str:
+    return reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
 
 
 def _percentiles(times: Percentiles) -> str:

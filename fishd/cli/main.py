@@ -6,6 +6,7 @@ from importlib import import_module
 import click
 
 from fishd import __version__
+from fishd.console import complain, run
 from fishd.errors import FishdError, Refused
 
 # verb: (module in fishd.cli, command in it, one line of help)
@@ -61,27 +62,11 @@ def main() -> None:
     Exit status: 0, 1 when the daemon refused or does not answer, 2 for a wrong command line.
     """
     try:
-        status = fishctl(prog_name="fishctl", standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message(), err=True)
-        sys.exit(2)
-    except click.UsageError as error:
-        path = error.ctx.command_path if error.ctx else "fishctl"
-        _complain(f"{error.format_message().rstrip('.')}; see '{path} --help'", 2)
-    except click.ClickException as error:
-        _complain(error.format_message(), 1)
-    except click.Abort:
-        sys.exit(130)
+        sys.exit(run(fishctl, "fishctl"))
     except Refused as error:
-        _complain(f"{error} [{error.code}]", 1)
+        complain("fishctl", f"{error} [{error.code}]", 1)
     except FishdError as error:
-        _complain(str(error), 1)
+        complain("fishctl", str(error), 1)
     except BrokenPipeError:  # the reader, `head` say, has seen enough
         sys.stderr.close()
         sys.exit(0)
-    sys.exit(status if isinstance(status, int) else 0)
-
-
-def _complain(message: str, status: int) -> None:
-    click.echo("fishctl: " + " ".join(message.split()), err=True)
-    sys.exit(status)

@@ -9,7 +9,7 @@ import click
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.errors import FishError, UnknownController
-from fishd.schema import Field
+from fishd.schema import Field, spelled, wanted
 from fishd.signals import ControllerInfo
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -46,8 +46,7 @@ class ParameterType(click.ParamType[Any]):
         try:
             return _PARSERS.get(field.kind, str)(value)
         except ValueError:
-            within = f" in {field.interval}" if field.interval else ""
-            self.fail(f"'{value}' is not a {field.kind}{within}", param, ctx)
+            self.fail(f"'{value}' is not valid: {wanted(field)} is needed", param, ctx)
 
 
 def _finite(text: str) -> float:
@@ -58,9 +57,10 @@ def _finite(text: str) -> float:
 
 
 def _boolean(text: str) -> bool:
-    return {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}[
-        text.lower()
-    ]
+    words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+    if text.lower() not in words:
+        raise ValueError(text)
+    return words[text.lower()]
 
 
 _PARSERS: dict[str, Callable[[str], Any]] = {"number": _finite, "integer": int, "boolean": _boolean}
@@ -94,11 +94,9 @@ def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str
 
 def describe(field: Field) -> str:
     """Description, permitted values, unit and default of a parameter in one line."""
-    unit = "" if field.unit in ("", "1") else f" {field.unit}"
-    default = "null" if field.default is None else f"{field.default}"
-    if field.interval:
-        return f"{field.description} In {field.interval}{unit}, default {default}."
-    return f"{field.description} Default {default}{unit}."
+    permitted = wanted(field)
+    default = spelled(field.default)
+    return f"{field.description} {permitted[0].upper()}{permitted[1:]}; default {default}."
 
 
 class ControllerGroup(click.Group):
@@ -124,7 +122,7 @@ class ControllerGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The controllers installed here."""
-        return registry.names()
+        return [info.name for info in registry.describe_all()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The sub-command of one controller."""

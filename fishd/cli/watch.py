@@ -32,9 +32,9 @@ REDRAW = 0.18
 SPAN = 5.0
 """How far back the traces go [s]."""
 POINTS = 120
-"""Most points in a trace; of a faster loop, only every so many-th tick is drawn."""
+"""Most points in a trace; a faster loop has ticks that are not drawn."""
 MODES = {"idle": "cyan", "running": "green", "fault": "red", "estop": "red"}
-LEVELS = {"info": "none", "warning": "yellow", "error": "red"}
+LEVELS = {"warning": "yellow", "error": "red"}
 
 
 class Trace(NamedTuple):
@@ -71,12 +71,8 @@ def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
     'lost' counts ticks that did not arrive here. Where standard output is not a terminal, a line
     is printed every second instead; with --json, every tick as one line.
     """
-    if as_json:
-        show = _print_ticks
-    elif sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
-        show = _draw
-    else:
-        show = _print_lines
+    can_draw = sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+    show = _print_ticks if as_json else _draw if can_draw else _print_lines
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too must restore the terminal
     with suppress(KeyboardInterrupt, TimeoutError):
         asyncio.run(_run(show, endpoint, seconds))
@@ -160,8 +156,7 @@ class View:
         width, height = options.max_width, options.height or console.height
         header = [self._title()]
         if reason := self.status.reason:
-            text = Text(f"{reason.code}: {reason.message}", "red")
-            header += text.wrap(console, width)
+            header += Text(f"{reason.code}: {reason.message}", "red").wrap(console, width)
         yield from header
         yield self._figures()
         events = max(0, min(3, (height - 14) // 3))
@@ -210,9 +205,9 @@ class View:
         import plotext
         from rich.text import Text
 
-        latest = self._ticks[-1]
         stride = max(1, math.ceil(SPAN / self.status.tick / POINTS))
         ticks = [tick for tick in self._ticks if tick.seq % stride == 0]
+        ages = [tick.t - self._ticks[-1].t for tick in ticks]
         values = [trace.value(tick) for tick in ticks]
         low, high = _scale(values, trace.least)
 
@@ -225,9 +220,7 @@ class View:
         if 0 < round(-low / (high - low) * (rows - 1)) < rows - 1:
             marks[0.0] = "0"
         figure.ruler("y").lim(low, high).ticks(list(marks), list(marks.values()))
-        line = figure.signal(
-            [tick.t - latest.t for tick in ticks], values, marker="braille"
-        ).lines()
+        line = figure.signal(ages, values, marker="braille").lines()
         for index, (before, after) in enumerate(itertools.pairwise(ticks), start=1):
             if after.seq - before.seq != stride:
                 line.line(index, False)
@@ -247,7 +240,7 @@ class View:
 
 def _scale(values: Sequence[float], least: float) -> tuple[float, float]:
     """Round limits around `values`, zero and ±`least`, so that the scale seldom changes."""
-    low, high = min(-least, *values), max(least, *values)
+    low, high = min([-least, *values]), max([least, *values])
     step = 10.0 ** math.floor(math.log10(high - low)) / 2.0
     return step * math.floor(low / step), step * math.ceil(high / step)
 

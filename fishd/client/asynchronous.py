@@ -74,11 +74,11 @@ class AsyncFish(Connection):
         return await self._call(State, "mark", text=text)
 
     def ticks(self) -> AsyncIterator[Tick]:
-        """Every tick from now on; raises `NoDaemon` when none comes in time."""
+        """Every tick from the first iteration on; raises `NoDaemon` when none comes in time."""
         return self._subscribe(b"tick", Tick)
 
     def events(self) -> AsyncIterator[Event]:
-        """Every event from now on, however long it takes."""
+        """Every event from the first iteration on, however long it takes."""
         return self._subscribe(b"event", Event)
 
     async def _call(self, kind: type[T], op: str, **args: Any) -> T:

@@ -19,7 +19,7 @@ class HoldParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             ge=-math.pi,
             le=math.pi,
             description="The instruction angle; 0 is neutral.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = 0.0
 

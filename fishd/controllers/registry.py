@@ -1,5 +1,6 @@
 """Finds controllers, built in and third-party, by the entry-point group `fishd.controllers`."""
 
+import contextlib
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -46,6 +47,11 @@ def find(name: str) -> type[Controller[Any]]:
             f"controller '{name}' ({entry.value}) is no subclass of "
             "fishd.controllers.base.Controller"
         )
+    parameters = getattr(found, "Parameters", None)
+    if not (isinstance(parameters, type) and issubclass(parameters, Struct)):
+        raise UnknownController(
+            f"controller '{name}' ({entry.value}) has no Parameters, a msgspec.Struct"
+        )
     return found
 
 
@@ -54,6 +60,15 @@ def describe(name: str) -> ControllerInfo:
     found = find(name)
     summary = (found.__doc__ or "").strip().partition("\n")[0]
     return ControllerInfo(name=name, summary=summary, parameters=fields_of(found.Parameters))
+
+
+def describe_all() -> list[ControllerInfo]:
+    """All controllers that load; the name of one that does not says why when it is used."""
+    found = []
+    for name in names():
+        with contextlib.suppress(UnknownController):
+            found.append(describe(name))
+    return found
 
 
 def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:

@@ -1,5 +1,6 @@
 """`swing`: reverse when the fin slows down. The paper's model-free control (Fu et al.)."""
 
+import math
 from typing import Annotated
 
 from msgspec import Meta, Struct
@@ -20,14 +21,14 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=0,
             le=1,
             description="Reverse when the fin's speed falls to C times its last maximum.",
-            extra={"unit": "1"},
+            extra_json_schema={"unit": "1"},
         ),
     ] = 0.6
     amplitude: Annotated[
-        Annotated[float, Meta(gt=0, le=3.1416)] | None,
+        Annotated[float, Meta(gt=0, le=math.pi)] | None,
         Meta(
             description="Instruction angle on either side; null: the robot's amplitude_limit.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = None
     longest_half_period: Annotated[
@@ -36,7 +37,7 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             gt=0,
             le=10,
             description="Reverse after this time even if the fin shows no sign of slowing down.",
-            extra={"unit": "s"},
+            extra_json_schema={"unit": "s"},
         ),
     ] = 1.0
 

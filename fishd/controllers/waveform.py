@@ -18,13 +18,15 @@ class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     frequency: Annotated[
         float,
-        Meta(gt=0, le=10, description="Frequency of the waveform.", extra={"unit": "Hz"}),
+        Meta(
+            gt=0, le=10, description="Frequency of the waveform.", extra_json_schema={"unit": "Hz"}
+        ),
     ] = 1.8
     amplitude: Annotated[
         Annotated[float, Meta(gt=0, le=math.pi)] | None,
         Meta(
             description="Largest instruction angle; null: the robot's amplitude_limit.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = None
 

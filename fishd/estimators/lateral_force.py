@@ -23,7 +23,7 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             gt=0,
             le=100,
             description="Time constant by which the integral of the lateral force forgets.",
-            extra={"unit": "s"},
+            extra_json_schema={"unit": "s"},
         ),
     ] = 0.3
     bias_time: Annotated[
@@ -32,7 +32,7 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             gt=0,
             le=1000,
             description="Time constant of the average that tracks the offset of the lateral force.",
-            extra={"unit": "s"},
+            extra_json_schema={"unit": "s"},
         ),
     ] = 2.0
 

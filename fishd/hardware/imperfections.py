@@ -22,16 +22,16 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             ge=0,
             le=1,
             description="Noise of each force, rms of the mean over one tick.",
-            extra={"unit": "N"},
+            extra_json_schema={"unit": "N"},
         ),
     ] = 1e-3
     offset_x: Annotated[
         float,
-        Meta(ge=-10, le=10, description="Constant offset on F_x.", extra={"unit": "N"}),
+        Meta(ge=-10, le=10, description="Constant offset on F_x.", extra_json_schema={"unit": "N"}),
     ] = 0.0
     offset_y: Annotated[
         float,
-        Meta(ge=-10, le=10, description="Constant offset on F_y.", extra={"unit": "N"}),
+        Meta(ge=-10, le=10, description="Constant offset on F_y.", extra_json_schema={"unit": "N"}),
     ] = 0.0
     drift: Annotated[
         float,
@@ -40,7 +40,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             le=10,
             description="Amplitude of a slow drift of both offsets, a sine of 60 s "
             "whose phase depends on the seed.",
-            extra={"unit": "N"},
+            extra_json_schema={"unit": "N"},
         ),
     ] = 0.0
     rotation: Annotated[
@@ -49,7 +49,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             ge=-math.pi,
             le=math.pi,
             description="Angle by which the sensor's axes are turned against the fish.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = 0.0
     sample_rate: Annotated[
@@ -59,7 +59,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             le=10_000,
             description="Pairs of samples per second; a window's mean is the mean of the samples "
             "that fall in it, at least one.",
-            extra={"unit": "1/s"},
+            extra_json_schema={"unit": "1/s"},
         ),
     ] = 200.0
     seed: Annotated[

@@ -14,7 +14,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=0.1,
             le=1e3,
             description="Undamped natural angular frequency of the fin in water, ω₀.",
-            extra={"unit": "rad/s"},
+            extra_json_schema={"unit": "rad/s"},
         ),
     ] = 12.5
     xi: Annotated[
@@ -23,7 +23,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=0.0,
             le=20.0,
             description="Damping ξ of the fin; its friction term is ξω₀α̇, not 2ξω₀α̇.",
-            extra={"unit": "1"},
+            extra_json_schema={"unit": "1"},
         ),
     ] = 1.2
     coupling: Annotated[
@@ -32,7 +32,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             gt=0.0,
             le=10.0,
             description="Fin angle at rest per angle of the servo wheel, λ.",
-            extra={"unit": "1"},
+            extra_json_schema={"unit": "1"},
         ),
     ] = 0.46
     servo_speed: Annotated[
@@ -41,7 +41,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=0.01,
             le=1e4,
             description="Highest angular speed of the servo wheel, Ω.",
-            extra={"unit": "rad/s"},
+            extra_json_schema={"unit": "rad/s"},
         ),
     ] = 5.8
     servo_lag: Annotated[
@@ -50,7 +50,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=1e-4,
             le=10.0,
             description="Lag of the wheel behind its instruction that saturates the servo, Δ.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = 0.29
     thrust_coefficient: Annotated[
@@ -59,7 +59,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             gt=0.0,
             le=10.0,
             description="Thrust coefficient K, in F_x = −K α α̈.",
-            extra={"unit": "N s^2/rad^2"},
+            extra_json_schema={"unit": "N s^2/rad^2"},
         ),
     ] = 12.9e-3
     lateral_drag: Annotated[
@@ -68,7 +68,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=0.0,
             le=10.0,
             description="Lateral drag coefficient K_d, in F_y = −K α̈ − K_d α̇.",
-            extra={"unit": "N s/rad"},
+            extra_json_schema={"unit": "N s/rad"},
         ),
     ] = 39.9e-3
     cable_slack: Annotated[
@@ -77,6 +77,6 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             ge=0.0,
             le=1.0,
             description="Wheel angle either side of centre that only takes up slack in the cables.",
-            extra={"unit": "rad"},
+            extra_json_schema={"unit": "rad"},
         ),
     ] = 0.0

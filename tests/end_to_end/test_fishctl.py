@@ -40,7 +40,7 @@ def test_stop_estop_and_clear_fault_do_what_they_say(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry, b"tick") as subscriber:
         assert daemon.fishctl("stop").stdout.startswith("idle: hold")
         subscriber.until(mode="idle", phi_c=0.0, servo_on=True)
-        assert "estop (estop: leak)" in daemon.fishctl("estop", "leak").stdout
+        assert "estop (leak): hold" in daemon.fishctl("estop", "leak").stdout
         subscriber.until(mode="estop", servo_on=False)
         refused = daemon.fishctl("set-controller", "square")
         assert refused.returncode == 1
@@ -64,7 +64,7 @@ def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon
     text = daemon.fishctl("controllers").stdout
     assert "swing  Reverse the tail" in text
     assert "--longest-half-period" in text
-    assert "In (0, 10] s, default 1.0." in text
+    assert "A number in (0, 10] s; default 1.0." in text
     known = {
         info["name"]: info for info in json.loads(daemon.fishctl("controllers", "--json").stdout)
     }
@@ -92,7 +92,7 @@ def test_the_status_says_what_runs_and_how_well(daemon: Daemon) -> None:
     [
         (("set-controller", "swin"), "no controller is named 'swin'; did you mean 'swing'?"),
         (("set-controller", "swing", "--C", "2"), "swing: C: 2.0 is not valid: a number in [0, 1]"),
-        (("set-controller", "swing", "--C", "nan"), "'nan' is not a number in [0, 1]"),
+        (("set-controller", "swing", "--C", "nan"), "'nan' is not valid: a number in [0, 1]"),
         (
             ("set-controller", "sine", "--amplitude", "1"),
             "beyond the robot's amplitude_limit, 0.42",

@@ -1,0 +1,142 @@
+"""Controllers of other people's packages: slow ones, broken ones, and what they must not spoil."""
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes import Daemon, Subscriber, running
+
+from fishd.client import Fish, Refused
+
+MODULE = '''
+"""Controllers with bad manners."""
+
+import time
+
+from fishd.controllers.base import Controller
+from fishd.controllers.hold import Hold
+
+
+class Slow(Hold):
+    """Takes its time to load."""
+
+    def __init__(self, parameters, limits):
+        super().__init__(parameters, limits)
+        time.sleep(1.0)
+
+
+class Shapeless(Controller):
+    """Has no parameters struct."""
+
+    def update(self, observation):
+        return 0.0
+
+
+class Explosive(Hold):
+    """Fails while it loads."""
+
+    def __init__(self, parameters, limits):
+        raise RuntimeError("no such model")
+
+
+class Drunk(Hold):
+    """Fails while it runs."""
+
+    def update(self, observation):
+        return float("nan")
+'''
+ENTRY_POINTS = """[fishd.controllers]
+slow = manners:Slow
+shapeless = manners:Shapeless
+explosive = manners:Explosive
+drunk = manners:Drunk
+absent = nowhere:Absent
+function = time:sleep
+"""
+
+
+@pytest.fixture
+def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    """A daemon on a machine where a package of bad controllers is installed."""
+    installed = tmp_path / "site"
+    info = installed / "manners-1.0.dist-info"
+    info.mkdir(parents=True)
+    (installed / "manners.py").write_text(MODULE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: manners\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    monkeypatch.setenv("PYTHONPATH", str(installed))
+    with running(tmp_path) as found:
+        yield found
+
+
+def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> None:
+    known = [info["name"] for info in json.loads(daemon.fishctl("controllers", "--json").stdout)]
+    assert {"slow", "drunk", "swing"} <= set(known)
+    assert not {"shapeless", "absent", "function"} & set(known)
+    assert "swing" in daemon.fishctl("simulate", "--help").stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("shapeless", "(manners:Shapeless) has no Parameters, a msgspec.Struct"),
+        ("absent", "(nowhere:Absent) does not load: ModuleNotFoundError"),
+        ("function", "(time:sleep) is no subclass of fishd.controllers.base.Controller"),
+        ("explosive", "controller 'explosive' cannot start: RuntimeError: no such model"),
+    ],
+)
+def test_one_that_cannot_start_says_why_in_one_line(
+    daemon: Daemon, name: str, message: str
+) -> None:
+    done = daemon.fishctl("set-controller", name)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_one_that_fails_in_the_tick_is_a_fault_with_its_reason(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        daemon.fishctl("set-controller", "drunk")
+        ticks.until(mode="fault", servo_on=False)
+    status = json.loads(daemon.fishctl("status", "--json").stdout)
+    assert status["reason"]["code"] == "controller-error"
+    assert "the command is nan, not an angle" in status["reason"]["message"]
+
+
+def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        before = ticks.message()
+        daemon.fishctl("set-controller", "slow")
+        after = ticks.until(controller="slow")
+    assert after["missed"] == before["missed"]
+    assert after["seq"] - before["seq"] > 15
+
+
+@pytest.mark.parametrize("newer", ["stop", "estop"])
+def test_one_that_is_still_loading_does_not_undo_a_newer_request(
+    daemon: Daemon, newer: str
+) -> None:
+    refusals: list[str] = []
+
+    def start() -> None:
+        with Fish(daemon.endpoint, timeout=10.0) as fish:
+            try:
+                fish.set_controller("slow")
+            except Refused as refusal:
+                refusals.append(refusal.code)
+
+    loading = [threading.Thread(target=start) for _ in range(8)]
+    for thread in loading:
+        thread.start()
+    with Fish(daemon.endpoint) as fish:
+        while fish.status().mode == "idle" and "busy" not in refusals:
+            pass
+        assert getattr(fish, newer)().mode == {"stop": "idle", "estop": "estop"}[newer]
+        fish.clear_fault()
+        for thread in loading:
+            thread.join()
+        assert fish.status().mode == "idle"
+    assert set(refusals) == {"busy", "superseded"}
+    assert len(refusals) == 8
