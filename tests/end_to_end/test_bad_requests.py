@@ -27,15 +27,15 @@ def ask(socket: "zmq.Socket[bytes]", payload: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
-def test_both_kinds_of_socket_get_an_answer_with_their_id(daemon: Daemon, kind: int) -> None:
-    with socket_of(daemon, kind) as socket:
+def test_both_kinds_of_socket_get_an_answer_with_their_id(idle_daemon: Daemon, kind: int) -> None:
+    with socket_of(idle_daemon, kind) as socket:
         reply = ask(socket, b'{"v":1,"id":"a1","op":"status","args":{}}')
     assert (reply["v"], reply["id"], reply["ok"]) == (1, "a1", True)
     assert reply["result"]["mode"] == "idle"
 
 
-def test_many_requests_sent_at_once_are_all_answered(daemon: Daemon) -> None:
-    with socket_of(daemon, zmq.DEALER) as socket:
+def test_many_requests_sent_at_once_are_all_answered(idle_daemon: Daemon) -> None:
+    with socket_of(idle_daemon, zmq.DEALER) as socket:
         for number in range(60):
             socket.send(b'{"v":1,"id":%d,"op":"stop"}' % number)
         answered = {json.loads(socket.recv())["id"] for _ in range(60)}
@@ -63,9 +63,9 @@ def test_many_requests_sent_at_once_are_all_answered(daemon: Daemon) -> None:
     ],
 )
 def test_a_bad_request_gets_an_error_that_says_what_is_wrong(
-    daemon: Daemon, request_: bytes, code: str, message: str
+    idle_daemon: Daemon, request_: bytes, code: str, message: str
 ) -> None:
-    with socket_of(daemon, zmq.DEALER) as socket:
+    with socket_of(idle_daemon, zmq.DEALER) as socket:
         reply = ask(socket, request_)
     assert (reply["ok"], reply["id"], reply["error"]["code"]) == (False, 1, code)
     assert message in reply["error"]["message"]
@@ -81,8 +81,8 @@ def test_a_bad_request_gets_an_error_that_says_what_is_wrong(
         b"\xff\xfe\x00",
     ],
 )
-def test_what_is_no_json_gets_an_error_without_an_id(daemon: Daemon, payload: bytes) -> None:
-    with socket_of(daemon, zmq.DEALER) as socket:
+def test_what_is_no_json_gets_an_error_without_an_id(idle_daemon: Daemon, payload: bytes) -> None:
+    with socket_of(idle_daemon, zmq.DEALER) as socket:
         reply = ask(socket, payload)
     assert (reply["ok"], reply["id"], reply["error"]["code"]) == (False, None, "bad-request")
 

@@ -36,8 +36,8 @@ TICK_FIELDS = {
 }
 
 
-def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(daemon: Daemon) -> None:
-    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(idle_daemon: Daemon) -> None:
+    with Subscriber(idle_daemon.telemetry, b"tick") as subscriber:
         for _ in range(5):
             topic, payload = subscriber.frames()
             assert topic == b"tick"
@@ -46,8 +46,8 @@ def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(daemon: Da
             assert b"null" not in payload
 
 
-def test_ticks_are_numbered_without_gaps_and_timed_without_drift(daemon: Daemon) -> None:
-    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+def test_ticks_are_numbered_without_gaps_and_timed_without_drift(idle_daemon: Daemon) -> None:
+    with Subscriber(idle_daemon.telemetry, b"tick") as subscriber:
         ticks = [subscriber.message() for _ in range(40)]
     assert [t["seq"] for t in ticks] == list(range(ticks[0]["seq"], ticks[0]["seq"] + 40))
     starts = [t["t"] - t["lateness_us"] * 1e-6 - (t["seq"] + t["missed"]) * 0.05 for t in ticks]
@@ -55,13 +55,16 @@ def test_ticks_are_numbered_without_gaps_and_timed_without_drift(daemon: Daemon)
     assert max(starts) - min(starts) < 0.05
 
 
-def test_the_three_topics_can_be_told_apart_by_prefix(daemon: Daemon) -> None:
-    with Subscriber(daemon.telemetry, b"status") as status:
+def test_the_three_topics_can_be_told_apart_by_prefix(idle_daemon: Daemon) -> None:
+    with Subscriber(idle_daemon.telemetry, b"status") as status:
         assert status.message()["robot"] == "simulated"
-    with Subscriber(daemon.telemetry, b"event") as events, Subscriber(daemon.telemetry) as every:
+    with (
+        Subscriber(idle_daemon.telemetry, b"event") as events,
+        Subscriber(idle_daemon.telemetry) as every,
+    ):
         every.message()  # connected
-        daemon.fishctl("mark", "first")
-        daemon.fishctl("mark", "second")
+        idle_daemon.fishctl("mark", "first")
+        idle_daemon.fishctl("mark", "second")
         assert events.until(kind="mark")["message"] in ("first", "second")
 
 
@@ -100,14 +103,17 @@ def test_a_bad_configuration_exits_with_78_and_one_line(tmp_path: Path) -> None:
     assert errors == f"fishd: {file}:2: plant.omega: unknown key; did you mean 'omega0'?\n"
 
 
-def test_a_second_daemon_on_the_same_control_address_says_so_and_exits(daemon: Daemon) -> None:
-    folder = Path(daemon.endpoint.removeprefix("ipc://")).parent
+def test_a_second_daemon_on_the_same_control_address_says_so_and_exits(idle_daemon: Daemon) -> None:
+    folder = Path(idle_daemon.endpoint.removeprefix("ipc://")).parent
     second = Daemon(folder)
     status, _, errors = second.finish()
     assert status == 1
-    assert f"another fishd (pid {daemon.process.pid}) already serves {daemon.endpoint}" in errors
+    assert (
+        f"another fishd (pid {idle_daemon.process.pid}) already serves {idle_daemon.endpoint}"
+        in errors
+    )
     assert "Traceback" not in errors
-    assert daemon.fishctl("status").returncode == 0
+    assert idle_daemon.fishctl("status").returncode == 0
 
 
 def test_a_second_daemon_on_the_same_telemetry_address_says_so_and_exits(

@@ -60,13 +60,16 @@ def test_a_mark_arrives_as_an_event(daemon: Daemon) -> None:
     assert (event["message"], event["level"]) == ("changed the fin", "info")
 
 
-def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon: Daemon) -> None:
-    text = daemon.fishctl("controllers").stdout
+def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(
+    idle_daemon: Daemon,
+) -> None:
+    text = idle_daemon.fishctl("controllers").stdout
     assert "swing  Reverse the tail" in text
     assert "--longest-half-period" in text
     assert "A number in (0, 10] s; default 1.0." in text
     known = {
-        info["name"]: info for info in json.loads(daemon.fishctl("controllers", "--json").stdout)
+        info["name"]: info
+        for info in json.loads(idle_daemon.fishctl("controllers", "--json").stdout)
     }
     assert {"hold", "square", "sine", "triangle", "swing"} <= set(known)
     assert known["swing"]["parameters"][0] == {
@@ -106,9 +109,9 @@ def test_the_status_says_what_runs_and_how_well(daemon: Daemon) -> None:
     ],
 )
 def test_a_mistake_gets_one_line_that_says_what_to_do(
-    daemon: Daemon, arguments: tuple[str, ...], message: str
+    idle_daemon: Daemon, arguments: tuple[str, ...], message: str
 ) -> None:
-    done = daemon.fishctl(*arguments)
+    done = idle_daemon.fishctl(*arguments)
     assert done.returncode in (1, 2)
     assert message in done.stderr
     assert done.stderr.startswith("fishctl: ")
@@ -122,16 +125,16 @@ def test_a_parameter_that_the_controller_lacks_is_refused_by_name(daemon: Daemon
     assert "swing: frequency: unknown key; valid: C, amplitude, longest_half_period" in done.stderr
 
 
-def test_the_configuration_can_be_checked_shown_and_explained(daemon: Daemon) -> None:
-    shown = daemon.fishctl("config", "show", "--set", "plant.xi=0.5").stdout
+def test_the_configuration_can_be_checked_shown_and_explained(idle_daemon: Daemon) -> None:
+    shown = idle_daemon.fishctl("config", "show", "--set", "plant.xi=0.5").stdout
     assert "  xi: 0.5" in shown
-    schema = json.loads(daemon.fishctl("config", "schema").stdout)
+    schema = json.loads(idle_daemon.fishctl("config", "schema").stdout)
     assert "tick" in schema["$defs"]["Config"]["properties"]
-    done = daemon.fishctl("config", "check", "nowhere.yaml")
+    done = idle_daemon.fishctl("config", "check", "nowhere.yaml")
     assert (done.returncode, done.stderr[:30]) == (78, "fishctl: nowhere.yaml: no such")
 
 
-def test_help_and_completion_need_no_daemon(daemon: Daemon) -> None:
-    assert "--C NUMBER" in daemon.fishctl("set-controller", "swing", "--help").stdout
-    assert "_fishctl_completion" in daemon.fishctl("completion", "bash").stdout
-    assert "set-controller" in daemon.fishctl("--help").stdout
+def test_help_and_completion_need_no_daemon(idle_daemon: Daemon) -> None:
+    assert "--C NUMBER" in idle_daemon.fishctl("set-controller", "swing", "--help").stdout
+    assert "_fishctl_completion" in idle_daemon.fishctl("completion", "bash").stdout
+    assert "set-controller" in idle_daemon.fishctl("--help").stdout

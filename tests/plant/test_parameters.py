@@ -18,7 +18,7 @@ def test_every_parameter_has_bounds_a_unit_and_a_description() -> None:
     for name in PlantParameters.__struct_fields__:
         (meta,) = hints[name].__metadata__
         assert meta.description.endswith("."), name
-        assert meta.extra["unit"], name
+        assert meta.extra_json_schema["unit"], name
         assert meta.le is not None, name
         assert meta.ge is not None or meta.gt is not None, name
 
