@@ -201,11 +201,11 @@ class ControlLoop:
                 observation,
                 self.robot.truth() if self.robot.truth else None,
                 seq=self.seq,
-                mode=self.supervisor.mode.value,
+                mode=self.supervisor.mode,
                 controller=self.controller_name,
-                phi_c=self.applied,
+                angle=self.applied,
                 servo_on=self.servo_on,
-                busy_us=busy * 1e6,
+                busy=busy,
                 missed=self.statistics.missed,
             )
         except Exception as error:

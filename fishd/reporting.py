@@ -8,6 +8,7 @@ from msgspec import UNSET
 from fishd.clock import Clock, Slot
 from fishd.signals import Event, Measurement, Observation, Tick, Truth
 from fishd.statistics import PHASES
+from fishd.supervisor import Mode
 
 log = logging.getLogger(__name__)
 
@@ -43,27 +44,46 @@ class Reporter:
         measurement: Measurement,
         observation: Observation,
         truth: Truth | None,
-        **decided: Any,
-    ) -> Tick:
-        """Seal and publish the record of a tick; `decided` are the fields the loop itself sets."""
-        tick = Tick(
-            t=self._clock.wall(),
-            fx=observation.fx,
-            fy=observation.fy,
-            fy_rate=observation.fy_rate,
-            fin_velocity=observation.fin_velocity,
-            thrust=observation.thrust,
-            frequency=observation.frequency,
-            samples=measurement.samples,
-            age_ms=(slot.now - measurement.time) * 1e3,
-            lateness_us=(slot.now - slot.deadline) * 1e6,
-            alpha=truth.alpha if truth else UNSET,
-            alpha_rate=truth.alpha_rate if truth else UNSET,
-            phi=truth.phi if truth else UNSET,
-            **decided,
+        *,
+        seq: int,
+        mode: Mode,
+        controller: str,
+        angle: float,
+        servo_on: bool,
+        busy: float,
+        missed: int,
+    ) -> None:
+        """Seal and publish the record of a tick.
+
+        angle: the instruction angle that was sent [rad]
+        busy: time that the tick has taken so far [s]
+        missed: slots skipped since start
+        """
+        now = slot.now
+        self._publisher.tick(
+            Tick(
+                t=self._clock.wall(),
+                seq=seq,
+                mode=mode.value,
+                controller=controller,
+                fx=observation.fx,
+                fy=observation.fy,
+                fy_rate=observation.fy_rate,
+                fin_velocity=observation.fin_velocity,
+                phi_c=angle,
+                servo_on=servo_on,
+                thrust=observation.thrust,
+                frequency=observation.frequency,
+                samples=measurement.samples,
+                age_ms=(now - measurement.time) * 1e3,
+                lateness_us=(now - slot.deadline) * 1e6,
+                busy_us=busy * 1e6,
+                missed=missed,
+                alpha=truth.alpha if truth else UNSET,
+                alpha_rate=truth.alpha_rate if truth else UNSET,
+                phi=truth.phi if truth else UNSET,
+            )
         )
-        self._publisher.tick(tick)
-        return tick
 
 
 def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None:

@@ -1,7 +1,6 @@
 """The verb that shows a fish live in the terminal: force, command, thrust and timing."""
 
 import asyncio
-import itertools
 import math
 import os
 import signal
@@ -27,12 +26,10 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-REDRAW = 0.18
+REDRAW = 0.1
 """Least time from one drawing to the next [s]; every tick that came meanwhile is in it."""
 SPAN = 5.0
 """How far back the traces go [s]."""
-POINTS = 120
-"""Most points in a trace; a faster loop has ticks that are not drawn."""
 MODES = {"idle": "cyan", "running": "green", "fault": "red", "estop": "red"}
 LEVELS = {"warning": "yellow", "error": "red"}
 
@@ -162,9 +159,11 @@ class View:
         events = max(0, min(3, (height - 14) // 3))
         room = height - len(header) - 2 - events - 1  # 2 rows of figures, 1 for the time axis
         traces = TRACES[: max(0, room // 2)] if width >= 2 * LABEL else ()
-        for number, trace in enumerate(traces, start=1):
-            rows = room // len(traces)
-            yield self._plot(trace, width, rows, time_axis=number == len(traces))
+        for trace in traces:
+            yield self._plot(trace, width, room // len(traces))
+        if traces:
+            ago = f"-{SPAN:g} s"
+            yield Text(f"{'':{LABEL + 1}}{ago:<{width - LABEL - 4}}now", "dim")
         for event in list(self._events)[-events:] if events else ():
             yield self._event(event)
 
@@ -200,32 +199,27 @@ class View:
         table.add_row(*figures.values(), style="bold")
         return table
 
-    def _plot(self, trace: Trace, width: int, rows: int, time_axis: bool) -> "Text":
-        """A trace in `rows` rows, and the time axis in one more."""
-        import plotext
+    def _plot(self, trace: Trace, width: int, rows: int) -> "Text":
+        """A trace with its name and scale to the left; lost ticks leave a gap."""
         from rich.text import Text
 
-        stride = max(1, math.ceil(SPAN / self.status.tick / POINTS))
-        ticks = [tick for tick in self._ticks if tick.seq % stride == 0]
-        ages = [tick.t - self._ticks[-1].t for tick in ticks]
-        values = [trace.value(tick) for tick in ticks]
-        low, high = _scale(values, trace.least)
+        from fishd.cli.braille import curve
 
-        plotext.terminal.limit(False, False)
-        figure = plotext.figure.clear().plot_size(width, rows + time_axis)
-        figure.axes(False).axes(True, axis="y", side="left")
-        times = (-SPAN, -SPAN / 2, 0.0) if time_axis else ()
-        figure.ruler("x").lim(-SPAN, 0.0).ticks(times, (f"-{SPAN:g} s", f"-{SPAN / 2:g}", "now"))
-        marks = {low: f"{low:g}", high: f"{trace.name:<9}{high:>{LABEL - 9}g}"}
-        if 0 < round(-low / (high - low) * (rows - 1)) < rows - 1:
-            marks[0.0] = "0"
-        figure.ruler("y").lim(low, high).ticks(list(marks), list(marks.values()))
-        line = figure.signal(ages, values, marker="braille").lines()
-        for index, (before, after) in enumerate(itertools.pairwise(ticks), start=1):
-            if after.seq - before.seq != stride:
-                line.line(index, False)
-        drawn = figure.draw(line).build().string(colorless=True).splitlines()[: rows + time_axis]
-        return Text("\n").join(Text(row, trace.style) for row in drawn)
+        values = [trace.value(tick) for tick in self._ticks]
+        low, high = _scale(values, trace.least)
+        now = self._ticks[-1].t
+        points = [(now - SPAN, math.nan)]
+        for before, tick, value in zip((None, *self._ticks), self._ticks, values, strict=False):
+            if before and tick.seq - before.seq != 1:
+                points.append((before.t, math.nan))
+            points.append((tick.t, (value - low) / (high - low)))
+        labels = [""] * rows
+        labels[round(high / (high - low) * (rows - 1))] = "0"
+        labels[-1] = f"{low:g}"
+        labels[0] = f"{trace.name:<9}{high:>{LABEL - 9}g}"
+        drawn = curve(points, now - SPAN, now, rows, width - LABEL - 1)
+        lines = (f"{label:>{LABEL}}┤{line}" for label, line in zip(labels, drawn, strict=True))
+        return Text("\n".join(lines), trace.style, no_wrap=True)
 
     def _event(self, event: Event) -> "Text":
         from rich.text import Text

@@ -6,6 +6,7 @@ The periodic state is solved for directly, so no transient is ever simulated.
 import cmath
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ def square_wave(parameters: PlantParameters, amplitude: float, frequency: float)
     return SteadyState(frequency, window.thrust, window.fin_peak)
 
 
+@lru_cache(maxsize=256)
 def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadyState:
     """Return the square wave of this amplitude (rad) that thrusts most, over all frequencies.
 
