@@ -1,10 +1,12 @@
-"""Where the control socket is, for the daemon that binds it and for clients that look for it."""
+"""Where the sockets are, for the daemon that binds them and for clients that look for it."""
 
 import fcntl
 import os
 import stat
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import zmq
 
 from fishd.errors import StartupError
 
@@ -87,3 +89,16 @@ def claim(address: str) -> IO[str] | None:
     lock.write(f"{os.getpid()}\n")
     lock.flush()
     return lock
+
+
+def bind(socket: "zmq.Socket[Any]", address: str, key: str) -> None:
+    """Bind a socket; raises `StartupError` that names the configuration key of its address."""
+    try:
+        socket.bind(address)
+    except zmq.ZMQError as error:
+        socket.close(linger=0)
+        if error.errno == zmq.EADDRINUSE:
+            why = "it is in use, by another fishd perhaps; stop that, or choose another address"
+        else:
+            why = f"{zmq.strerror(error.errno or 0)}; choose another address"
+        raise StartupError(f"{key}: cannot listen on {address}: {why}") from None

@@ -10,8 +10,8 @@ import zmq
 import zmq.asyncio
 
 from fishd import protocol
+from fishd.addresses import bind
 from fishd.errors import Refused
-from fishd.telemetry import bind
 
 log = logging.getLogger(__name__)
 

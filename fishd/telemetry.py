@@ -1,11 +1,9 @@
 """Publishes ticks, events and status over ZeroMQ; nothing here ever waits for a subscriber."""
 
-from typing import Any
-
 import msgspec
 import zmq
 
-from fishd.errors import StartupError
+from fishd.addresses import bind
 from fishd.signals import Event, Status, Tick
 
 QUEUE = 100
@@ -42,16 +40,3 @@ class Telemetry:
 
     def _send(self, topic: bytes, message: Tick | Event | Status) -> None:
         self._socket.send_multipart((topic, self._encode(message)), zmq.DONTWAIT)
-
-
-def bind(socket: "zmq.Socket[Any]", address: str, key: str) -> None:
-    """Bind a socket; raises `StartupError` that names the configuration key of its address."""
-    try:
-        socket.bind(address)
-    except zmq.ZMQError as error:
-        socket.close(linger=0)
-        if error.errno == zmq.EADDRINUSE:
-            why = "it is in use, by another fishd perhaps; stop that, or choose another address"
-        else:
-            why = f"{zmq.strerror(error.errno or 0)}; choose another address"
-        raise StartupError(f"{key}: cannot listen on {address}: {why}") from None

@@ -90,7 +90,7 @@ these, with the line and what to write instead:
 
 | written | YAML reads | write |
 |---|---|---|
-| `lock_memory: on` (also `off`, `yes`, `no`, `y`, `n`) | `true` or `false` | `true`, `false`, or the word in quotes |
+| `lock_memory: on` (or off, yes, no, y, n) | `true`, `false` | `true`, `false`, or in quotes |
 | `tick: 1e-2` | the text "1e-2" | `1.0e-2` or `0.01` |
 | `tick: 1:30` | ninety, in sixties | a plain number |
 | `priority: 010` | eight, in octal | `10` |
