@@ -1,10 +1,14 @@
 """Where the sockets are, for the daemon that binds them and for clients that look for it."""
 
+import errno
 import fcntl
 import os
+import socket
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import zmq
 
@@ -59,15 +63,18 @@ def _private_socket() -> Path:
     return Path(f"/tmp/fishd-{os.getuid()}/control")
 
 
-def claim(address: str) -> IO[str] | None:
-    """Make sure that no other daemon serves an ipc address; keep what is returned until the end.
+@contextmanager
+def claimed(address: str) -> Iterator[None]:
+    """Make sure that no other daemon serves an ipc address, and take its files away at the end.
 
-    Binding alone does not tell: ZeroMQ takes the socket file of a living daemon away from it.
-    Raises `StartupError` when another daemon is there.
+    Binding alone does not tell: ZeroMQ takes the socket file of a living daemon away from it, and
+    leaves its own behind. Raises `StartupError` when another daemon is there.
     """
     if not address.startswith("ipc://"):
-        return None
-    lock_path = Path(address.removeprefix("ipc://") + ".lock")
+        yield
+        return
+    path = socket_path(address)
+    lock_path = path.with_name(path.name + ".lock")
     try:
         lock = lock_path.open("a+", encoding="ascii")
     except OSError as error:
@@ -75,28 +82,45 @@ def claim(address: str) -> IO[str] | None:
             f"{lock_path}: cannot be made: {error.strerror}; "
             "set control.address to a path in a folder that exists"
         ) from None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.seek(0)
-        pid = lock.read().strip() or "unknown"
-        lock.close()
-        raise StartupError(
-            f"another fishd (pid {pid}) already serves {address}; stop it, or give this one "
-            "another control.address and telemetry.address"
-        ) from None
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()
-    return lock
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            pid = lock.read().strip() or "unknown"
+            raise StartupError(
+                f"another fishd (pid {pid}) already serves {address}; stop it, or give this one "
+                "another control.address and telemetry.address"
+            ) from None
+        lock.truncate(0)
+        lock.write(f"{os.getpid()}\n")
+        lock.flush()
+        try:
+            yield
+        finally:  # the lock file stays: to remove it would let two daemons hold two of them
+            path.unlink(missing_ok=True)
 
 
-def bind(socket: "zmq.Socket[Any]", address: str, key: str) -> None:
+def socket_path(address: str) -> Path:
+    """The file of an ipc address."""
+    return Path(address.removeprefix("ipc://"))
+
+
+def is_deserted(address: str) -> bool:
+    """True when it is certain, without a wait, that nobody listens at an ipc address."""
+    if not address.startswith("ipc://"):
+        return False
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        return probe.connect_ex(str(socket_path(address))) in (errno.ENOENT, errno.ECONNREFUSED)
+
+
+def bind(server: "zmq.Socket[Any]", address: str, key: str) -> None:
     """Bind a socket; raises `StartupError` that names the configuration key of its address."""
     try:
-        socket.bind(address)
+        server.bind(address)
     except zmq.ZMQError as error:
-        socket.close(linger=0)
+        server.close(linger=0)
         if error.errno == zmq.EADDRINUSE:
             why = "it is in use, by another fishd perhaps; stop that, or choose another address"
         else:

@@ -47,9 +47,7 @@ class Daemon:
         with ExitStack() as stack:
             config = self._config
             address = config.control.address or addresses.control_address()
-            lock = addresses.claim(address)
-            if lock:
-                stack.enter_context(lock)
+            stack.enter_context(addresses.claimed(address))
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.term)
             self._telemetry = Telemetry(context, config.telemetry.address)

@@ -1,5 +1,8 @@
 """How well the loop keeps its time, in constant memory however long it runs."""
 
+from bisect import bisect_left
+from itertools import accumulate
+
 from fishd.signals import Percentiles, Timing
 
 _STEPS = 3  # 2**3 buckets per octave: an error of at most 12 %
@@ -32,13 +35,10 @@ class Histogram:
 
     def quantile(self, share: float) -> float:
         """The duration that `share` of all counted ones do not exceed [s]; 0 without any."""
-        wanted = share * self._total
-        seen = 0
-        for bucket, count in enumerate(self._counts):
-            seen += count
-            if count and seen >= wanted:
-                return min(_upper_edge(bucket), self._worst)
-        return 0.0
+        if not self._total:
+            return 0.0
+        bucket = bisect_left(list(accumulate(self._counts)), share * self._total)
+        return min(_upper_edge(bucket), self._worst)
 
     def percentiles(self) -> Percentiles:
         """Median, 99th percentile and worst [µs]."""

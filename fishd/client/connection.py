@@ -4,14 +4,13 @@ import itertools
 import math
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import zmq
 
 from fishd import protocol
-from fishd.addresses import find_control
+from fishd.addresses import find_control, is_deserted
 from fishd.errors import NoDaemon, ParameterError, Refused
 
 T = TypeVar("T")
@@ -30,11 +29,9 @@ class Connection:
         self._ids = itertools.count(1)
 
     def check_endpoint(self) -> None:
-        """Spare the wait where there is no socket to connect to."""
-        if self.endpoint.startswith("ipc://"):
-            path = Path(self.endpoint.removeprefix("ipc://"))
-            if not path.exists():
-                raise self._nobody("there is no such socket")
+        """Spare the wait where it is certain that nobody listens; raises `NoDaemon`."""
+        if is_deserted(self.endpoint):
+            raise self._nobody("nobody listens there")
 
     def _nobody(self, why: str) -> NoDaemon:
         return NoDaemon(

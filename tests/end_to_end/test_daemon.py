@@ -128,6 +128,20 @@ def test_a_second_daemon_on_the_same_telemetry_address_says_so_and_exits(
     assert "Traceback" not in errors
 
 
+def test_after_its_end_nothing_is_left_to_connect_to(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon:
+        assert daemon.end()[0] == 0
+        assert not (tmp_path / "control").exists()
+
+
+def test_after_a_kill_a_client_knows_at_once_that_nobody_is_there(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon:
+        daemon.process.kill()
+        daemon.process.wait()
+        assert (tmp_path / "control").exists()
+        assert "nobody listens there" in daemon.fishctl("status").stderr
+
+
 def test_after_a_kill_the_next_daemon_takes_the_socket_over(tmp_path: Path) -> None:
     with running(tmp_path) as first:
         first.process.kill()
@@ -160,6 +174,6 @@ def test_fishctl_says_when_no_daemon_is_there(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr == (
-        f"fishctl: no fishd at {endpoint}: there is no such socket; start one with 'fishd', "
+        f"fishctl: no fishd at {endpoint}: nobody listens there; start one with 'fishd', "
         "or name another with --endpoint or $FISHD_ENDPOINT\n"
     )
