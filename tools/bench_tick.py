@@ -1,0 +1,398 @@
+"""Measures how punctual, quick and light fishd is, next to other loops on the same busy machine.
+
+    python tools/bench_tick.py                                the tables of docs/performance.md
+    python tools/bench_tick.py --write docs/performance.md    put them there
+    python tools/bench_tick.py --quick                        a rough look, in a minute
+
+Machines are noisy, so look at ratios: all contestants run at the same time, under the same load.
+Everything stays on this machine and stops by itself.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import msgspec
+from bench_contestants import (
+    PLAIN_LOOPS,
+    CyclicTest,
+    Fishd,
+    Lateness,
+    PlainLoop,
+    lateness,
+    quantile,
+)
+from msgspec import Struct
+
+from fishd.signals import Percentiles, Tick, Timing
+from fishd.statistics import PHASES
+
+PRIORITY = 50
+TICK = 0.05
+"""The tick that the robot swims with [s]."""
+FAST = 0.002
+"""The shortest tick that fishd can be asked for [s]."""
+BEGIN, END = "<!-- bench_tick: begin -->", "<!-- bench_tick: end -->"
+FISHCTL = str(Path(sys.executable).with_name("fishctl"))
+
+
+class Figures(Struct, frozen=True):
+    """What one fishd cost over one round."""
+
+    sealed: Percentiles
+    """Start of a tick until its record is sealed, from every tick of the round [µs]."""
+    timing: Timing
+    """What `fishctl status` says at the end, start-up included."""
+    cpu: float
+    """Share of one core."""
+    rss: float
+    """Resident memory at the end [MB]."""
+    peak: float
+    """Most resident memory ever [MB]."""
+
+
+class Round(Struct, frozen=True):
+    """All contestants at the same time; fishd is the first of `lateness`."""
+
+    stressed: bool
+    priority: int
+    """SCHED_FIFO priority; 0 for the normal scheduler."""
+    tick: float
+    lateness: list[Lateness]
+    fishd: Figures
+
+
+class Latency(Struct, frozen=True):
+    """What a person waits for, idle or stressed: medians over several runs [s]."""
+
+    stressed: bool
+    first_tick: float
+    """From starting the process to the first tick."""
+    status: float
+    """`fishctl status`, from starting the process to its exit."""
+
+
+class Results(Struct, frozen=True):
+    """Everything that one run measured."""
+
+    machine: dict[str, str]
+    seconds: float
+    """Length of a round."""
+    rounds: list[Round]
+    latencies: list[Latency]
+    real_time_factor: float
+    """Of `fishctl simulate` at 50 ms ticks."""
+
+
+def machine() -> dict[str, str]:
+    """What the numbers depend on."""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    names = [line for line in cpuinfo.splitlines() if line.startswith(("model name", "Model"))]
+    kernel = os.uname()
+    virtual = "yes" if "hypervisor" in cpuinfo else "no hypervisor is visible"
+    if shutil.which("systemd-detect-virt"):
+        found = subprocess.run(["systemd-detect-virt"], stdout=subprocess.PIPE, text=True).stdout
+        virtual += f"; systemd-detect-virt says {found.strip()}"
+    load = "one busy Python process per core, as stress-ng is not installed"
+    if shutil.which("stress-ng"):
+        load = "stress-ng: one cpu worker per core, one io, one vm"
+    return {
+        "CPU": names[0].partition(":")[2].strip() if names else kernel.machine,
+        "Cores": str(os.cpu_count()),
+        "Kernel": f"{kernel.sysname} {kernel.release} {kernel.version}",
+        "Virtual machine": virtual,
+        "Python": sys.version.partition(" ")[0],
+        "Load": load,
+        "cyclictest": "installed" if shutil.which("cyclictest") else "left out, not installed",
+        "SCHED_FIFO": f"priority {PRIORITY}" if fifo_permitted() else "left out, not permitted",
+    }
+
+
+def fifo_permitted() -> bool:
+    """May processes that this one starts ask for real-time scheduling?"""
+    ask = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({PRIORITY}))"
+    return subprocess.run([sys.executable, "-c", ask], stderr=subprocess.DEVNULL).returncode == 0
+
+
+@contextmanager
+def stress(wanted: bool, limit: float) -> Iterator[None]:
+    """Keep every core busy; whatever happens to us, it ends after `limit` seconds."""
+    cores = os.cpu_count() or 1
+    commands: list[list[str]] = []
+    if wanted and shutil.which("stress-ng"):
+        load = ["--cpu", str(cores), "--io", "1", "--vm", "1", "--vm-bytes", "128M"]
+        commands = [["stress-ng", "--quiet", *load, "--timeout", f"{limit:.0f}s"]]
+    elif wanted:
+        spin = f"import time; end = time.monotonic() + {limit}\nwhile time.monotonic() < end: pass"
+        commands = [[sys.executable, "-c", spin]] * cores
+    processes = [subprocess.Popen(command) for command in commands]
+    try:
+        time.sleep(1.0 if wanted else 0.0)
+        yield
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.wait()
+
+
+def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Round:
+    """Let fishd and all the others tick for `seconds`."""
+    with ExitStack() as stack:
+        fishd = stack.enter_context(Fishd(f"tick={tick}", f"realtime.priority={priority}"))
+        fishd.next_tick()
+        time.sleep(1.0)
+        others: list[PlainLoop | CyclicTest] = [
+            PlainLoop(kind, tick, seconds, priority) for kind in PLAIN_LOOPS
+        ]
+        if shutil.which("cyclictest"):
+            others.append(CyclicTest(tick, seconds, priority))
+        for other in others:
+            stack.callback(other.kill)
+        fishd.waiting_ticks()
+        offset, began, cpu = _wall_offset(), time.monotonic(), fishd.cpu_seconds()
+        time.sleep(seconds)
+        cpu = (fishd.cpu_seconds() - cpu) / (time.monotonic() - began)
+        slewed = _wall_offset() - offset
+        ticks = fishd.waiting_ticks()
+        late, busy, offsets = zip(*_tick_times(ticks, tick, slewed), strict=True)
+        missed = ticks[-1].missed - ticks[0].missed
+        itself = msgspec.structs.replace(
+            lateness("fishd", tick, late, offsets),
+            missed=missed / (ticks[-1].seq - ticks[0].seq + missed),
+        )
+        figures = Figures(
+            sealed=Percentiles(quantile(busy, 0.5), quantile(busy, 0.99), max(busy), 0),
+            timing=fishd.status().timing,
+            cpu=cpu,
+            rss=fishd.memory("VmRSS"),
+            peak=fishd.memory("VmHWM"),
+        )
+        everyone = [itself, *(other.result() for other in others)]
+        return Round(stressed, priority, tick, everyone, figures)
+
+
+def _wall_offset() -> float:
+    """Unix time less monotonic time [s]; it changes, as only one of the two is steered by NTP."""
+    before, wall, after = min(
+        ((time.monotonic(), time.time(), time.monotonic()) for _ in range(10)),
+        key=lambda clocks: clocks[2] - clocks[0],
+    )
+    return wall - (before + after) / 2
+
+
+def _tick_times(
+    ticks: list[Tick], period: float, slewed: float
+) -> Iterator[tuple[float, float, float]]:
+    """Lateness [s], time until sealed [µs] and offset from whole periods [s] of each tick."""
+    first = ticks[0]
+    for index, tick in enumerate(ticks):
+        slots = tick.seq - first.seq + tick.missed - first.missed
+        began = tick.t - first.t - tick.busy_us * 1e-6 - slewed * index / len(ticks)
+        yield tick.lateness_us * 1e-6, tick.busy_us, began - slots * period
+
+
+def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
+    """Start fishd a few times, and ask for its status a few times."""
+    first_ticks, statuses = [], []
+    override = f"realtime.priority={priority}"
+    for _ in range(runs):
+        with Fishd(override) as fishd:
+            tick = fishd.next_tick()  # the very first one may have been sent to nobody yet
+            before = (tick.seq - 1 + tick.missed) * fishd.status().tick
+            first_ticks.append(tick.t - before - fishd.started)
+            for _ in range(3):
+                began = time.monotonic()
+                command = [FISHCTL, "status", "--endpoint", fishd.endpoint]
+                subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+                statuses.append(time.monotonic() - began)
+    return Latency(stressed, statistics.median(first_ticks), statistics.median(statuses))
+
+
+def real_time_factor() -> float:
+    """How much faster than time a simulated fish swims; the better of two runs."""
+    command = [FISHCTL, "simulate", "swing", "--seconds", "600", "--json"]
+    reports = [subprocess.run(command, check=True, stdout=subprocess.PIPE) for _ in range(2)]
+    return max(float(json.loads(report.stdout)["real_time_factor"]) for report in reports)
+
+
+def measure(seconds: float, runs: int) -> Results:
+    """The whole benchmark: idle, then under load."""
+    factor = real_time_factor()
+    priorities = [0, PRIORITY] if fifo_permitted() else [0]
+    best = priorities[-1]
+    rounds, latencies = [], []
+    for stressed in (False, True):
+        with stress(stressed, limit=4 * seconds + 30 * runs + 60):
+            for tick, priority in (*((TICK, priority) for priority in priorities), (FAST, best)):
+                _say(f"{seconds:g} s of {tick * 1e3:g} ms ticks", stressed, priority)
+                rounds.append(run_round(stressed, priority, tick, seconds))
+            _say("start-up and fishctl status", stressed, best)
+            latencies.append(measure_latency(stressed, best, runs))
+    return Results(machine(), seconds, rounds, latencies, factor)
+
+
+def _say(what: str, stressed: bool, priority: int) -> None:
+    where = f"{_load(stressed)}, {_scheduling(priority)} scheduling"
+    print(f"bench_tick: {what}, {where}", file=sys.stderr)
+
+
+def markdown(results: Results) -> str:
+    """All tables, goals first."""
+    rounds = results.rounds
+    late = [
+        [
+            *_conditions(round_),
+            late.contestant,
+            *(f"{value:.0f}" for value in (late.p50, late.p99, late.worst)),
+            f"{late.missed:.3%}",
+            "not known" if late.drift is None else f"{late.drift:+.0f}",
+        ]
+        for round_ in rounds
+        for late in round_.lateness
+    ]
+    phases = [
+        [
+            *_conditions(round_),
+            *(_percentiles(round_.fishd.timing.phases[phase]) for phase in PHASES),
+            _percentiles(round_.fishd.timing.busy),
+            _percentiles(round_.fishd.sealed),
+        ]
+        for round_ in rounds
+    ]
+    costs = [
+        [*_conditions(round_), f"{f.cpu:.1%}", f"{f.rss:.0f}", f"{f.peak:.0f}"]
+        for round_ in rounds
+        for f in [round_.fishd]
+    ]
+    head = ["tick", "machine", "scheduling"]
+    sections = {
+        "The machine": (["", ""], [[key, value] for key, value in results.machine.items()]),
+        "Goals": (["goal", "idle", "met", "under load", "met"], goals(results)),
+        f"Lateness over {results.seconds:g} s [µs]": (
+            [*head, "contestant", "p50", "p99", "worst", "missed", "drift"],
+            late,
+        ),
+        "Time per phase of a fishd tick, p50 / p99 [µs]": (
+            [*head, *PHASES, "whole tick", "until sealed"],
+            phases,
+        ),
+        "What fishd costs": ([*head, "CPU", "RSS [MB]", "peak RSS [MB]"], costs),
+    }
+    return "\n\n".join(f"### {title}\n\n{_table(*table)}" for title, table in sections.items())
+
+
+def goals(results: Results) -> list[list[str]]:
+    """One row per goal: what was aimed at, and what came out idle and under load."""
+    best = max(round_.priority for round_ in results.rounds)  # as the robot would run
+
+    def judged(
+        goal: str,
+        limit: float,
+        form: str,
+        figure: Callable[[Round], float | None],
+        tick: float = TICK,
+        priority: int = best,
+    ) -> list[str]:
+        idle, busy = (
+            figure(round_)
+            for round_ in results.rounds
+            if round_.tick == tick and round_.priority == priority
+        )
+        return [goal, *_verdict(idle, limit, form), *_verdict(busy, limit, form)]
+
+    late, us = "lateness p99 ≤ 2 × that of cyclictest", "{:.0f} µs"
+    idle, busy = results.latencies
+    factor = results.real_time_factor
+    return [
+        *(
+            judged(
+                f"{late}, {_scheduling(p)} scheduling", 2, "{:.2f} ×", _to_cyclictest, priority=p
+            )
+            for p in sorted({round_.priority for round_ in results.rounds})
+        ),
+        judged("no drift: ≤ 100 µs over a round", 100, us, lambda r: abs(r.lateness[0].drift or 0)),
+        judged("busy time p50 ≤ 100 µs", 100, us, lambda r: r.fishd.timing.busy.p50),
+        judged("busy time p99 ≤ 300 µs", 300, us, lambda r: r.fishd.timing.busy.p99),
+        judged(
+            "2 ms tick, < 0.1 % missed", 1e-3, "{:.3%}", lambda r: r.lateness[0].missed, tick=FAST
+        ),
+        judged("RSS ≤ 60 MB", 60, "{:.0f} MB", lambda r: r.fishd.rss),
+        ["first tick ≤ 0.5 s", *_verdict(idle.first_tick, 0.5), *_verdict(busy.first_tick, 0.5)],
+        ["fishctl status ≤ 0.15 s", *_verdict(idle.status, 0.15), *_verdict(busy.status, 0.15)],
+        [
+            "virtual time ≥ 1000 × real time",
+            f"{factor:.0f} ×",
+            "yes" if factor >= 1000 else "**no**",
+            "not measured",
+            "",
+        ],
+    ]
+
+
+def _to_cyclictest(round_: Round) -> float | None:
+    fishd, *others = round_.lateness
+    return next((fishd.p99 / o.p99 for o in others if o.contestant == "cyclictest"), None)
+
+
+def _verdict(value: float | None, limit: float, form: str = "{:.2f} s") -> list[str]:
+    if value is None:
+        return ["not measured", ""]
+    return [form.format(value), "yes" if value <= limit else "**no**"]
+
+
+def _load(stressed: bool) -> str:
+    return "under load" if stressed else "idle"
+
+
+def _scheduling(priority: int) -> str:
+    return f"SCHED_FIFO {priority}" if priority else "normal"
+
+
+def _conditions(round_: Round) -> list[str]:
+    return [f"{round_.tick * 1e3:g} ms", _load(round_.stressed), _scheduling(round_.priority)]
+
+
+def _percentiles(times: Percentiles) -> str:
+    return f"{times.p50:.0f} / {times.p99:.0f}"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def write(path: Path, tables: str) -> None:
+    """Replace what is between the two markers in a document."""
+    before, begin, rest = path.read_text(encoding="utf-8").partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise SystemExit(f"bench_tick: {path}: the markers {BEGIN} and {END} are needed")
+    path.write_text(f"{before}{BEGIN}\n\n{tables}\n{END}{after}", encoding="utf-8")
+
+
+def main() -> None:
+    """Parse the command line, measure, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--seconds", type=float, default=60.0, help="per round (default: 60)")
+    parser.add_argument("--quick", action="store_true", help="5 s per round, for a rough look")
+    parser.add_argument("--json", action="store_true", help="print all figures as JSON")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="replace the tables in FILE")
+    options = parser.parse_args()
+    seconds, runs = (5.0, 3) if options.quick else (options.seconds, 7)
+    results = measure(seconds, runs)
+    if options.write:
+        write(options.write, markdown(results))
+    print(msgspec.json.encode(results).decode() if options.json else markdown(results))
+
+
+if __name__ == "__main__":
+    main()
