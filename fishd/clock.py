@@ -7,7 +7,7 @@ that have passed meanwhile are skipped and counted, and the phase is kept.
 import asyncio
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from msgspec import Struct
@@ -84,13 +84,18 @@ class Ticker:
     so neither epoll's latency nor another task that was just running makes a tick late.
     """
 
-    MARGIN = 1e-3
+    MARGIN = 2e-3
     """How long before the deadline to stop other work [s], at most a quarter of the period."""
 
-    def __init__(self, period: float) -> None:
-        """Must be made inside a running asyncio loop; the first slot is one period from now."""
+    def __init__(self, period: float, rehearse: Callable[[], None] | None = None) -> None:
+        """Must be made inside a running asyncio loop; the first slot is one period from now.
+
+        rehearse: called just before each deadline, if there is time for it
+        """
         self._period = period
+        self._rehearse = rehearse
         self._margin = min(self.MARGIN, period / 4)
+        self._rehearsal_time = self._margin / 2
         self._start = time.monotonic() + period
         self._index = -1
         self._timer = TimerFd()
@@ -113,7 +118,10 @@ class Ticker:
         self._woken.clear()
         self._timer.arm(self._start + following * self._period - self._margin)
         await self._woken.wait()
-        self._sleep_until(self._start + following * self._period)
+        deadline = self._start + following * self._period
+        if self._rehearse:
+            self._rehearse_before(deadline, self._rehearse)
+        self._sleep_until(deadline)
         now = time.monotonic()
         current = max(following, math.floor((now - self._start) / self._period))
         self._index = current
@@ -122,6 +130,18 @@ class Ticker:
     def _wake(self) -> None:
         self._timer.clear()
         self._woken.set()
+
+    def _rehearse_before(self, deadline: float, rehearse: Callable[[], None]) -> None:
+        """Rehearse as late as is safe, then wait awake: a sleep would lose the caches again."""
+        self._sleep_until(deadline - 2.0 * self._rehearsal_time)
+        begun = time.monotonic()
+        # One that took long, on a machine that was busy just then, must not end them for good.
+        self._rehearsal_time *= 0.98
+        if deadline - begun > self._rehearsal_time:
+            rehearse()
+            self._rehearsal_time = max(self._rehearsal_time, time.monotonic() - begun)
+            while time.monotonic() < deadline:
+                pass
 
     @staticmethod
     def _sleep_until(deadline: float) -> None:

@@ -65,6 +65,13 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     priority: Annotated[
         int, Meta(ge=0, le=99, description="SCHED_FIFO priority; 0 keeps the normal scheduler.")
     ] = 50
+    rehearse: Annotated[
+        bool,
+        Meta(
+            description="Run mock ticks just before each real one, so that it finds warm caches; "
+            "has no effect for ticks below 10 ms."
+        ),
+    ] = True
     lock_memory: Annotated[bool, Meta(description="Keep fishd's memory from being paged out.")] = (
         True
     )

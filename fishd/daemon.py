@@ -1,6 +1,7 @@
 """The daemon: wiring and lifetimes, from a configuration to a fish that swims until it is told."""
 
 import asyncio
+import itertools
 import logging
 import signal
 import sys
@@ -17,6 +18,7 @@ from fishd.console import complain, run, status_line
 from fishd.errors import ConfigError, StartupError
 from fishd.logs import LogWriter
 from fishd.operations import Operations
+from fishd.rehearsal import rehearsal
 from fishd.server import ControlServer
 from fishd.telemetry import Telemetry
 
@@ -49,9 +51,10 @@ class Daemon:
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claimed(address))
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-            stack.callback(context.term)
+            stack.callback(context.destroy, linger=100)  # with every socket that is still open
             self._telemetry = Telemetry(context, config.telemetry.address)
             stack.callback(self._telemetry.close)
+            self._rehearse = rehearsal(config, context)
             robot = build.build_robot(config)
             stack.callback(robot.sensor.close)
             stack.callback(robot.servo.close)
@@ -88,14 +91,15 @@ class Daemon:
             server.cancel()
 
     async def _tick_until(self, stopping: asyncio.Event, server: asyncio.Task[None]) -> None:
-        ticker = Ticker(self._config.tick)
-        next_report = 0.0
+        ticker = Ticker(self._config.tick, self._rehearse)
+        chores = itertools.cycle((self._report, realtime.collect_garbage))
+        next_chore = 0.0
         try:
             async for slot in ticker:
                 self._loop.tick(slot)
-                if slot.now >= next_report:
-                    next_report = slot.now + HOUSEKEEPING
-                    self._report()
+                if slot.now >= next_chore:
+                    next_chore = slot.now + HOUSEKEEPING / 2
+                    next(chores)()  # one at a time, to fit between two ticks of 2 ms
                 if server.done():
                     server.result()
                 if stopping.is_set():
@@ -115,7 +119,6 @@ class Daemon:
         self._telemetry.status(status)
         if self._print_status:
             console.info("%s", status_line(status))
-        realtime.collect_garbage()
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

@@ -87,3 +87,42 @@ def test_a_timer_in_the_past_expires_at_once_and_can_be_closed_twice() -> None:
         assert timer.closed
 
     asyncio.run(run())
+
+
+def test_a_rehearsal_comes_before_each_deadline_and_delays_no_tick() -> None:
+    async def run() -> None:
+        rehearsed: list[float] = []
+        ticker = Ticker(PERIOD, lambda: rehearsed.append(time.monotonic()))
+        try:
+            async for slot in ticker:
+                if slot.index >= 20:
+                    break
+        finally:
+            ticker.close()
+        assert len(rehearsed) >= 5
+        deadlines = [slot.deadline - k * PERIOD for k in range(25)]
+        for moment in rehearsed:
+            assert any(0 < deadline - moment < Ticker.MARGIN for deadline in deadlines)
+
+    asyncio.run(run())
+
+
+def test_a_rehearsal_for_which_there_is_no_time_is_left_out() -> None:
+    async def run() -> int:
+        rehearsals = 0
+
+        def slow() -> None:
+            nonlocal rehearsals
+            rehearsals += 1
+            time.sleep(PERIOD)
+
+        ticker = Ticker(PERIOD, slow)
+        try:
+            async for slot in ticker:
+                if slot.index >= 20:
+                    break
+        finally:
+            ticker.close()
+        return rehearsals
+
+    assert asyncio.run(run()) == 1
