@@ -23,7 +23,7 @@ class Histogram:
     def add(self, seconds: float, seq: int) -> None:
         """Count a duration [s] that was measured in tick `seq`; a negative one counts as zero."""
         self._total += 1
-        if seconds <= 0.0:  # all there is in virtual time
+        if seconds <= 0.0:
             self._counts[0] += 1
             return
         nanoseconds = min(int(seconds * 1e9), _LONGEST)
@@ -72,6 +72,8 @@ class Statistics:
         lateness: start after the deadline [s]
         marks: times at the start of the tick and after each of PHASES [s]
         """
+        if lateness == 0.0 and marks[0] == marks[-1]:
+            return  # in virtual time nothing takes any, and there is nothing to count
         self._lateness.add(lateness, seq)
         before = marks[0]
         for histogram, mark in zip(self._phases, marks[1:], strict=True):

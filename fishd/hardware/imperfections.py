@@ -86,17 +86,12 @@ class Imperfections:
         Noise of a longer window averages out as white noise does.
         """
         settings = self._settings
+        gauss = self._random.gauss
         noise = settings.noise * math.sqrt(self._tick / duration)
         angle = math.tau * time / DRIFT_PERIOD
+        offset_x = settings.offset_x + settings.drift * math.sin(angle + self._phase_x)
+        offset_y = settings.offset_y + settings.drift * math.sin(angle + self._phase_y)
         return (
-            self._cos * fx
-            - self._sin * fy
-            + settings.offset_x
-            + settings.drift * math.sin(angle + self._phase_x)
-            + noise * self._random.gauss(0.0, 1.0),
-            self._sin * fx
-            + self._cos * fy
-            + settings.offset_y
-            + settings.drift * math.sin(angle + self._phase_y)
-            + noise * self._random.gauss(0.0, 1.0),
+            self._cos * fx - self._sin * fy + offset_x + gauss(0.0, noise),
+            self._sin * fx + self._cos * fy + offset_y + gauss(0.0, noise),
         )
