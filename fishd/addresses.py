@@ -74,13 +74,15 @@ def claimed(address: str) -> Iterator[None]:
         yield
         return
     path = socket_path(address)
+    if path.exists() and not path.is_socket():
+        raise StartupError(f"{path} is there already and is no socket; choose another address")
     lock_path = path.with_name(path.name + ".lock")
     try:
         lock = lock_path.open("a+", encoding="ascii")
     except OSError as error:
         raise StartupError(
             f"{lock_path}: cannot be made: {error.strerror}; "
-            "set control.address to a path in a folder that exists"
+            "choose an address in a folder that exists"
         ) from None
     with lock:
         try:
@@ -98,7 +100,8 @@ def claimed(address: str) -> Iterator[None]:
         try:
             yield
         finally:  # the lock file stays: to remove it would let two daemons hold two of them
-            path.unlink(missing_ok=True)
+            if path.is_socket():
+                path.unlink()
 
 
 def socket_path(address: str) -> Path:

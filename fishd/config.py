@@ -20,7 +20,8 @@ from fishd.hardware.imperfections import SimulationSettings
 from fishd.plant.parameters import PlantParameters
 from fishd.schema import Problem, convert, without_empty_sections
 
-_ADDRESS = re.compile(r"tcp://[^/\s]+:[0-9]+|ipc://[^@\s]\S*")
+_ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
+_LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -212,24 +213,31 @@ def _check_start(config: Config) -> None:
     except UnknownController as error:
         raise Problem(("start", "controller"), str(error)) from None
     except ParameterError as error:
-        raise Problem(("start", "parameters"), str(error)) from None
+        raise Problem(("start", "parameters", *error.path), str(error)) from None
 
 
 def _check_addresses(config: Config) -> None:
-    address = config.telemetry.address
-    if not _ADDRESS.fullmatch(address):
+    telemetry, address = config.telemetry.address, config.control.address
+    if not _is_address(telemetry):
         raise Problem(
             ("telemetry", "address"),
-            f"'{address}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
+            f"'{telemetry}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
         )
-    address = config.control.address or "ipc://default"
-    local = ("ipc://", "tcp://127.", "tcp://localhost:")
-    if not (_ADDRESS.fullmatch(address) and address.startswith(local)):
+    if address is None:
+        return
+    if not (_is_address(address) and _LOCAL.match(address)):
         raise Problem(
             ("control", "address"),
             f"'{address}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
             "who can send requests can move the fish, so they are taken from this machine only",
         )
+    if address == telemetry:
+        raise Problem(("control", "address"), f"'{address}' is the address of telemetry already")
+
+
+def _is_address(text: str) -> bool:
+    found = _ADDRESS.fullmatch(text)
+    return found is not None and int(found["port"] or 0) < 65536
 
 
 def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:

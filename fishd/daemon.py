@@ -50,6 +50,7 @@ class Daemon:
             config = self._config
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claimed(address))
+            stack.enter_context(addresses.claimed(config.telemetry.address))
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.destroy, linger=100)  # with every socket that is still open
             self._telemetry = Telemetry(context, config.telemetry.address)
@@ -69,12 +70,8 @@ class Daemon:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    async def run(self) -> None:
-        """Tick until SIGTERM or SIGINT, then fade to neutral."""
-        stopping = asyncio.Event()
-        events = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            events.add_signal_handler(number, stopping.set)
+    async def run(self, stopping: asyncio.Event) -> None:
+        """Tick until `stopping` is set, then fade to neutral."""
         log.info(
             "fishd %s drives the %s robot every %g ms; control %s, telemetry %s",
             __version__,
@@ -121,6 +118,15 @@ class Daemon:
             console.info("%s", status_line(status))
 
 
+async def swim(config: Config, print_status: bool) -> None:
+    """Run a daemon until SIGTERM or SIGINT, which count from before it touches the servo."""
+    stopping = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stopping.set)
+    with Daemon(config, print_status) as daemon:
+        await daemon.run(stopping)
+
+
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
     "--config",
@@ -162,10 +168,7 @@ def fishd(
         complain("fishd", str(error), EX_CONFIG)
     logs = LogWriter(log_format)
     try:
-        with Daemon(
-            config, sys.stdout.isatty() if print_status is None else print_status
-        ) as daemon:
-            asyncio.run(daemon.run())
+        asyncio.run(swim(config, sys.stdout.isatty() if print_status is None else print_status))
     except StartupError as error:
         log.critical("%s", error)
         sys.exit(1)

@@ -24,7 +24,14 @@ class ConfigError(FishdError, ValueError):
 
 
 class ParameterError(FishdError, ValueError):
-    """A controller's parameter is unknown, of the wrong type or out of range."""
+    """A controller's parameter is unknown, of the wrong type or out of range.
+
+    `path` names it where there is one to blame.
+    """
+
+    def __init__(self, message: str, path: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.path = path
 
 
 class UnknownController(FishdError, LookupError):

@@ -120,6 +120,7 @@ class Operations:
 
     async def _set_parameter(self, wanted: protocol.SetParameter) -> State:
         loop = self._loop
+        loop.supervisor.check_startable()
         if loop.supervisor.mode is not Mode.RUNNING:
             raise Refused(
                 "not-running",
@@ -146,6 +147,7 @@ class Operations:
         return self._state()
 
     async def _clear_fault(self, _: protocol.NoArguments) -> State:
+        self._decide()
         self._loop.clear_fault()
         return self._state()
 

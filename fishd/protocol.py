@@ -3,10 +3,10 @@
 docs/protocol.md is its reference for clients in other languages.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from fishd.errors import Refused
 from fishd.signals import Reason
@@ -16,6 +16,9 @@ MAX_MESSAGE = 65536
 """Longer messages are not even received [bytes]."""
 
 RequestId = int | str | None
+
+Line = Annotated[str, Meta(max_length=1000, pattern="^[^\x00-\x1f\x7f-\x9f]*$")]
+"""Text that goes into logs and terminals: one line without control characters."""
 
 
 class Request(Struct, forbid_unknown_fields=True):
@@ -75,13 +78,13 @@ class SetParameter(Struct, frozen=True, forbid_unknown_fields=True):
 class Estop(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of estop."""
 
-    message: str = "requested by a client"
+    message: Line = "requested by a client"
 
 
 class Mark(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of mark."""
 
-    text: str
+    text: Line
 
 
 _request_decoder = msgspec.json.Decoder(Request)

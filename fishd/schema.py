@@ -92,7 +92,8 @@ def wanted(field: Field) -> str:
         "choice": "one of",
         "section": "a section (a mapping of keys to values)",
     }[field.kind]
-    within = field.interval if field.kind == "choice" else f"in {field.interval}"
+    preposition = {"choice": "", "text": "of "}.get(field.kind, "in ")
+    within = preposition + field.interval
     unit = "" if field.unit in ("", "1") else field.unit
     words = " ".join(word for word in (kind, within if field.interval else "", unit) if word)
     return words + (" (or null)" if field.optional else "")
@@ -138,6 +139,8 @@ def _describe(field: inspect.Field) -> Field:
 
 
 def _interval(kind: inspect.Type) -> str:
+    if isinstance(kind, inspect.StrType) and kind.max_length is not None:
+        return f"up to {kind.max_length} printable characters"
     if isinstance(kind, inspect.LiteralType):
         return " | ".join(str(value) for value in kind.values)
     if not isinstance(kind, inspect.FloatType | inspect.IntType):
@@ -166,6 +169,9 @@ def _explain(
         if not hint.startswith("did"):
             elsewhere = nearest(key, everywhere)
             hint = elsewhere if elsewhere.startswith("did") else hint
+        if key in everywhere and "." in key:
+            section, _, name = key.rpartition(".")
+            hint = f"write '{section}:' and below it, indented, '{name}:'"
         return (*path, key), f"unknown key; {hint}"
     missing = re.search(r"missing required field `(.*)`", complaint)
     if missing:

@@ -62,7 +62,9 @@ class ControlServer:
             identity = request.id
             reply = protocol.success(identity, await self._perform(request.op, request.args))
         except Refused as error:
-            reply = protocol.failure(identity or protocol.request_id(payload), error)
+            if identity is None:
+                identity = protocol.request_id(payload)
+            reply = protocol.failure(identity, error)
         except Exception as error:
             log.exception("a request failed")
             internal = Refused("internal", f"fishd failed: {type(error).__name__}: {error}")

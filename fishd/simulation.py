@@ -19,6 +19,9 @@ from fishd.hardware.simulated import SimulatedFish
 from fishd.plant.optimum import best_square_wave
 from fishd.signals import Event, Reason, Tick
 
+LONGEST = 1e8
+"""Runs are shorter than this [s]: three years."""
+
 
 class Report(Struct, frozen=True):
     """What a run came to. Forces are the plant's true ones, over whole beats once settled."""
@@ -34,7 +37,7 @@ class Report(Struct, frozen=True):
     fin_amplitude: float
     """Largest fin angle of each half beat, mean over half beats [rad]."""
     efficiency: float
-    """`mean_thrust` over `best_square_thrust`."""
+    """`mean_thrust` over `best_square_thrust`; 0 where no square wave moves the fin at all."""
     best_square_thrust: float
     """What the best square wave at this amplitude gives [N]."""
     best_square_frequency: float
@@ -142,9 +145,14 @@ def simulate(
 
     Raises `UnknownController` and `ParameterError`.
     """
+    if not (0.0 <= settle < LONGEST and 0.0 < seconds < LONGEST):  # neither is NaN, say
+        raise ParameterError(
+            f"a run of {seconds:g} s with {settle:g} s to settle: numbers from 0 to {LONGEST:g} s "
+            "are needed"
+        )
     ticks = round(seconds / config.tick)
     first = math.ceil(settle / config.tick - 1e-9) + 1
-    if not 0 < first < ticks:
+    if first >= ticks:
         raise ParameterError(
             f"nothing is left to judge: a run of {seconds:g} s must be longer than the "
             f"{settle:g} s that it may take to settle"
@@ -179,7 +187,7 @@ def simulate(
         mean_thrust=mean_thrust,
         frequency=frequency,
         fin_amplitude=fin_amplitude,
-        efficiency=mean_thrust / best.thrust,
+        efficiency=mean_thrust / best.thrust if best.thrust > 0.0 else 0.0,
         best_square_thrust=best.thrust,
         best_square_frequency=best.frequency,
         ticks=ticks,

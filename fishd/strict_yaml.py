@@ -38,6 +38,8 @@ def parse(text: str, name: str = "the document") -> Document:
     """Parse `text`; raises `YamlProblem`. A lone value is called `name` in complaints."""
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except RecursionError:
+        raise YamlProblem(1, "nested too deeply") from None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1

@@ -90,13 +90,21 @@ def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
         ("tick: [\n", "fish.yaml:2: not valid YAML"),
         ("tick: 1:30\n", "fish.yaml:1: tick: '1:30' counts in sixties in YAML"),
         ("a: &a [*a]\n", "nested too deeply"),
+        ("a: " + "[" * 3000, "nested too deeply"),
+        ("plant.xi: 2\n", "plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'"),
+        ("telemetry: {address: 'tcp://127.0.0.1:99999'}\n", "tcp://HOST:PORT or ipc://PATH"),
+        ("control: {address: 'tcp://127.evil.com:99'}\n", "taken from this machine only"),
+        (
+            "control: {address: 'ipc:///tmp/a'}\ntelemetry: {address: 'ipc:///tmp/a'}\n",
+            "fish.yaml:1: control.address: 'ipc:///tmp/a' is the address of telemetry already",
+        ),
         (
             "start: {controller: swim}\n",
             "fish.yaml:1: start.controller: no controller is named 'swim'; did you mean 'swing'?",
         ),
         (
             "start:\n  controller: swing\n  parameters:\n    c: 0.5\n",
-            "fish.yaml:3: start.parameters: swing: c: unknown key; valid: C, amplitude",
+            "fish.yaml:4: start.parameters.c: swing: c: unknown key; valid: C, amplitude",
         ),
         (
             "start:\n  controller: swing\n  parameters:\n    amplitude: 0.5\n",

@@ -1,6 +1,7 @@
 """Runs in virtual time: repeatable to the last bit, and their figures are the plant's truth."""
 
 import json
+import math
 import subprocess
 
 import msgspec
@@ -71,6 +72,17 @@ def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
     report = simulate(load(), "hold", {"angle": 0.3}, 30)
     assert (report.frequency, report.mean_thrust) == (0.0, pytest.approx(0.0, abs=1e-9))
     assert report.fin_amplitude == pytest.approx(0.3 * 0.46, rel=1e-3)
+
+
+@pytest.mark.parametrize(("seconds", "settle"), [(math.nan, 1), (math.inf, 1), (9, -1), (1e300, 1)])
+def test_a_length_that_is_no_length_is_refused(seconds: float, settle: float) -> None:
+    with pytest.raises(ParameterError, match=r"numbers from 0 to 1e\+08 s are needed"):
+        simulate(load(), "swing", {}, seconds, settle)
+
+
+def test_slack_that_swallows_the_whole_amplitude_leaves_nothing_to_compare_with() -> None:
+    report = simulate(load(None, ["plant.cable_slack=0.5"]), "square", {}, 20)
+    assert (report.mean_thrust, report.efficiency) == (0.0, 0.0)
 
 
 def test_a_run_that_is_too_short_to_judge_is_refused() -> None:

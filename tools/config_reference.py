@@ -76,7 +76,7 @@ the line, the key and what is permitted:
 fishd: fish.yaml:2: plant.omega: unknown key; did you mean 'omega0'?
 fishd: fish.yaml:1: tick: 1 is not valid: a number in [0.002, 0.2] s is needed
 fishd: --set plant.xi=99: plant.xi: 99 is not valid: a number in [0, 20] is needed
-fishd: fish.yaml:3: start.parameters: swing: C: 3 is not valid: a number in [0, 1] is needed
+fishd: fish.yaml:4: start.parameters.C: swing: C: 3 is not valid: a number in [0, 1] is needed
 ```
 
 The parameters under `start` are checked against the controller that is to take them, and against

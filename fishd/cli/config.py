@@ -1,6 +1,5 @@
 """Verbs about the configuration: check a file, show what is in force, print the schema."""
 
-import sys
 from pathlib import Path
 
 import click
@@ -8,6 +7,7 @@ import click
 from fishd.cli.options import json_option
 from fishd.cli.output import print_json
 from fishd.config import Config, load, to_yaml
+from fishd.console import complain
 from fishd.errors import ConfigError
 
 set_option = click.option(
@@ -62,5 +62,4 @@ def load_or_exit(file: Path | None, overrides: tuple[str, ...]) -> Config:
     try:
         return load(file, overrides)
     except ConfigError as error:
-        click.echo(f"fishctl: {error}", err=True)
-        sys.exit(EX_CONFIG)
+        complain("fishctl", str(error), EX_CONFIG)

@@ -4,6 +4,7 @@ import sys
 from importlib import import_module
 
 import click
+import msgspec
 
 from fishd import __version__
 from fishd.console import complain, run
@@ -67,6 +68,12 @@ def main() -> None:
         complain("fishctl", f"{error} [{error.code}]", 1)
     except FishdError as error:
         complain("fishctl", str(error), 1)
+    except msgspec.DecodeError as error:
+        complain("fishctl", f"what answers at this endpoint is no fishd: {error}", 1)
+    except KeyboardInterrupt:
+        sys.exit(130)
     except BrokenPipeError:  # the reader, `head` say, has seen enough
         sys.stderr.close()
         sys.exit(0)
+    except OSError as error:
+        complain("fishctl", f"the output cannot be written: {error.strerror}", 1)

@@ -49,9 +49,11 @@ class Connection:
         for name, value in args.get("parameters", {}).items():
             if isinstance(value, float) and not math.isfinite(value):  # JSON would make it null
                 raise ParameterError(f"{name}: {value} is not a number that can be sent")
-        return identity, protocol.encode(
-            protocol.Request(v=protocol.VERSION, id=identity, op=op, args=dict(args))
-        )
+        request = protocol.Request(v=protocol.VERSION, id=identity, op=op, args=dict(args))
+        payload = protocol.encode(request)
+        if len(payload) > protocol.MAX_MESSAGE:
+            raise ParameterError(f"{op}: the request is longer than {protocol.MAX_MESSAGE} bytes")
+        return identity, payload
 
     @staticmethod
     def result(payload: bytes, identity: int, kind: type[T]) -> T | None:

@@ -42,7 +42,7 @@ def find(name: str) -> type[Controller[Any]]:
     entry = _entries()[name]
     try:
         found = entry.load()
-    except Exception as error:  # a third-party package may fail in any way
+    except (Exception, SystemExit) as error:  # a third-party package may fail in any way
         raise UnknownController(
             f"controller '{name}' ({entry.value}) does not load: {type(error).__name__}: {error}"
         ) from error
@@ -56,6 +56,13 @@ def find(name: str) -> type[Controller[Any]]:
         raise UnknownController(
             f"controller '{name}' ({entry.value}) has no Parameters, a msgspec.Struct"
         )
+    try:
+        fields_of(parameters)
+    except Exception as error:
+        raise UnknownController(
+            f"controller '{name}' ({entry.value}) has Parameters that cannot be read: "
+            f"{type(error).__name__}: {error}"
+        ) from error
     return found
 
 
@@ -84,13 +91,12 @@ def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
     try:
         parameters = convert(dict(values), found.Parameters)
     except Problem as problem:
-        raise ParameterError(
-            f"{name}: {'.'.join(problem.path) or 'parameters'}: {problem}"
-        ) from None
+        what = ".".join(problem.path) or "parameters"
+        raise ParameterError(f"{name}: {what}: {problem}", problem.path) from None
     try:
         found.check(parameters, limits)
     except ParameterError as error:
-        raise ParameterError(f"{name}: {error}") from None
+        raise ParameterError(f"{name}: {error}", error.path) from None
     return parameters
 
 

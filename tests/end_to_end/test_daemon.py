@@ -128,6 +128,28 @@ def test_a_second_daemon_on_the_same_telemetry_address_says_so_and_exits(
     assert "Traceback" not in errors
 
 
+def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
+    precious = tmp_path / "precious.txt"
+    precious.write_text("data")
+    for key in ("control", "telemetry"):
+        status, _, errors = Daemon(tmp_path, "--set", f"{key}.address=ipc://{precious}").finish()
+        assert status == 1
+        assert f"{precious} is there already and is no socket" in errors
+        assert "Traceback" not in errors
+    assert precious.read_text() == "data"
+
+
+def test_a_second_daemon_on_the_same_telemetry_socket_says_so_and_exits(tmp_path: Path) -> None:
+    address = ("--set", f"telemetry.address=ipc://{tmp_path}/telemetry")
+    other = tmp_path / "other"
+    other.mkdir()
+    with running(tmp_path, *address) as first:
+        status, _, errors = Daemon(other, *address).finish()
+        assert status == 1
+        assert f"another fishd (pid {first.process.pid}) already serves ipc://" in errors
+    assert not (tmp_path / "telemetry").exists()
+
+
 def test_after_its_end_nothing_is_left_to_connect_to(tmp_path: Path) -> None:
     with running(tmp_path) as daemon:
         assert daemon.end()[0] == 0

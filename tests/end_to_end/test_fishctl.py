@@ -106,6 +106,9 @@ def test_the_status_says_what_runs_and_how_well(daemon: Daemon) -> None:
         (("status", "--endpoint", "nonsense"), "'nonsense' is no address"),
         (("stat",), "No such command 'stat'"),
         (("mark",), "Missing argument 'TEXT'"),
+        (("mark", "a\nb\x1b[2J"), "a text of up to 1000 printable characters is needed"),
+        (("mark", "x" * 70_000), "mark: the request is longer than 65536 bytes"),
+        (("estop", "line\nline"), "a text of up to 1000 printable characters is needed"),
     ],
 )
 def test_a_mistake_gets_one_line_that_says_what_to_do(

@@ -47,12 +47,30 @@ class Drunk(Hold):
     def update(self, observation):
         return float("nan")
 '''
+QUITTER = "import sys\nsys.exit(3)\n"
+UNTYPED = '''
+from msgspec import Struct
+
+from fishd.controllers.hold import Hold
+
+
+class Parameters(Struct):
+    x: "Missing" = 1
+
+
+class Untyped(Hold):
+    """Has parameters of no known type."""
+
+    Parameters = Parameters
+'''
 ENTRY_POINTS = """[fishd.controllers]
 slow = manners:Slow
 shapeless = manners:Shapeless
 explosive = manners:Explosive
 drunk = manners:Drunk
 absent = nowhere:Absent
+quitter = quitter:Quitter
+untyped = untyped:Untyped
 function = time:sleep
 """
 
@@ -64,6 +82,8 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
     info = installed / "manners-1.0.dist-info"
     info.mkdir(parents=True)
     (installed / "manners.py").write_text(MODULE)
+    (installed / "quitter.py").write_text(QUITTER)
+    (installed / "untyped.py").write_text(UNTYPED)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: manners\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.setenv("PYTHONPATH", str(installed))
@@ -82,6 +102,8 @@ def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> No
     ("name", "message"),
     [
         ("shapeless", "(manners:Shapeless) has no Parameters, a msgspec.Struct"),
+        ("quitter", "(quitter:Quitter) does not load: SystemExit: 3"),
+        ("untyped", "(untyped:Untyped) has Parameters that cannot be read: NameError"),
         ("absent", "(nowhere:Absent) does not load: ModuleNotFoundError"),
         ("function", "(time:sleep) is no subclass of fishd.controllers.base.Controller"),
         ("explosive", "controller 'explosive' cannot start: RuntimeError: no such model"),
