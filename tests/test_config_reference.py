@@ -32,7 +32,8 @@ def test_the_configuration_reference_names_every_key() -> None:
         ("tick: 1\n", "fish.yaml:1: tick: 1 is not valid: a number in [0.002, 0.2] s is needed"),
         (
             "start:\n  controller: swing\n  parameters:\n    C: 3\n",
-            "fish.yaml:4: start.parameters.C: swing: C: 3 is not valid: a number in [0, 1] is needed",
+            "fish.yaml:4: start.parameters.C: swing: C: 3 is not valid: "
+            "a number in [0, 1] is needed",
         ),
     ],
     ids=["unknown key", "out of bounds", "parameter of a controller"],
