@@ -54,7 +54,6 @@ class Daemon:
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.destroy, linger=100)  # with every socket that is still open
             self._telemetry = Telemetry(context, config.telemetry.address)
-            stack.callback(self._telemetry.close)
             self._rehearse = rehearsal(config, context)
             robot = build.build_robot(config)
             stack.callback(robot.sensor.close)

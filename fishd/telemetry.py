@@ -11,7 +11,7 @@ QUEUE = 100
 
 
 class Telemetry:
-    """A PUB socket that sends a topic frame and one JSON object."""
+    """A PUB socket: a topic frame and one JSON object. It lives as long as its context."""
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", address: str) -> None:
         """Raises `StartupError` when the address cannot be bound."""
@@ -33,10 +33,6 @@ class Telemetry:
     def status(self, status: Status) -> None:
         """Publish on topic `status`."""
         self._send(b"status", status)
-
-    def close(self) -> None:
-        """Close the socket; may be called twice."""
-        self._socket.close()
 
     def _send(self, topic: bytes, message: Tick | Event | Status) -> None:
         self._socket.send_multipart((topic, self._encode(message)), zmq.DONTWAIT)

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,13 @@ PATIENCE = 20.0
 class Daemon:
     """A running fishd with addresses of its own."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, under: Sequence[str] = ()) -> None:
+        """under: a command that starts the daemon, `setpriv` say."""
         self.endpoint = f"ipc://{folder}/control"
         own = [f"control.address={self.endpoint}", "telemetry.address=tcp://127.0.0.1:0"]
         settings = [word for setting in own for word in ("--set", setting)]
         self.process = subprocess.Popen(
-            [FISHD, *settings, *arguments],
+            [*under, FISHD, *settings, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -67,9 +68,9 @@ class Daemon:
 
 
 @contextlib.contextmanager
-def running(folder: Path, *arguments: str) -> Iterator[Daemon]:
+def running(folder: Path, *arguments: str, under: Sequence[str] = ()) -> Iterator[Daemon]:
     """A daemon that is up, and gone afterwards whatever happens."""
-    daemon = Daemon(folder, *arguments)
+    daemon = Daemon(folder, *arguments, under=under)
     try:
         yield daemon.wait_until_up()
     finally:

@@ -1,6 +1,7 @@
 """The real daemon process: start, telemetry, signals, exit status."""
 
 import json
+import os
 import signal
 import subprocess
 from itertools import pairwise
@@ -182,9 +183,22 @@ def test_logs_can_be_json(tmp_path: Path) -> None:
 
 
 def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None:
-    """Priority 0 and unlocked memory ask for nothing, so there is nothing to warn about."""
-    quiet = ("--set", "realtime.priority=0", "--set", "realtime.lock_memory=false")
-    with running(tmp_path, *quiet) as daemon:
+    unprivileged = ["prlimit", "--memlock=65536", "--rtprio=0"]
+    if os.geteuid() == 0:
+        unprivileged += ["setpriv", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"]
+        unprivileged += ["--inh-caps=-sys_nice,-ipc_lock,-sys_resource"]
+    with running(tmp_path, under=unprivileged) as daemon:
+        assert json.loads(daemon.fishctl("status", "--json").stdout)["realtime"] is False
+        status, _, errors = daemon.end()
+    assert status == 0
+    assert errors.count("warning") == 1
+    assert "memory is not locked" in errors
+    assert "no real-time scheduling" in errors
+
+
+def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:
+    modest = ("--set", "realtime.priority=0", "--set", "realtime.lock_memory=false")
+    with running(tmp_path, *modest) as daemon:
         assert json.loads(daemon.fishctl("status", "--json").stdout)["realtime"] is False
         _, _, errors = daemon.end()
     assert "warning" not in errors
