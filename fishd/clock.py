@@ -37,12 +37,16 @@ class Clock(Protocol):
     def wall(self) -> float:
         """Unix time [s]; for people."""
 
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+
 
 class SystemClock:
     """The machine's own clocks."""
 
     monotonic = staticmethod(time.monotonic)
     wall = staticmethod(time.time)
+    sleep = staticmethod(time.sleep)
 
 
 class VirtualClock:
@@ -58,6 +62,10 @@ class VirtualClock:
     def wall(self) -> float:
         """Virtual time [s], so that a run gives the same bytes whenever it is made."""
         return self.now
+
+    def sleep(self, seconds: float) -> None:
+        """Move on at once."""
+        self.now += max(0.0, seconds)
 
 
 class VirtualTicker:

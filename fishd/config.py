@@ -6,7 +6,7 @@ Each section is a struct of the part that it configures; this module only puts t
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -14,13 +14,22 @@ from msgspec import Meta, Struct
 from fishd import strict_yaml
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
+from fishd.emulation.settings import VirtualPiSettings
 from fishd.errors import ConfigError, ParameterError, UnknownController
 from fishd.estimators.lateral_force import EstimatorSettings
+from fishd.hardware import pulses
 from fishd.hardware.imperfections import SimulationSettings
+from fishd.hardware.settings import (
+    FULL_SCALES,
+    ForceSensorSettings,
+    PanelSettings,
+    ServoSettings,
+)
 from fishd.plant.parameters import PlantParameters
 from fishd.schema import Problem, convert, without_empty_sections
 
 _ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
+PWM_PINS = (12, 13, 18, 19)
 _LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
 
@@ -81,6 +90,13 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Everything that can be configured; `Config()` is a simulated fish at rest."""
 
+    robot: Annotated[
+        Literal["simulated", "pi", "virtual-pi"],
+        Meta(
+            description="What swims: a simulated fish, the robot on this Raspberry Pi, or a "
+            "simulated fish behind the robot's own drivers (fishctl virtual-pi)."
+        ),
+    ] = "simulated"
     tick: Annotated[
         float,
         Meta(ge=0.002, le=0.2, description="Period of the loop.", extra_json_schema={"unit": "s"}),
@@ -121,6 +137,25 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     simulation: Annotated[
         SimulationSettings, Meta(description="The simulated fish: imperfections of the rig.")
     ] = SimulationSettings()
+    force_sensor: Annotated[
+        ForceSensorSettings, Meta(description="The force sensor; not for a simulated fish.")
+    ] = ForceSensorSettings()
+    servo: Annotated[
+        ServoSettings, Meta(description="The tail servo; not for a simulated fish.")
+    ] = ServoSettings()
+    panel: Annotated[
+        PanelSettings, Meta(description="E-stop button and status light, where there are any.")
+    ] = PanelSettings()
+    state_folder: Annotated[
+        str | None,
+        Meta(
+            description="Folder for calibrations; null: $STATE_DIRECTORY, else "
+            "$XDG_STATE_HOME/fishd, else ~/.local/state/fishd; in it, a folder for each robot."
+        ),
+    ] = None
+    virtual_pi: Annotated[
+        VirtualPiSettings, Meta(description="The virtual Pi, with robot virtual-pi.")
+    ] = VirtualPiSettings()
     telemetry: Annotated[TelemetrySettings, Meta(description="What is published, and where.")] = (
         TelemetrySettings()
     )
@@ -154,6 +189,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
         config = convert(without_empty_sections(document.data, Config), Config)
         _check_start(config)
         _check_addresses(config)
+        _check_hardware(config)
     except Problem as problem:
         raise ConfigError(_located(problem, sources)) from None
     return config
@@ -233,6 +269,42 @@ def _check_addresses(config: Config) -> None:
         )
     if address == telemetry:
         raise Problem(("control", "address"), f"'{address}' is the address of telemetry already")
+
+
+def _check_hardware(config: Config) -> None:
+    sensor, servo = config.force_sensor, config.servo
+    if sensor.full_scale not in FULL_SCALES:
+        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES)
+        raise Problem(
+            ("force_sensor", "full_scale"),
+            f"{sensor.full_scale:g} is not valid: one of {permitted} V is needed",
+        )
+    if sensor.channel_x == sensor.channel_y:
+        raise Problem(
+            ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"
+        )
+    low, high = pulses.reach(servo)
+    if not low <= 0.0 <= high:
+        raise Problem(
+            ("servo", "trim"),
+            f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to 2500 µs",
+        )
+    if servo.driver == "pigpio" and servo.frequency != 50.0 and not servo.pigpio.hardware_pwm:
+        raise Problem(
+            ("servo", "frequency"),
+            f"{servo.frequency:g} is not valid: pigpiod's servo pulses come at 50 Hz; for others "
+            "set servo.pigpio.hardware_pwm: true",
+        )
+    if servo.pigpio.hardware_pwm and servo.driver == "pigpio" and servo.gpio not in PWM_PINS:
+        raise Problem(
+            ("servo", "gpio"),
+            f"{servo.gpio} is not valid: hardware PWM comes out of GPIO 12, 13, 18 or 19 only",
+        )
+    pins = {"servo.gpio": servo.gpio, "panel.estop_gpio": config.panel.estop_gpio}
+    for key, pin in (*pins.items(), ("panel.led_gpio", config.panel.led_gpio)):
+        taken = [other for other, used in pins.items() if used == pin and other != key]
+        if pin is not None and taken and key != "servo.gpio":
+            raise Problem(tuple(key.split(".")), f"{pin} is the pin of {taken[0]} already")
 
 
 def _is_address(text: str) -> bool:

@@ -9,6 +9,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from fishd.errors import Refused
+from fishd.hardware.calibration import ForceCalibration, ServoCalibration
 from fishd.signals import Reason
 
 VERSION = 1
@@ -79,6 +80,34 @@ class Estop(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of estop."""
 
     message: Line = "requested by a client"
+
+
+class SampleForce(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of sample-force and tare."""
+
+    seconds: Annotated[float, Meta(ge=0.1, le=60)] = 2.0
+
+
+class CalibrateForce(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of calibrate-force: it is saved, and in force from the next tick on."""
+
+    calibration: ForceCalibration
+
+
+class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of calibrate-servo: in force from the next tick on, saved only where `save`."""
+
+    calibration: ServoCalibration
+    save: bool = False
+
+
+class Calibrations(Struct, frozen=True):
+    """The calibrations in force, and their files; null where they come from the configuration."""
+
+    force: ForceCalibration
+    force_file: str | None
+    servo: ServoCalibration
+    servo_file: str | None
 
 
 class Mark(Struct, frozen=True, forbid_unknown_fields=True):

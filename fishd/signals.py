@@ -22,8 +22,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """Mean lateral force of the window [N]."""
     samples: int
     """How many pairs of samples the means are taken over."""
-    clipped: bool = False
-    """True where a sample reached the end of the sensor's range."""
+    suspect: str = ""
+    """Why these forces are not to be believed, such as a clipped sample; empty where they are."""
 
 
 class Observation(Struct, frozen=True, gc=False):

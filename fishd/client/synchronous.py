@@ -9,7 +9,8 @@ import msgspec
 import zmq
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
-from fishd.protocol import State
+from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.protocol import Calibrations, State
 from fishd.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -80,6 +81,26 @@ class Fish(Connection):
         """Publish a mark in the event stream, such as what you just changed on the rig."""
         return self._call(State, "mark", text=text)
 
+    def calibrations(self) -> Calibrations:
+        """The calibrations of force sensor and servo that are in force."""
+        return self._call(Calibrations, "calibrations")
+
+    def sample_force(self, seconds: float = 2.0) -> ForceSample:
+        """Measure for a while; refused while the fish swims, and for a simulated fish."""
+        return self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
+
+    def tare(self, seconds: float = 2.0) -> Calibrations:
+        """Measure for a while and call that zero force; refused unless all is still."""
+        return self._call(Calibrations, "tare", patience=seconds, seconds=seconds)
+
+    def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
+        """Put another calibration of the force sensor in force, and save it."""
+        return self._call(Calibrations, "calibrate-force", calibration=calibration)
+
+    def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
+        """Put another calibration of the servo in force, and save it or not."""
+        return self._call(Calibrations, "calibrate-servo", calibration=calibration, save=save)
+
     def ticks(self) -> Iterator[Tick]:
         """Every tick from now on; raises `NoDaemon` when none comes in time."""
         return self._subscribe(b"tick", Tick)
@@ -88,12 +109,13 @@ class Fish(Connection):
         """Every event from now on, however long it takes."""
         return self._subscribe(b"event", Event)
 
-    def _call(self, kind: type[T], op: str, **args: Any) -> T:
+    def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
+        """Ask; patience: how long the answer may take, beyond the time-out [s]."""
         if self._socket is None:
             self.check_endpoint()
             self._socket = dealer(self._context, self.endpoint)
         identity, request = self.request(op, args)
-        deadline = time.monotonic() + self.timeout
+        deadline = time.monotonic() + self.timeout + patience
         if not self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
             raise self.silent()
         self._socket.send(request)

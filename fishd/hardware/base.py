@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.signals import Measurement, Truth
 
 
@@ -40,6 +41,50 @@ class Servo(Protocol):
         """Release the servo and let go of it; may be called twice."""
 
 
+class Panel(Protocol):
+    """The operator's panel: an E-stop button and a status light."""
+
+    on_press: Callable[[], None]
+    """Called from any thread as soon as the button is pressed, without waiting for a tick."""
+
+    def update(self, mode: str, now: float) -> bool:
+        """Show the mode on the light; True while the button is pressed. Called in every tick.
+
+        Raises OSError when the button cannot be read.
+        """
+
+    def close(self) -> None:
+        """Switch the light off and let go of the pins; may be called twice."""
+
+
+class CalibratedSensor(ForceSensor, Protocol):
+    """A force sensor that measures voltages, and can be calibrated."""
+
+    calibration: ForceCalibration
+
+    def watch(self) -> "Watch":
+        """Begin to add up the voltages of every pair that is read from now on."""
+
+    def recalibrate(self, calibration: ForceCalibration) -> None:
+        """Use another calibration from the next read on."""
+
+
+class CalibratedServo(Servo, Protocol):
+    """A servo whose pulses can be calibrated."""
+
+    calibration: ServoCalibration
+
+    def recalibrate(self, calibration: ServoCalibration) -> None:
+        """Use another calibration from the next write on."""
+
+
+class Watch(Protocol):
+    """Voltages that are being added up."""
+
+    def close(self) -> ForceSample:
+        """Stop, and say what came in; may be called twice."""
+
+
 @dataclass(frozen=True)
 class Robot:
     """All that the loop reads from and writes to."""
@@ -49,3 +94,18 @@ class Robot:
     servo: Servo
     truth: Callable[[], Truth] | None = None
     """The true state at the latest read, where the fish is simulated."""
+    panel: Panel | None = None
+    bench: "Bench | None" = None
+    """What can be calibrated; None for a simulated fish, which has nothing to calibrate."""
+    degraded: tuple[str, ...] = ()
+    """What keeps this robot from being as good as it could be, a line each."""
+    counters: Callable[[], dict[str, int]] = dict
+    """Errors that were survived, such as failed I2C transfers, since start."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A robot's sensor and servo, as far as they can be calibrated."""
+
+    sensor: CalibratedSensor
+    servo: CalibratedServo

@@ -1,0 +1,1 @@
+"""A virtual Raspberry Pi: chips and daemons that the real driver libraries run on unchanged."""

@@ -1,0 +1,128 @@
+"""Calibrations of force sensor and servo, and the dated files that they are kept in.
+
+A file is never overwritten; the newest one of a kind is in force.
+"""
+
+import datetime
+import os
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from fishd import strict_yaml
+from fishd.errors import ConfigError
+from fishd.schema import Problem, convert
+
+
+class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """F_x = xx V_x + xy V_y + x0 and F_y = yx V_x + yy V_y + y0; volts to newtons."""
+
+    xx: float = 1.0
+    """[N/V]"""
+    xy: float = 0.0
+    x0: float = 0.0
+    """[N]"""
+    yx: float = 0.0
+    yy: float = 1.0
+    y0: float = 0.0
+    date: str = ""
+    """When it was made, ISO 8601; empty for one that nobody made."""
+    loads: int = 0
+    """How many loads it was fitted to; 0 for one that was not."""
+    residual: float = 0.0
+    """Root mean square of what the fit leaves over [N]."""
+    condition: float = 0.0
+    """Condition number of the fit."""
+    tared: str = ""
+    """When x0 and y0 were last set by a tare, ISO 8601; empty for never."""
+
+    def forces(self, vx: float, vy: float) -> tuple[float, float]:
+        """F_x and F_y [N] for two voltages [V]."""
+        return (
+            self.xx * vx + self.xy * vy + self.x0,
+            self.yx * vx + self.yy * vy + self.y0,
+        )
+
+
+class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the same keys of section `servo` mean; a file of this takes precedence over them."""
+
+    trim: Annotated[float, Meta(ge=-500, le=500)] = 0.0
+    """[µs]"""
+    direction: Literal[1, -1] = 1
+    scale: Annotated[float, Meta(ge=10, le=5000)] = 600.0
+    """[µs/rad]"""
+    lowest: Annotated[float, Meta(ge=-3.15, le=0)] = -1.2
+    """[rad]"""
+    highest: Annotated[float, Meta(ge=0, le=3.15)] = 1.2
+    """[rad]"""
+    date: str = ""
+
+
+class ForceSample(Struct, frozen=True):
+    """What the force sensor said over a while; means and standard deviations over pairs."""
+
+    pairs: int
+    seconds: float
+    vx: float
+    """[V]"""
+    vy: float
+    vx_std: float
+    vy_std: float
+    fx: float
+    """By the calibration in force [N]."""
+    fy: float
+    suspect: str = ""
+    """Why this is not to be believed; empty where it is."""
+
+
+C = TypeVar("C", ForceCalibration, ServoCalibration)
+
+_NAMES: dict[type[Struct], str] = {ForceCalibration: "force", ServoCalibration: "servo"}
+
+
+class CalibrationFolder:
+    """The folder with the dated files of one robot."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def newest(self, kind: type[C]) -> tuple[C, Path] | None:
+        """The calibration in force and its file; None where none was ever saved.
+
+        Raises `ConfigError` where the newest file is broken: an older one would be wrong silently.
+        """
+        files = sorted(self.folder.glob(f"{_NAMES[kind]}-*.yaml"))
+        if not files:
+            return None
+        path = files[-1]
+        try:
+            return convert(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
+        except strict_yaml.YamlProblem as problem:
+            raise ConfigError(f"{path}:{problem.line}: {problem}") from None
+        except Problem as problem:
+            raise ConfigError(f"{path}: {'.'.join(problem.path)}: {problem}") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: cannot be read: {error}") from None
+
+    def save(self, calibration: C, now: datetime.datetime) -> tuple[C, Path]:
+        """Write a new file, dated `now`; the calibration with its date, and the path.
+
+        Raises OSError when it cannot be written; an older file is never touched.
+        """
+        import yaml
+
+        dated = msgspec.structs.replace(calibration, date=now.isoformat(timespec="seconds"))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        stem = f"{_NAMES[type(calibration)]}-{now:%Y-%m-%dT%H%M%S.%f}"
+        path = self.folder / f"{stem}.yaml"
+        text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
+        temporary = path.with_suffix(".part")
+        with temporary.open("x", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.rename(path)
+        return dated, path
