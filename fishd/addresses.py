@@ -23,21 +23,31 @@ def control_address() -> str:
 
     Raises `StartupError` when the folder could be somebody else's trap.
     """
-    path = _private_socket()
+    return f"ipc://{_guarded(_private_socket('control'), 'control.address')}"
+
+
+def virtual_pi_socket(configured: str | None) -> Path:
+    """Where the virtual Pi is reached; makes the default's folder, as for `control_address`."""
+    if configured is not None:
+        return Path(configured)
+    return _guarded(_private_socket("virtual-pi"), "virtual_pi.socket")
+
+
+def _guarded(path: Path, key: str) -> Path:
+    """The path of a socket, once its folder is there and belongs to this user."""
     folder = path.parent
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.stat(follow_symlinks=False)
     except OSError as error:
         raise StartupError(
-            f"{folder}: cannot be made: {error.strerror}; set control.address in the configuration"
+            f"{folder}: cannot be made: {error.strerror}; set {key} in the configuration"
         ) from None
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
         raise StartupError(
-            f"{folder} is not a folder of your own; remove it, or set control.address in the "
-            "configuration"
+            f"{folder} is not a folder of your own; remove it, or set {key} in the configuration"
         )
-    return f"ipc://{path}"
+    return path
 
 
 def find_control() -> str:
@@ -48,19 +58,19 @@ def find_control() -> str:
     given = os.environ.get(ENDPOINT_VARIABLE)
     if given:
         return given
-    own = _private_socket()
+    own = _private_socket("control")
     return f"ipc://{_SERVICE if _SERVICE.exists() and not own.exists() else own}"
 
 
-def _private_socket() -> Path:
+def _private_socket(name: str) -> Path:
     """systemd's folder, else the login session's, else one under /tmp."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
     if runtime:
-        return Path(runtime) / "control"
+        return Path(runtime) / name
     session = os.environ.get("XDG_RUNTIME_DIR")
     if session and Path(session).is_dir():
-        return Path(session) / "fishd" / "control"
-    return Path(f"/tmp/fishd-{os.getuid()}/control")
+        return Path(session) / "fishd" / name
+    return Path(f"/tmp/fishd-{os.getuid()}") / name
 
 
 @contextmanager

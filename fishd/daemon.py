@@ -11,16 +11,19 @@ from pathlib import Path
 import click
 import zmq
 
-from fishd import __version__, addresses, build, realtime
+from fishd import __version__, addresses, build, realtime, robots
 from fishd.clock import SystemClock, Ticker
 from fishd.config import Config, load
 from fishd.console import complain, run, status_line
+from fishd.controllers import registry
 from fishd.errors import ConfigError, StartupError
 from fishd.logs import LogWriter
+from fishd.notify import SystemdNotifier
 from fishd.operations import Operations
 from fishd.rehearsal import rehearsal
 from fishd.server import ControlServer
 from fishd.telemetry import Telemetry
+from fishd.workbench import Workbench
 
 log = logging.getLogger(__name__)
 console = logging.getLogger("console")
@@ -35,19 +38,23 @@ HOUSEKEEPING = 1.0
 class Daemon:
     """Everything that lives as long as the process; use it as a context manager.
 
-    Raises `StartupError` when an address is in use. Whatever happens inside, leaving releases the
-    servo first and closes the sockets then, each even if another step fails.
+    Raises `StartupError` when an address is in use or the robot's drivers are missing. Whatever
+    happens inside, leaving releases the servo first and lets go of the rest then, each even if
+    another step fails.
     """
 
     def __init__(self, config: Config, print_status: bool) -> None:
         self._config = config
         self._print_status = print_status
         self._clock = SystemClock()
+        self._events = asyncio.get_running_loop()
         self._stack = ExitStack()
 
     def __enter__(self) -> "Daemon":
         with ExitStack() as stack:
             config = self._config
+            self._notifier = SystemdNotifier()
+            stack.callback(self._notifier.close)
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claimed(address))
             stack.enter_context(addresses.claimed(config.telemetry.address))
@@ -55,14 +62,19 @@ class Daemon:
             stack.callback(context.destroy, linger=100)  # with every socket that is still open
             self._telemetry = Telemetry(context, config.telemetry.address)
             self._rehearse = rehearsal(config, context)
-            robot = build.build_robot(config)
-            stack.callback(robot.sensor.close)
-            stack.callback(robot.servo.close)
-            self._loop = build.build_loop(config, robot, self._clock, self._telemetry)
+            controllers = registry.describe_all()  # imports what other packages offer
+            robot = robots.open_robot(config, self._clock, stack)
+            self._loop = build.build_loop(
+                config, robot, self._clock, self._telemetry, self._notifier.ticked
+            )
+            if robot.panel:
+                robot.panel.on_press = self._on_press
+            workbench = Workbench(self._loop, self._clock, config, robots.state_folder(config))
             fifo = realtime.enter(config.realtime.priority, config.realtime.lock_memory)
-            self._operations = Operations(self._loop, self._clock, self._telemetry.address, fifo)
+            self._operations = Operations(
+                self._loop, self._clock, workbench, controllers, self._telemetry.address, fifo
+            )
             self._server = ControlServer(context, address, self._operations.perform)
-            stack.callback(self._server.close)
             self._stack = stack.pop_all()
         return self
 
@@ -85,6 +97,7 @@ class Daemon:
             await self._tick_until(stopping, server)
         finally:
             server.cancel()
+            self._server.close()
 
     async def _tick_until(self, stopping: asyncio.Event, server: asyncio.Task[None]) -> None:
         ticker = Ticker(self._config.tick, self._rehearse)
@@ -101,6 +114,7 @@ class Daemon:
                 if stopping.is_set():
                     break
             log.info("stopping: fading to neutral")
+            self._notifier.stopping()
             self._loop.stop()
             deadline = self._clock.monotonic() + FADE_LIMIT
             async for slot in ticker:
@@ -110,11 +124,18 @@ class Daemon:
         finally:
             ticker.close()
 
+    def _on_press(self) -> None:
+        """The E-stop button was pressed, says a thread of the driver: do not wait for a tick."""
+        message = "the E-stop button was pressed"
+        self._events.call_soon_threadsafe(self._loop.estop, message)
+
     def _report(self) -> None:
         status = self._operations.status()
         self._telemetry.status(status)
+        line = status_line(status)
+        self._notifier.status(line)
         if self._print_status:
-            console.info("%s", status_line(status))
+            console.info("%s", line)
 
 
 async def swim(config: Config, print_status: bool) -> None:

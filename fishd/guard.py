@@ -1,26 +1,33 @@
-"""The last word on what reaches the servo: finite, within ±Φ, and no faster than permitted."""
+"""The last word on what reaches the servo: finite, within its limits, no faster than permitted."""
 
 import math
 
 
 class Guard:
-    """Limits the instruction angle. It keeps no state, so nothing can wind up."""
+    """Limits the instruction angle. It remembers no command, so nothing can wind up."""
 
     def __init__(
         self, amplitude: float, tick: float, slew_limit: float | None, fade_time: float
     ) -> None:
-        """
+        """Permits every angle within ±Φ until `restrict` is called.
+
         amplitude: Φ [rad]
         tick: period of the loop [s]
         slew_limit: fastest permitted change [rad/s]; None permits one full reversal a tick
         fade_time: how long a fade from Φ to neutral takes [s]
         """
         self._amplitude = amplitude
+        self.restrict(-amplitude, amplitude)
         full_reversal = 2 * amplitude
         self.step = full_reversal if slew_limit is None else min(full_reversal, slew_limit * tick)
         """Largest change per tick while a controller is in command [rad]."""
         self.fade_step = min(self.step, amplitude * tick / fade_time)
         """Largest change per tick while fading to neutral [rad]."""
+
+    def restrict(self, lowest: float, highest: float) -> None:
+        """Permit angles from `lowest` to `highest` [rad] only, as far as they are within ±Φ."""
+        self._lowest = max(-self._amplitude, lowest)
+        self._highest = min(self._amplitude, highest)
 
     def apply(self, command: float, previous: float) -> float:
         """The instruction angle to send [rad].
@@ -31,7 +38,7 @@ class Guard:
         """
         if not math.isfinite(command):
             raise ValueError(f"the command is {command}, not an angle")
-        wanted = max(-self._amplitude, min(self._amplitude, command))
+        wanted = max(self._lowest, min(self._highest, command))
         return _towards(wanted, previous, self.step)
 
     def fade(self, previous: float) -> float:

@@ -6,6 +6,7 @@ Everything else here is called between two ticks, by the thread that ticks.
 """
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 from msgspec import Struct, structs
@@ -40,7 +41,9 @@ class ControlLoop:
         limits: Limits,
         clock: Clock,
         publisher: Publisher,
+        notify: Callable[[float], None] = lambda now: None,
     ) -> None:
+        """notify: called at the end of every tick with the time of its start [s, monotonic]"""
         self.robot = robot
         self.limits = limits
         self.supervisor = Supervisor()
@@ -58,8 +61,10 @@ class ControlLoop:
         self.controller_name: str
         self._fresh: bool
         self._estimator = estimator
-        self._guard = guard
+        self.guard = guard
         self._now = clock.monotonic
+        self._notify = notify
+        self._lost = False
         self._measurement: Measurement | None = None
         self._index = -1
         self._overran = False
@@ -74,6 +79,7 @@ class ControlLoop:
         dt = (slot.index - self._index) * self.limits.tick
         self._index = slot.index
         self.statistics.missed += slot.missed
+        self._attend_panel(slot)
         measurement = self._read(slot)
         read = now()
         self.observation = observation = self._estimate(measurement, slot, dt)
@@ -86,6 +92,7 @@ class ControlLoop:
         marks = (started, read, estimated, updated, written, now())
         self.statistics.add(self.seq, slot.now - slot.deadline, marks)
         self._check_overrun(slot, marks)
+        self._notify(started)
 
     def set_controller(self, name: str, controller: Controller[Any]) -> None:
         """Put a ready-made controller in command from the next tick on.
@@ -131,11 +138,22 @@ class ControlLoop:
         self.controller = Hold(HoldParameters(), self.limits)
         self._fresh = False
 
+    def _attend_panel(self, slot: Slot) -> None:
+        """Show the mode on the operator's panel, and stop at once while its button is pressed."""
+        panel = self.robot.panel
+        if panel is None:
+            return
+        try:
+            if panel.update(self.supervisor.mode.value, slot.now):
+                self.estop("the E-stop button is pressed")
+        except Exception as error:
+            self._fail("estop-button", "the E-stop button cannot be read", error)
+
     def _read(self, slot: Slot) -> Measurement:
         problem = None
         try:
             measurement = self.robot.sensor.read(slot.deadline)
-            if self.supervisor.clipped(measurement.clipped):
+            if self.supervisor.suspect(measurement.suspect):
                 self._fall()
         except Exception as error:
             problem = f"the force sensor cannot be read: {_named(error)}"
@@ -162,33 +180,39 @@ class ControlLoop:
         if mode is Mode.ESTOP:
             return self.applied
         if mode is not Mode.RUNNING:
-            return self._guard.fade(self.applied)
+            return self.guard.fade(self.applied)
         started = self._now()
         try:
             if self._fresh:
                 self.controller.activate(observation)
                 self._fresh = False
-            applied = self._guard.apply(self.controller.update(observation), self.applied)
+            applied = self.guard.apply(self.controller.update(observation), self.applied)
         except Exception as error:
             self._fail("controller-error", f"controller {self.controller_name} failed", error)
-            return self._guard.fade(self.applied)
+            return self.guard.fade(self.applied)
         budget = UPDATE_BUDGET * self.limits.tick
         if self.supervisor.update_time(self._now() - started, budget, self.controller_name):
             self._fall()
         return applied
 
     def _write(self, neutral: bool) -> None:
-        """Drive the servo, or release it: at once in estop, once neutral in fault."""
+        """Drive the servo, or release it: at once in estop, once neutral in fault.
+
+        In fault pulses never begin: a servo that was lost is released when it is back.
+        """
         mode = self.supervisor.mode
+        fading = self.servo_on and not self._lost and not neutral
         try:
-            if mode is Mode.ESTOP or (mode is Mode.FAULT and neutral):
-                if self.servo_on:
+            if mode is Mode.ESTOP or (mode is Mode.FAULT and not fading):
+                if self.servo_on or self._lost:
                     self.robot.servo.release()
                 self.servo_on = False
             else:
                 self.robot.servo.write(self.applied)
                 self.servo_on = True
+            self._lost = False
         except Exception as error:
+            self._lost = True
             self._fail("servo-link", "the servo cannot be driven", error)
 
     def _publish(

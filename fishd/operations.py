@@ -17,6 +17,7 @@ from fishd.protocol import State
 from fishd.schema import Problem, convert, nearest
 from fishd.signals import ControllerInfo, Status
 from fishd.supervisor import Mode
+from fishd.workbench import Workbench
 
 MOST_LOADING = 4
 """Controllers that may be on their way into memory at once."""
@@ -25,8 +26,20 @@ MOST_LOADING = 4
 class Operations:
     """Answers requests from what the loop knows, and makes changes between its ticks."""
 
-    def __init__(self, loop: ControlLoop, clock: Clock, telemetry: str, realtime: bool) -> None:
-        """telemetry: the address that clients are told; realtime: is SCHED_FIFO in force?"""
+    def __init__(
+        self,
+        loop: ControlLoop,
+        clock: Clock,
+        workbench: Workbench,
+        controllers: list[ControllerInfo],
+        telemetry: str,
+        realtime: bool,
+    ) -> None:
+        """
+        controllers: all that can be put in command
+        telemetry: the address that clients are told
+        realtime: is SCHED_FIFO in force?
+        """
         self._loop = loop
         self._clock = clock
         self._telemetry = telemetry
@@ -34,7 +47,7 @@ class Operations:
         self._started = clock.monotonic()
         self._decisions = 0
         self._loading = 0
-        self._controllers = registry.describe_all()
+        self._controllers = controllers
         self._operations: dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]] = {
             "status": (protocol.NoArguments, self._status),
             "controllers": (protocol.NoArguments, self._list_controllers),
@@ -44,6 +57,7 @@ class Operations:
             "estop": (protocol.Estop, self._estop),
             "clear-fault": (protocol.NoArguments, self._clear_fault),
             "mark": (protocol.Mark, self._mark),
+            **workbench.operations,
         }
 
     async def perform(self, op: str, args: dict[str, Any]) -> Any:
@@ -81,6 +95,8 @@ class Operations:
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
+            degraded=loop.robot.degraded,
+            counters=loop.robot.counters(),
             realtime=self._realtime,
             telemetry=self._telemetry,
         )

@@ -192,6 +192,10 @@ class Status(Struct, frozen=True):
     timing: Timing
     robot: str
     """What the loop drives, such as simulated."""
+    degraded: tuple[str, ...]
+    """What keeps the robot from being as good as it could be."""
+    counters: dict[str, int]
+    """Errors of the hardware that were survived, since start."""
     realtime: bool
     """True when the loop runs under SCHED_FIFO."""
     telemetry: str

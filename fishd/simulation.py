@@ -3,7 +3,8 @@
 import itertools
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
@@ -15,8 +16,11 @@ from fishd.config import Config
 from fishd.controllers import registry
 from fishd.controllers.base import amplitude_of
 from fishd.errors import ParameterError
+from fishd.hardware.base import Robot
 from fishd.hardware.simulated import SimulatedFish
 from fishd.plant.optimum import best_square_wave
+from fishd.plant.tethered import TrueWindow
+from fishd.robots import open_lockstep
 from fishd.signals import Event, Reason, Tick
 
 LONGEST = 1e8
@@ -65,14 +69,8 @@ class Beats:
         self._began = False
         self._side = 0.0
 
-    def add(self, angle: float, thrust: float, fin_angle: float, duration: float) -> None:
-        """Add a window.
-
-        angle: instruction angle in force [rad]
-        thrust: true mean F_x [N]
-        fin_angle: largest |α| [rad]
-        duration: length of the window [s]
-        """
+    def add(self, angle: float, window: TrueWindow) -> None:
+        """Add a window in which the instruction angle `angle` [rad] was in force."""
         side = math.copysign(1.0, angle) if angle else self._side
         if side != self._side and self._side:
             self._open.close_half()
@@ -82,7 +80,7 @@ class Beats:
                 self._began = True
                 self._open = _Sums()
         self._side = side
-        self._open.add(thrust, fin_angle, duration)
+        self._open.add(window)
 
     def figures(self) -> tuple[float, float, float]:
         """Mean thrust [N], frequency [Hz], fin amplitude [rad]."""
@@ -101,10 +99,10 @@ class _Sums:
         self.halves = 0
         self._peak = 0.0
 
-    def add(self, thrust: float, fin_angle: float, duration: float) -> None:
-        self.duration += duration
-        self.impulse += thrust * duration
-        self._peak = max(self._peak, fin_angle)
+    def add(self, window: TrueWindow) -> None:
+        self.duration += window.duration
+        self.impulse += window.thrust * window.duration
+        self._peak = max(self._peak, window.fin_peak)
 
     def close_half(self) -> None:
         self.halves += 1
@@ -158,25 +156,22 @@ def simulate(
             f"{settle:g} s that it may take to settle"
         )
     clock = VirtualClock()
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
-    loop = build_loop(config, fish.robot(), clock, EncodingPublisher())
     controller = registry.create(name, parameters, config.limits)
-    loop.set_controller(name, controller)
-
     beats = Beats()
-    rate = begun = 0.0
-    for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
-        if slot.index == first:  # the first ticks build what later ones reuse
-            begun = time.perf_counter()
-        angle = loop.applied
-        loop.tick(slot)
-        window, state = fish.window, fish.fish.state
-        if slot.index >= first:
-            peaked = rate * state.alpha_rate <= 0.0
-            fin_angle = window.fin_peak if peaked else abs(state.alpha)
-            beats.add(angle, window.thrust, fin_angle, window.duration)
-        rate = state.alpha_rate
-    elapsed = time.perf_counter() - begun
+    begun = 0.0
+    with ExitStack() as stack:
+        robot, take_window = _swimmer(config, stack)
+        loop = build_loop(config, robot, clock, EncodingPublisher())
+        loop.set_controller(name, controller)
+        for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
+            if slot.index == first:  # the first ticks build what later ones reuse
+                begun = time.perf_counter()
+            angle = loop.applied
+            loop.tick(slot)
+            window = take_window()
+            if slot.index >= first:
+                beats.add(angle, window)
+        elapsed = time.perf_counter() - begun
 
     amplitude = amplitude_of(controller.parameters, config.limits)
     best = best_square_wave(config.plant, amplitude)
@@ -197,3 +192,12 @@ def simulate(
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )
+
+
+def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], TrueWindow]]:
+    """What swims, and how to ask what it truly did since the last time."""
+    if config.robot == "virtual-pi":
+        robot, pi = open_lockstep(config, stack)
+        return robot, pi.tank.take_window
+    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    return fish.robot(), fish.take_window

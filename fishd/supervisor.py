@@ -37,7 +37,7 @@ class Supervisor:
         self.mode = Mode.IDLE
         self.reason: Reason | None = None
         self._bad_reads = 0
-        self._clipped = 0
+        self._suspect = 0
         self._slow_updates = 0
         self._ticks = 0
         self._overruns: deque[int] = deque()  # in which of the latest ticks
@@ -80,7 +80,7 @@ class Supervisor:
         if self.reason is not None:
             self.mode = Mode.IDLE
             self.reason = None
-            self._bad_reads = self._clipped = self._slow_updates = 0
+            self._bad_reads = self._suspect = self._slow_updates = 0
             self._overruns.clear()
 
     def sensor(self, problem: str | None) -> bool:
@@ -92,11 +92,11 @@ class Supervisor:
             and self.fail("sensor-stale", f"{problem}, {self._bad_reads} times in a row")
         )
 
-    def clipped(self, clipped: bool) -> bool:
-        """Count a window; True when that latches the fault sensor-range."""
-        self._clipped = self._clipped + 1 if clipped else 0
-        return self._clipped >= SENSOR_STREAK and self.fail(
-            "sensor-range", f"the force was out of range in {self._clipped} windows in a row"
+    def suspect(self, suspicion: str) -> bool:
+        """Count a window, one to believe (empty) or not; True when that latches sensor-range."""
+        self._suspect = self._suspect + 1 if suspicion else 0
+        return self._suspect >= SENSOR_STREAK and self.fail(
+            "sensor-range", f"{suspicion}, in {self._suspect} windows in a row"
         )
 
     def update_time(self, seconds: float, budget: float, controller: str) -> bool:

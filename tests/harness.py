@@ -34,13 +34,18 @@ class Recorder:
 class Rig:
     """A loop on a virtual clock, and everything a test wants to look at or break."""
 
-    def __init__(self, *overrides: str, wrap: Callable[[Robot], Robot] = lambda r: r) -> None:
+    def __init__(
+        self,
+        *overrides: str,
+        wrap: Callable[[Robot], Robot] = lambda robot: robot,
+        notify: Callable[[float], None] = lambda now: None,
+    ) -> None:
         self.config: Config = load(None, overrides)
         self.clock = VirtualClock()
         self.fish = SimulatedFish(self.config.plant, self.config.simulation, self.config.tick)
         self.recorder = Recorder()
         robot = wrap(self.fish.robot())
-        self.loop: ControlLoop = build_loop(self.config, robot, self.clock, self.recorder)
+        self.loop: ControlLoop = build_loop(self.config, robot, self.clock, self.recorder, notify)
         self.index = 0
 
     @property
@@ -128,7 +133,7 @@ class Wrapped:
         self.read_error: Exception | None = None
         self.write_error: Exception | None = None
         self.release_error: Exception | None = None
-        self.clipped = False
+        self.suspect = ""
         self.delay = 0.0
         """Age that is added to every measurement [s]."""
         self.log: list[float | None] = []
@@ -141,7 +146,7 @@ class Wrapped:
         if self.read_error:
             raise self.read_error
         m = self._robot.sensor.read(now)
-        return Measurement(m.time - self.delay, m.fx, m.fy, m.samples, self.clipped)
+        return Measurement(m.time - self.delay, m.fx, m.fy, m.samples, self.suspect)
 
     def write(self, angle: float) -> None:
         if self.write_error:

@@ -60,3 +60,16 @@ def test_a_fade_takes_the_fade_time_from_the_limit_to_neutral() -> None:
 def test_a_command_that_is_no_number_is_refused(command: float, previous: float) -> None:
     with pytest.raises(ValueError, match="not an angle"):
         Guard(0.42, 0.05, None, 0.4).apply(command, previous)
+
+
+@given(angles, angles, st.lists(st.floats(allow_nan=False, allow_infinity=False)))
+def test_a_restricted_guard_permits_neither_more_than_the_servo_reaches_nor_more_than_phi(
+    one: float, other: float, commands: list[float]
+) -> None:
+    lowest, highest = -abs(one), abs(other)
+    guard = Guard(0.42, 0.05, None, fade_time=0.4)
+    guard.restrict(lowest, highest)
+    angle = 0.0
+    for command in commands:
+        angle = guard.apply(command, angle)
+        assert max(-0.42, lowest) <= angle <= min(0.42, highest)

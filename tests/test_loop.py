@@ -185,7 +185,7 @@ def test_one_or_two_failed_reads_are_bridged_with_the_last_measurement() -> None
         ({"read_error": SensorError("no acknowledge")}, "sensor-stale"),
         ({"read_error": ZeroDivisionError()}, "sensor-stale"),
         ({"delay": 0.11}, "sensor-stale"),
-        ({"clipped": True}, "sensor-range"),
+        ({"suspect": "F_x is clipped"}, "sensor-range"),
         ({"write_error": ServoError("pigpiod is gone")}, "servo-link"),
         ({"write_error": TypeError("my bug")}, "servo-link"),
     ],
@@ -228,10 +228,10 @@ def test_clearing_a_fault_that_is_still_there_latches_it_again() -> None:
     assert rig.recorder.kinds().count("fault") == 2
 
 
-def test_one_clipped_window_and_failed_reads_are_not_three_clipped_windows() -> None:
+def test_one_suspect_window_and_failed_reads_are_not_three_suspect_windows() -> None:
     rig, robot = fragile_rig()
     rig.run(3)
-    robot.clipped = True
+    robot.suspect = "F_x is clipped"
     rig.run(1)
     robot.read_error = SensorError("no acknowledge")
     rig.run(2)

@@ -11,6 +11,7 @@ from processes import FISHCTL
 from fishd.config import load
 from fishd.errors import ParameterError
 from fishd.plant.optimum import square_wave
+from fishd.plant.tethered import TrueWindow
 from fishd.simulation import Beats, Report, simulate
 
 REALISTIC = ["simulation.offset_y=0.02", "simulation.drift=0.02", "simulation.rotation=0.1"]
@@ -106,7 +107,7 @@ def test_cable_slack_costs_thrust() -> None:
 def test_only_whole_beats_are_counted() -> None:
     beats = Beats()
     for angle, thrust in [(1.0, 9.0)] * 3 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
-        beats.add(angle, thrust, 0.1 * thrust, 0.5)
+        beats.add(angle, TrueWindow(0.5, thrust, 0.1 * thrust))
     thrust, frequency, fin = beats.figures()
     assert (thrust, frequency, fin) == pytest.approx((1.5, 1.0, 0.15))
 

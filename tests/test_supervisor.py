@@ -78,10 +78,10 @@ def test_clearing_starts_all_counts_anew() -> None:
     supervisor = Supervisor()
     for _ in range(3):
         supervisor.sensor("silent")
-        supervisor.clipped(True)
+        supervisor.suspect("clipped")
     supervisor.clear()
     assert not supervisor.sensor("silent")
-    assert not supervisor.clipped(True)
+    assert not supervisor.suspect("clipped")
     assert supervisor.mode is Mode.IDLE
 
 

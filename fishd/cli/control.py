@@ -148,6 +148,7 @@ def _status_text(status: Status) -> str:
     timing = status.timing
     scheduling = "real-time" if status.realtime else "normal"
     uptime = datetime.timedelta(seconds=int(status.uptime))
+    survived = {name: count for name, count in status.counters.items() if count}
     rows = [
         ("mode", status.mode + reason),
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
@@ -162,6 +163,8 @@ def _status_text(status: Status) -> str:
         ("busy", _percentiles(timing.busy)),
         *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
         ("robot", status.robot),
+        *(("degraded", line) for line in status.degraded),
+        *([("survived", spelled(survived))] if survived else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]

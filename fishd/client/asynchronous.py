@@ -10,7 +10,8 @@ import msgspec
 import zmq.asyncio
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
-from fishd.protocol import State
+from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.protocol import Calibrations, State
 from fishd.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -73,6 +74,28 @@ class AsyncFish(Connection):
         """Publish a mark in the event stream."""
         return await self._call(State, "mark", text=text)
 
+    async def calibrations(self) -> Calibrations:
+        """The calibrations of force sensor and servo that are in force."""
+        return await self._call(Calibrations, "calibrations")
+
+    async def sample_force(self, seconds: float = 2.0) -> ForceSample:
+        """Measure for a while; refused while the fish swims, and for a simulated fish."""
+        return await self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
+
+    async def tare(self, seconds: float = 2.0) -> Calibrations:
+        """Measure for a while and call that zero force; refused unless all is still."""
+        return await self._call(Calibrations, "tare", patience=seconds, seconds=seconds)
+
+    async def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
+        """Put another calibration of the force sensor in force, and save it."""
+        return await self._call(Calibrations, "calibrate-force", calibration=calibration)
+
+    async def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
+        """Put another calibration of the servo in force, and save it or not."""
+        return await self._call(
+            Calibrations, "calibrate-servo", calibration=calibration, save=save
+        )
+
     def ticks(self) -> AsyncIterator[Tick]:
         """Every tick from the first iteration on; raises `NoDaemon` when none comes in time."""
         return self._subscribe(b"tick", Tick)
@@ -81,13 +104,16 @@ class AsyncFish(Connection):
         """Every event from the first iteration on, however long it takes."""
         return self._subscribe(b"event", Event)
 
-    async def _call(self, kind: type[T], op: str, **args: Any) -> T:
-        """One request at a time: tasks that share this object must take turns."""
+    async def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
+        """One request at a time: tasks that share this object must take turns.
+
+        patience: how long the answer may take, beyond the time-out [s]
+        """
         if self._socket is None:
             self.check_endpoint()
             self._socket = dealer(self._context, self.endpoint)
         identity, request = self.request(op, args)
-        deadline = time.monotonic() + self.timeout
+        deadline = time.monotonic() + self.timeout + patience
         try:
             await asyncio.wait_for(self._socket.send(request), self.timeout)
         except TimeoutError:

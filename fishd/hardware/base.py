@@ -68,6 +68,9 @@ class CalibratedSensor(ForceSensor, Protocol):
     def recalibrate(self, calibration: ForceCalibration) -> None:
         """Use another calibration from the next read on."""
 
+    def counters(self) -> dict[str, int]:
+        """Errors that were survived, since start."""
+
 
 class CalibratedServo(Servo, Protocol):
     """A servo whose pulses can be calibrated."""
@@ -76,6 +79,15 @@ class CalibratedServo(Servo, Protocol):
 
     def recalibrate(self, calibration: ServoCalibration) -> None:
         """Use another calibration from the next write on."""
+
+    def counters(self) -> dict[str, int]:
+        """Errors that were survived, since start."""
+
+    def neutralise(self) -> bool:
+        """Last resort, from a process that does not drive this servo: neutral, then no pulses.
+
+        False when there were no pulses. Raises `ServoError` when the servo cannot be reached.
+        """
 
 
 class Watch(Protocol):

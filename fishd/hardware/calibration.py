@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 
 from fishd import strict_yaml
 from fishd.errors import ConfigError
+from fishd.hardware.settings import ServoSettings
 from fishd.schema import Problem, convert
 
 
@@ -59,6 +60,29 @@ class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     highest: Annotated[float, Meta(ge=0, le=3.15)] = 1.2
     """[rad]"""
     date: str = ""
+
+
+def calibrated(settings: ServoSettings, calibration: ServoCalibration) -> ServoSettings:
+    """The settings with what a calibration says instead."""
+    return msgspec.structs.replace(
+        settings,
+        trim=calibration.trim,
+        direction=calibration.direction,
+        scale=calibration.scale,
+        lowest=calibration.lowest,
+        highest=calibration.highest,
+    )
+
+
+def as_configured(settings: ServoSettings) -> ServoCalibration:
+    """The calibration that the settings themselves amount to."""
+    return ServoCalibration(
+        trim=settings.trim,
+        direction=settings.direction,
+        scale=settings.scale,
+        lowest=settings.lowest,
+        highest=settings.highest,
+    )
 
 
 class ForceSample(Struct, frozen=True):

@@ -47,6 +47,24 @@ class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             extra_json_schema={"unit": "N"},
         ),
     ] = 10.0
+    still: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1e3,
+            description="Noise of single samples, rms, up to which a tare is permitted.",
+            extra_json_schema={"unit": "N"},
+        ),
+    ] = 0.02
+    tare_limit: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1e4,
+            description="Largest force that a tare takes away.",
+            extra_json_schema={"unit": "N"},
+        ),
+    ] = 1.0
     frozen_after: Annotated[
         Annotated[float, Meta(ge=0.1, le=600)] | None,
         Meta(

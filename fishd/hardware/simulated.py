@@ -7,7 +7,7 @@ was last written. So it knows no clock and runs as well in real time as in virtu
 from fishd.hardware.base import Robot
 from fishd.hardware.imperfections import Imperfections, SimulationSettings
 from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import TetheredFish, Window
+from fishd.plant.tethered import TetheredFish, TrueWindow, Window
 from fishd.signals import Measurement, Truth
 
 
@@ -24,6 +24,7 @@ class SimulatedFish:
         self._tick = tick
         self._time: float | None = None
         self._angle: float | None = None
+        self._fin_speed = 0.0
 
     def read(self, now: float) -> Measurement:
         """Swim until `now` [s] and measure the forces on the way."""
@@ -35,6 +36,15 @@ class SimulatedFish:
             window.sampled_thrust, window.sampled_lateral_force, now, duration
         )
         return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
+
+    def take_window(self) -> TrueWindow:
+        """What truly happened between the latest two reads."""
+        window, state = self.window, self.fish.state
+        turned = self._fin_speed * state.alpha_rate <= 0.0
+        self._fin_speed = state.alpha_rate
+        # Where the fin has not turned, it is at the end that it has gone furthest.
+        peak = window.fin_peak if turned else abs(state.alpha)
+        return TrueWindow(window.duration, window.thrust, peak)
 
     def write(self, angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""

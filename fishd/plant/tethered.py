@@ -63,6 +63,17 @@ class Window(Struct, frozen=True, eq=False):
         return max(panel.peak(response) for panel, response in self.course)
 
 
+class TrueWindow(NamedTuple):
+    """What truly happened during a window, for those who judge a run."""
+
+    duration: float
+    """[s]"""
+    thrust: float
+    """Mean F_x [N]."""
+    fin_peak: float
+    """Largest |α| [rad]."""
+
+
 class TetheredFish:
     """A fish in still water that cannot swim away; not safe for use from several threads.
 

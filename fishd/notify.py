@@ -1,0 +1,61 @@
+"""What fishd tells systemd: that it is ready, that it still ticks, that it stops.
+
+The protocol of sd_notify(3): datagrams to the socket that $NOTIFY_SOCKET names. Without systemd,
+nothing is sent.
+"""
+
+import os
+import socket
+
+_FEEDS_PER_LIMIT = 8
+"""How many times the watchdog is fed in the time that systemd allows."""
+
+
+class SystemdNotifier:
+    """Sends without waiting; what cannot be sent is dropped, the watchdog will see to it."""
+
+    def __init__(self) -> None:
+        path = os.environ.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + path[1:] if path.startswith("@") else path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._feed_period = _watchdog_limit() / _FEEDS_PER_LIMIT
+        self._next_feed = 0.0
+        self._ready = False
+
+    def ticked(self, now: float) -> None:
+        """Feed the watchdog, and be ready with the first tick; to be called from the tick only.
+
+        now: start of the tick [s, monotonic]
+        """
+        if now < self._next_feed or not self._address:
+            return
+        self._next_feed = now + self._feed_period
+        self._send("WATCHDOG=1" if self._ready else "READY=1\nWATCHDOG=1")
+        self._ready = True
+
+    def status(self, line: str) -> None:
+        """What `systemctl status` shows."""
+        self._send(f"STATUS={line}")
+
+    def stopping(self) -> None:
+        """The daemon has begun to stop."""
+        self._send("STOPPING=1")
+
+    def close(self) -> None:
+        """Close the socket; may be called twice."""
+        self._socket.close()
+
+    def _send(self, state: str) -> None:
+        if self._address:
+            try:
+                self._socket.sendto(state.encode(), self._address)
+            except OSError:
+                return
+
+
+def _watchdog_limit() -> float:
+    """Longest silence that systemd allows this process [s]; infinite without a watchdog."""
+    if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+        return float("inf")
+    microseconds = os.environ.get("WATCHDOG_USEC", "")
+    return int(microseconds) * 1e-6 if microseconds.isdigit() else float("inf")

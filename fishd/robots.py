@@ -1,0 +1,182 @@
+"""Opens the robot that the configuration describes: its sensor, servo and panel, ready to use."""
+
+import os
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from msgspec.structs import replace
+
+from fishd.addresses import virtual_pi_socket
+from fishd.clock import Clock, VirtualClock
+from fishd.config import Config
+from fishd.errors import SensorError
+from fishd.hardware.base import Bench, CalibratedServo, Panel, Robot
+from fishd.hardware.calibration import (
+    CalibrationFolder,
+    ForceCalibration,
+    ServoCalibration,
+    as_configured,
+)
+from fishd.hardware.simulated import SimulatedFish
+from fishd.signals import Truth
+
+if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
+    from fishd.emulation.virtual_pi import VirtualPi
+
+START_LIMIT = 1.0
+"""How long the force sensor may take for its first sample [s]."""
+
+
+def open_robot(config: Config, clock: Clock, stack: ExitStack) -> Robot:
+    """The robot, in real time; leaving `stack` releases its servo first, then lets go of the rest.
+
+    A sensor or servo that does not answer is no error here: the loop will say so, and recovers
+    when it comes back. Raises `StartupError` when a package is missing or no virtual Pi is
+    running, `ConfigError` when a calibration file is broken.
+    """
+    if config.robot == "simulated":
+        return SimulatedFish(config.plant, config.simulation, config.tick).robot()
+    if config.robot == "virtual-pi":
+        plug_in_virtual_pi(config, stack)
+    return _assemble(config, clock, stack, threaded=True)
+
+
+class Lockstep(NamedTuple):
+    """A robot whose whole hardware path runs in virtual time, and the virtual Pi behind it."""
+
+    robot: Robot
+    pi: "VirtualPi"
+
+
+def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
+    """A virtual Pi and the drivers on it in virtual time: it moves when the loop reads the sensor.
+
+    Its own clock runs ahead of the loop's by the rest of a conversion.
+    """
+    from fishd.emulation.linux_i2c import LinuxI2c
+    from fishd.emulation.virtual_pi import VirtualPi
+
+    clock = VirtualClock()
+    clock.now = -config.tick  # so that the first read, at 0, finds a window
+    pi = VirtualPi(config.virtual_pi, config.plant, config.simulation, config.tick, clock)
+    stack.callback(pi.close)
+    pi.start()
+    i2c = LinuxI2c(pi.bus.transfer, {config.virtual_pi.bus}, partial(setattr, pi.bus, "timeout"))
+    stack.callback(i2c.remove)
+    i2c.install()
+    robot = _assemble(
+        with_pigpio_port(config, pi.pigpiod.port), clock, stack, threaded=False, truth=pi.tank.truth
+    )
+    return Lockstep(robot, pi)
+
+
+def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
+    """Let the I2C bus of this process be that of the virtual Pi that is running.
+
+    Raises `StartupError` where there is none.
+    """
+    from fishd.emulation.link import RemotePi
+    from fishd.emulation.linux_i2c import LinuxI2c
+
+    remote = RemotePi(virtual_pi_socket(config.virtual_pi.socket))
+    stack.callback(remote.close)
+    i2c = LinuxI2c(remote.transfer, {config.virtual_pi.bus}, remote.set_timeout)
+    stack.callback(i2c.remove)
+    i2c.install()
+
+
+def state_folder(config: Config) -> Path:
+    """Where the calibrations of this robot are kept."""
+    folder = config.state_folder or os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if folder:
+        return Path(folder).expanduser() / config.robot
+    state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(state).expanduser() / "fishd" / config.robot
+
+
+def open_servo(config: Config, clock: Clock, *, threaded: bool) -> CalibratedServo:
+    """The servo alone; raises `StartupError` when its package is missing."""
+    found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
+    calibration = found[0] if found else as_configured(config.servo)
+    settings = config.servo
+    if settings.driver == "pigpio":
+        from fishd.hardware.pigpio import PigpioServo
+
+        return PigpioServo(settings, calibration, clock, threaded=threaded, tick=config.tick)
+    if settings.driver == "sysfs-pwm":
+        from fishd.hardware.sysfs_pwm import SysfsPwmServo
+
+        return SysfsPwmServo(settings, calibration, clock)
+    from fishd.hardware.rpi_gpio import RpiGpioServo
+
+    return RpiGpioServo(settings, calibration, clock)
+
+
+def _assemble(
+    config: Config,
+    clock: Clock,
+    stack: ExitStack,
+    *,
+    threaded: bool,
+    truth: Callable[[], Truth] | None = None,
+) -> Robot:
+    from fishd.hardware.ads1115 import open_force_sensor
+
+    panel = _open_panel(config, clock, stack)
+    found = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
+    sensor = open_force_sensor(
+        config.force_sensor,
+        found[0] if found else ForceCalibration(),
+        clock,
+        threaded=threaded,
+        tick=config.tick,
+    )
+    stack.callback(sensor.close)
+    servo = open_servo(config, clock, threaded=threaded)
+    stack.callback(servo.close)  # last in, first out: whatever fails, this is done first
+    if threaded:
+        _await_first_sample(sensor.read, clock)
+    degraded = list(getattr(servo, "degraded", ()))
+    if not found:
+        degraded.append("the force is not calibrated: fishctl calibrate force")
+    return Robot(
+        name=config.robot,
+        sensor=sensor,
+        servo=servo,
+        truth=truth,
+        panel=panel,
+        bench=Bench(sensor, servo),
+        degraded=tuple(degraded),
+        counters=lambda: {**sensor.counters(), **servo.counters()},
+    )
+
+
+def _open_panel(config: Config, clock: Clock, stack: ExitStack) -> Panel | None:
+    if config.panel.estop_gpio is None and config.panel.led_gpio is None:
+        return None
+    from fishd.hardware.panel import RpiGpioPanel
+
+    panel = RpiGpioPanel(config.panel, clock)
+    stack.callback(panel.close)
+    return panel
+
+
+def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
+    """Give the sensor the time that it needs to begin, so that a healthy start is no fault."""
+    deadline = clock.monotonic() + START_LIMIT
+    while clock.monotonic() < deadline:
+        try:
+            read(clock.monotonic())
+        except SensorError:
+            clock.sleep(0.01)
+        else:
+            return
+
+
+def with_pigpio_port(config: Config, port: int) -> Config:
+    """The configuration with the TCP port of pigpiod that was really taken."""
+    pigpio = replace(config.servo.pigpio, host="127.0.0.1", port=port)
+    return replace(config, servo=replace(config.servo, pigpio=pigpio))

@@ -1,0 +1,142 @@
+"""The fit of known loads: what it recovers, and which loads it refuses."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd.calibrating import G0, WORST_CONDITION, Load, PoorLoads, fit, missing_loads
+
+PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
+
+gains = st.floats(0.2, 20.0)
+crosstalk = st.floats(-0.3, 0.3)
+zeros = st.floats(-2.0, 2.0)
+
+
+def measured(
+    plan: list[tuple[float, float]],
+    sensor: "np.ndarray",
+    zero: tuple[float, float] = (0.0, 0.0),
+    noise: float = 0.0,
+    seed: int = 0,
+) -> list[Load]:
+    """What a sensor with V = S·F + zero says of these loads; noise in volts, rms."""
+    random = np.random.default_rng(seed)
+    voltages = np.array(plan) @ sensor.T + zero + noise * random.standard_normal((len(plan), 2))
+    return [Load(*force, *v) for force, v in zip(plan, voltages.tolist(), strict=True)]
+
+
+def sensor(gx: float, gy: float, cx: float = 0.0, cy: float = 0.0) -> "np.ndarray":
+    return np.array([[gx, cx * gx], [cy * gy, gy]])
+
+
+@given(gains, gains, crosstalk, crosstalk, zeros, zeros)
+def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
+    gx: float, gy: float, cx: float, cy: float, x0: float, y0: float
+) -> None:
+    loads = measured(PLAN, sensor(gx, gy, cx, cy), (x0, y0))
+    if np.linalg.cond(sensor(gx, gy, cx, cy)) > 0.5 * WORST_CONDITION:
+        return
+    calibration = fit(loads).calibration
+    for load in loads:
+        assert calibration.forces(load.vx, load.vy) == pytest.approx((load.fx, load.fy), abs=1e-9)
+    assert calibration.residual < 1e-9
+    assert calibration.loads == 5
+
+
+@given(crosstalk, crosstalk, st.integers(0, 2**32 - 1))
+def test_with_noise_it_is_recovered_within_what_the_noise_permits(
+    cx: float, cy: float, seed: int
+) -> None:
+    noise = 1e-4
+    loads = measured(PLAN * 8, sensor(1.0, 1.0, cx, cy), (0.5, -0.5), noise, seed)
+    found = fit(loads)
+    matrix = np.array(
+        [
+            [found.calibration.xx, found.calibration.xy],
+            [found.calibration.yx, found.calibration.yy],
+        ]
+    )
+    # Six standard errors: 16 loads of 0.2 N and more along each axis, and a matrix of norm < 2.
+    tolerance = 6 * 2 * 2 * noise / (0.2 * math.sqrt(16))
+    assert np.abs(matrix - np.linalg.inv(sensor(1.0, 1.0, cx, cy))).max() < tolerance
+    assert 0.2 * noise < found.calibration.residual < 5 * noise
+    errors = np.array(found.errors)
+    assert found.calibration.residual == pytest.approx(np.sqrt(np.mean(errors**2)))
+
+
+def test_the_error_of_each_load_points_at_the_one_that_was_entered_wrongly() -> None:
+    loads = measured([*PLAN, (0.1, 0.1), (-0.1, 0.1), (0.1, -0.1), (-0.1, -0.1)], sensor(1, 1))
+    loads[3] = loads[3]._replace(fy=0.35)
+    errors = [math.hypot(*error) for error in fit(loads).errors]
+    assert errors.index(max(errors)) == 3
+
+
+def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gains_else() -> None:
+    cross = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)]
+    assert fit(measured(cross, sensor(2, 2))).calibration.condition == pytest.approx(1.0)
+    assert fit(measured(cross, sensor(1, 8))).calibration.condition == pytest.approx(8.0)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
+def test_the_condition_number_depends_neither_on_units_nor_on_an_offset(
+    unit: float, offset: float
+) -> None:
+    plain = fit(measured(PLAN, sensor(1, 3))).calibration.condition
+    zero = (offset * unit, offset * unit)
+    scaled = fit(measured(PLAN, sensor(unit, 3 * unit), zero)).calibration.condition
+    assert scaled == pytest.approx(plain, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "name"),
+    [(0, "no load at all"), (1, "along +x"), (2, "along -x"), (3, "along +y"), (4, "along -y")],
+)
+def test_a_plan_without_one_of_its_loads_is_refused_by_the_name_of_that_load(
+    left_out: int, name: str
+) -> None:
+    plan = PLAN[:left_out] + PLAN[left_out + 1 :]
+    with pytest.raises(PoorLoads, match=f"{name.replace('+', '[+]')}.* is missing"):
+        fit(measured(plan, sensor(1, 1)))
+
+
+@given(st.floats(-3, 3), st.lists(st.floats(-1, 1), min_size=3, max_size=9))
+def test_loads_on_one_line_are_refused_whatever_its_direction(
+    angle: float, sizes: list[float]
+) -> None:
+    line = [(size * math.cos(angle), size * math.sin(angle)) for size in (*sizes, 0.0, 1.0, -1.0)]
+    assert missing_loads(line)
+    with pytest.raises(PoorLoads):
+        fit(measured(line, sensor(1, 1), noise=1e-5))
+
+
+def test_too_few_loads_are_counted() -> None:
+    corners = [(0.0, 0.0), (0.2, 0.2), (-0.2, -0.2), (0.2, -0.2)]
+    assert missing_loads(corners) == ["5 loads are needed, there are 4"]
+    assert missing_loads([]) != []
+    assert missing_loads(PLAN) == []
+
+
+def test_a_channel_that_is_not_connected_is_named() -> None:
+    with pytest.raises(PoorLoads, match=r"V_y moved by .* wired to force_sensor.channel_y"):
+        fit(measured(PLAN, sensor(1, 1e-5), noise=1e-6))
+
+
+def test_channels_that_say_the_same_are_refused() -> None:
+    with pytest.raises(PoorLoads, match="both channels moved together"):
+        fit(measured(PLAN, np.array([[1.0, 1.0], [1.0, 1.0]]), noise=1e-5))
+
+
+def test_numbers_that_are_none_are_refused() -> None:
+    loads = measured(PLAN, sensor(1, 1))
+    with pytest.raises(PoorLoads, match="measure that load again"):
+        fit([*loads, Load(0.1, 0.1, math.nan, 0.0)])
+    with pytest.raises(PoorLoads, match="finite"):
+        fit([*loads, Load(math.inf, 0.1, 0.0, 0.0)])
+
+
+def test_a_gram_weighs_what_it_does() -> None:
+    assert pytest.approx(0.0098, rel=1e-3) == G0 / 1e3
