@@ -6,18 +6,20 @@ Everything else here is called between two ticks, by the thread that ticks.
 """
 
 import logging
+import math
 from collections.abc import Callable
 from typing import Any
 
-from msgspec import Struct, structs
+from msgspec import Struct
 
 from fishd.clock import Clock, Slot
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.hold import Hold, HoldParameters
+from fishd.errors import FishdError, SensorError
 from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
-from fishd.reporting import Publisher, Reporter, why_overrun
+from fishd.reporting import Publisher, Reporter, why_overrun, why_skipped
 from fishd.signals import Measurement, Observation
 from fishd.statistics import Statistics
 from fishd.supervisor import Mode, Supervisor
@@ -102,34 +104,36 @@ class ControlLoop:
         before = self.supervisor.mode
         self.supervisor.start()
         self.controller_name, self.controller, self._fresh = name, controller, True
-        self._announce_controller("controller", "takes over with")
-        self._announce_mode(before)
+        self.reporter.controller(name, controller.parameters, "controller", "takes over with")
+        self.reporter.mode(before, self.supervisor)
 
     def retune(self, parameters: Struct) -> None:
         """Give the controller in command new, already checked parameters."""
         self.controller.retune(parameters)
-        self._announce_controller("parameters", "goes on with")
+        self.reporter.controller(
+            self.controller_name, self.controller.parameters, "parameters", "goes on with"
+        )
 
     def stop(self) -> None:
         """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
         before = self.supervisor.mode
         self.supervisor.stop()
         self._rest()
-        self._announce_mode(before)
+        self.reporter.mode(before, self.supervisor)
 
     def clear_fault(self) -> None:
         """Leave mode fault or estop for idle: the servo gets pulses again."""
         before = self.supervisor.mode
         self._latest_problem = ""
         self.supervisor.clear()
-        self._announce_mode(before)
+        self.reporter.mode(before, self.supervisor)
 
     def estop(self, message: str) -> None:
         """Stop the pulses now, without waiting for a tick."""
         before = self.supervisor.mode
         self.supervisor.estop(message)
         self._rest()
-        self._announce_mode(before, level="error")
+        self.reporter.mode(before, self.supervisor, level="error")
         self._write(neutral=False)
 
     def _rest(self) -> None:
@@ -153,6 +157,8 @@ class ControlLoop:
         problem = None
         try:
             measurement = self.robot.sensor.read(slot.deadline)
+            if not math.isfinite(measurement.fx + measurement.fy):
+                raise SensorError(f"it gave ({measurement.fx}, {measurement.fy}) N")
             if self.supervisor.suspect(measurement.suspect):
                 self._fall()
         except Exception as error:
@@ -210,6 +216,8 @@ class ControlLoop:
             else:
                 self.robot.servo.write(self.applied)
                 self.servo_on = True
+            if self._lost:
+                self.reporter.event("servo", "the servo can be reached again")
             self._lost = False
         except Exception as error:
             self._lost = True
@@ -238,13 +246,9 @@ class ControlLoop:
     def _check_overrun(self, slot: Slot, marks: tuple[float, ...]) -> None:
         """Report a tick that took too long, or slots that were lost for another reason."""
         message = why_overrun(self.seq, marks, self.limits.tick)
-        if message:
-            self.statistics.overruns += 1
-        elif slot.missed and not self._overran:
-            message = (
-                f"{slot.missed} slots were skipped before tick {self.seq}: fishd was woken late, "
-                "the machine is overloaded or was suspended"
-            )
+        self.statistics.overruns += message is not None
+        if not message and not self._overran:
+            message = why_skipped(self.seq, slot.missed)
         self._overran = message is not None
         if message:
             self.reporter.event("overrun", message, "warning", seq=self.seq, missed=slot.missed)
@@ -255,7 +259,7 @@ class ControlLoop:
         """Latch a fault; an error while one is latched is logged all the same, once."""
         problem = f"{what}: {_named(error)}"
         if problem != self._latest_problem:
-            log.error("%s", what, exc_info=error)
+            log.error("%s", problem, exc_info=None if isinstance(error, FishdError) else error)
         self._latest_problem = problem
         if self.supervisor.fail(code, problem):
             self._fall()
@@ -263,25 +267,10 @@ class ControlLoop:
     def _fall(self) -> None:
         """The supervisor has just latched a fault: put `hold` in command and tell everyone."""
         self._rest()
-        reason = self.supervisor.reason
-        assert reason is not None
-        message = f"{reason.code}: {reason.message}"
-        mode = self.supervisor.mode.value
-        self.reporter.event("fault", message, "error", code=reason.code, mode=mode)
-
-    def _announce_controller(self, kind: str, does: str) -> None:
-        name, parameters = self.controller_name, structs.asdict(self.controller.parameters)
-        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in parameters.items())
-        message = f"{name} {does} {spelled or 'no parameters'}"
-        self.reporter.event(kind, message, controller=name, parameters=parameters)
-
-    def _announce_mode(self, before: Mode, level: str = "info") -> None:
-        mode, reason = self.supervisor.mode, self.supervisor.reason
-        if mode is before:
-            return
-        message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
-        self.reporter.event("mode", message, level, before=before.value, mode=mode.value)
+        self.reporter.fault(self.supervisor)
 
 
 def _named(error: Exception) -> str:
+    if isinstance(error, FishdError):  # one of ours is a sentence by itself
+        return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

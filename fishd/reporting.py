@@ -3,12 +3,12 @@
 import logging
 from typing import Any, Protocol
 
-from msgspec import UNSET
+from msgspec import UNSET, Struct, structs
 
 from fishd.clock import Clock, Slot
 from fishd.signals import Event, Measurement, Observation, Tick, Truth
 from fishd.statistics import PHASES
-from fishd.supervisor import Mode
+from fishd.supervisor import Mode, Supervisor
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +37,28 @@ class Reporter:
             self._publisher.event(Event(self._clock.wall(), level, kind, message, data))
         except Exception:
             log.exception("the event could not be published")
+
+    def controller(self, name: str, parameters: Struct, kind: str, does: str) -> None:
+        """Tell who is in command with which parameters; does: such as `takes over with`."""
+        values = structs.asdict(parameters)
+        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in values.items())
+        message = f"{name} {does} {spelled or 'no parameters'}"
+        self.event(kind, message, controller=name, parameters=values)
+
+    def mode(self, before: Mode, supervisor: Supervisor, level: str = "info") -> None:
+        """Tell which mode follows on `before`, if it is another."""
+        mode, reason = supervisor.mode, supervisor.reason
+        if mode is before:
+            return
+        message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
+        self.event("mode", message, level, before=before.value, mode=mode.value)
+
+    def fault(self, supervisor: Supervisor) -> None:
+        """Tell of the fault that was just latched."""
+        reason = supervisor.reason
+        assert reason is not None
+        message = f"{reason.code}: {reason.message}"
+        self.event("fault", message, "error", code=reason.code, mode=supervisor.mode.value)
 
     def tick(
         self,
@@ -101,4 +123,14 @@ def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None
     return (
         f"tick {seq} took {busy * 1e3:.1f} ms of its {period * 1e3:g} ms, "
         f"{longest * 1e3:.1f} ms of it in {phase}"
+    )
+
+
+def why_skipped(seq: int, missed: int) -> str | None:
+    """One line on slots that were skipped although no tick was to blame, or None."""
+    if not missed:
+        return None
+    return (
+        f"{missed} slots were skipped before tick {seq}: fishd was woken late, "
+        "the machine is overloaded or was suspended"
     )

@@ -134,6 +134,8 @@ class Wrapped:
         self.write_error: Exception | None = None
         self.release_error: Exception | None = None
         self.suspect = ""
+        self.fx: float | None = None
+        """What every measurement says instead of the true one [N]."""
         self.delay = 0.0
         """Age that is added to every measurement [s]."""
         self.log: list[float | None] = []
@@ -146,7 +148,8 @@ class Wrapped:
         if self.read_error:
             raise self.read_error
         m = self._robot.sensor.read(now)
-        return Measurement(m.time - self.delay, m.fx, m.fy, m.samples, self.suspect)
+        fx = m.fx if self.fx is None else self.fx
+        return Measurement(m.time - self.delay, fx, m.fy, m.samples, self.suspect)
 
     def write(self, angle: float) -> None:
         if self.write_error:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.calibrating import G0, WORST_CONDITION, Load, PoorLoads, fit, missing_loads
+from fishd.calibrating import WORST_CONDITION, Load, PoorLoads, fit, missing_loads
 
 PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
@@ -136,7 +136,3 @@ def test_numbers_that_are_none_are_refused() -> None:
         fit([*loads, Load(0.1, 0.1, math.nan, 0.0)])
     with pytest.raises(PoorLoads, match="finite"):
         fit([*loads, Load(math.inf, 0.1, 0.0, 0.0)])
-
-
-def test_a_gram_weighs_what_it_does() -> None:
-    assert pytest.approx(0.0098, rel=1e-3) == G0 / 1e3

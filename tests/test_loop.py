@@ -184,6 +184,7 @@ def test_one_or_two_failed_reads_are_bridged_with_the_last_measurement() -> None
     [
         ({"read_error": SensorError("no acknowledge")}, "sensor-stale"),
         ({"read_error": ZeroDivisionError()}, "sensor-stale"),
+        ({"fx": math.nan}, "sensor-stale"),
         ({"delay": 0.11}, "sensor-stale"),
         ({"suspect": "F_x is clipped"}, "sensor-range"),
         ({"write_error": ServoError("pigpiod is gone")}, "servo-link"),
