@@ -283,6 +283,13 @@ def _check_hardware(config: Config) -> None:
         raise Problem(
             ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"
         )
+    virtual = config.virtual_pi
+    if virtual.servo_scale == 0.0:
+        raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")
+    if virtual.channel_x == virtual.channel_y:
+        raise Problem(
+            ("virtual_pi", "channel_y"), f"'{virtual.channel_y}' is what channel_x is wired to"
+        )
     low, high = pulses.reach(servo)
     if not low <= 0.0 <= high:
         raise Problem(

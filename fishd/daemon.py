@@ -31,6 +31,8 @@ console = logging.getLogger("console")
 EX_CONFIG = 78
 FADE_LIMIT = 0.5
 """Longest time from a signal to exit that fading to neutral may take [s]."""
+REST_TIME = 0.3
+"""Time at neutral before the pulses end, where there was no fade [s]."""
 HOUSEKEEPING = 1.0
 """Time between two status messages [s]."""
 
@@ -67,6 +69,7 @@ class Daemon:
             self._loop = build.build_loop(
                 config, robot, self._clock, self._telemetry, self._notifier.ticked
             )
+            stack.callback(self._come_to_rest)
             if robot.panel:
                 robot.panel.on_press = self._on_press
             workbench = Workbench(self._loop, self._clock, config, robots.state_folder(config))
@@ -123,6 +126,12 @@ class Daemon:
                 self._loop.tick(slot)
         finally:
             ticker.close()
+
+    def _come_to_rest(self) -> None:
+        """Where fishd failed and could not fade: neutral, and time to get there."""
+        if self._loop.servo_on and self._loop.applied != 0.0:
+            self._loop.robot.servo.write(0.0)
+            self._clock.sleep(REST_TIME)
 
     def _on_press(self) -> None:
         """The E-stop button was pressed, says a thread of the driver: do not wait for a tick."""

@@ -56,17 +56,20 @@ def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
 
     Its own clock runs ahead of the loop's by the rest of a conversion.
     """
+    from fishd.emulation.lgpio import EmulatedLgpio
     from fishd.emulation.linux_i2c import LinuxI2c
     from fishd.emulation.virtual_pi import VirtualPi
 
     clock = VirtualClock()
     clock.now = -config.tick  # so that the first read, at 0, finds a window
-    pi = VirtualPi(config.virtual_pi, config.plant, config.simulation, config.tick, clock)
+    settings = replace(config.virtual_pi, pigpio_port=0)  # several may run at once
+    pi = VirtualPi(settings, config.plant, config.simulation, config.tick, clock)
     stack.callback(pi.close)
     pi.start()
-    i2c = LinuxI2c(pi.bus.transfer, {config.virtual_pi.bus}, partial(setattr, pi.bus, "timeout"))
-    stack.callback(i2c.remove)
-    i2c.install()
+    set_timeout = partial(setattr, pi.bus, "timeout")
+    stack.enter_context(LinuxI2c(pi.bus.transfer, {settings.bus}, set_timeout))
+    if _has_panel(config):
+        stack.enter_context(EmulatedLgpio(pi.pins))
     robot = _assemble(
         with_pigpio_port(config, pi.pigpiod.port), clock, stack, threaded=False, truth=pi.tank.truth
     )
@@ -74,18 +77,25 @@ def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
-    """Let the I2C bus of this process be that of the virtual Pi that is running.
+    """Let the I2C bus and the pins of this process be those of the virtual Pi that is running.
 
     Raises `StartupError` where there is none.
     """
+    from fishd.emulation.lgpio import EmulatedLgpio
     from fishd.emulation.link import RemotePi
     from fishd.emulation.linux_i2c import LinuxI2c
+    from fishd.emulation.pins import Pins
+    from fishd.emulation.wires import Wires
 
-    remote = RemotePi(virtual_pi_socket(config.virtual_pi.socket))
+    path = virtual_pi_socket(config.virtual_pi.socket)
+    remote = RemotePi(path)
     stack.callback(remote.close)
-    i2c = LinuxI2c(remote.transfer, {config.virtual_pi.bus}, remote.set_timeout)
-    stack.callback(i2c.remove)
-    i2c.install()
+    buses = {config.virtual_pi.bus}
+    stack.enter_context(LinuxI2c(remote.transfer, buses, remote.set_timeout))
+    if _has_panel(config):
+        pins = Pins()
+        stack.enter_context(EmulatedLgpio(pins))
+        stack.callback(Wires(path, pins.set_level).close)
 
 
 def state_folder(config: Config) -> Path:
@@ -155,13 +165,17 @@ def _assemble(
 
 
 def _open_panel(config: Config, clock: Clock, stack: ExitStack) -> Panel | None:
-    if config.panel.estop_gpio is None and config.panel.led_gpio is None:
+    if not _has_panel(config):
         return None
     from fishd.hardware.panel import RpiGpioPanel
 
     panel = RpiGpioPanel(config.panel, clock)
     stack.callback(panel.close)
     return panel
+
+
+def _has_panel(config: Config) -> bool:
+    return config.panel.estop_gpio is not None or config.panel.led_gpio is not None
 
 
 def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:

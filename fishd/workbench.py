@@ -156,7 +156,7 @@ class Workbench:
                 "not-saved", f"{self._folder.folder}: cannot be written: {error.strerror}"
             ) from None
 
-    def _file(self, kind: type[ForceCalibration] | type[ServoCalibration]) -> str | None:
+    def _file(self, kind: type[C]) -> str | None:
         found = self._folder.newest(kind) if self._loop.robot.bench else None
         return str(found[1]) if found else None
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from fishd.clock import VirtualClock
+from fishd.clock import SystemClock, VirtualClock
 from fishd.emulation.ads1115 import Ads1115Chip
 from fishd.emulation.faults import Faults
 from fishd.emulation.i2c import I2cBus
@@ -11,25 +11,35 @@ from fishd.emulation.linux_i2c import LinuxI2c
 from fishd.errors import SensorError
 from fishd.hardware.ads1115 import Ads1115Sensor
 from fishd.hardware.calibration import ForceCalibration
-from fishd.hardware.sampler import Sampler
+from fishd.hardware.sampler import Pair, Sampler
 from fishd.hardware.settings import ForceSensorSettings
 from fishd.signals import Measurement
 
 TICK = 0.05
+ABSENT_BUS = 201
+"""A bus that is there only while a rig is; a Pi may have a true bus 1."""
+STEP = 2.048 / 32768
+"""Of the ADC at the default range [V]."""
 MUX = {"A0-A1": 0, "A0-A3": 1, "A1-A3": 2, "A2-A3": 3, "A0": 4, "A1": 5, "A2": 6, "A3": 7}
 
 
 class ForceRig:
-    """Bus 1 with a chip at 0x48; a context manager, while which its device file exists."""
+    """A bus with a chip at 0x48; a context manager, while which its device files exist."""
 
-    def __init__(self, noise: float = 1.0, speed: float = 400e3, seed: int = 0) -> None:
-        self.clock = VirtualClock()
+    def __init__(
+        self,
+        noise: float = 1.0,
+        speed: float = 400e3,
+        seed: int = 0,
+        clock: VirtualClock | SystemClock | None = None,
+    ) -> None:
+        self.clock: Any = clock or VirtualClock()
         self.faults = Faults(self.clock, seed)
         self.bus = I2cBus(self.clock, speed, self.faults)
         self.volts: dict[str, float | Callable[[float], float]] = {"A0-A1": 0.5, "A2-A3": -0.25}
         self.chip = Ads1115Chip(self.clock, self._volts, self.faults, noise=noise, seed=seed)
         self.bus.attach(0x48, self.chip)
-        self.device = LinuxI2c(self.bus.transfer, {1}, self._set_timeout)
+        self.device = LinuxI2c(self.bus.transfer, {1, ABSENT_BUS}, self._set_timeout)
 
     def __enter__(self) -> "ForceRig":
         self.device.install()
@@ -43,7 +53,7 @@ class ForceRig:
         return Sampler(ForceSensorSettings(**settings), self.clock)
 
     def sensor(
-        self, calibration: ForceCalibration | None = None, **settings: Any
+        self, calibration: ForceCalibration | None = None, tick: float = TICK, **settings: Any
     ) -> Ads1115Sensor:
         """A sensor that reads step."""
         return Ads1115Sensor(
@@ -51,7 +61,7 @@ class ForceRig:
             calibration or ForceCalibration(),
             self.clock,
             threaded=False,
-            tick=TICK,
+            tick=tick,
         )
 
     def _volts(self, mux: int, start: float, end: float) -> float:
@@ -67,21 +77,45 @@ class ForceRig:
 class Ticks:
     """Reads of a sensor, one per tick."""
 
-    def __init__(self, sensor: Ads1115Sensor) -> None:
+    def __init__(self, sensor: Ads1115Sensor, tick: float = TICK) -> None:
         self.sensor = sensor
+        self.tick = tick
         self.index = 0
 
     def next(self) -> Measurement:
         """The measurement of the next tick; raises `SensorError` as it does."""
         self.index += 1
-        return self.sensor.read(self.index * TICK)
+        return self.sensor.read(self.index * self.tick)
 
     def run(self, seconds: float) -> list[Measurement | str]:
         """What each of many ticks gets: a measurement, or the text of the error."""
         found: list[Measurement | str] = []
-        for _ in range(round(seconds / TICK)):
+        for _ in range(round(seconds / self.tick)):
             try:
                 found.append(self.next())
             except SensorError as error:
                 found.append(str(error))
         return found
+
+
+def measurements(found: list[Measurement | str]) -> list[Measurement]:
+    """The same, where no read failed."""
+    assert all(isinstance(item, Measurement) for item in found), found
+    return [item for item in found if isinstance(item, Measurement)]
+
+
+def take_pairs(sampler: Sampler, rig: ForceRig, seconds: float) -> list[Pair]:
+    """What a sampler delivers in so long a time from now on."""
+    sampler.pairs.clear()
+    found: list[Pair] = []
+    end = rig.clock.now + seconds
+    while rig.clock.now < end:
+        sampler.step()
+        while sampler.pairs:
+            found.append(sampler.pairs.popleft())
+    return found
+
+
+def volts(pair: Pair) -> tuple[float, float]:
+    """Of both channels at the default range."""
+    return pair.x * STEP, pair.y * STEP

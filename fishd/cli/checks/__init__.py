@@ -1,0 +1,32 @@
+"""The checks of `fishctl doctor`, in the order in which they are made."""
+
+from collections.abc import Iterator
+
+from fishd.cli.checks import computer, sensor, service, servo, software, timing
+from fishd.cli.checks.base import Check, Context, Result, fail
+
+CHECKS: tuple[Check, ...] = (
+    *software.CHECKS,
+    *computer.CHECKS,
+    *timing.CHECKS,
+    *sensor.CHECKS,
+    *servo.CHECKS,
+    *service.CHECKS,
+)
+
+
+def examine(context: Context) -> Iterator[tuple[str, Result]]:
+    """Make every check that concerns the configured robot: its name and what came out.
+
+    A check that fails to be made is itself a failure, and does not keep the others from being made.
+    """
+    for check in CHECKS:
+        if context.config.robot not in check.robots:
+            continue
+        try:
+            result = check.function(context)
+        except Exception as error:
+            what = f"this check broke off: {type(error).__name__}: {error}"
+            result = fail(what, "please report this, with the output of 'fishctl doctor --json'")
+        if result is not None:
+            yield check.name, result

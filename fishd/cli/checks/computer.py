@@ -1,0 +1,131 @@
+"""Checks of the computer: model, power, disk, and the folder of calibrations."""
+
+import os
+import shutil
+from pathlib import Path
+
+from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
+from fishd.errors import ConfigError
+from fishd.hardware.calibration import CalibrationFolder, ForceCalibration, ServoCalibration
+from fishd.robots import state_folder
+
+LITTLE_DISK, NO_DISK = 1e9, 50e6
+"""Free space that is worth a warning, and that is too little [bytes]."""
+_THROTTLED = "/sys/devices/platform/soc/soc:firmware/get_throttled"
+_BEFORE = 16
+"""A flag of what happened since start is so many bits above that of what happens now."""
+
+
+def model(context: Context) -> Result:
+    """Robot `pi` is for a Raspberry Pi."""
+    if "Raspberry Pi" in context.model:
+        return ok(context.model)
+    return warning(
+        f"this machine is no Raspberry Pi: {context.model or 'it does not say what it is'}",
+        "run fishd on the Pi, or set robot: simulated or virtual-pi",
+    )
+
+
+def power(context: Context) -> Result:
+    """What the firmware says, or the kernel's own under-voltage alarm."""
+    text = context.text(_THROTTLED)
+    if text:
+        return _firmware(int(text, 16))
+    for monitor in sorted(context.path("/sys/class/hwmon").glob("hwmon*")):
+        name = context.text(f"/sys/class/hwmon/{monitor.name}/name")
+        if name == "rpi_volt":
+            if context.text(f"/sys/class/hwmon/{monitor.name}/in0_lcrit_alarm") == "1":
+                return _UNDER_VOLTAGE
+            return ok("no under-voltage")
+    return skipped("this machine does not tell whether its power suffices")
+
+
+def _firmware(flags: int) -> Result:
+    if flags & 1:
+        return _UNDER_VOLTAGE
+    now = [text for bit, text in _FLAGS.items() if flags >> bit & 1]
+    if now:
+        return warning(f"the Pi is {' and '.join(now)}", "cool it, and check its power supply")
+    before = [text for bit, text in _FLAGS.items() if flags >> bit + _BEFORE & 1]
+    if before:
+        return warning(
+            f"since it was started, the Pi has been {' and '.join(before)}",
+            "cool it, and check its power supply; give the servo a supply of its own",
+        )
+    return ok("no under-voltage, not throttled")
+
+
+_FLAGS = {0: "under-voltage", 1: "slowed down", 2: "throttled", 3: "too hot"}
+_UNDER_VOLTAGE = fail(
+    "under-voltage: the Pi gets less than 4.63 V",
+    "use a stronger power supply and a shorter cable; give the servo a supply of its own",
+)
+
+
+def state(context: Context) -> Result:
+    """Calibrations and whatever else outlives the daemon are kept there."""
+    if context.running and context.running.calibrations:
+        return skipped("fishd is running: it writes to its own folder")
+    folder = state_folder(context.config)
+    there = _nearest(folder)
+    if not there.is_dir():
+        return fail(
+            f"{there} is no folder", f"move it away, or set state_folder; {folder} is needed"
+        )
+    if not os.access(there, os.W_OK | os.X_OK):
+        return fail(
+            f"{folder}: no permission to write to {there}",
+            "run this as the user of fishd (sudo -u fishd fishctl doctor), or set state_folder",
+        )
+    return ok(f"{folder}" + ("" if folder.exists() else ", which will be made when it is needed"))
+
+
+def disk(context: Context) -> Result:
+    """A full disk loses calibrations and logs."""
+    there = _nearest(state_folder(context.config))
+    free = shutil.disk_usage(there).free
+    message = f"{free / 1e9:.1f} GB free at {there}"
+    mend = "remove old recordings and logs (journalctl --vacuum-size=100M)"
+    if free < NO_DISK:
+        return fail(message, mend)
+    return warning(message, mend) if free < LITTLE_DISK else ok(message)
+
+
+def calibrations(context: Context) -> Result:
+    """Both calibrations that are, or would be, in force."""
+    if context.running and context.running.calibrations:
+        found = context.running.calibrations
+        force, servo = found.force.date, found.servo.date
+    else:
+        folder = CalibrationFolder(state_folder(context.config))
+        try:
+            newest_force = folder.newest(ForceCalibration)
+            newest_servo = folder.newest(ServoCalibration)
+        except ConfigError as error:
+            return fail(str(error), "mend that file, or remove it: the one before is then in force")
+        force = newest_force[0].date if newest_force else ""
+        servo = newest_servo[0].date if newest_servo else ""
+    if not force:
+        return warning(
+            "the force sensor is not calibrated: forces are volts", "fishctl calibrate force"
+        )
+    if not servo:
+        return warning(
+            f"force of {force}; the servo has no calibration but the configuration's",
+            "fishctl calibrate servo",
+        )
+    return ok(f"force of {force}, servo of {servo}")
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the nearest above it that exists."""
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+CHECKS = (
+    Check("model", model, ("pi",)),
+    Check("power", power, ("pi",)),
+    Check("state folder", state, ("pi", "virtual-pi")),
+    Check("disk", disk),
+    Check("calibrations", calibrations, ("pi", "virtual-pi")),
+)

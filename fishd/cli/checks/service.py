@@ -1,0 +1,87 @@
+"""Checks of the daemon: whether it runs, its addresses, and its systemd unit."""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import zmq
+
+from fishd import addresses
+from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
+from fishd.errors import StartupError
+
+UNIT = "fishd.service"
+_UNIT_FOLDERS = ("/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/lib/systemd/system")
+
+
+def daemon(context: Context) -> Result:
+    """Whether one runs, and what it is doing."""
+    if context.running is None:
+        return ok("no fishd is running")
+    status, endpoint = context.running.status, context.running.endpoint
+    message = f"fishd {status.version} (pid {status.pid}), robot {status.robot}, {status.mode}"
+    if status.robot != context.config.robot:
+        return warning(
+            f"{message}; this configuration is for robot {context.config.robot}",
+            f"check the configuration of the fishd at {endpoint}: --config FILE",
+        )
+    if status.reason:
+        return fail(
+            f"{message}: {status.reason.code}: {status.reason.message}",
+            "mend the cause, then fishctl clear-fault",
+        )
+    if status.degraded:
+        return warning(f"{message}; {'; '.join(status.degraded)}", "see docs/troubleshooting.md")
+    return ok(message)
+
+
+def telemetry(context: Context) -> Result:
+    """Free, or the daemon's."""
+    return _address(context, context.config.telemetry.address, "telemetry.address", zmq.PUB)
+
+
+def control(context: Context) -> Result:
+    """Free, or the daemon's."""
+    served = context.running.endpoint if context.running else None
+    try:
+        address = context.config.control.address or served or addresses.control_address()
+    except StartupError as error:
+        return fail(str(error), "remove that folder, or set control.address")
+    return _address(context, address, "control.address", zmq.ROUTER)
+
+
+def unit(context: Context) -> Result:
+    """Installed and enabled, by the files that systemd goes by."""
+    if not context.path("/run/systemd/system").is_dir():
+        return skipped("systemd does not run on this machine")
+    found = [folder for folder in _UNIT_FOLDERS if context.path(f"{folder}/{UNIT}").exists()]
+    if not found:
+        return warning(
+            f"{UNIT} is not installed: fishd does not start by itself", "make install-pi"
+        )
+    wants = context.path(_UNIT_FOLDERS[0]).glob(f"*.wants/{UNIT}")
+    if not any(True for _ in wants):
+        return warning(f"{UNIT} is not enabled", f"sudo systemctl enable --now {UNIT}")
+    return ok(f"{Path(found[0]) / UNIT}, enabled")
+
+
+def _address(context: Context, address: str, key: str, kind: int) -> Result:
+    running = context.running
+    if running and address in (running.status.telemetry, running.endpoint):
+        return ok(f"{address} is served by the running fishd")
+    context_of_sockets: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with ExitStack() as stack:
+        stack.callback(context_of_sockets.destroy, linger=0)
+        try:
+            stack.enter_context(addresses.claimed(address))
+            addresses.bind(context_of_sockets.socket(kind), address, key)
+        except StartupError as error:
+            return fail(str(error), f"stop what uses it, or set {key} to another address")
+    return ok(f"{address} is free")
+
+
+CHECKS = (
+    Check("daemon", daemon),
+    Check("telemetry", telemetry),
+    Check("control", control),
+    Check("systemd", unit, ("pi",)),
+)

@@ -1,0 +1,104 @@
+"""Checks of what drives the servo: pigpiod, the kernel's PWM, or GPIO pins."""
+
+import re
+import time
+
+from msgspec.structs import replace
+
+from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
+from fishd.clock import SystemClock
+from fishd.errors import ServoError
+
+SLOW_ANSWER = 5e-3
+"""An answer of pigpiod that takes longer may keep a tick waiting [s]."""
+EXPORT_PATIENCE = 2.0
+"""How long udev may take to hand over a new PWM channel [s]."""
+_LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
+
+
+def pigpiod(context: Context) -> Result | None:
+    """Through the client that fishd itself uses, whose every step has a time limit."""
+    settings = context.config.servo
+    if settings.driver != "pigpio":
+        return None
+    if context.config.robot == "pi" and "Raspberry Pi 5" in context.model:
+        return fail("pigpio does not work on a Pi 5", "set servo.driver: sysfs-pwm")
+    from fishd.hardware.pigpio_client import opened
+
+    virtual = context.config.robot == "virtual-pi"
+    try:
+        with opened(settings.pigpio) as client:
+            began = time.monotonic()
+            version = client.get_pigpio_version()
+            took = time.monotonic() - began
+    except ServoError as error:
+        frozen = "answer" in str(error)
+        if virtual:
+            mend = "fishctl virtual-pi run; its port must be that of servo.pigpio.port"
+        elif frozen:
+            mend = "sudo systemctl restart pigpiod"
+        else:
+            mend = "sudo systemctl enable --now pigpiod (not in Debian 13: servo.driver sysfs-pwm)"
+        return fail(str(error), mend)
+    message = f"version {version} answers in {took * 1e3:.2f} ms"
+    if took > SLOW_ANSWER:
+        return warning(f"{message}: too slow for a tick", "see what else loads this machine")
+    return ok(message)
+
+
+def pwm(context: Context) -> Result | None:
+    """Open the channel as fishd does, and leave everything as it was."""
+    settings = context.config.servo
+    if settings.driver != "sysfs-pwm":
+        return None
+    if context.running:
+        return skipped("fishd is running and owns the channel; see daemon")
+    from fishd.hardware.pwm_channel import PwmChannel
+
+    root = str(context.path(settings.sysfs.root))
+    channel = PwmChannel(replace(settings, sysfs=replace(settings.sysfs, root=root)), SystemClock())
+    try:
+        channel.open(EXPORT_PATIENCE)
+        duty = channel.read("enable") and channel.read("duty_cycle")
+    except ServoError as error:
+        return fail(
+            str(error), "do as it says, and restart; 'make install-pi' gives group pwm its files"
+        )
+    finally:
+        channel.close()
+        if channel.exported:
+            channel.unexport()
+    if duty:
+        return warning(f"{channel.path}: pulses are on, but no fishd is running", "fishctl release")
+    return ok(f"{channel.path} may be written to")
+
+
+def pins(context: Context) -> Result | None:
+    """Who holds the pins that are configured, as far as the kernel knows."""
+    config = context.config
+    wanted = {config.panel.estop_gpio: "panel.estop_gpio", config.panel.led_gpio: "panel.led_gpio"}
+    wanted[config.servo.gpio] = "servo.gpio"
+    wanted.pop(None, None)
+    text = context.text("/sys/kernel/debug/gpio")
+    if not text:
+        return skipped("only root can see who uses GPIO pins: sudo fishctl doctor")
+    if context.running:
+        return skipped("fishd is running and uses its pins")
+    users = {int(found["pin"]): found["user"].strip() for found in _LINE.finditer(text)}
+    taken = [
+        f"GPIO{pin} ({key}) is used by {users[pin]}"
+        for pin, key in wanted.items()
+        if pin is not None and users.get(pin)
+    ]
+    if taken:
+        return warning(
+            "; ".join(taken), "stop that program, remove its dtoverlay, or choose another pin"
+        )
+    return ok(", ".join(f"GPIO{pin}" for pin in wanted) + " free")
+
+
+CHECKS = (
+    Check("pigpiod", pigpiod, ("pi", "virtual-pi")),
+    Check("pwm", pwm, ("pi", "virtual-pi")),
+    Check("gpio pins", pins, ("pi",)),
+)

@@ -1,0 +1,124 @@
+"""Checks of fishd's own software: Python, packages, configuration file."""
+
+import importlib
+import re
+import stat
+import sys
+from importlib import metadata
+
+from fishd.cli.checks.base import Check, Context, Result, fail, ok, warning
+
+_MODULES = {
+    "adafruit-circuitpython-ads1x15": "adafruit_ads1x15",
+    "adafruit-extended-bus": "adafruit_extended_bus",
+    "pyyaml": "yaml",
+    "pyzmq": "zmq",
+}
+"""Where the module has another name than its package."""
+_REQUIREMENT = re.compile(
+    r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(;.*extra == [\"'](?P<extra>.+)[\"'])?"
+)
+_BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
+
+
+def configuration(context: Context) -> Result:
+    """That it is valid is known by now; whether strangers may change it is not."""
+    file = context.file
+    if file is None:
+        return ok(f"the defaults: robot {context.config.robot}; --config FILE to check a file")
+    try:
+        mode = file.stat().st_mode
+    except OSError as error:
+        return warning(f"{file}: {error.strerror}", "give a file that exists")
+    if mode & stat.S_IWOTH:
+        return warning(
+            f"{file}: good, but everybody on this machine may change it", f"chmod o-w {file}"
+        )
+    return ok(f"{file}: good, robot {context.config.robot}")
+
+
+def packages(context: Context) -> Result:
+    """Those that this configuration needs, as fishd's own metadata demands them."""
+    robot, servo = context.config.robot, context.config.servo
+    real = robot != "simulated"
+    wanted = []
+    for text in metadata.requires("fishd") or []:
+        found = _REQUIREMENT.match(text)
+        assert found
+        name, extra = found["name"].lower(), found["extra"]
+        if extra is None or (
+            extra == "pi" and real and (name != "pigpio" or _uses_pigpio(context))
+        ):
+            wanted.append((name, found["bounds"]))
+    problems = [problem for name, bounds in wanted if (problem := _problem(name, bounds))]
+    if problems:
+        extra = "fishd[pi]" if real else "fishd"
+        return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
+    driver = f" and servo driver {servo.driver}" if real else ""
+    return ok(f"all {len(wanted)} that robot {robot}{driver} needs, under {sys.executable}")
+
+
+def gpio_package(context: Context) -> Result | None:
+    """RPi.GPIO and rpi-lgpio overwrite each other."""
+    panel = context.config.panel
+    pins = context.config.servo.driver == "rpi-gpio" or {panel.estop_gpio, panel.led_gpio} != {None}
+    installed = {
+        name
+        for d in metadata.distributions()
+        if (name := d.name.lower().replace(".", "-")) in _GPIO
+    }
+    pip = f"{sys.executable} -m pip"
+    if len(installed) > 1:
+        right = "rpi-lgpio" if "Raspberry Pi 5" in context.model else "the one for this Pi"
+        return fail(
+            "RPi.GPIO and rpi-lgpio are both installed, and overwrite each other",
+            f"{pip} uninstall RPi.GPIO rpi-lgpio; then install {right}",
+        )
+    if not pins:
+        return None
+    if not installed:
+        return fail(
+            "neither RPi.GPIO nor rpi-lgpio is installed, but the configuration uses GPIO pins",
+            f"{pip} install 'fishd[rpi-lgpio]' (Pi 5, Debian 13) or 'fishd[rpi-gpio]'",
+        )
+    if "rpi-gpio" in installed and "Raspberry Pi 5" in context.model:
+        return fail(
+            "RPi.GPIO does not work on a Pi 5",
+            f"{pip} uninstall RPi.GPIO; {pip} install 'fishd[rpi-lgpio]'",
+        )
+    return ok(" and ".join(sorted(_GPIO[name] for name in installed)))
+
+
+_GPIO = {"rpi-gpio": "RPi.GPIO", "rpi-lgpio": "rpi-lgpio"}
+
+
+def _uses_pigpio(context: Context) -> bool:
+    return context.config.servo.driver == "pigpio"
+
+
+def _problem(name: str, bounds: str) -> str:
+    """What is wrong with an installed package; empty if nothing is."""
+    try:
+        version = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return f"{name} is not installed"
+    for relation, bound in _BOUND.findall(bounds):
+        mine, limit = _numbers(version), _numbers(bound)
+        if (relation == ">=" and mine < limit) or (relation == "<" and mine >= limit):
+            return f"{name} is {version}, {relation} {bound} is needed"
+    try:
+        importlib.import_module(_MODULES.get(name, name))
+    except Exception as error:
+        return f"{name} cannot be imported: {type(error).__name__}: {error}"
+    return ""
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in re.findall(r"\d+", version)]
+
+
+CHECKS = (
+    Check("configuration", configuration),
+    Check("packages", packages),
+    Check("gpio package", gpio_package, ("pi",)),
+)

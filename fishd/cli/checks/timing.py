@@ -1,0 +1,105 @@
+"""Checks of what makes ticks late, and of the clock that stamps them."""
+
+import ctypes
+import getpass
+import resource
+import subprocess
+import sys
+
+from fishd.cli.checks.base import Check, Context, Result, ok, skipped, warning
+
+_TRY = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
+ENOUGH_MEMORY = 512 * 2**20
+"""Limit on locked memory that is no limit to fishd [bytes]."""
+_CAP_IPC_LOCK = 14
+_UNSYNCHRONISED = 0x40
+_TIME_ERROR = 5
+
+
+def realtime(context: Context) -> Result:
+    """Try it, in a process that ends at once."""
+    priority = context.config.realtime.priority
+    if not priority:
+        return ok("not asked for (realtime.priority: 0)")
+    if context.running:
+        if context.running.status.realtime:
+            return ok("the running fishd has real-time scheduling")
+        return warning("the running fishd has no real-time scheduling", _PRIVILEGE)
+    tried = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", _TRY, str(priority)], capture_output=True, check=False
+    )
+    if tried.returncode == 0:
+        return ok(f"SCHED_FIFO {priority} is permitted")
+    return warning(
+        f"user {getpass.getuser()} may not use SCHED_FIFO {priority}: ticks come late under load",
+        _PRIVILEGE,
+    )
+
+
+def memory(context: Context) -> Result:
+    """Locked memory is never waited for."""
+    if not context.config.realtime.lock_memory:
+        return ok("not to be locked (realtime.lock_memory: false)")
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    capabilities = [
+        int(line.split()[1], 16)
+        for line in context.text("/proc/self/status").splitlines()
+        if line.startswith("CapEff:")
+    ]
+    privileged = any(mask >> _CAP_IPC_LOCK & 1 for mask in capabilities)
+    if privileged or limit == resource.RLIM_INFINITY or limit >= ENOUGH_MEMORY:
+        return ok("may be locked")
+    return warning(
+        f"user {getpass.getuser()} may lock only {limit // 1024} kB of memory: a tick may wait for "
+        "the disk",
+        "run fishd as its systemd service, or allow 'memlock unlimited' in "
+        "/etc/security/limits.d/fishd.conf",
+    )
+
+
+def governor(context: Context) -> Result:
+    """A processor that first has to speed up makes ticks late."""
+    names = {
+        context.text(f"/sys/devices/system/cpu/{cpu.parent.name}/cpufreq/scaling_governor")
+        for cpu in context.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq")
+    } - {""}
+    if not names:
+        return skipped("this machine does not say how it chooses its speed")
+    if names == {"performance"}:
+        return ok("performance")
+    return warning(
+        f"{', '.join(sorted(names))}: the processor slows down between ticks",
+        "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor "
+        "(cpufrequtils makes it last)",
+    )
+
+
+def clock(context: Context) -> Result:
+    """Ticks are stamped with unix time; a Pi without a network starts in the past."""
+    if context.path("/run/systemd/timesync/synchronized").exists() or _kernel_is_synchronised():
+        return ok("synchronised")
+    return warning(
+        "the clock is not synchronised: times in telemetry and files may be wrong",
+        "sudo timedatectl set-ntp true, and see 'timedatectl'; or set it by hand",
+    )
+
+
+def _kernel_is_synchronised() -> bool:
+    # struct timex begins with modes, three longs and status; zero modes only ask.
+    timex = ctypes.create_string_buffer(512)
+    state = ctypes.CDLL(None).adjtimex(timex)
+    at = 5 * ctypes.sizeof(ctypes.c_long)
+    status = ctypes.c_int.from_buffer(timex, at).value
+    return 0 <= state < _TIME_ERROR and not status & _UNSYNCHRONISED
+
+
+_PRIVILEGE = (
+    "run fishd as its systemd service, or allow 'rtprio 50' in /etc/security/limits.d/fishd.conf"
+)
+
+CHECKS = (
+    Check("real time", realtime),
+    Check("memory", memory),
+    Check("governor", governor, ("pi",)),
+    Check("clock", clock),
+)

@@ -1,0 +1,73 @@
+"""`fishctl doctor`: looks at everything that fishd needs, and says how to mend what is wrong."""
+
+from collections import Counter
+from pathlib import Path
+
+import click
+from msgspec import Struct
+
+from fishd.cli.checks import examine
+from fishd.cli.checks.base import Context
+from fishd.cli.config import load_or_exit, set_option
+from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.output import print_json
+
+_COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "bright_black"}
+
+
+class Finding(Struct, frozen=True):
+    """One line of the report."""
+
+    check: str
+    level: str
+    """ok, warning, FAIL or skipped."""
+    message: str
+    mend: str
+    """How to mend it; empty where nothing is to be mended."""
+
+
+@click.command()
+@click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path),
+    help="YAML file of the daemon; without it, the defaults.",
+)
+@set_option
+@endpoint_option
+@json_option
+def doctor(
+    file: Path | None, overrides: tuple[str, ...], endpoint: str | None, as_json: bool
+) -> int:
+    """Check everything that fishd needs with this configuration, and say how to mend it.
+
+    Only what concerns the configured robot is checked. Nothing moves and nothing is changed; a
+    running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the
+    configuration is wrong.
+    """
+    config = load_or_exit(file, overrides)
+    context = Context(config, file, endpoint or config.control.address)
+    findings = []
+    for name, (level, message, mend) in examine(context):
+        finding = Finding(name, level, " ".join(message.split()), mend)
+        findings.append(finding)
+        if not as_json:
+            _print(finding)
+    counts = Counter(finding.level for finding in findings)
+    if as_json:
+        print_json(findings)
+    else:
+        click.echo(
+            f"robot {config.robot}: {counts['ok']} ok, {counts['warning']} warnings, "
+            f"{counts['FAIL']} failed, {counts['skipped']} skipped"
+        )
+        if config.robot == "simulated":
+            click.echo("a simulated fish needs no hardware, so none was checked")
+    return 1 if counts["FAIL"] else 0
+
+
+def _print(finding: Finding) -> None:
+    level = click.style(f"{finding.level:<8}", fg=_COLOURS[finding.level])
+    click.echo(f"{level} {finding.check:<14} {finding.message}")
+    if finding.mend:
+        click.echo(f"{'':<24}{finding.mend}")

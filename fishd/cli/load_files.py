@@ -1,0 +1,92 @@
+"""CSV files of loads for `fishctl calibrate force`: read as a plan or a measurement, written."""
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+
+from fishd.hardware.calibration import ForceSample
+
+G0 = 9.80665
+"""Standard gravity [m/s²]: the weight of a gram is G0 millinewtons."""
+NEWTONS = {"N": 1.0, "g": G0 * 1e-3}
+"""One of each unit, in newtons."""
+
+
+class Step(NamedTuple):
+    """One line of a file: forces [N], and voltages [V] where they were measured."""
+
+    fx: float
+    fy: float
+    volts: tuple[float, float] | None
+
+
+def read(path: Path, unit: str) -> list[Step]:
+    """The loads of a file with columns fx_N and fy_N (or _g, or none: then in `unit`), vx_V, vy_V.
+
+    Raises `click.ClickException` with one line that names file and line.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            names = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = names
+            columns = _columns(path, names, unit)
+            steps = [_step(f"{path}:{reader.line_num}", row, columns) for row in reader]
+    except OSError as error:
+        raise click.ClickException(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise click.ClickException(f"{path}: not a CSV file in UTF-8: {error}") from None
+    if not steps:
+        raise click.ClickException(f"{path}: there is no load in it")
+    return steps
+
+
+def write(path: Path, measured: Sequence[tuple[tuple[float, float], ForceSample]]) -> None:
+    """Write loads [N] and what was measured [V], as `read` takes it."""
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["fx_N", "fy_N", "vx_V", "vy_V", "vx_std_V", "vy_std_V", "pairs"])
+            for (fx, fy), sample in measured:
+                volts = (sample.vx, sample.vy, sample.vx_std, sample.vy_std)
+                writer.writerow([*(f"{value:.9g}" for value in (fx, fy, *volts)), sample.pairs])
+    except OSError as error:
+        raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, float]]:
+    """For each quantity the column that holds it, and one of the column in SI."""
+    columns = {}
+    for quantity in ("fx", "fy"):
+        spellings = {f"{quantity}_{each}": factor for each, factor in NEWTONS.items()}
+        spellings[quantity] = NEWTONS[unit]
+        found = [(name, spellings[name]) for name in names if name in spellings]
+        if len(found) != 1:
+            raise click.ClickException(
+                f"{path}:1: one column {quantity}_N or {quantity}_g is needed, such as in the "
+                "header fx_N,fy_N,vx_V,vy_V"
+            )
+        columns[quantity] = found[0]
+    measured = [name for name in ("vx_V", "vy_V") if name in names]
+    if len(measured) == 1:
+        raise click.ClickException(f"{path}:1: vx_V and vy_V are needed, or neither for a plan")
+    columns.update({name[:2]: (name, 1.0) for name in measured})
+    return columns
+
+
+def _step(where: str, row: dict[str, str], columns: dict[str, tuple[str, float]]) -> Step:
+    values = {}
+    for quantity, (column, factor) in columns.items():
+        text = row[column]
+        try:
+            values[quantity] = float(text) * factor
+        except (TypeError, ValueError):
+            values[quantity] = math.nan
+        if not math.isfinite(values[quantity]):
+            raise click.ClickException(f"{where}: {column}: '{text or ''}' is not a number")
+    volts = (values["vx"], values["vy"]) if "vx" in values else None
+    return Step(values["fx"], values["fy"], volts)

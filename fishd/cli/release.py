@@ -1,0 +1,49 @@
+"""`fishctl release`: the last resort, when fishd can no longer let go of the servo itself."""
+
+import os
+from pathlib import Path
+
+import click
+from msgspec.structs import replace
+
+from fishd.cli.config import load_or_exit, set_option
+from fishd.config import Config
+from fishd.errors import ConfigError
+from fishd.hardware.base import CalibratedServo
+
+
+@click.command()
+@click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path),
+    help="YAML file of the daemon; without it, the defaults.",
+)
+@set_option
+def release(file: Path | None, overrides: tuple[str, ...]) -> None:
+    """Send the servo to neutral and stop its pulses, without the daemon.
+
+    systemd runs this when the service has ended (ExecStopPost). A servo without pulses is left
+    alone. Exit status 1 when the servo cannot be reached.
+    """
+    config = load_or_exit(file, overrides)
+    ended = os.environ.get("SERVICE_RESULT")
+    why = f"the service ended with '{ended}': " if ended else ""
+    if config.robot == "simulated":
+        click.echo(f"{why}a simulated fish has nothing to release")
+        return
+    done = _open(config).neutralise()
+    click.echo(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
+
+
+def _open(config: Config) -> CalibratedServo:
+    """The servo, even if its calibration cannot be read: neutral may then be off by the trim."""
+    from fishd.clock import SystemClock
+    from fishd.robots import open_servo
+
+    clock = SystemClock()
+    try:
+        return open_servo(config, clock, threaded=False)
+    except ConfigError as error:
+        click.echo(f"fishctl: {error}; going on without it", err=True)
+        return open_servo(replace(config, state_folder=os.devnull), clock, threaded=False)

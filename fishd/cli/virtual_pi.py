@@ -1,0 +1,195 @@
+"""Verbs that run a virtual Raspberry Pi and break it."""
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from fishd import realtime
+from fishd.addresses import virtual_pi_socket
+from fishd.cli.config import load_or_exit, set_option
+from fishd.cli.options import json_option
+from fishd.cli.output import print_json
+from fishd.config import Config
+from fishd.console import complain
+from fishd.emulation.faults import FAULTS
+from fishd.emulation.link import RemotePi
+from fishd.emulation.link_server import LinkServer
+from fishd.emulation.punctual_clock import PunctualClock
+from fishd.emulation.virtual_pi import PiState, VirtualPi
+
+CHIP_PRIORITY = 60
+"""SCHED_FIFO priority of a virtual Pi, above that of the fishd that drives it."""
+
+
+def config_options(function: Any) -> Any:
+    """`--config` and `--set`: those of the fishd that uses this virtual Pi."""
+    option = click.option(
+        "--config",
+        "file",
+        type=click.Path(path_type=Path),
+        help="YAML file, the same as for fishd; without it, the defaults.",
+    )
+    return option(set_option(function))
+
+
+def _complete(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    return [CompletionItem(n, help=a) for n, a in FAULTS.items() if n.startswith(incomplete)]
+
+
+@contextmanager
+def _remote(config: Config) -> Iterator[RemotePi]:
+    """The virtual Pi that is running; what it refuses is one line and exit status 2."""
+    with RemotePi(virtual_pi_socket(config.virtual_pi.socket)) as pi:
+        try:
+            yield pi
+        except ValueError as error:
+            complain("fishctl", str(error), 2)
+        except OSError as error:
+            complain("fishctl", error.strerror or str(error), 1)
+
+
+@click.group()
+def virtual_pi() -> None:
+    """Run a virtual Raspberry Pi with sensor, servo and fish, and break it.
+
+    fishd drives it with robot: virtual-pi, through the very drivers of the robot.
+    """
+
+
+@virtual_pi.command()
+@config_options
+def run(file: Path | None, overrides: tuple[str, ...]) -> None:
+    """Run a virtual Pi until Ctrl-C or SIGTERM."""
+    config = load_or_exit(file, overrides)
+    with contextlib.suppress(OSError):  # where permitted: chips do not wait for a busy machine
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(CHIP_PRIORITY))
+    realtime.enter(priority=0, lock_memory=False)  # for the sleeps that stand for bus time
+    settings = config.virtual_pi
+    path = virtual_pi_socket(settings.socket)
+    pi = VirtualPi(settings, config.plant, config.simulation, config.tick, PunctualClock())
+    with _signals() as stopped, LinkServer(pi, path):
+        click.echo(
+            f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
+            f"pigpiod on 127.0.0.1:{pi.pigpiod.port} with the servo on GPIO {settings.servo_gpio}"
+        )
+        sys.stdout.flush()
+        realtime.quiet_garbage_collector()
+        while not stopped(1.0):
+            realtime.collect_garbage()
+            state = pi.state()  # also lets the fish swim on while nobody reads the sensor
+            if sys.stdout.isatty():
+                click.echo(_line(state))
+
+
+@virtual_pi.command()
+@click.argument("name", shell_complete=_complete)
+@click.option("--seconds", type=float, help="How long it lasts; without this, until 'clear'.")
+@config_options
+def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple[str, ...]) -> None:
+    """Let the fault NAME begin; 'fishctl virtual-pi faults' lists them."""
+    with _remote(load_or_exit(file, overrides)) as pi:
+        pi.inject(name, seconds)
+
+
+@virtual_pi.command()
+@click.argument("name", required=False, shell_complete=_complete)
+@config_options
+def clear(name: str | None, file: Path | None, overrides: tuple[str, ...]) -> None:
+    """End the fault NAME, or all faults."""
+    with _remote(load_or_exit(file, overrides)) as pi:
+        pi.clear(name)
+
+
+@virtual_pi.command()
+@json_option
+def faults(as_json: bool) -> None:
+    """List the faults that can be injected."""
+    if as_json:
+        print_json(FAULTS)
+        return
+    for name, about in FAULTS.items():
+        click.echo(f"{click.style(f'{name:<18}', bold=True)}{about}")
+
+
+@virtual_pi.command()
+@config_options
+@json_option
+def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Show pulses, fish and faults of the virtual Pi that is running."""
+    with _remote(load_or_exit(file, overrides)) as pi:
+        state = pi.state()
+    if as_json:
+        print_json(state)
+        return
+    truth = state.truth
+    rows = [
+        ("pulses", _pulses(state)),
+        ("wheel", f"{truth.phi:+.3f} rad"),
+        ("fin", f"{truth.alpha:+.3f} rad, {truth.alpha_rate:+.2f} rad/s"),
+        ("faults", _active(state) or "none"),
+        ("pigpiod", f"127.0.0.1:{state.pigpio_port}"),
+    ]
+    click.echo("\n".join(f"{label:<12}{text}" for label, text in rows))
+
+
+@virtual_pi.command()
+@config_options
+def press(file: Path | None, overrides: tuple[str, ...]) -> None:
+    """Press the E-stop button and keep it pressed."""
+    _set_button(load_or_exit(file, overrides), pressed=True)
+
+
+@virtual_pi.command()
+@config_options
+def unpress(file: Path | None, overrides: tuple[str, ...]) -> None:
+    """Let the E-stop button go."""
+    _set_button(load_or_exit(file, overrides), pressed=False)
+
+
+@contextmanager
+def _signals() -> Iterator[Callable[[float], bool]]:
+    """Lets one wait so many seconds for SIGINT or SIGTERM; True once it has come."""
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        signal.set_wakeup_fd(writer.fileno())
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: None)
+        yield lambda seconds: bool(select.select([reader], [], [], seconds)[0])
+        signal.set_wakeup_fd(-1)
+
+
+def _set_button(config: Config, pressed: bool) -> None:
+    panel = config.panel
+    if panel.estop_gpio is None:
+        complain("fishctl", "panel.estop_gpio is null: the configuration has no E-stop button", 1)
+    with _remote(config) as pi:
+        pi.set_level(panel.estop_gpio, int(pressed == (panel.estop_pressed == "high")))
+
+
+def _line(state: PiState) -> str:
+    faults = _active(state)
+    return f"pulses {_pulses(state):<24} fin {state.truth.alpha:+.3f} rad" + (
+        f"  faults: {faults}" if faults else ""
+    )
+
+
+def _pulses(state: PiState) -> str:
+    return "none" if state.angle is None else f"{state.pulse:.0f} µs, {state.angle:+.3f} rad"
+
+
+def _active(state: PiState) -> str:
+    return ", ".join(
+        name if left is None else f"{name} ({left:.1f} s left)"
+        for name, left in state.faults.items()
+    )

@@ -1,0 +1,123 @@
+"""An I2C bus: carries transfers to the emulated chips, takes as long as a real one, and fails.
+
+Both front ends, `linux_i2c` and `busio_i2c`, end in `I2cBus.transfer`.
+"""
+
+import errno
+import os
+import threading
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from fishd.clock import Clock
+from fishd.emulation.faults import TRANSFER_ERRORS, Faults
+
+
+class Write(NamedTuple):
+    """Bytes to a device; none at all is a probe."""
+
+    data: bytes
+
+
+class Read(NamedTuple):
+    """So many bytes from a device."""
+
+    length: int
+
+
+Message = Write | Read
+
+
+class I2cDevice(Protocol):
+    """A chip on the bus. Each method raises OSError EREMOTEIO to withhold the acknowledge."""
+
+    def write(self, data: bytes) -> None:
+        """Take what a master writes."""
+
+    def read(self, length: int) -> bytes:
+        """Give `length` bytes."""
+
+    def general_call(self, data: bytes) -> None:
+        """Take what a master writes to all chips at once."""
+
+
+def kernel_error(number: int) -> OSError:
+    """An error as the kernel gives it; EREMOTEIO is a missing acknowledge."""
+    return OSError(number, os.strerror(number))
+
+
+class I2cBus:
+    """One master and its chips; transfers from several threads queue.
+
+    Lets time pass on its clock: nine bits per byte, addresses included, start and stop, and the
+    kernel's own time. The chips see the messages at the end of the transfer.
+    """
+
+    OVERHEAD = 50e-6
+    """Time that the kernel adds to each transfer [s]."""
+
+    def __init__(
+        self, clock: Clock, speed: float, faults: Faults, kernel_timeout: float = 1.0
+    ) -> None:
+        """`speed` in bit/s; `kernel_timeout` [s]: how long the kernel waits for a hanging bus."""
+        self.timeout = kernel_timeout
+        self._clock = clock
+        self._speed = speed
+        self._faults = faults
+        self._devices: dict[int, I2cDevice] = {}
+        self._lock = threading.Lock()
+
+    def attach(self, address: int, device: I2cDevice) -> None:
+        """Put a chip on the bus; ValueError if the address is taken or is none of a chip."""
+        if not 0x08 <= address <= 0x77:
+            raise ValueError(f"address {address:#04x} is not valid: 0x08 to 0x77 is needed")
+        if address in self._devices:
+            raise ValueError(f"address {address:#04x} is taken by another chip on the bus")
+        self._devices[address] = device
+
+    def transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
+        """Carry out one transfer; the bytes of each `Read`.
+
+        Raises OSError as the kernel does: 121 no acknowledge, 110 (TimeoutError) after `timeout`,
+        5 clock held too long, 16 bus owned, 11 (BlockingIOError) arbitration lost. A transfer that
+        fails may have reached the chip in part or in full.
+        """
+        with self._lock:
+            error = self._faults.transfer_error()
+            reached = messages[: self._reach(error, len(messages))]
+            self._clock.sleep(self.OVERHEAD + self._time_on_wire(reached))
+            replies = [self._carry_out(address, message) for message in reached]
+            if error is None:
+                return [reply for reply in replies if reply is not None]
+            if error == "timeout":
+                self._clock.sleep(self.timeout)
+            raise kernel_error(TRANSFER_ERRORS[error])
+
+    def _reach(self, error: str | None, count: int) -> int:
+        """How many of the messages get through to the chip."""
+        if error is None:
+            return count
+        if error == "bus-owned":
+            return 0
+        if error == "nack":  # The message that nobody acknowledged did not get through.
+            return self._faults.random.randint(0, max(0, count - 1))
+        return self._faults.random.randint(0, count)
+
+    def _time_on_wire(self, messages: Sequence[Message]) -> float:
+        bits = 1  # stop
+        for message in messages:
+            length = len(message.data) if isinstance(message, Write) else message.length
+            bits += 1 + 9 * (1 + length)
+        return bits / self._speed
+
+    def _carry_out(self, address: int, message: Message) -> bytes | None:
+        if address == 0 and isinstance(message, Write) and self._devices:
+            for device in self._devices.values():
+                device.general_call(message.data)
+            return None
+        if address not in self._devices:
+            raise kernel_error(errno.EREMOTEIO)
+        if isinstance(message, Read):
+            return self._devices[address].read(message.length)
+        self._devices[address].write(message.data)
+        return None

@@ -1,0 +1,223 @@
+"""A stand-in for the C module lgpio: pins in memory, on which rpi-lgpio's RPi.GPIO runs unchanged.
+
+Its error numbers, modes and what it refuses are those of lgpio 0.2.2 on a chip that belongs to
+one process: a line that somebody else holds is busy.
+"""
+
+import os
+import sys
+from types import ModuleType, TracebackType
+from typing import Self
+
+from fishd.emulation.pins import (
+    ALERT,
+    INPUT,
+    LINES,
+    OUTPUT,
+    PULL_DOWN,
+    PULL_NONE,
+    PULL_UP,
+    Callback,
+    EdgeFunction,
+    Line,
+    Pins,
+)
+
+REVISION = "c03114"
+"""What rpi-lgpio takes for the Pi's revision: a Pi 4 B."""
+
+_KERNEL_OUTPUT = 2
+_EDGE_SHIFT = 17
+_CONSTANTS = {
+    "SET_PULL_UP": PULL_UP,
+    "SET_PULL_DOWN": PULL_DOWN,
+    "SET_PULL_NONE": PULL_NONE,
+    "RISING_EDGE": 1,
+    "FALLING_EDGE": 2,
+    "BOTH_EDGES": 3,
+    "GPIO_BUSY": -79,
+}
+_ERRORS = {
+    -5: "unknown handle",
+    -72: "bad event request",
+    -73: "bad GPIO number",
+    -78: "can not open gpiochip",
+    -79: "GPIO busy",
+    -80: "GPIO not allocated",
+    -98: "bad debounce microseconds",
+    -102: "bad PWM frequency",
+    -103: "bad PWM dutycycle",
+}
+
+
+class Error(Exception):
+    """As lgpio.error: no kind of OSError, and its text in quotes."""
+
+    def __str__(self) -> str:
+        return repr(self.args[0])
+
+
+class EmulatedLgpio:
+    """Puts the stand-in in place of lgpio until it is removed; a context manager, too."""
+
+    def __init__(self, pins: Pins) -> None:
+        self._pins = pins
+        self._modules: dict[str, ModuleType] = {}
+        self._revision: str | None = None
+
+    def install(self) -> None:
+        """From now on an import of RPi.GPIO finds the emulated pins, and a Pi 4 B around it."""
+        self._modules = _forget_modules()
+        sys.modules["lgpio"] = self._module()
+        self._revision = os.environ.get("RPI_LGPIO_REVISION")
+        os.environ["RPI_LGPIO_REVISION"] = REVISION
+
+    def remove(self) -> None:
+        """Everything as before."""
+        _forget_modules()
+        sys.modules.update(self._modules)
+        if self._revision is None:
+            os.environ.pop("RPI_LGPIO_REVISION", None)
+        else:
+            os.environ["RPI_LGPIO_REVISION"] = self._revision
+
+    def __enter__(self) -> Self:
+        self.install()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.remove()
+
+    def _module(self) -> ModuleType:
+        module = ModuleType("lgpio")
+        for name, value in _CONSTANTS.items():
+            setattr(module, name, value)
+        chip = _Chip(self._pins)
+        for name in dir(chip):
+            if not name.startswith("_"):
+                setattr(module, name, getattr(chip, name))
+        vars(module).update(error=Error, error_text=_ERRORS.get)
+        return module
+
+
+class _Chip:
+    """The functions of the module that RPi.GPIO uses."""
+
+    def __init__(self, pins: Pins) -> None:
+        self._pins = pins
+        self._open = False
+
+    def gpiochip_open(self, _number: int) -> int:
+        if not self._pins.present:
+            raise Error(_ERRORS[-78])
+        self._open = True
+        return 0
+
+    def gpiochip_close(self, handle: int) -> int:
+        for gpio in range(LINES):
+            self._free(self._line(handle, gpio))
+        self._open = False
+        return 0
+
+    def gpio_get_chip_info(self, _handle: int) -> list[object]:
+        return [0, LINES, "gpiochip0", "emulated"]
+
+    def gpio_get_mode(self, handle: int, gpio: int) -> int:
+        line = self._line(handle, gpio)
+        kernel = _KERNEL_OUTPUT if line.mode & OUTPUT else 0
+        return line.mode | kernel | line.pull | line.edges << _EDGE_SHIFT
+
+    def gpio_claim_input(self, handle: int, gpio: int, flags: int = 0) -> int:
+        self._claim(self._line(handle, gpio), INPUT).pull = flags
+        return 0
+
+    def gpio_claim_output(self, handle: int, gpio: int, level: int = 0, flags: int = 0) -> int:
+        line = self._line(handle, gpio)
+        if not line.mode & OUTPUT:  # one that is an output already keeps its level
+            self._claim(line, OUTPUT).pull = flags
+            self._drive(line, level)
+        return 0
+
+    def gpio_claim_alert(self, handle: int, gpio: int, edges: int, flags: int = 0) -> int:
+        if not self._pins.reports_edges:
+            raise Error(_ERRORS[-72])
+        line = self._claim(self._line(handle, gpio), ALERT)
+        line.pull, line.edges = flags, edges
+        return 0
+
+    def gpio_free(self, handle: int, gpio: int) -> int:
+        line = self._line(handle, gpio)
+        if not line.mode:
+            raise Error(_ERRORS[-80])
+        self._free(line)
+        return 0
+
+    def gpio_read(self, handle: int, gpio: int) -> int:
+        line = self._line(handle, gpio)
+        if not line.mode:
+            self._claim(line, INPUT)
+        return line.level()
+
+    def gpio_write(self, handle: int, gpio: int, level: int) -> int:
+        line = self._line(handle, gpio)
+        if not line.mode & OUTPUT:
+            self._claim(line, OUTPUT)
+        self._drive(line, level)
+        return 0
+
+    def gpio_set_debounce_micros(self, handle: int, gpio: int, micros: int) -> int:
+        self._line(handle, gpio)
+        if not 0 <= micros <= 5_000_000:
+            raise Error(_ERRORS[-98])
+        return 0
+
+    def tx_pwm(self, handle: int, gpio: int, frequency: float, duty_cycle: float) -> int:
+        line = self._line(handle, gpio)
+        if frequency == 0.0:
+            line.pwm = None
+            return 0
+        if not 0.1 <= frequency <= 10_000.0:
+            raise Error(_ERRORS[-102])
+        if not 0.0 <= duty_cycle <= 100.0:
+            raise Error(_ERRORS[-103])
+        if not line.mode & OUTPUT:
+            self._claim(line, OUTPUT)
+        line.pwm = (frequency, duty_cycle)
+        return 9  # entries left in its queue
+
+    def callback(self, _handle: int, gpio: int, func: EdgeFunction) -> Callback:
+        return Callback(self._pins, gpio, func)
+
+    def _line(self, handle: int, gpio: int) -> Line:
+        if handle != 0 or not self._open:
+            raise Error(_ERRORS[-5])
+        if not 0 <= gpio < LINES:
+            raise Error(_ERRORS[-73])
+        return self._pins.lines[gpio]
+
+    def _claim(self, line: Line, mode: int) -> Line:
+        if line.busy:
+            raise Error(_ERRORS[-79])
+        self._free(line)
+        line.mode = mode
+        return line
+
+    @staticmethod
+    def _drive(line: Line, level: int) -> None:
+        line.driven = int(bool(level))
+        line.writes.append(line.driven)
+
+    @staticmethod
+    def _free(line: Line) -> None:
+        line.mode, line.pull, line.edges, line.pwm = 0, PULL_NONE, 0, None
+
+
+def _forget_modules() -> dict[str, ModuleType]:
+    """Take lgpio and RPi.GPIO out of the imported modules; what was there."""
+    names = [name for name in sys.modules if name.partition(".")[0] in ("lgpio", "RPi")]
+    return {name: sys.modules.pop(name) for name in names}

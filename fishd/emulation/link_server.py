@@ -1,0 +1,169 @@
+"""Offers a virtual Pi to other processes on a Unix socket; `fishctl virtual-pi run` runs it."""
+
+import contextlib
+import errno
+import fcntl
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fishd.emulation.i2c import Message, Read, Write
+from fishd.emulation.link import (
+    LONG_POLL,
+    PACKET,
+    AnyRequest,
+    AwaitLevels,
+    Clear,
+    Done,
+    Failed,
+    Inject,
+    SetLevel,
+    SetTimeout,
+    Transfer,
+)
+from fishd.emulation.virtual_pi import VirtualPi
+from fishd.errors import StartupError
+
+
+class LinkServer:
+    """Runs a virtual Pi and serves it, a thread per connection; use it as a context manager."""
+
+    def __init__(self, pi: VirtualPi, path: Path) -> None:
+        self._pi = pi
+        self._path = path
+        self._connections: dict[socket.socket, threading.Thread] = {}
+        self._lock = threading.Lock()
+        self._stack = ExitStack()
+
+    def start(self) -> None:
+        """Start the virtual Pi and listen.
+
+        Raises `StartupError` when another one does already, or an address is no good.
+        """
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(_claimed(self._path))
+                stack.enter_context(self._pi)
+                self._path.unlink(missing_ok=True)  # of one that was killed
+                listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+                listener.bind(str(self._path))
+                stack.callback(self._path.unlink, missing_ok=True)
+                self._path.chmod(0o600)
+                listener.listen()
+            except OSError as error:
+                raise StartupError(
+                    f"virtual_pi.socket: cannot listen on {self._path}: "
+                    f"{error.strerror or error}; choose a path in a folder that exists"
+                ) from None
+            acceptor = threading.Thread(target=self._accept, args=(listener,), daemon=True)
+            acceptor.start()
+            stack.callback(self._hang_up)
+            stack.callback(acceptor.join)
+            stack.callback(_shut, listener)
+            self._stack = stack.pop_all()
+
+    def close(self) -> None:
+        """Hang up and stop the virtual Pi; may be called twice."""
+        self._stack.close()
+
+    def __enter__(self) -> "LinkServer":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _accept(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                connection, _ = listener.accept()
+            except OSError:  # closed
+                return
+            thread = threading.Thread(target=self._serve, args=(connection,), daemon=True)
+            with self._lock:
+                self._connections[connection] = thread
+            thread.start()
+
+    def _hang_up(self) -> None:
+        with self._lock:
+            connections = dict(self._connections)
+        for connection, thread in connections.items():
+            _shut(connection)
+            thread.join()
+
+    def _serve(self, connection: socket.socket) -> None:
+        decode = msgspec.msgpack.Decoder(AnyRequest).decode
+        encode = msgspec.msgpack.Encoder().encode
+        with connection:
+            try:
+                while packet := connection.recv(PACKET):
+                    connection.send(encode(self._answer(decode, packet)))
+            except OSError:  # the client went away before it had its reply
+                pass
+            finally:
+                with self._lock:
+                    del self._connections[connection]
+
+    def _answer(self, decode: Any, packet: bytes) -> Done | Failed:
+        try:
+            return Done(self._perform(decode(packet)))
+        except OSError as error:
+            number = error.errno or errno.EIO
+            return Failed(number, error.strerror or os.strerror(number))
+        except (ValueError, msgspec.MsgspecError) as error:
+            return Failed(0, str(error))
+
+    def _perform(self, request: AnyRequest) -> Any:
+        pi = self._pi
+        match request:
+            case Transfer(address, messages):
+                return pi.bus.transfer(address, [_message(spoken) for spoken in messages])
+            case SetTimeout(seconds):
+                pi.bus.timeout = seconds
+            case Inject(name, seconds):
+                pi.faults.inject(name, seconds)
+            case Clear(name):
+                pi.faults.clear(name)
+            case SetLevel(gpio, level):
+                pi.set_level(gpio, level)
+            case AwaitLevels(known):
+                return pi.levels(known, LONG_POLL)
+            case _:
+                return pi.state()
+        return None
+
+
+def _message(spoken: bytes | int) -> Message:
+    return Read(spoken) if isinstance(spoken, int) else Write(spoken)
+
+
+def _shut(connection: socket.socket) -> None:
+    """Wake up the thread that waits on a socket."""
+    with contextlib.suppress(OSError):  # not connected any more
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+@contextlib.contextmanager
+def _claimed(path: Path) -> Iterator[None]:
+    """Hold the lock file beside a socket: only a living process does, so a socket file may lie."""
+    if path.exists() and not path.is_socket():
+        raise StartupError(f"{path} is there already and is no socket; choose another path")
+    with path.with_name(path.name + ".lock").open("a+", encoding="ascii") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            raise StartupError(
+                f"another virtual Pi (pid {lock.read().strip() or 'unknown'}) already listens on "
+                f"{path}; stop it, or give this one another virtual_pi.socket"
+            ) from None
+        lock.truncate(0)
+        lock.write(f"{os.getpid()}\n")
+        lock.flush()
+        yield  # the lock file stays: to remove it would let two processes hold two of them

@@ -1,0 +1,196 @@
+"""The kernel's PWM class as files in memory: refuses what Linux refuses, with the same errors.
+
+Takes the place of module `os` in `fishd.hardware.pwm_channel`. It is as strict as kernels up to
+6.9: while the period is 0 they refuse everything. They ignore a state that they believe to be set.
+"""
+
+import errno
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from fishd.clock import Clock
+from fishd.emulation.pulses import PulseTrain
+
+
+@dataclass(frozen=True)
+class _State:
+    """What the kernel believes of a channel; times in ns."""
+
+    period: int = 0
+    duty_cycle: int = 0
+    enable: int = 0
+
+
+@dataclass
+class _Channel:
+    state: _State = _State()
+    exported_at: float | None = None
+    pulses: PulseTrain = field(default_factory=PulseTrain)
+    """What the hardware puts out."""
+
+
+class SysfsPwm:
+    """PWM chips below `root`, and the functions of module `os` to use them with."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        chips: Mapping[str, int],
+        root: str = "/sys/class/pwm",
+        udev_delay: float = 0.03,
+    ) -> None:
+        """`chips`: how many channels each device has, in the order of the chips' numbers.
+
+        udev_delay: how long after an export the files of a channel belong to root alone [s]
+        """
+        self._clock = clock
+        self._root = root
+        self._udev_delay = udev_delay
+        self._chips = {
+            device: [_Channel() for _ in range(channels)] for device, channels in chips.items()
+        }
+        self._numbers = dict(enumerate(chips))
+        self._taken: set[tuple[str, int]] = set()
+        self._fds: dict[int, tuple[str, int | None, str]] = {}
+        self._next_fd = 1000  # far from any true one
+
+    def pulses(self, device: str, channel: int) -> PulseTrain:
+        """What comes out of a channel."""
+        return self._chips[device][channel].pulses
+
+    def take(self, device: str, channel: int) -> None:
+        """Let a driver of the kernel use a channel, as the one of the Pi 5's fan does."""
+        self._taken.add((device, channel))
+
+    def unload(self, device: str) -> None:
+        """Unload a chip's driver: its pulses and files are gone, open ones too."""
+        for number, channel in enumerate(self._chips[device]):
+            if channel.exported_at is not None:
+                self._unexport(device, number)
+            channel.state = _State()
+        self._numbers = {n: chip for n, chip in self._numbers.items() if chip != device}
+
+    def load(self, device: str, number: int) -> None:
+        """Load a chip's driver again, which gets the number that is free."""
+        self._numbers[number] = device
+
+    def open(self, path: str, flags: int, /) -> int:
+        """As os.open."""
+        device, channel, name = self._find(path)
+        if channel is not None:
+            since = self._chips[device][channel].exported_at or 0.0
+            writing = flags & (os.O_WRONLY | os.O_RDWR)
+            if writing and self._clock.monotonic() < since + self._udev_delay:
+                raise _error(errno.EACCES, path)
+        self._next_fd += 1
+        self._fds[self._next_fd] = (device, channel, name)
+        return self._next_fd
+
+    def close(self, fd: int, /) -> None:
+        """As os.close."""
+        if self._fds.pop(fd, None) is None:
+            raise _error(errno.EBADF)
+
+    def pread(self, fd: int, length: int, offset: int, /) -> bytes:
+        """As os.pread."""
+        device, channel, name = self._opened(fd)
+        if channel is None:
+            raise _error(errno.EIO)  # export and unexport can only be written to
+        text = b"%d\n" % getattr(self._chips[device][channel].state, name)
+        return text[offset : offset + length]
+
+    def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
+        """As os.pwrite."""
+        device, channel, name = self._opened(fd)
+        try:
+            value = int(data)
+        except ValueError:
+            raise _error(errno.EINVAL) from None
+        if channel is not None:
+            self._apply(self._chips[device][channel], name, value)
+        elif not 0 <= value < len(self._chips[device]):
+            raise _error(errno.ENODEV)
+        elif name == "export":
+            self._export(device, value)
+        else:
+            self._unexport(device, value)
+        return len(data)
+
+    def listdir(self, path: str, /) -> list[str]:
+        """As os.listdir."""
+        folders = {self._root: [f"pwmchip{number}" for number in self._numbers]}
+        for number, device in self._numbers.items():
+            channels = enumerate(self._chips[device])
+            exported = [f"pwm{n}" for n, channel in channels if channel.exported_at is not None]
+            folders[f"{self._root}/pwmchip{number}"] = ["device", "export", "unexport", *exported]
+        if path not in folders:
+            raise _error(errno.ENOENT, path)
+        return folders[path]
+
+    def readlink(self, path: str, /) -> str:
+        """As os.readlink."""
+        folder, _, name = path.rpartition("/")
+        if name != "device" or name not in self.listdir(folder):
+            raise _error(errno.ENOENT, path)
+        return f"../../../{self._device(folder)}"
+
+    def _find(self, path: str) -> tuple[str, int | None, str]:
+        """Device, channel and name of a file; no channel for export and unexport."""
+        folder, _, name = path.rpartition("/")
+        if name in ("export", "unexport") and name in self.listdir(folder):
+            return self._device(folder), None, name
+        chip, _, channel = folder.rpartition("/")
+        if name not in ("period", "duty_cycle", "enable") or channel not in self.listdir(chip):
+            raise _error(errno.ENOENT, path)
+        return self._device(chip), int(channel.removeprefix("pwm")), name
+
+    def _device(self, folder: str) -> str:
+        return self._numbers[int(folder.removeprefix(f"{self._root}/pwmchip"))]
+
+    def _opened(self, fd: int) -> tuple[str, int | None, str]:
+        """What is open as `fd`."""
+        if fd not in self._fds:
+            raise _error(errno.EBADF)
+        device, channel, name = self._fds[fd]
+        gone = device not in self._numbers.values()
+        if gone or (channel is not None and self._chips[device][channel].exported_at is None):
+            raise _error(errno.ENODEV)
+        return device, channel, name
+
+    def _export(self, device: str, number: int) -> None:
+        channel = self._chips[device][number]
+        if channel.exported_at is not None or (device, number) in self._taken:
+            raise _error(errno.EBUSY)
+        channel.exported_at = self._clock.monotonic()
+
+    def _unexport(self, device: str, number: int) -> None:
+        """The driver switches the hardware off; the kernel's belief stays."""
+        channel = self._chips[device][number]
+        if channel.exported_at is None:
+            raise _error(errno.ENODEV)
+        channel.exported_at = None
+        # A file that was open stays dead, even if the channel is exported again.
+        dead = [fd for fd, opened in self._fds.items() if opened[:2] == (device, number)]
+        for fd in dead:
+            self._fds[fd] = ("", None, "")
+        channel.pulses.cut(self._clock.monotonic())
+
+    def _apply(self, channel: _Channel, name: str, value: int) -> None:
+        if name == "enable" and value not in (0, 1):
+            raise _error(errno.EINVAL)
+        state = replace(channel.state, **{name: value})
+        if state.period <= 0 or not 0 <= state.duty_cycle <= state.period:
+            raise _error(errno.EINVAL)
+        if state == channel.state:
+            return
+        channel.state = state
+        now = self._clock.monotonic()
+        if state.enable:  # from the next period on
+            channel.pulses.set(now, 1e-3 * state.duty_cycle, 1e-9 * state.period)
+        else:  # at once
+            channel.pulses.cut(now)
+
+
+def _error(number: int, path: str | None = None) -> OSError:
+    return OSError(number, os.strerror(number), path)

@@ -1,0 +1,153 @@
+"""The fish on its force sensor, between the pulses of a pigpiod and the inputs of an ADS1115.
+
+It swims lazily: only when the chip converts, or someone asks, does it catch up with the time.
+"""
+
+import math
+import threading
+from collections.abc import Callable
+from typing import NamedTuple
+
+from fishd.emulation.settings import VirtualPiSettings
+from fishd.hardware.imperfections import Imperfections, SimulationSettings
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.tethered import TetheredFish, TrueWindow
+from fishd.signals import Truth
+
+STEP = 1e-4
+"""Time moves in whole multiples of this [s], so that a few lengths of time come again and again."""
+_PIECE = 200  # longest stretch swum at once, in steps: one servo frame
+_REHEARSED = 40  # stretches up to this many steps are met all the time
+_ROUNDING = 1e-7  # a frame that begins with a step has begun by then [s]
+_INPUTS = ("A0-A1", "A0-A3", "A1-A3", "A2-A3", "A0", "A1", "A2", "A3")  # by MUX code
+
+
+class Tank:
+    """Turns pulses into voltages; safe for use from several threads."""
+
+    def __init__(
+        self,
+        settings: VirtualPiSettings,
+        plant: PlantParameters,
+        imperfections: SimulationSettings,
+        tick: float,
+        pulse: Callable[[float], float],
+        start: float,
+    ) -> None:
+        """The fish is at rest at `start` [s].
+
+        tick: period that the noise of `imperfections` refers to [s]
+        pulse: the servo pulse in force at a time [s], past or present [µs]; 0 for none
+        """
+        self._settings = settings
+        self._pulse = pulse
+        self._imperfections = Imperfections(imperfections, tick)
+        self._weights = tuple(_weights(name, settings) for name in _INPUTS)
+        self._fish = TetheredFish(plant)
+        for steps in range(1, _REHEARSED + 1):
+            self._fish.advance(None, steps * STEP, 1)
+        self._fish.state = REST
+        self._now = _steps(start)
+        self._conversion = (0.0, 0.0)
+        self._steps = 0
+        self._impulse = 0.0
+        self._fin_peak = 0.0
+        self._lock = threading.Lock()
+
+    def volts(self, mux: int, begin: float, end: float) -> float:
+        """Mean voltage at the inputs that `mux`, 0 to 7, selects, from `begin` to `end` [s]."""
+        along, across = self._weights[mux]
+        with self._lock:
+            self._swim(_steps(begin))
+            first, last = self._now, max(_steps(end), _steps(begin) + 1)
+            if last > first:  # else someone asked for a later state meanwhile
+                x, y = self._swim(last)
+                span = (last - first) * STEP
+                self._conversion = (x / span, y / span)
+            fx, fy = self._imperfections.apply(*self._conversion, end, max(end - begin, STEP))
+        settings = self._settings
+        vx = settings.sensitivity * (fx + settings.crosstalk * fy) + settings.zero_x
+        vy = settings.sensitivity * (fy + settings.crosstalk * fx) + settings.zero_y
+        return along * vx + across * vy
+
+    def catch_up(self, time: float) -> None:
+        """Swim until `time` [s], where that is later than the state."""
+        with self._lock:
+            self._swim(_steps(time))
+
+    def truth(self) -> Truth:
+        """The true state at the end of the latest conversion."""
+        with self._lock:
+            state = self._fish.state
+        return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
+
+    def angle(self, time: float) -> float | None:
+        """The instruction angle [rad] that the pulse at a time [s] means; None without pulses."""
+        width = self._pulse(time)
+        return (width - self._settings.servo_centre) / self._settings.servo_scale if width else None
+
+    def take_window(self) -> TrueWindow:
+        """What the fish truly did since the previous call, or since the start."""
+        with self._lock:
+            duration = self._steps * STEP
+            swum = TrueWindow(duration, self._impulse / duration if duration else 0.0, self._fin_peak)
+            self._steps, self._impulse = 0, 0.0
+            self._fin_peak = abs(self._fish.state.alpha)
+        return swum
+
+    def _swim(self, until: int) -> tuple[float, float]:
+        """Swim until a step; the impulses of F_x and F_y on the way [N s]."""
+        impulse_x = impulse_y = 0.0
+        while self._now < until:
+            angle = self._angle_at(self._now)
+            end = self._change(angle, min(until, self._now + _PIECE))
+            rate = self._fish.state.alpha_rate
+            window = self._fish.advance(angle, (end - self._now) * STEP, 1)
+            self._steps += end - self._now
+            self._now = end
+            impulse_x += window.thrust * window.duration
+            impulse_y += window.lateral_force * window.duration
+            state = self._fish.state
+            turned = rate * state.alpha_rate < 0.0  # only then is the peak within the window
+            peak = window.fin_peak if turned else abs(state.alpha)
+            self._fin_peak = max(self._fin_peak, peak)
+        self._impulse += impulse_x
+        return impulse_x, impulse_y
+
+    def _angle_at(self, step: int) -> float | None:
+        return self.angle(step * STEP + _ROUNDING)
+
+    def _change(self, angle: float | None, until: int) -> int:
+        """The step, `until` at the latest, up to which the pulses still mean this angle."""
+        if self._angle_at(until) == angle:
+            return until
+        same, other = self._now, until
+        while other - same > 1:
+            middle = (same + other) // 2
+            if self._angle_at(middle) == angle:
+                same = middle
+            else:
+                other = middle
+        return other
+
+
+def _steps(time: float) -> int:
+    """Whole steps until a time, rounded down: nobody knows yet which pulses come later."""
+    return math.floor((time + _ROUNDING) / STEP)
+
+
+def _weights(name: str, settings: VirtualPiSettings) -> tuple[float, float]:
+    """Shares of the two channels' voltages at an input.
+
+    The first pin of a channel carries its voltage, pins that no channel uses are grounded.
+    """
+    if name == settings.channel_x:
+        return 1.0, 0.0
+    if name == settings.channel_y:
+        return 0.0, 1.0
+    plus, _, minus = name.partition("-")
+
+    def share(channel: str) -> float:
+        return float(channel[:2] == plus) - float(channel[:2] == minus)
+
+    return share(settings.channel_x), share(settings.channel_y)

@@ -1,0 +1,163 @@
+"""The dual force sensor on an ADS1115: a thread samples it, the tick takes what has come in.
+
+In virtual time there is no thread: a read samples until its clock has come to the tick.
+"""
+
+import math
+import threading
+
+from msgspec.structs import replace
+
+from fishd.clock import Clock
+from fishd.errors import SensorError
+from fishd.hardware.calibration import ForceCalibration
+from fishd.hardware.sampler import Pair, Sampler
+from fishd.hardware.settings import ForceSensorSettings
+from fishd.hardware.window import Evaluation, VoltageWatch
+from fishd.signals import Measurement
+
+HOLD = 2.5e-3
+"""How long before a read no conversion begins any more, at most a quarter of a tick [s]."""
+CLOSE_LIMIT = 0.5
+"""How long to wait for the thread to end [s]."""
+
+
+def open_force_sensor(
+    settings: ForceSensorSettings,
+    calibration: ForceCalibration,
+    clock: Clock,
+    *,
+    threaded: bool,
+    tick: float,
+) -> "Ads1115Sensor":
+    """The force sensor as configured; see `Ads1115Sensor`."""
+    return Ads1115Sensor(settings, calibration, clock, threaded=threaded, tick=tick)
+
+
+class Ads1115Sensor:
+    """A force sensor that measures voltages, and can be calibrated.
+
+    What is read, watched and calibrated is for one thread, the one that ticks.
+    """
+
+    def __init__(
+        self,
+        settings: ForceSensorSettings,
+        calibration: ForceCalibration,
+        clock: Clock,
+        *,
+        threaded: bool,
+        tick: float,
+        hold_before: float = HOLD,
+    ) -> None:
+        """Begin to sample; a bus or a chip that is missing may come later.
+
+        clock: of the bus; in virtual time one of its own, which reads move on
+        threaded: sample in a thread, which needs a clock that moves by itself
+        tick: time between two reads [s]
+        hold_before: how long before a read to keep out of its way [s], at most a quarter of a tick
+
+        Raises `StartupError` where the driver is not installed.
+        """
+        self.calibration = calibration
+        """What turns voltages into forces."""
+        self._clock = clock
+        self._tick = tick
+        self._hold = min(hold_before, 0.25 * tick)
+        self._place = f"the ADS1115 at {settings.address:#04x} on /dev/i2c-{settings.bus}"
+        self._sampler = Sampler(settings, clock)
+        self._evaluation = Evaluation(settings)
+        self._latest: Measurement | None = None
+        self._watches: list[VoltageWatch] = []
+        self._next_read = math.inf
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        if threaded:
+            self._thread = threading.Thread(target=self._run, name="force-sampler", daemon=True)
+            self._thread.start()
+
+    def recalibrate(self, calibration: ForceCalibration) -> None:
+        """Use another calibration from the next read on."""
+        self.calibration = calibration
+
+    def read(self, now: float) -> Measurement:
+        """What was measured since the previous read; in real time it waits for nothing.
+
+        Without a new pair of samples it is the previous measurement, its time included, of no
+        samples. Raises `SensorError`, with what to check, while the chip cannot be read, before
+        the first pair, and once closed.
+        """
+        if self._closing.is_set():
+            raise SensorError(f"{self._place} is closed")
+        if self._thread is None:
+            self._catch_up(now)
+        self._next_read = now + self._tick
+        pairs = self._take()
+        if pairs:
+            measurement = self._evaluation.measure(pairs, self.calibration)
+            if self._watches:
+                self._watches = [watch for watch in self._watches if not watch.closed]
+                for watch in self._watches:
+                    watch.add(pairs, measurement.suspect)
+            self._latest = replace(measurement, samples=0)
+            return measurement
+        if trouble := self._sampler.trouble:
+            self._evaluation.interrupt()
+            raise SensorError(trouble)
+        if self._latest is None:
+            raise SensorError(f"{self._place} has not delivered yet")
+        return self._latest
+
+    def watch(self) -> VoltageWatch:
+        """Begin to add up the voltages of every pair that is sampled from now on."""
+        watch = VoltageWatch(self._clock.monotonic(), self._evaluation.step, self.calibration)
+        self._watches.append(watch)
+        return watch
+
+    def counters(self) -> dict[str, int]:
+        """Errors that were survived, since start."""
+        return {"i2c_errors": self._sampler.errors, "i2c_reconnects": self._sampler.reconnects}
+
+    def close(self) -> None:
+        """Stop to sample and let go of the bus; may be called twice, and never hangs.
+
+        A thread that is stuck in a transfer is left to end by itself.
+        """
+        self._closing.set()
+        if self._thread is None:
+            self._sampler.close()
+        else:
+            self._thread.join(CLOSE_LIMIT)
+
+    def _take(self) -> list[Pair]:
+        """All that has come in; a deque needs no lock for that, so the tick waits for nobody."""
+        pairs = self._sampler.pairs
+        return [pairs.popleft() for _ in range(len(pairs))]
+
+    def _catch_up(self, now: float) -> None:
+        """Sample until `now` as the thread would have done."""
+        clock, sampler = self._clock, self._sampler
+        while max(clock.monotonic(), sampler.ready_at) <= now - self._hold:
+            sampler.step()
+        clock.sleep(now - clock.monotonic())
+
+    def _run(self) -> None:
+        """Sample until closed; what the thread does."""
+        clock, sampler = self._clock, self._sampler
+        while not self._closing.is_set():
+            pause = max(sampler.ready_at - clock.monotonic(), self._pause())
+            if pause > 0.0:
+                self._closing.wait(pause)
+            else:
+                sampler.step()
+        sampler.close()
+
+    def _pause(self) -> float:
+        """How long to stay quiet, so that the tick does not have to wait for the interpreter [s].
+
+        That is around an expected read, until it has come and had some time.
+        """
+        late = self._clock.monotonic() - self._next_read
+        if not -self._hold <= late < self._hold:
+            return 0.0
+        return 0.25 * self._hold - min(late, 0.0)

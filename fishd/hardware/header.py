@@ -1,0 +1,74 @@
+"""The pins of the Pi's header, through the module RPi.GPIO of either RPi.GPIO or rpi-lgpio."""
+
+import logging
+import warnings
+from importlib import metadata
+from typing import Any
+
+from fishd.errors import StartupError
+
+log = logging.getLogger(__name__)
+
+_PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
+_EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
+
+
+def load() -> Any:
+    """The module RPi.GPIO, set to Broadcom numbers; raises `StartupError`.
+
+    Imported only here, because that fails on whatever is not a Raspberry Pi.
+    """
+    if all(map(_is_installed, _PROVIDERS)):
+        raise StartupError(
+            "RPi.GPIO and rpi-lgpio are both installed and overwrite each other: "
+            f"uninstall both, then install {_EXTRAS}"
+        )
+    try:
+        from RPi import GPIO
+    except ImportError:
+        raise StartupError(
+            "E-stop button, status light and servo driver rpi-gpio need the package RPi.GPIO: "
+            f"install {_EXTRAS}"
+        ) from None
+    except OSError as error:
+        # lgpio makes a pipe, .lgd-nfyN, in the working folder as soon as it is imported.
+        raise StartupError(
+            f"rpi-lgpio cannot make its pipe in the working folder: {error.strerror}; "
+            "start fishd in a folder that it may write to"
+        ) from None
+    except Exception as error:  # RuntimeError, NotImplementedError: not a Pi
+        raise StartupError(f"the pins of the header cannot be used: {one_line(error)}") from None
+    try:
+        GPIO.setmode(GPIO.BCM)
+    except Exception as error:  # lgpio.error is a bare Exception
+        raise StartupError(
+            f"the pins of the header cannot be used: {one_line(error)}; "
+            "fishd has to be in group gpio"
+        ) from None
+    return GPIO
+
+
+def claim(gpio_module: Any, gpio: int, direction: int, **options: int) -> None:
+    """Set up one pin; raises whatever the library does.
+
+    RPi.GPIO warns of a pin that is in use, as after kill -9. That is logged and not switched off
+    with setwarnings(False): it is the only hint that another program drives the same pin.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        gpio_module.setup(gpio, direction, **options)
+    for warning in caught:
+        log.info("GPIO %d: %s", gpio, warning.message)
+
+
+def one_line(error: Exception) -> str:
+    """What an error says; lgpio puts its text in quotes."""
+    return " ".join(str(error).strip("'").split()).rstrip(".!") or type(error).__name__
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        metadata.distribution(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True

@@ -1,0 +1,159 @@
+"""The operator's panel on pins of the header: an E-stop button and a status light."""
+
+import logging
+import threading
+from collections.abc import Callable
+
+from fishd.clock import Clock
+from fishd.errors import StartupError
+from fishd.hardware import header
+from fishd.hardware.settings import PanelSettings
+
+log = logging.getLogger(__name__)
+
+BOUNCE = 5
+"""How long the contact of a button may bounce [ms]."""
+RELEASED_POLLS = 2
+"""Polls in a row that must find the button released: a press acts at once, its end does not."""
+
+
+class RpiGpioPanel:
+    """Button and light through RPi.GPIO or rpi-lgpio; either may be missing.
+
+    The button is a contact to ground, and a pull-up makes the level high where it is open. One that
+    opens when it is pressed (`estop_pressed: high`) looks pressed with a broken wire, too.
+    """
+
+    def __init__(self, settings: PanelSettings, clock: Clock) -> None:
+        """Claim the pins; raises `StartupError` where that is not possible."""
+        self.on_press: Callable[[], None] = _nothing
+        self._settings = settings
+        self._pressed = False
+        self._released_polls = 0
+        self._lock = threading.Lock()  # the library calls from a thread of its own
+        self._lit = False
+        self._changed = 0.0
+        self._dark = settings.led_gpio is None
+        self._pins = [p for p in (settings.estop_gpio, settings.led_gpio) if p is not None]
+        self._closed = not self._pins
+        if self._pins:
+            self._gpio = header.load()
+            self._claim(clock)
+
+    def update(self, mode: str, now: float) -> bool:
+        """Show the mode on the light; True while the button is pressed. Called in every tick.
+
+        now: time of the tick [s]. Raises OSError when the button cannot be read.
+        """
+        self._show(self._wanted(mode, now), now)
+        if self._settings.estop_gpio is None:
+            return False
+        try:
+            down = self._is_down()
+        except Exception as error:  # lgpio.error is a bare Exception
+            raise OSError(
+                f"E-stop button on GPIO {self._settings.estop_gpio}: {header.one_line(error)}"
+            ) from None
+        with self._lock:
+            if down:
+                self._pressed, self._released_polls = True, 0
+            else:
+                self._released_polls += 1
+                if self._released_polls >= RELEASED_POLLS:
+                    self._pressed = False
+            return self._pressed
+
+    def close(self) -> None:
+        """Switch the light off and let go of the pins; may be called twice.
+
+        A step that fails is logged, and the next one is done all the same.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        self.on_press = _nothing
+        if not self._dark:
+            self._attempt("switch off", self._gpio.output, self._settings.led_gpio, self._gpio.LOW)
+        for pin in self._pins:  # cleanup() without a pin takes those of everybody
+            self._attempt("give back", self._gpio.cleanup, pin)
+
+    def _claim(self, clock: Clock) -> None:
+        gpio, settings = self._gpio, self._settings
+        pin = 0
+        try:
+            for pin in self._pins:
+                if pin == settings.led_gpio:
+                    header.claim(gpio, pin, gpio.OUT, initial=gpio.LOW)
+                else:
+                    header.claim(gpio, pin, gpio.IN, pull_up_down=gpio.PUD_UP)
+        except Exception as error:
+            raise StartupError(
+                f"GPIO {pin} cannot be used for the panel: {header.one_line(error)}"
+            ) from None
+        if settings.estop_gpio is not None:
+            clock.sleep(0.001)  # the pull-up has to charge the wire first
+            self._listen(settings.estop_gpio)
+
+    def _listen(self, pin: int) -> None:
+        """Have presses reported at once; without that, the polls of the ticks have to do."""
+        try:
+            self._gpio.add_event_detect(pin, self._gpio.BOTH, self._on_edge, BOUNCE)
+        except Exception as error:
+            # RPi.GPIO on kernels from 6.6 on
+            log.warning(
+                "E-stop button on GPIO %d is polled only, once a tick: %s; "
+                "rpi-lgpio instead of RPi.GPIO would report it at once",
+                pin,
+                header.one_line(error),
+            )
+
+    def _on_edge(self, pin: int) -> None:
+        try:
+            down = self._is_down()  # and not a spike that has gone
+        except Exception as error:
+            log.warning("E-stop button on GPIO %d: %s", pin, header.one_line(error))
+            return
+        with self._lock:
+            new = down and not self._pressed
+            if down:
+                self._pressed, self._released_polls = True, 0
+        if new:
+            self.on_press()
+
+    def _is_down(self) -> bool:
+        level = self._gpio.input(self._settings.estop_gpio)
+        return bool(level) == (self._settings.estop_pressed == "high")
+
+    def _wanted(self, mode: str, now: float) -> bool:
+        if mode == "running":
+            return True
+        if mode == "idle":  # a flash each second, as long as the slowest tick
+            return now % 1.0 < 0.2
+        # 5 Hz, or slower where ticks are: by phase, some ticks would always meet the same half.
+        return self._lit if now - self._changed < 0.09 else not self._lit
+
+    def _show(self, lit: bool, now: float) -> None:
+        """A light that fails is reported once, and does not stop the fish."""
+        if self._dark or lit == self._lit:
+            return
+        self._lit = lit
+        self._changed = now
+        try:
+            self._gpio.output(self._settings.led_gpio, int(lit))
+        except Exception as error:
+            self._dark = True
+            log.warning(
+                "the status light on GPIO %d stays dark: %s",
+                self._settings.led_gpio,
+                header.one_line(error),
+            )
+
+    def _attempt(self, what: str, step: Callable[..., object], pin: int | None, *more: int) -> None:
+        try:
+            step(pin, *more)
+        except Exception as error:
+            log.warning("cannot %s GPIO %s: %s", what, pin, header.one_line(error))
+
+
+def _nothing() -> None:
+    """What a press does until somebody says otherwise."""

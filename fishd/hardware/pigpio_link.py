@@ -1,0 +1,158 @@
+"""The link to pigpiod: one client at a time, thrown away after any failure and made again."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from fishd.clock import Clock
+from fishd.errors import ServoError
+from fishd.hardware.pigpio_client import ANSWER, FAILURES, Client, reason, where
+from fishd.hardware.settings import PigpioSettings
+
+START = 2.0
+"""How long a new link waits for its first connection [s]."""
+
+PAUSES = 0.2, 1.0
+"""Shortest and longest pause between two attempts to connect [s]."""
+
+# In virtual time nothing waits for a tick: a busy machine must not pass for a frozen pigpiod.
+VIRTUAL_ANSWER = 0.25
+VIRTUAL_CONNECT = 0.05
+VIRTUAL_PAUSE = 0.5
+
+
+class PigpioLink:
+    """One client at a time, kept connected."""
+
+    def __init__(
+        self,
+        settings: PigpioSettings,
+        clock: Clock,
+        prepare: Callable[[Client], None],
+        *,
+        threaded: bool,
+    ) -> None:
+        """Wait up to 2 s for the first connection; without one, go on trying.
+
+        prepare: called with every new client before anyone else has it; may raise what a client
+            raises
+        threaded: connect in a thread of its own. Otherwise within `session`, at most once per
+            0.5 s of `clock`, and with time limits that suit virtual time
+        """
+        self.reconnects = 0
+        """How often a connection was made again."""
+        self._settings = settings
+        self._clock = clock
+        self._prepare = prepare
+        self._client: Client | None = None
+        self._opening: Client | None = None
+        self._reason = "no answer yet"
+        self._connections = 0
+        self._next_attempt = float("-inf")
+        self._lock = threading.RLock()
+        self._needed = threading.Event()
+        self._connected = threading.Event()
+        self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
+        if threaded:
+            self._needed.set()
+            self._thread = threading.Thread(
+                target=self._keep_connected, name="pigpio-link", daemon=True
+            )
+            self._thread.start()
+            self._connected.wait(START)
+
+    @contextlib.contextmanager
+    def session(self, limit: float | None = None) -> Iterator[Client]:
+        """The client, all of whose commands must be done within `limit` [s].
+
+        Without a limit, that of the settings. Raises `ServoError` where there is no connection,
+        without waiting for one, and where a command fails, which ends the connection.
+        """
+        if limit is None:
+            limit = self._settings.timeout if self._thread else VIRTUAL_ANSWER
+        deadline = time.monotonic() + limit
+        if not self._lock.acquire(timeout=limit):
+            raise ServoError(f"{where(self._settings)}: busy for more than {limit * 1e3:g} ms")
+        try:
+            client = self._current()
+            client.within(deadline - time.monotonic() if self._thread else limit)
+            try:
+                yield client
+            except BaseException as error:
+                # An answer may still be under way, and would be taken for that of the next command.
+                self._drop(client, reason(error, limit))
+                if not isinstance(error, FAILURES):
+                    raise
+                raise ServoError(f"{where(self._settings)}: {self._reason}; reconnecting") from None
+        finally:
+            self._lock.release()
+
+    def close(self) -> None:
+        """Disconnect, and connect no more; may be called twice."""
+        self._closed.set()
+        self._needed.set()
+        with self._lock:
+            if self._client:
+                self._drop(self._client, "closed")
+        opening = self._opening
+        if opening:
+            opening.interrupt()
+        if self._thread:
+            self._thread.join(ANSWER)
+
+    def _current(self) -> Client:
+        if self._closed.is_set():
+            raise ServoError(f"{where(self._settings)}: closed")
+        now = self._clock.monotonic()
+        if not self._client and not self._thread and now >= self._next_attempt:
+            self._next_attempt = now + VIRTUAL_PAUSE
+            self._connect(VIRTUAL_CONNECT, VIRTUAL_ANSWER)
+        if not self._client:
+            raise ServoError(
+                f"{where(self._settings)}: not connected: {self._reason}; reconnecting"
+            )
+        return self._client
+
+    def _drop(self, client: Client, why: str) -> None:
+        self._client = None
+        self._reason = why
+        client.dispose()
+        self._needed.set()
+
+    def _connect(self, limit: float, preparation: float) -> bool:
+        client = None
+        allowed = limit
+        try:
+            client = self._opening = Client(self._settings.host, self._settings.port, limit)
+            client.get_pigpio_version()
+            allowed = preparation
+            client.within(preparation)
+            self._prepare(client)
+        except FAILURES as error:
+            self._reason = reason(error, allowed)
+            if client:
+                client.dispose()
+            return False
+        finally:
+            self._opening = None
+        with self._lock:
+            if self._closed.is_set():
+                client.dispose()
+                return False
+            self._connections += 1
+            self.reconnects = self._connections - 1
+            self._client = client
+        self._connected.set()
+        return True
+
+    def _keep_connected(self) -> None:
+        shortest, longest = PAUSES
+        while self._needed.wait() and not self._closed.is_set():
+            self._needed.clear()
+            pause = shortest
+            while not self._connect(ANSWER, 2.0 * ANSWER) and not self._closed.wait(pause):
+                pause = min(2.0 * pause, longest)
+            # A pigpiod that refuses every command would otherwise be connected to in every tick.
+            self._closed.wait(shortest)

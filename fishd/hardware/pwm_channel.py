@@ -1,0 +1,210 @@
+"""A channel of a PWM chip of the kernel, as the files that Linux shows below /sys/class/pwm."""
+
+import errno
+import os
+from typing import Protocol
+
+from fishd.clock import Clock
+from fishd.errors import ServoError
+from fishd.hardware.settings import ServoSettings
+
+_BROADCOM = {12: 0, 18: 0, 13: 1, 19: 1}
+
+HEADER_CHIPS: dict[str, dict[int, int]] = {
+    # Pi 5. Channels 0 and 1 by what `pinctrl funcs` lists there, not tried on one.
+    "1f00098000.pwm": {18: 2, 19: 3, 12: 0, 13: 1},
+    # Pi 4. An estimate, like the two below: by the chip's address in the device tree.
+    "fe20c000.pwm": _BROADCOM,
+    "3f20c000.pwm": _BROADCOM,  # Pi 2, 3, Zero 2
+    "2020c000.pwm": _BROADCOM,  # Pi 1, Zero
+}
+"""The chip of the 40-pin header, by device name, and the channel that a GPIO is wired to.
+
+Devices keep their names; the N of pwmchipN changes from kernel to kernel.
+"""
+
+
+class Files(Protocol):
+    """The functions of module `os` that a channel needs; an emulated kernel has them too."""
+
+    def open(self, path: str, flags: int, /) -> int:
+        """As os.open."""
+
+    def pread(self, fd: int, length: int, offset: int, /) -> bytes:
+        """As os.pread."""
+
+    def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
+        """As os.pwrite."""
+
+    def close(self, fd: int, /) -> None:
+        """As os.close."""
+
+    def listdir(self, path: str, /) -> list[str]:
+        """As os.listdir."""
+
+    def readlink(self, path: str, /) -> str:
+        """As os.readlink."""
+
+
+class PwmChannel:
+    """One channel; each method raises `ServoError` with a line that says how to mend it."""
+
+    NAMES = ("period", "duty_cycle", "enable")
+    """Its files: two times [ns], and 1 for on."""
+
+    def __init__(self, servo: ServoSettings, clock: Clock, files: Files = os) -> None:
+        """Nothing is looked for before `open`."""
+        self._servo = servo
+        self._files = files
+        self._clock = clock
+        self._fds: dict[str, int] = {}
+        self._chip = ""
+        self._number = 0
+        self.path = ""
+        """The channel's folder; empty before the first `open`."""
+        self.exported = False
+        """Whether this object has made that folder appear."""
+
+    def open(self, patience: float) -> None:
+        """Find the channel, export it if it is not, open its files; nothing where they are open.
+
+        patience: how long to wait for udev to hand over the files of a new channel [s]
+        """
+        if self._fds:
+            return
+        self._chip, device = self._find_chip()
+        self._number = _channel_number(self._servo, device)
+        self.path = f"{self._chip}/pwm{self._number}"
+        if not self._is_exported():
+            self._export()
+        deadline = self._clock.monotonic() + patience
+        while True:
+            try:
+                for name in self.NAMES:
+                    self._fds[name] = self._files.open(f"{self.path}/{name}", os.O_RDWR)
+                return
+            except OSError as error:
+                self.close()
+                late = self._clock.monotonic() >= deadline
+                if late or not isinstance(error, PermissionError | FileNotFoundError):
+                    raise _explained(f"{self.path}/{name}", error) from None
+            self._clock.sleep(0.01)
+
+    def read(self, name: str) -> int:
+        """The number in a file of the open channel."""
+        try:
+            # A plain file of a test keeps the tail of a longer number; the kernel has no tails.
+            return int(self._files.pread(self._fds[name], 32, 0).split()[0])
+        except OSError as error:
+            raise _explained(f"{self.path}/{name}", error) from None
+        except (ValueError, IndexError):
+            raise ServoError(f"{self.path}/{name} does not contain a number") from None
+
+    def write(self, name: str, value: int) -> None:
+        """Write a number to a file of the open channel."""
+        try:
+            self._files.pwrite(self._fds[name], b"%d\n" % value, 0)
+        except OSError as error:
+            raise _explained(f"{self.path}/{name}", error) from None
+
+    def close(self) -> None:
+        """Close the files; the channel stays as it is."""
+        for fd in self._fds.values():
+            self._files.close(fd)
+        self._fds.clear()
+
+    def unexport(self) -> None:
+        """Make the channel's files disappear; nothing if they have."""
+        if self.path and self._is_exported():
+            self._tell("unexport")
+        self.exported = False
+
+    def _find_chip(self) -> tuple[str, str]:
+        """The chip's folder and its device."""
+        servo, root = self._servo, self._servo.sysfs.root
+        wanted = [servo.sysfs.chip] if servo.sysfs.chip else list(HEADER_CHIPS)
+        chips = {}
+        try:
+            for name in self._files.listdir(root):
+                if name.startswith("pwmchip"):
+                    device = self._files.readlink(f"{root}/{name}/device")
+                    chips[os.path.basename(device)] = f"{root}/{name}"  # noqa: PTH119
+        except OSError as error:
+            raise ServoError(f"no PWM chips can be found in {root}: {error.strerror}") from None
+        for device in wanted:
+            if device in chips:
+                return chips[device], device
+        overlay = "pwm-2chan"
+        if servo.gpio in (12, 13):
+            overlay += ",pin=12,func=4,pin2=13,func2=4"
+        raise ServoError(
+            f"no PWM chip {' or '.join(wanted)} in {root}, which has "
+            f"{', '.join(sorted(chips)) or 'none'}: add dtoverlay={overlay} to "
+            "/boot/firmware/config.txt and reboot, or name the chip in servo.sysfs.chip"
+        )
+
+    def _is_exported(self) -> bool:
+        try:
+            return f"pwm{self._number}" in self._files.listdir(self._chip)
+        except OSError as error:
+            raise _explained(self._chip, error) from None
+
+    def _export(self) -> None:
+        try:
+            self._tell("export")
+        except ServoError:
+            # Somebody was quicker: the channel is there all the same.
+            if not self._is_exported():
+                raise
+        else:
+            self.exported = True
+
+    def _tell(self, name: str) -> None:
+        path = f"{self._chip}/{name}"
+        try:
+            fd = self._files.open(path, os.O_WRONLY)
+            try:
+                self._files.pwrite(fd, b"%d\n" % self._number, 0)
+            finally:
+                self._files.close(fd)
+        except OSError as error:
+            if error.errno in (errno.ENODEV, errno.EINVAL) and name == "export":
+                raise ServoError(
+                    f"servo.sysfs.channel: {self._chip} has no channel {self._number}"
+                ) from None
+            if error.errno == errno.EBUSY:
+                raise ServoError(
+                    f"channel {self._number} of {self._chip} is in use by a driver of the kernel: "
+                    "choose another pin with servo.gpio, or channel with servo.sysfs.channel"
+                ) from None
+            raise _explained(path, error) from None
+
+
+def _channel_number(servo: ServoSettings, device: str) -> int:
+    if servo.sysfs.channel is not None:
+        return servo.sysfs.channel
+    if device not in HEADER_CHIPS:
+        raise ServoError(
+            f"servo.sysfs.channel is missing: for chip {device} it is not known which channel "
+            f"drives GPIO {servo.gpio}"
+        )
+    channels = HEADER_CHIPS[device]
+    if servo.gpio not in channels:
+        raise ServoError(
+            f"servo.gpio: GPIO {servo.gpio} has no hardware PWM; "
+            f"{', '.join(map(str, sorted(channels)))} have"
+        )
+    return channels[servo.gpio]
+
+
+def _explained(path: str, error: OSError) -> ServoError:
+    """One line about an error of the file system, with its number."""
+    hint = f"cannot be used: {error.strerror}"
+    if isinstance(error, PermissionError):
+        hint = (
+            "may not be used by this user: join group gpio, and let fishd's udev rule "
+            "give it the files of PWM chips (make install-pi)"
+        )
+    elif error.errno in (errno.ENOENT, errno.ENODEV):
+        hint = "is gone: was the PWM chip's driver unloaded, or the channel unexported?"
+    return ServoError(f"{path} {hint}")

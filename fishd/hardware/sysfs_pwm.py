@@ -1,0 +1,176 @@
+"""The servo through the kernel's PWM: exact pulses on a Pi 5, and wherever there is no pigpiod.
+
+The hardware makes the pulses, so they outlive this process: see `neutralise`.
+"""
+
+import os
+from contextlib import suppress
+
+from fishd.clock import Clock
+from fishd.errors import ServoError
+from fishd.hardware.calibration import ServoCalibration, calibrated
+from fishd.hardware.pulses import pulse_width
+from fishd.hardware.pwm_channel import Files, PwmChannel
+from fishd.hardware.settings import ServoSettings
+
+PATIENCE = 2.0
+"""How long udev may take to hand over the files of a new channel [s]; ticks do not wait for it."""
+NEUTRAL_HOLD = 0.3
+"""How long the last resort holds neutral before it stops the pulses [s]."""
+
+
+class SysfsPwmServo:
+    """A servo on one channel of the kernel's PWM."""
+
+    def __init__(
+        self,
+        settings: ServoSettings,
+        calibration: ServoCalibration,
+        clock: Clock,
+        files: Files = os,
+    ) -> None:
+        """Open the channel and leave its pulses as they are, or go on without and keep trying.
+
+        files: where the channel's files are; by default those of this machine
+        Raises `ServoError` for a calibration whose neutral is no pulse for a servo.
+        """
+        self._settings = settings
+        self._clock = clock
+        self._period = 1.0 / settings.frequency
+        self.recalibrate(calibration)
+        self._driving = False  # pulses of ours are on
+        self._owned = False  # the channel was used: it has to be unexported
+        self._closed = False
+        self._lost = False
+        self._reconnects = 0
+        self._channel = PwmChannel(settings, clock, files)
+        # Each write and release tries again, and says what is wrong.
+        with suppress(ServoError):
+            self._channel.open(PATIENCE)
+
+    def recalibrate(self, calibration: ServoCalibration) -> None:
+        """Use another calibration from the next write on.
+
+        Raises `ServoError`, and keeps the old one, if its neutral is no pulse for a servo.
+        """
+        servo = calibrated(self._settings, calibration)
+        self._neutral = _nanoseconds(pulse_width(servo, 0.0))
+        self._servo = servo
+        self.calibration = calibration
+
+    def counters(self) -> dict[str, int]:
+        """How often the channel was opened again since start."""
+        return {"servo_reconnects": self._reconnects}
+
+    def write(self, angle: float) -> None:
+        """Send an instruction angle [rad], and with it pulses if there were none.
+
+        Raises `ServoError`; after that, each write tries to open the channel again, at once.
+        """
+        duty = _nanoseconds(pulse_width(self._servo, angle))
+        try:
+            if self._driving:
+                self._check_pulses()
+                self._channel.write("duty_cycle", duty)
+            else:
+                self._channel.open(patience=0.0)
+                self._begin(duty)
+        except ServoError:
+            self._lose()
+            raise
+
+    def release(self) -> None:
+        """Stop the pulses once the present one has ended; may be called twice.
+
+        Raises `ServoError` when the channel cannot be reached.
+        """
+        try:
+            self._channel.open(patience=0.0)
+            if self._pulses_are_on():
+                # Not enable 0, which lets the level fall in the middle of a pulse: the servo would
+                # jerk. A new duty cycle takes effect when the present period has ended.
+                self._channel.write("duty_cycle", 0)
+        except ServoError:
+            self._lose()
+            raise
+        self._driving = False
+
+    def close(self) -> None:
+        """Release the servo, switch the channel off and unexport it; may be called twice.
+
+        A channel that was already exported and has not been used is left alone, as another process
+        may hold it. Raises `ServoError` when that fails; no step is left out because of another.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self.release()
+            if self._owned:
+                self._switch_off()
+        finally:
+            self._channel.close()
+            if self._owned or self._channel.exported:
+                self._channel.unexport()
+
+    def neutralise(self) -> bool:
+        """Send a servo that gets pulses to neutral and stop them; False where there are none.
+
+        The last resort when fishd is dead. Should it be alive, its next write fails, because
+        its pulses are off. Raises `ServoError`.
+        """
+        self._channel.open(PATIENCE)
+        if not self._pulses_are_on():
+            return False
+        self._channel.write("duty_cycle", self._neutral)
+        self._clock.sleep(NEUTRAL_HOLD)
+        self._channel.write("duty_cycle", 0)
+        self._switch_off()
+        return True
+
+    def _begin(self, duty: int) -> None:
+        """Start pulses [ns] from whatever state the channel was left in.
+
+        A channel that nobody has used has a period of 0, and older kernels then refuse a duty
+        cycle, even 0. A kernel that believes a channel to be on does nothing on enable 1, even
+        where the hardware is off because the channel was unexported: it is switched off first.
+        """
+        self._owned = True
+        if self._channel.read("duty_cycle"):
+            self._channel.write("duty_cycle", 0)
+        if self._channel.read("enable"):
+            self._channel.write("enable", 0)
+        self._channel.write("period", round(1e9 * self._period))
+        self._channel.write("duty_cycle", duty)
+        self._channel.write("enable", 1)
+        self._driving = True
+        self._reconnects += self._lost
+        self._lost = False
+
+    def _check_pulses(self) -> None:
+        """Without this, a servo that somebody else has released would be written to in vain."""
+        if not self._channel.read("enable"):
+            raise ServoError(
+                f"{self._channel.path}: the servo's pulses were switched off from outside, "
+                "such as by 'fishctl release'"
+            )
+
+    def _pulses_are_on(self) -> bool:
+        return bool(self._channel.read("enable") and self._channel.read("duty_cycle"))
+
+    def _switch_off(self) -> None:
+        """Switch the channel off after the last pulse, whose duty cycle was 0."""
+        if self._channel.read("enable"):
+            self._clock.sleep(self._period)
+            self._channel.write("enable", 0)
+
+    def _lose(self) -> None:
+        """Forget a channel that has failed, so that it is opened again."""
+        self._driving = False
+        self._lost = True
+        self._channel.close()
+
+
+def _nanoseconds(width: float) -> int:
+    """A pulse [µs] as the kernel counts it."""
+    return round(1000.0 * width)

@@ -1,0 +1,124 @@
+"""What the samples of one window amount to: forces and whether to believe them; voltages."""
+
+import math
+from collections.abc import Sequence
+
+from fishd.hardware.calibration import ForceCalibration, ForceSample
+from fishd.hardware.sampler import Pair
+from fishd.hardware.settings import Channel, ForceSensorSettings
+from fishd.signals import Measurement
+
+STEPS = 32768
+"""Of the ADC, from zero to full scale."""
+
+
+class Evaluation:
+    """Turns pairs of codes into measurements of the forces."""
+
+    def __init__(self, settings: ForceSensorSettings) -> None:
+        self.step = settings.full_scale / STEPS
+        """Voltage of one step of the ADC [V]."""
+        self._limit = settings.force_limit
+        self._x = _Channel("F_x", settings.channel_x, settings)
+        self._y = _Channel("F_y", settings.channel_y, settings)
+
+    def measure(self, pairs: Sequence[Pair], calibration: ForceCalibration) -> Measurement:
+        """Means of at least one pair."""
+        _, times, xs, ys = zip(*pairs, strict=True)
+        scale = self.step / len(pairs)
+        fx, fy = calibration.forces(sum(xs) * scale, sum(ys) * scale)
+        newest = times[-1]
+        # Both channels see every window, else one that is not asked could not tell that it froze.
+        doubt_x, doubt_y = self._x.doubt(xs, newest), self._y.doubt(ys, newest)
+        suspect = doubt_x or doubt_y or self._beyond_limit(xs, ys, calibration)
+        return Measurement(newest, fx, fy, len(pairs), suspect)
+
+    def interrupt(self) -> None:
+        """Note that samples stopped coming in, so that nobody takes that for a frozen code."""
+        self._x.forget()
+        self._y.forget()
+
+    def _beyond_limit(
+        self, xs: Sequence[int], ys: Sequence[int], calibration: ForceCalibration
+    ) -> str:
+        forces, step, limit = calibration.forces, self.step, self._limit
+        for x, y in zip(xs, ys, strict=True):
+            fx, fy = forces(x * step, y * step)
+            if not (-limit <= fx <= limit and -limit <= fy <= limit):
+                name, force = ("F_y", fy) if -limit <= fx <= limit else ("F_x", fx)
+                return f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
+        return ""
+
+
+class _Channel:
+    """One channel of the ADC, and whether its codes can be believed."""
+
+    def __init__(self, force: str, channel: Channel, settings: ForceSensorSettings) -> None:
+        self._name = f"{force} (channel {channel})"
+        self._full_scale = settings.full_scale
+        self._patience = math.inf if settings.frozen_after is None else settings.frozen_after
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin to watch anew for a frozen code."""
+        self._code: int | None = None
+        self._since = math.inf
+
+    def doubt(self, codes: Sequence[int], newest: float) -> str:
+        """Why not to believe these codes, empty if there is no reason; `newest` in seconds."""
+        lowest, highest = min(codes), max(codes)
+        if not lowest == highest == self._code:
+            self._code = codes[-1]
+            self._since = newest
+        if highest == STEPS - 1 or lowest == -STEPS:
+            end = self._full_scale if highest == STEPS - 1 else -self._full_scale
+            return f"{self._name} is clipped at {end:+g} V"
+        still = newest - self._since
+        if still >= self._patience:
+            volts = lowest * self._full_scale / STEPS
+            return f"{self._name} has been frozen at {volts:+.6g} V for {still:.1f} s"
+        return ""
+
+
+class VoltageWatch:
+    """The voltages of many windows, added up as codes, which is exact."""
+
+    def __init__(self, begun: float, step: float, calibration: ForceCalibration) -> None:
+        """Pairs from before `begun` [s, monotonic] do not count; `step` of the ADC in volts."""
+        self.closed = False
+        self._step = step
+        self._calibration = calibration
+        self._begun = self._newest = begun
+        self._pairs = self._x = self._y = self._xx = self._yy = 0
+        self._suspect = ""
+
+    def add(self, pairs: Sequence[Pair], suspect: str) -> None:
+        """Add a window, and why it is not to be believed."""
+        for begun, time, x, y in pairs:
+            if begun >= self._begun:
+                self._newest = time
+                self._pairs += 1
+                self._x += x
+                self._y += y
+                self._xx += x * x
+                self._yy += y * y
+        self._suspect = self._suspect or suspect
+
+    def close(self) -> ForceSample:
+        """Stop, and say what came in, all zero if nothing did; may be called twice."""
+        self.closed = True
+        count = max(self._pairs, 1)
+        scale = self._step / count
+        vx, vy = self._x * scale, self._y * scale
+        fx, fy = self._calibration.forces(vx, vy)
+        return ForceSample(
+            pairs=self._pairs,
+            seconds=self._newest - self._begun,
+            vx=vx,
+            vy=vy,
+            vx_std=math.sqrt(count * self._xx - self._x**2) * scale,
+            vy_std=math.sqrt(count * self._yy - self._y**2) * scale,
+            fx=fx,
+            fy=fy,
+            suspect=self._suspect,
+        )

@@ -1,0 +1,84 @@
+"""A bus with one emulated ADS1115, for the tests of chip, bus and driver."""
+
+from collections.abc import Sequence
+
+from adafruit_ads1x15 import ADS1115
+
+from fishd.clock import VirtualClock
+from fishd.emulation.ads1115 import Ads1115Chip
+from fishd.emulation.busio_i2c import BusioI2c
+from fishd.emulation.faults import Faults
+from fishd.emulation.i2c import I2cBus, Message, Read, Write
+from fishd.emulation.linux_i2c import LinuxI2c
+
+VOLTS = [0.5, -0.3, 0.1, -0.25, 1.0, 0.7, 0.0, 1.9]
+"""The mean voltage of each input, by mux bits."""
+
+X, Y = 0, 3
+"""Mux bits of the inputs A0-A1 and A2-A3."""
+
+ABSENT_BUS = 201
+"""A bus that no machine has."""
+
+
+class Enough(Exception):
+    """Ends a driver that would go on for ever."""
+
+
+class Board:
+    """A chip on a bus, with what a test wants to look at or change."""
+
+    def __init__(
+        self, speed: float = 400e3, noise: float = 0.0, seed: int = 0, zero_length: bool = True
+    ) -> None:
+        self.clock = VirtualClock()
+        self.faults = Faults(self.clock)
+        self.bus = I2cBus(self.clock, speed, self.faults)
+        self.volts = list(VOLTS)
+        self.measured: list[tuple[int, float, float]] = []
+        self.chip = Ads1115Chip(
+            self.clock, self.input, self.faults, noise, seed, zero_length_probe=zero_length
+        )
+        self.bus.attach(0x48, self.chip)
+        self.transfers = 0
+        self.allowed = 10**9
+
+    def input(self, mux: int, start: float, end: float) -> float:
+        self.measured.append((mux, start, end))
+        return self.volts[mux]
+
+    def transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
+        self.transfers += 1
+        if self.transfers > self.allowed:
+            raise Enough
+        return self.bus.transfer(address, messages)
+
+    def driver(self, **options: float) -> ADS1115:
+        options.setdefault("data_rate", 860)
+        return ADS1115(BusioI2c(self.transfer), **options)
+
+    def register(self, pointer: int) -> int:
+        (word,) = self.bus.transfer(0x48, [Write(bytes([pointer])), Read(2)])
+        return int.from_bytes(word, "big")
+
+    def configure(self, word: int) -> None:
+        self.bus.transfer(0x48, [Write(b"\x01" + word.to_bytes(2, "big"))])
+
+    def set_timeout(self, seconds: float) -> None:
+        self.bus.timeout = seconds
+
+    def device_file(self, bus: int = ABSENT_BUS) -> LinuxI2c:
+        return LinuxI2c(self.bus.transfer, {bus}, self.set_timeout)
+
+    def wait(self, rate: float = 860.0) -> None:
+        """Until any conversion at that rate has ended."""
+        self.clock.sleep(1.25 / rate + 1e-3)
+
+
+def codes(volts: float, full_scale: float = 4.096) -> int:
+    return round(volts / full_scale * 0x8000)
+
+
+def config(mux: int, *, start: bool = True, rate: int = 7, low_byte: int = 3) -> int:
+    """A single-shot config at ±4.096 V."""
+    return (0x8000 if start else 0) | mux << 12 | 1 << 9 | 0x100 | rate << 5 | low_byte

@@ -1,0 +1,141 @@
+"""What the emulated ADS1115 measures, how fast, and what its registers do."""
+
+import statistics
+
+import pytest
+from adafruit_ads1x15 import ADS1115, AnalogIn
+from adafruit_extended_bus import ExtendedI2C
+from ads1115_board import ABSENT_BUS, VOLTS, Board, X, Y, codes, config
+
+from fishd.emulation.ads1115 import DATA_RATES, POWER_UP
+from fishd.emulation.i2c import Read, Write
+
+PINS = [(0, 1), (0, 3), (1, 3), (2, 3), (0,), (1,), (2,), (3,)]
+"""What AnalogIn is given, by mux bits."""
+
+
+@pytest.fixture
+def board() -> Board:
+    return Board()
+
+
+def test_the_driver_reads_every_input_through_the_busio_front_end(board: Board) -> None:
+    ads = board.driver()
+    assert [AnalogIn(ads, *pins).value for pins in PINS] == [codes(volts) for volts in VOLTS]
+
+
+def test_the_driver_reads_every_input_through_the_device_file(board: Board) -> None:
+    with board.device_file():
+        ads = ADS1115(ExtendedI2C(ABSENT_BUS, frequency=None), data_rate=860)
+        values = [AnalogIn(ads, *pins).value for pins in PINS]
+    assert values == [codes(volts) for volts in VOLTS]
+
+
+@pytest.mark.parametrize(
+    ("gain", "full_scale"),
+    [(2 / 3, 6.144), (1, 4.096), (2, 2.048), (4, 1.024), (8, 0.512), (16, 0.256)],
+)
+def test_a_code_is_a_share_of_the_range_and_clips_at_its_ends(
+    board: Board, gain: float, full_scale: float
+) -> None:
+    board.volts[:3] = [0.2, 1.001 * full_scale, -1.001 * full_scale]
+    ads = board.driver(gain=gain)
+    assert ads.read(0) == codes(0.2, full_scale)
+    assert ads.read(1) == 32767
+    assert ads.read(2) == -32768
+
+
+def test_noise_is_as_large_as_asked_for_and_the_same_for_the_same_seed() -> None:
+    def readings(seed: int) -> list[int]:
+        ads = Board(noise=5.0, seed=seed).driver()
+        return [ads.read(X) for _ in range(400)]
+
+    assert statistics.stdev(readings(1)) == pytest.approx(5.0, rel=0.15)
+    assert statistics.mean(readings(1)) == pytest.approx(codes(VOLTS[X]), abs=1.0)
+    assert readings(1) == readings(1)
+    assert readings(1) != readings(2)
+
+
+@pytest.mark.parametrize(("bits", "rate"), list(enumerate(DATA_RATES)))
+def test_a_conversion_lasts_one_period_of_a_data_rate_that_is_off_by_up_to_a_tenth(
+    bits: int, rate: int
+) -> None:
+    lengths = []
+    for seed in range(20):
+        board = Board(seed=seed)
+        board.configure(config(X, rate=bits))
+        begun = board.clock.now
+        board.clock.sleep(1.2 / rate)
+        assert board.register(0) == codes(VOLTS[X])
+        (_, start, end) = board.measured[0]
+        assert start == pytest.approx(begun + POWER_UP)
+        lengths.append((end - start) * rate)
+    assert 1 / 1.1 <= min(lengths) < 0.97
+    assert 1.03 < max(lengths) <= 1 / 0.9
+
+
+def test_a_late_reader_gets_the_voltage_of_the_time_of_the_conversion(board: Board) -> None:
+    board.configure(config(X))
+    begun = board.clock.now
+    board.clock.sleep(100.0)
+    assert board.measured == []
+    board.register(0)
+    ((_, start, end),) = board.measured
+    assert begun < start < end < begun + 2e-3
+
+
+def test_registers_have_their_reset_values(board: Board) -> None:
+    assert [board.register(pointer) for pointer in range(4)] == [0x0000, 0x8583, 0x8000, 0x7FFF]
+
+
+def test_the_pointer_stays_where_it_was_set(board: Board) -> None:
+    board.bus.transfer(0x48, [Write(b"\x03")])
+    assert board.bus.transfer(0x48, [Read(2)]) == [b"\x7f\xff"]
+    assert board.bus.transfer(0x48, [Read(1)]) == [b"\x7f"]
+    assert board.bus.transfer(0x48, [Read(3)]) == [b"\x7f\xff\xff"]
+
+
+def test_half_a_word_changes_no_register(board: Board) -> None:
+    board.bus.transfer(0x48, [Write(b"\x03\x12")])
+    assert board.register(3) == 0x7FFF
+
+
+def test_a_general_call_resets_the_chip(board: Board) -> None:
+    board.configure(config(Y))
+    board.bus.transfer(0x00, [Write(b"\x06")])
+    board.wait()
+    assert [board.register(pointer) for pointer in range(2)] == [0x0000, 0x8583]
+
+
+def test_a_busy_chip_tells_so_and_ignores_a_start(board: Board) -> None:
+    board.configure(config(X))
+    assert not board.register(1) & 0x8000
+    board.configure(config(Y))
+    board.wait()
+    assert board.register(1) == config(Y), "the config is kept, but it did not start"
+    assert board.register(0) == codes(VOLTS[X])
+    assert [mux for mux, _, _ in board.measured] == [X]
+
+
+def test_a_config_without_the_start_bit_starts_nothing(board: Board) -> None:
+    board.configure(config(Y, start=False))
+    assert board.register(1) & 0x8000
+    board.wait()
+    assert board.measured == []
+
+
+@pytest.mark.parametrize(("speed", "fewest", "most"), [(400e3, 13, 16), (100e3, 8, 10)])
+def test_so_many_pairs_fit_into_a_window_of_50_ms(speed: float, fewest: int, most: int) -> None:
+    for seed in range(10):
+        board = Board(speed, seed=seed)
+        ads = board.driver()
+        begun, pairs = board.clock.now, 0
+        while board.clock.now < begun + 0.5:
+            for mux in (X, Y):
+                ads._write_config(mux)
+                board.clock.sleep(POWER_UP + 1 / 860)
+                while not ads._conversion_complete():
+                    pass
+                assert ads.get_last_result() == codes(VOLTS[mux]) & 0xFFFF
+            pairs += 1
+        assert fewest <= pairs / 10 <= most

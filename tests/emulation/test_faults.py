@@ -1,0 +1,109 @@
+"""Faults of the virtual Pi: named, timed, repeatable."""
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+from fishd.clock import VirtualClock
+from fishd.emulation.faults import FAULTS, INSTANTANEOUS, TRANSFER_ERRORS, Faults
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def faults(clock: VirtualClock) -> Faults:
+    return Faults(clock)
+
+
+def test_nothing_is_wrong_at_first(faults: Faults) -> None:
+    assert not any(faults.active(name) for name in FAULTS)
+    assert faults.listing() == {}
+    assert faults.transfer_error() is None
+
+
+def test_a_fault_lasts_until_it_is_cleared(faults: Faults, clock: VirtualClock) -> None:
+    faults.inject("stuck-busy")
+    clock.sleep(1e6)
+    assert faults.active("stuck-busy")
+    faults.clear("stuck-busy")
+    assert not faults.active("stuck-busy")
+
+
+def test_a_timed_fault_ends_by_itself(faults: Faults, clock: VirtualClock) -> None:
+    faults.inject("nack", 0.5)
+    clock.sleep(0.4)
+    assert faults.active("nack")
+    clock.sleep(0.2)
+    assert not faults.active("nack")
+
+
+def test_the_listing_tells_how_long_each_has_left(faults: Faults, clock: VirtualClock) -> None:
+    faults.inject("clipped")
+    faults.inject("nack", 2.0)
+    clock.sleep(0.5)
+    assert faults.listing() == {"nack": pytest.approx(1.5), "clipped": None}
+
+
+def test_clearing_all_ends_random_errors_too(faults: Faults) -> None:
+    faults.inject("clipped")
+    faults.error_rate = 1.0
+    faults.clear()
+    assert faults.listing() == {}
+    assert faults.transfer_error() is None
+
+
+@pytest.mark.parametrize("call", [Faults.inject, Faults.clear])
+def test_an_unknown_name_is_answered_with_the_nearest_one(
+    faults: Faults, call: Callable[[Faults, str], None]
+) -> None:
+    with pytest.raises(ValueError, match="no fault is called 'brownout'; did you mean 'brown-out'"):
+        call(faults, "brownout")
+
+
+def test_a_fault_that_happens_at_once_tells_its_listeners_and_does_not_last(
+    faults: Faults,
+) -> None:
+    for name in INSTANTANEOUS:
+        heard: list[str] = []
+        faults.listen(name, partial(heard.append, name))
+        faults.inject(name)
+        assert heard == [name]
+        assert not faults.active(name)
+        with pytest.raises(ValueError, match="takes no seconds"):
+            faults.inject(name, 1.0)
+
+
+def test_a_duration_that_is_not_positive_is_refused(faults: Faults) -> None:
+    for seconds in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="a positive number is needed"):
+            faults.inject("nack", seconds)
+    assert not faults.active("nack")
+
+
+def test_random_errors_have_the_share_asked_for_and_are_of_every_kind(faults: Faults) -> None:
+    faults.error_rate = 0.1
+    drawn = [faults.transfer_error() for _ in range(10_000)]
+    errors = [name for name in drawn if name]
+    assert 900 < len(errors) < 1100
+    assert set(errors) == set(TRANSFER_ERRORS)
+
+
+def test_the_same_seed_gives_the_same_errors(clock: VirtualClock) -> None:
+    def draw(seed: int) -> list[str | None]:
+        faults = Faults(clock, seed)
+        faults.error_rate = 0.2
+        return [faults.transfer_error() for _ in range(200)]
+
+    assert draw(3) == draw(3)
+    assert draw(3) != draw(4)
+
+
+def test_an_error_rate_that_is_no_share_is_refused(faults: Faults) -> None:
+    for share in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match=r"error rate .* is not valid"):
+            faults.error_rate = share
+    assert faults.error_rate == 0.0

@@ -1,0 +1,248 @@
+"""A virtual Pi behind its socket: what goes through, what fails, and what survives."""
+
+import contextlib
+import errno
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from adafruit_ads1x15 import ADS1115, AnalogIn
+from adafruit_extended_bus import ExtendedI2C
+
+from fishd.clock import VirtualClock
+from fishd.emulation.i2c import Read, Write
+from fishd.emulation.link import RemotePi
+from fishd.emulation.link_server import LinkServer
+from fishd.emulation.linux_i2c import LinuxI2c
+from fishd.emulation.pins import Pins
+from fishd.emulation.settings import VirtualPiSettings
+from fishd.emulation.virtual_pi import VirtualPi
+from fishd.emulation.wires import Wires
+from fishd.errors import StartupError
+from fishd.hardware.imperfections import SimulationSettings
+from fishd.plant.parameters import PlantParameters
+
+ADDRESS = 0x48
+CONFIG = [Write(b"\x01"), Read(2)]
+PATIENCE = 20.0
+
+
+def virtual_pi() -> VirtualPi:
+    """On a virtual clock, so that the bus takes no time."""
+    return VirtualPi(
+        VirtualPiSettings(pigpio_port=0),
+        PlantParameters(),
+        SimulationSettings(),
+        0.05,
+        VirtualClock(),
+    )
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "pi"
+
+
+@pytest.fixture
+def pi(path: Path) -> Iterator[VirtualPi]:
+    pi = virtual_pi()
+    with LinkServer(pi, path):
+        yield pi
+
+
+def wait_until_equal(found: list[object], wanted: object) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while found[-1:] != [wanted] and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert found[-1:] == [wanted]
+
+
+def test_a_transfer_over_the_link_is_one_on_the_bus(pi: VirtualPi, path: Path) -> None:
+    with RemotePi(path) as remote:
+        assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+        assert remote.transfer(ADDRESS, [Write(b"\x02\x12\x34")]) == []
+        assert remote.transfer(ADDRESS, [Write(b"\x02"), Read(2), Read(1)]) == [
+            b"\x12\x34",
+            b"\x12",
+        ]
+        assert pi.bus.transfer(ADDRESS, [Write(b"\x02"), Read(2)]) == [b"\x12\x34"]
+
+
+def test_the_true_driver_works_over_the_link(pi: VirtualPi, path: Path) -> None:
+    with RemotePi(path) as remote, LinuxI2c(remote.transfer, {204}, remote.set_timeout):
+        ads = ADS1115(ExtendedI2C(204, frequency=None), data_rate=860, gain=8)
+        assert abs(AnalogIn(ads, 2, 3).voltage) < 0.1
+        pi.faults.inject("clipped")
+        assert AnalogIn(ads, 2, 3).value == 0x7FFF
+
+
+@pytest.mark.parametrize(
+    ("fault", "number", "kind"),
+    [
+        ("nack", errno.EREMOTEIO, OSError),
+        ("timeout", errno.ETIMEDOUT, TimeoutError),
+        ("clock-stretch", errno.EIO, OSError),
+        ("bus-owned", errno.EBUSY, OSError),
+        ("arbitration-lost", errno.EAGAIN, BlockingIOError),
+    ],
+)
+def test_errors_of_the_bus_arrive_as_they_are(
+    pi: VirtualPi, path: Path, fault: str, number: int, kind: type[OSError]
+) -> None:
+    with RemotePi(path) as remote:
+        remote.inject(fault, 60.0)
+        assert remote.state().faults == {fault: pytest.approx(60.0, abs=1.0)}
+        with pytest.raises(kind) as caught:
+            remote.transfer(ADDRESS, CONFIG)
+        assert caught.value.errno == number
+        remote.clear(fault)
+        assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+
+
+def test_what_makes_no_sense_is_refused_with_the_reason(pi: VirtualPi, path: Path) -> None:
+    with RemotePi(path) as remote:
+        with pytest.raises(ValueError, match=r"no fault is called 'nak'; did you mean 'nack'\?"):
+            remote.inject("nak")
+        with pytest.raises(ValueError, match="a positive number is needed"):
+            remote.inject("nack", -1.0)
+        with pytest.raises(ValueError, match="no fault is called 'x'"):
+            remote.clear("x")
+        with pytest.raises(ValueError, match="GPIO 99 is not valid"):
+            remote.set_level(99, 1)
+
+
+def test_bytes_that_are_no_request_do_no_harm(pi: VirtualPi, path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as raw, RemotePi(path) as remote:
+        raw.connect(str(path))
+        for nonsense in (b"\xff", b"hello", b"\x91\xa8Transfer", os.urandom(3000)):
+            raw.send(nonsense)
+            assert b"Failed" in raw.recv(65536)
+        raw.send(b"\xff")
+        raw.close()  # without taking the reply
+        assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+
+
+def test_who_waits_keeps_nobody_else_waiting(pi: VirtualPi, path: Path) -> None:
+    with RemotePi(path) as patient, RemotePi(path) as busy:
+        found: list[object] = []
+        thread = threading.Thread(target=lambda: found.append(patient.await_levels({})))
+        thread.start()
+        busy.transfer(ADDRESS, CONFIG)
+        busy.set_level(17, 0)
+        thread.join()
+        assert found[0] in ({17: 0}, {})  # {} where a slow machine let the wait run out
+        assert busy.await_levels({}) == {17: 0}
+        assert busy.state().levels == {17: 0}
+
+
+def test_a_button_reaches_the_pins_of_another_process(pi: VirtualPi, path: Path) -> None:
+    pi.set_level(4, 1)
+    pins, seen = Pins(), list[object]()
+
+    def set_level(gpio: int, level: int | None) -> None:
+        pins.set_level(gpio, level)
+        seen.append((gpio, level))
+
+    wires = Wires(path, set_level)
+    with contextlib.closing(wires):
+        assert seen == [(4, 1)]
+        pi.set_level(17, 1)
+        wait_until_equal(seen, (17, 1))
+        assert pins.level(17) == 1
+        pi.set_level(17, None)
+        wait_until_equal(seen, (17, None))
+        assert pins.level(17) == 0
+    wires.close()
+
+
+def test_a_button_is_found_again_when_the_virtual_pi_was_restarted(path: Path) -> None:
+    seen: list[object] = []
+    first, second = virtual_pi(), virtual_pi()
+    with LinkServer(first, path):
+        wires = Wires(path, lambda *level: seen.append(level))
+    with contextlib.closing(wires), LinkServer(second, path):
+        second.set_level(17, 1)
+        wait_until_equal(seen, (17, 1))
+
+
+def test_nobody_there_is_one_line_that_says_what_to_do(path: Path) -> None:
+    with pytest.raises(StartupError) as caught:
+        RemotePi(path)
+    assert str(caught.value) == (
+        f"no virtual Pi is running at {path}; start one with 'fishctl virtual-pi run'"
+    )
+    with pytest.raises(StartupError, match="too long"):
+        RemotePi(path / ("x" * 200))
+
+
+def test_a_virtual_pi_that_goes_away_is_no_device_until_it_is_back(path: Path) -> None:
+    first, second = virtual_pi(), virtual_pi()
+    with LinkServer(first, path):
+        remote = RemotePi(path)
+        remote.set_timeout(0.03)
+        assert first.bus.timeout == 0.03
+        remote.transfer(ADDRESS, CONFIG)
+    with contextlib.closing(remote):
+        for _ in range(3):
+            with pytest.raises(OSError, match=r"the virtual Pi at .* is gone") as caught:
+                remote.transfer(ADDRESS, CONFIG)
+            assert caught.value.errno == errno.ENODEV
+        with LinkServer(second, path):
+            assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+            assert second.bus.timeout == 0.03
+
+
+def test_a_second_virtual_pi_is_refused_and_the_first_one_unharmed(
+    pi: VirtualPi, path: Path
+) -> None:
+    with RemotePi(path) as remote:
+        wanted = rf"another virtual Pi \(pid {os.getpid()}\) already listens on {path}"
+        with pytest.raises(StartupError, match=wanted):
+            LinkServer(virtual_pi(), path).start()
+        assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+    with RemotePi(path) as remote:
+        assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+
+
+def test_the_socket_file_of_a_dead_virtual_pi_is_taken_over(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
+        dead.bind(str(path))
+    with pytest.raises(StartupError, match="no virtual Pi is running"):
+        RemotePi(path)
+    with LinkServer(virtual_pi(), path), RemotePi(path) as remote:
+        assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
+    assert not path.exists()
+
+
+def test_a_path_that_is_no_good_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "notes"
+    file.write_text("mine")
+    with pytest.raises(StartupError, match="notes is there already and is no socket"):
+        LinkServer(virtual_pi(), file).start()
+    assert file.read_text() == "mine"
+    with pytest.raises(StartupError, match=r"cannot listen on .*: No such file or directory"):
+        LinkServer(virtual_pi(), tmp_path / "nowhere" / "pi").start()
+    with pytest.raises(StartupError, match="too long"):
+        LinkServer(virtual_pi(), tmp_path / ("x" * 150)).start()
+
+
+def test_only_this_user_can_reach_it(pi: VirtualPi, path: Path) -> None:
+    assert path.stat().st_mode & 0o077 == 0
+
+
+def test_closing_leaves_no_thread_and_no_file(path: Path) -> None:
+    before = set(threading.enumerate())
+    server = LinkServer(virtual_pi(), path)
+    server.start()
+    remotes = [RemotePi(path) for _ in range(5)]
+    server.close()
+    server.close()
+    assert set(threading.enumerate()) <= before
+    assert not path.exists()
+    for remote in remotes:
+        remote.close()
+        remote.close()

@@ -1,0 +1,132 @@
+"""Debian's `pigs`, a client in C, drives the emulated pigpiod in real time."""
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+
+import pytest
+from pigpiod_client import GPIO, PATIENCE, PigpiodBench, eventually, pigpiod_bench
+
+from fishd.clock import SystemClock, VirtualClock
+
+PIGS = shutil.which("pigs")
+needs_pigs = pytest.mark.skipif(
+    PIGS is None, reason="`pigs` is not installed: it is in Debian's package pigpio-tools"
+)
+pytestmark = needs_pigs
+
+
+@pytest.fixture
+def bench() -> Iterator[PigpiodBench]:
+    with pigpiod_bench(SystemClock()) as bench:
+        yield bench
+
+
+def pigs(bench: PigpiodBench, *arguments: str) -> subprocess.CompletedProcess[str]:
+    assert PIGS is not None
+    environment = os.environ | {
+        "PIGPIO_ADDR": "127.0.0.1",
+        "PIGPIO_PORT": str(bench.daemon.port),
+    }
+    return subprocess.run(
+        [PIGS, *arguments], env=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
+
+
+def told(bench: PigpiodBench, *arguments: str) -> str:
+    """What pigs prints when all goes well."""
+    done = pigs(bench, *arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.strip()
+
+
+def test_the_last_resort_moves_the_servo_to_neutral_and_lets_go(bench: PigpiodBench) -> None:
+    bench.pi.set_servo_pulsewidth(GPIO, 1700)
+    assert eventually(lambda: bench.width == 1700)
+    begun = time.monotonic()
+    assert told(bench, "s", "18", "1500", "mils", "300", "s", "18", "0") == ""
+    assert time.monotonic() - begun >= 0.3
+    assert eventually(lambda: bench.width == 0)
+    (neutral, off) = bench.daemon.history(GPIO)[-2:]
+    assert (neutral[1], off[1]) == (1500, 0)
+    assert off[0] - neutral[0] >= 0.3 - 0.02
+
+
+def test_a_delay_of_one_client_holds_up_no_other(bench: PigpiodBench) -> None:
+    assert PIGS is not None
+    with subprocess.Popen(
+        [PIGS, "mils", "60000"],
+        env=os.environ | {"PIGPIO_ADDR": "127.0.0.1", "PIGPIO_PORT": str(bench.daemon.port)},
+    ) as waiting:
+        try:
+            assert bench.pi.set_servo_pulsewidth(GPIO, 1500) == 0
+            assert told(bench, "gpw", "18") == "1500"
+            assert waiting.poll() is None
+        finally:
+            waiting.kill()
+
+
+def test_a_delay_is_one_of_the_daemons_clock() -> None:
+    with pigpiod_bench(VirtualClock()) as bench:
+        assert PIGS is not None
+        with subprocess.Popen(
+            [PIGS, "s", "18", "1500", "mils", "60000", "s", "18", "1600"],
+            env=os.environ | {"PIGPIO_ADDR": "127.0.0.1", "PIGPIO_PORT": str(bench.daemon.port)},
+        ) as waiting:
+            assert eventually(lambda: bench.settled_width == 1500)
+            bench.sleep(60.0)
+            assert waiting.wait(PATIENCE) == 0
+        assert bench.settled_width == 1600
+
+
+def test_values_are_read_back(bench: PigpiodBench) -> None:
+    told(bench, "s", "18", "1504", "m", "4", "w", "w", "4", "1")
+    assert told(bench, "gpw", "18", "mg", "4", "r", "4", "pigpv").split() == [
+        "1504",
+        "1",
+        "1",
+        "79",
+    ]
+
+
+def test_hardware_pwm_is_set(bench: PigpiodBench) -> None:
+    told(bench, "hp", "18", "333", str(333 * 1500))
+    assert told(bench, "gdc", "18") == str(333 * 1500)
+    assert eventually(lambda: bench.width == pytest.approx(1500, abs=0.01))
+
+
+def test_scripts_are_stored_run_watched_and_deleted(bench: PigpiodBench) -> None:
+    number = told(bench, "proc", "tag 0 mils 10 lda p0 cmp 0 jz 0 dcr p0 jnz 0 s p1 p2 jmp 0")
+    assert number == "0"
+    told(bench, "procr", number, "5", "18", "1500")
+    assert eventually(lambda: bench.width == 1500)
+    assert told(bench, "procp", number) == "2 0 18 1500 0 0 0 0 0 0 0"
+    told(bench, "procu", number, "0", "18", "1600")
+    assert told(bench, "procp", number) == "2 0 18 1600 0 0 0 0 0 0 0"
+    told(bench, "procs", number)
+    assert eventually(lambda: told(bench, "procp", number).startswith("1 "))
+    told(bench, "procd", number)
+    assert pigs(bench, "procp", number).stdout.strip() == "-48"
+
+
+@pytest.mark.parametrize(
+    ("command", "number", "message"),
+    [
+        ("s 18 100", "-7", "pulsewidth not 0 or 500-2500"),
+        ("gpw 18", "-93", "GPIO is not in use for servo pulses"),
+        ("gdc 18", "-92", "GPIO is not in use for PWM"),
+        ("w 40 1", "-41", "no permission to update GPIO"),
+        ("procr 3", "-48", "unknown script id"),
+        ("proc frob", "-55", "illegal script command"),
+        ("i2co 1 0x48 0", "-88", "unknown command"),
+    ],
+)
+def test_errors_are_told_and_make_its_exit_status(
+    bench: PigpiodBench, command: str, number: str, message: str
+) -> None:
+    done = pigs(bench, *command.split(" ", 1 if command.startswith("proc ") else -1))
+    assert done.returncode != 0
+    assert done.stdout.strip() == number
+    assert message.casefold() in done.stderr.casefold()

@@ -1,0 +1,150 @@
+"""Pulses to forces to volts and back, with the true drivers on the virtual Pi."""
+
+import errno
+import math
+import socket
+
+import pytest
+from virtual_pi_rig import BUS, GPIO, TICK, VirtualPiRig
+
+from fishd.clock import VirtualClock
+from fishd.emulation.lgpio import EmulatedLgpio
+from fishd.emulation.settings import VirtualPiSettings
+from fishd.emulation.virtual_pi import VirtualPi
+from fishd.errors import StartupError
+from fishd.hardware.imperfections import SimulationSettings
+from fishd.plant.parameters import PlantParameters
+from fishd.plant.tethered import TetheredFish
+
+AMPLITUDE = 0.4  # 240 µs, a whole number of pigpiod's steps
+HALF_PERIOD = 0.24  # a whole number of servo frames
+
+
+def test_a_fish_that_is_told_to_beat_is_seen_to_swim() -> None:
+    fish = TetheredFish(PlantParameters())
+    with VirtualPiRig() as rig:
+        for half in range(20):
+            angle = AMPLITUDE if half % 2 == 0 else -AMPLITUDE
+            rig.clock.now = max(rig.clock.now, half * HALF_PERIOD - 0.005)
+            rig.steer(angle)
+            thrust, lateral = rig.forces_until((half + 1) * HALF_PERIOD - 0.006)
+            expected = fish.advance(angle, HALF_PERIOD, 1)
+            if half >= 2:
+                assert thrust == pytest.approx(expected.thrust, rel=0.05)
+                assert lateral == pytest.approx(expected.lateral_force, rel=0.05)
+                assert math.copysign(1, lateral) == -math.copysign(1, angle)
+        rig.clock.now = 20 * HALF_PERIOD
+        rig.pi.tank.catch_up(rig.clock.now)
+        assert rig.pi.tank.truth().alpha == pytest.approx(fish.state.alpha, abs=1e-3)
+        assert rig.pi.tank.take_window().fin_peak > 0.15
+
+
+def test_a_pulse_waits_for_the_next_frame_up_to_20_ms() -> None:
+    with VirtualPiRig() as rig:
+        delays = []
+        for k in range(50):
+            rig.clock.now = 1.0 + k * 0.0537
+            rig.steer(0.1 if k % 2 else -0.1)
+            rig.clock.now += 0.025
+            rig.x.voltage  # noqa: B018
+            effective, width = rig.pi.pigpiod.history(GPIO)[-1]
+            assert width == (1560 if k % 2 else 1440)
+            delays.append(effective - 1.0 - k * 0.0537)
+        assert min(delays) >= -1e-9
+        assert max(delays) <= 0.02
+        assert max(delays) - min(delays) > 0.015
+
+
+def test_codes_are_whole_steps_of_the_adc_and_as_noisy_as_configured() -> None:
+    with VirtualPiRig(adc_noise=0.0) as rig:
+        assert {rig.x.value for _ in range(50)} == {0}
+    with VirtualPiRig(adc_noise=3.0) as rig:
+        codes = [rig.x.value for _ in range(400)]
+        assert math.sqrt(sum(code**2 for code in codes) / len(codes)) == pytest.approx(3.0, rel=0.2)
+
+
+def test_the_rig_is_as_imperfect_as_the_simulation_says() -> None:
+    imperfections = {"offset_x": 0.02, "offset_y": -0.03, "noise": 1e-3, "drift": 0.0}
+    with VirtualPiRig(imperfections, sensitivity=0.5, adc_noise=0.0) as rig:
+        x, y = rig.forces_until(2.0)
+        assert x == pytest.approx(0.01, abs=5e-4)
+        assert y == pytest.approx(-0.015, abs=5e-4)
+        noisy = [rig.x.voltage for _ in range(500)]
+        rms = math.sqrt(sum((v - 0.01) ** 2 for v in noisy) / len(noisy))
+        duration = 1 / 860 / rig.pi.chip.rate_factor
+        assert rms == pytest.approx(0.5e-3 * math.sqrt(TICK / duration), rel=0.15)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
+    def run(seed: int) -> list[int]:
+        with VirtualPiRig({"noise": 1e-3, "seed": seed}) as rig:
+            rig.steer(AMPLITUDE)
+            return [rig.y.value for _ in range(100)]
+
+    assert run(1) == run(1)
+    assert run(1) != run(2)
+
+
+def test_faults_reach_both_halves_of_the_pi() -> None:
+    with VirtualPiRig() as rig:
+        rig.steer(AMPLITUDE)
+        rig.forces_until(0.11)  # between two pulses
+        rig.pi.faults.inject("unplugged", 1.0)
+        with pytest.raises(OSError, match="Remote I/O") as caught:
+            rig.x.voltage  # noqa: B018
+        assert caught.value.errno == errno.EREMOTEIO
+        rig.pi.faults.inject("pigpiod-gone")
+        assert set(rig.pi.state().faults) == {"unplugged", "pigpiod-gone"}
+        assert rig.pi.state().faults["pigpiod-gone"] is None
+        rig.clock.now += 1.0
+        wheel = TetheredFish(PlantParameters())
+        wheel.advance(AMPLITUDE, 0.09, 1)
+        assert rig.pi.state().pulse == 0.0
+        assert rig.pi.state().angle is None
+        rig.forces_until(1.5)  # the chip is back, and the wheel has stopped soon after 0.1
+        assert rig.pi.tank.truth().phi == pytest.approx(wheel.state.phi, abs=0.05)
+        assert abs(rig.pi.tank.truth().phi) < AMPLITUDE - 0.02
+
+
+def test_the_fish_swims_on_where_nobody_reads_the_sensor() -> None:
+    with VirtualPiRig() as rig:
+        rig.steer(AMPLITUDE)
+        assert rig.pi.state().truth.alpha == 0.0
+        rig.clock.now += 10.0
+        state = rig.pi.state()
+        assert (state.pulse, state.angle) == (1740.0, pytest.approx(AMPLITUDE))
+        assert state.truth.phi == pytest.approx(AMPLITUDE)
+        assert state.truth.alpha == pytest.approx(PlantParameters().coupling * AMPLITUDE)
+
+
+def test_a_button_is_seen_by_the_true_gpio_library() -> None:
+    with VirtualPiRig() as rig, EmulatedLgpio(rig.pi.pins):
+        from RPi import GPIO as gpio  # noqa: N811
+
+        gpio.setmode(gpio.BCM)
+        gpio.setup(17, gpio.IN, pull_up_down=gpio.PUD_UP)
+        assert gpio.input(17) == 1
+        rig.pi.set_level(17, 0)
+        assert gpio.input(17) == 0
+        assert rig.pi.state().levels == {17: 0}
+        rig.pi.set_level(17, None)
+        assert gpio.input(17) == 1
+        gpio.cleanup()
+    with pytest.raises(ValueError, match="GPIO 40 is not valid: 0 to 27 is needed"):
+        rig.pi.set_level(40, 1)
+
+
+def test_a_port_that_is_taken_is_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        pi = VirtualPi(
+            VirtualPiSettings(bus=BUS, pigpio_port=port),
+            PlantParameters(),
+            SimulationSettings(),
+            TICK,
+            VirtualClock(),
+        )
+        with pytest.raises(
+            StartupError, match=f"virtual_pi.pigpio_port: cannot listen on .*{port}"
+        ):
+            pi.start()

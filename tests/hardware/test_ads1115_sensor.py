@@ -1,0 +1,213 @@
+"""The force sensor on an emulated ADS1115, through the true driver: what each read says."""
+
+import itertools
+
+import pytest
+from force_rig import ABSENT_BUS, STEP, TICK, ForceRig, Ticks, measurements
+
+from fishd.errors import SensorError
+from fishd.hardware.calibration import ForceCalibration
+from fishd.signals import Measurement
+
+CALIBRATION = ForceCalibration(xx=2.0, xy=0.1, x0=-0.3, yx=-0.2, yy=3.0, y0=0.4)
+
+
+def test_forces_are_the_calibrated_voltages() -> None:
+    with ForceRig() as rig:
+        measured = Ticks(rig.sensor(CALIBRATION)).next()
+    assert measured.fx == pytest.approx(2.0 * 0.5 + 0.1 * -0.25 - 0.3, abs=2e-4)
+    assert measured.fy == pytest.approx(-0.2 * 0.5 + 3.0 * -0.25 + 0.4, abs=3e-4)
+    assert measured.suspect == ""
+
+
+@pytest.mark.parametrize(
+    ("channel_x", "channel_y"),
+    [("A0-A1", "A2-A3"), ("A2-A3", "A0-A1"), ("A0", "A3"), ("A1", "A2-A3"), ("A0-A3", "A1-A3")],
+)
+def test_each_force_comes_from_its_channel(channel_x: str, channel_y: str) -> None:
+    with ForceRig() as rig:
+        rig.volts = {channel_x: 0.8, channel_y: 0.3}
+        ticks = Ticks(rig.sensor(channel_x=channel_x, channel_y=channel_y))
+        for measured in measurements(ticks.run(1.0)):
+            assert (measured.fx, measured.fy) == pytest.approx((0.8, 0.3), abs=1e-3)
+
+
+@pytest.mark.parametrize("full_scale", [6.144, 4.096, 2.048, 1.024, 0.512, 0.256])
+def test_every_range_gives_the_same_voltage(full_scale: float) -> None:
+    with ForceRig() as rig:
+        rig.volts = {"A0-A1": 0.2, "A2-A3": -0.1}
+        measured = Ticks(rig.sensor(full_scale=full_scale)).next()
+    assert (measured.fx, measured.fy) == pytest.approx((0.2, -0.1), abs=full_scale / 8000)
+
+
+def test_a_window_of_50_ms_holds_at_least_eight_pairs() -> None:
+    with ForceRig() as rig:
+        found = measurements(Ticks(rig.sensor()).run(5.0))
+    assert min(measured.samples for measured in found) >= 12
+    with ForceRig(speed=100e3) as rig:
+        found = measurements(Ticks(rig.sensor()).run(5.0))
+    assert min(measured.samples for measured in found) >= 8
+
+
+def test_the_mean_of_a_window_is_quieter_than_a_sample() -> None:
+    with ForceRig(noise=20.0) as rig:
+        sensor = rig.sensor()
+        watch = sensor.watch()
+        found = measurements(Ticks(sensor).run(20.0))
+        sample = watch.close()
+    mean = sum(measured.fx for measured in found) / len(found)
+    deviation = (sum((m.fx - mean) ** 2 for m in found) / len(found)) ** 0.5
+    assert sample.vx_std == pytest.approx(20.0 * STEP, rel=0.1)
+    assert deviation == pytest.approx(sample.vx_std / 13.4**0.5, rel=0.25)
+
+
+def test_a_measurement_is_of_the_window_before_its_tick() -> None:
+    with ForceRig(noise=0.0) as rig:
+        rig.volts["A0-A1"] = lambda t: 0.1 * t
+        ticks = Ticks(rig.sensor())
+        for index, measured in enumerate(measurements(ticks.run(5.0)), 1):
+            now = index * TICK
+            assert now - 0.01 < measured.time <= now
+            assert measured.fx == pytest.approx(0.1 * (now - TICK / 2), abs=0.1 * 4e-3)
+
+
+def test_a_read_leaves_the_clock_at_the_tick() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        for index in range(1, 100):
+            sensor.read(index * TICK)
+            assert rig.clock.now == pytest.approx(index * TICK, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "nack",
+        "timeout",
+        "clock-stretch",
+        "bus-owned",
+        "arbitration-lost",
+        "unplugged",
+        "stuck-busy",
+    ],
+)
+def test_while_the_chip_cannot_be_read_reads_raise_and_half_a_second_later_it_is_well(
+    fault: str,
+) -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        ticks = Ticks(sensor)
+        measurements(ticks.run(1.0))
+        rig.faults.inject(fault, 2.0)
+        during = ticks.run(2.0)
+        assert all(isinstance(item, str) for item in during[1:])
+        after = ticks.run(0.6)
+        assert isinstance(after[-1], Measurement)
+        for measured in measurements(ticks.run(1.0)):
+            assert measured.samples >= 12
+            assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+    counters = sensor.counters()
+    assert counters["i2c_errors"] >= 5
+    assert counters["i2c_reconnects"] == 1
+
+
+def test_a_brown_out_costs_a_sample_and_nothing_else() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        ticks = Ticks(sensor)
+        for _ in range(40):
+            measured = ticks.next()
+            assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+            assert measured.suspect == ""
+            rig.faults.inject("brown-out")
+    assert sensor.counters()["i2c_reconnects"] == 0
+
+
+def test_one_failed_transfer_fails_no_read() -> None:
+    with ForceRig(seed=5) as rig:
+        sensor = rig.sensor()
+        ticks = Ticks(sensor)
+        rig.faults.error_rate = 0.01
+        for measured in measurements(ticks.run(20.0)):
+            assert measured.samples >= 1
+            assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+    assert sensor.counters()["i2c_errors"] > 100
+
+
+def test_before_the_first_pair_a_read_says_so() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        with pytest.raises(SensorError, match="0x48 on /dev/i2c-1 has not delivered yet"):
+            sensor.read(0.0)
+
+
+def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time() -> None:
+    with ForceRig() as rig:
+        ticks = Ticks(rig.sensor(data_rate=16))
+        found = measurements(ticks.run(3.0)[4:])
+    repeated = [(a, b) for a, b in itertools.pairwise(found) if b.samples == 0]
+    assert repeated
+    assert all((a.time, a.fx, a.fy) == (b.time, b.fx, b.fy) for a, b in repeated)
+
+
+def test_a_bus_that_is_missing_at_start_may_come_later() -> None:
+    rig = ForceRig()
+    ticks = Ticks(rig.sensor(bus=ABSENT_BUS))
+    assert all("/dev/i2c-201 does not exist" in str(item) for item in ticks.run(1.0))
+    with rig:
+        assert isinstance(ticks.run(0.6)[-1], Measurement)
+
+
+def test_recalibrating_changes_the_next_read() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        ticks = Ticks(sensor)
+        ticks.next()
+        sensor.recalibrate(CALIBRATION)
+        assert ticks.next().fx == pytest.approx(0.675, abs=1e-3)
+        assert sensor.calibration == CALIBRATION
+
+
+def test_a_watch_adds_up_the_voltages_of_its_time() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor(CALIBRATION)
+        ticks = Ticks(sensor)
+        ticks.run(0.5)
+        rig.volts["A0-A1"] = 0.6  # while the first sample of a pair is in already
+        watch = sensor.watch()
+        found = measurements(ticks.run(2.0))
+        sample = watch.close()
+        rig.volts["A0-A1"] = 0.9
+        ticks.run(0.5)
+        assert watch.close() == sample
+    assert sample.pairs == sum(measured.samples for measured in found) - 1
+    assert sample.seconds == pytest.approx(2.0, abs=0.01)
+    assert (sample.vx, sample.vy) == pytest.approx((0.6, -0.25), abs=1e-5)
+    assert (sample.fx, sample.fy) == pytest.approx(CALIBRATION.forces(0.6, -0.25), abs=1e-4)
+    assert sample.vx_std == pytest.approx(STEP, rel=0.3)
+    assert sample.suspect == ""
+
+
+def test_a_watch_remembers_that_samples_were_suspect() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        watch = sensor.watch()
+        ticks = Ticks(sensor)
+        rig.faults.inject("clipped", 0.1)
+        ticks.run(1.0)
+        assert "is clipped at +2.048 V" in watch.close().suspect
+
+
+def test_a_watch_without_a_sample_has_no_pairs() -> None:
+    with ForceRig() as rig:
+        assert rig.sensor().watch().close().pairs == 0
+
+
+def test_a_closed_sensor_can_be_closed_again_and_not_be_read() -> None:
+    with ForceRig() as rig:
+        sensor = rig.sensor()
+        sensor.read(TICK)
+        sensor.close()
+        sensor.close()
+        with pytest.raises(SensorError, match="is closed"):
+            sensor.read(2 * TICK)

@@ -1,0 +1,102 @@
+"""The force sensor in real time: its thread, how it keeps out of the tick's way, how it ends."""
+
+import threading
+import time
+
+import pytest
+from force_rig import TICK, ForceRig
+
+from fishd.clock import SystemClock
+from fishd.errors import SensorError
+from fishd.hardware.ads1115 import CLOSE_LIMIT, Ads1115Sensor, open_force_sensor
+from fishd.hardware.calibration import ForceCalibration
+from fishd.hardware.settings import ForceSensorSettings
+from fishd.signals import Measurement
+
+
+def threaded() -> Ads1115Sensor:
+    return open_force_sensor(
+        ForceSensorSettings(), ForceCalibration(), SystemClock(), threaded=True, tick=TICK
+    )
+
+
+def wait_for_pair(sensor: Ads1115Sensor) -> Measurement:
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        try:
+            measured = sensor.read(time.monotonic())
+        except SensorError:
+            pass
+        else:
+            if measured.samples:
+                return measured
+        time.sleep(0.005)
+    raise AssertionError("no pair came in")
+
+
+def sampler_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "force-sampler"]
+
+
+def test_a_thread_samples_in_real_time_until_closed() -> None:
+    with ForceRig(clock=SystemClock()):
+        sensor = threaded()
+        begun = time.monotonic()
+        measured = wait_for_pair(sensor)
+        assert begun <= measured.time <= time.monotonic()
+        assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+        wait_for_pair(sensor)
+        assert len(sampler_threads()) == 1
+        sensor.close()
+        assert not sampler_threads()
+
+
+def test_the_thread_stays_quiet_around_the_expected_read() -> None:
+    with ForceRig(clock=SystemClock()) as rig:
+        transfers: list[float] = []
+        transfer = rig.device.transfer
+
+        def recorded(address: int, messages: object) -> list[bytes]:
+            transfers.append(time.monotonic())
+            return transfer(address, messages)
+
+        rig.device.transfer = recorded
+        sensor = threaded()
+        wait_for_pair(sensor)
+        quiet = 0
+        for _ in range(20):
+            now = time.monotonic()
+            try:
+                sensor.read(now)
+            except SensorError:
+                continue
+            time.sleep(1.2 * TICK)  # the next read comes late: sampling goes on without it
+            expected = now + TICK
+            near = [moment for moment in transfers if -1e-3 < moment - expected < 0.5e-3]
+            later = [moment for moment in transfers if moment > expected + 2.4e-3]
+            quiet += not near and bool(later)
+        sensor.close()
+    assert quiet >= 5  # it would be 0; on a busy machine many a conversion is late
+
+
+def test_closing_does_not_wait_for_a_transfer_that_hangs() -> None:
+    with ForceRig(clock=SystemClock()) as rig:
+        released, entered = threading.Event(), threading.Event()
+
+        def hanging(address: int, messages: object) -> list[bytes]:
+            entered.set()
+            released.wait(30.0)
+            raise TimeoutError(110, "Connection timed out")
+
+        rig.device.transfer = hanging
+        sensor = threaded()
+        assert entered.wait(10.0)
+        with pytest.raises(SensorError, match="has not delivered yet"):
+            sensor.read(time.monotonic())
+        begun = time.monotonic()
+        sensor.close()
+        assert CLOSE_LIMIT <= time.monotonic() - begun < 10.0
+        (thread,) = sampler_threads()
+        released.set()
+        thread.join(10.0)
+        assert not thread.is_alive()

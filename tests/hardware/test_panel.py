@@ -1,0 +1,264 @@
+"""The E-stop button and the status light: the true rpi-lgpio on emulated pins."""
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from fishd.clock import VirtualClock
+from fishd.emulation.lgpio import EmulatedLgpio
+from fishd.emulation.pins import Pins
+from fishd.errors import StartupError
+from fishd.hardware.panel import RpiGpioPanel
+from fishd.hardware.settings import PanelSettings
+
+BUTTON, LIGHT = 17, 27
+OPENS = PanelSettings(estop_gpio=BUTTON, estop_pressed="high", led_gpio=LIGHT)
+CLOSES = PanelSettings(estop_gpio=BUTTON, estop_pressed="low")
+GROUND = 0
+OPEN = None  # a contact that is open, or a broken wire
+
+Make = Callable[[PanelSettings], RpiGpioPanel]
+
+
+@pytest.fixture
+def pins() -> Iterator[Pins]:
+    pins = Pins()
+    with EmulatedLgpio(pins):
+        yield pins
+
+
+@pytest.fixture
+def make(pins: Pins) -> Iterator[Make]:
+    """Panels that are closed in the end."""
+    panels = []
+
+    def made(settings: PanelSettings) -> RpiGpioPanel:
+        panels.append(RpiGpioPanel(settings, VirtualClock()))
+        return panels[-1]
+
+    yield made
+    for panel in panels:
+        panel.close()
+
+
+@pytest.fixture
+def panel(pins: Pins, make: Make) -> RpiGpioPanel:
+    """One whose button is released: its contact is closed."""
+    pins.set_level(BUTTON, GROUND)
+    return make(OPENS)
+
+
+def test_a_press_acts_in_the_next_tick(pins: Pins, panel: RpiGpioPanel) -> None:
+    assert panel.update("running", 0.0) is False
+    pins.set_level(BUTTON, OPEN)
+    assert panel.update("running", 0.05) is True
+
+
+def test_a_press_is_reported_at_once_from_a_thread_of_the_library(
+    pins: Pins, panel: RpiGpioPanel
+) -> None:
+    threads = []
+    panel.on_press = lambda: threads.append(threading.current_thread())
+    pins.set_level(BUTTON, OPEN)
+    assert len(threads) == 1
+    assert threads[0] is not threading.current_thread()
+
+
+def test_a_press_is_reported_once_however_the_contact_bounces(
+    pins: Pins, panel: RpiGpioPanel
+) -> None:
+    presses = []
+    panel.on_press = lambda: presses.append(1)
+    for level in (OPEN, GROUND, OPEN, GROUND, OPEN):
+        pins.set_level(BUTTON, level)
+    assert presses == [1]
+    for time in range(3):
+        assert panel.update("estop", 0.05 * time) is True
+
+
+def test_a_press_between_two_ticks_is_seen(pins: Pins, panel: RpiGpioPanel) -> None:
+    panel.update("running", 0.0)
+    pins.set_level(BUTTON, OPEN)
+    pins.set_level(BUTTON, GROUND)
+    assert panel.update("running", 0.05) is True
+    assert panel.update("running", 0.10) is False
+
+
+def test_a_release_takes_two_polls(pins: Pins, panel: RpiGpioPanel) -> None:
+    pins.set_level(BUTTON, OPEN)
+    assert panel.update("estop", 0.0) is True
+    pins.set_level(BUTTON, GROUND)
+    assert panel.update("estop", 0.05) is True
+    pins.set_level(BUTTON, OPEN)
+    assert panel.update("estop", 0.10) is True
+    pins.set_level(BUTTON, GROUND)
+    assert panel.update("estop", 0.15) is True
+    assert panel.update("estop", 0.20) is False
+
+
+def test_a_second_press_is_reported_again(pins: Pins, panel: RpiGpioPanel) -> None:
+    presses = []
+    panel.on_press = lambda: presses.append(1)
+    for _ in range(2):
+        pins.set_level(BUTTON, OPEN)
+        pins.set_level(BUTTON, GROUND)
+        panel.update("estop", 0.0)
+        panel.update("estop", 0.05)
+    assert presses == [1, 1]
+
+
+def test_a_spike_that_has_gone_when_it_is_looked_at_is_no_press(
+    pins: Pins, panel: RpiGpioPanel
+) -> None:
+    presses = []
+    panel.on_press = lambda: presses.append(1)
+    (callback,) = pins.callbacks
+    callback.function(0, BUTTON, 1, 0)  # an edge, and the level is low again
+    assert presses == []
+    assert panel.update("running", 0.0) is False
+
+
+def test_a_broken_wire_is_a_press_where_the_button_opens_a_contact(pins: Pins, make: Make) -> None:
+    pins.set_level(BUTTON, OPEN)
+    panel = make(OPENS)
+    assert pins.pull(BUTTON) == "up"
+    assert panel.update("idle", 0.0) is True
+
+
+def test_a_button_that_closes_a_contact_is_pressed_when_low(pins: Pins, make: Make) -> None:
+    panel = make(CLOSES)
+    assert pins.pull(BUTTON) == "up"
+    assert panel.update("running", 0.0) is False
+    pins.set_level(BUTTON, GROUND)
+    assert panel.update("running", 0.05) is True
+
+
+def test_without_edges_the_polls_do(
+    pins: Pins, make: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    pins.reports_edges = False
+    pins.set_level(BUTTON, GROUND)
+    panel = make(OPENS)
+    (message,) = caplog.messages
+    assert message.startswith("E-stop button on GPIO 17 is polled only, once a tick: bad event")
+    for tick in range(20):
+        assert panel.update("running", 0.05 * tick) is False
+    pins.set_level(BUTTON, OPEN)
+    assert panel.update("running", 1.0) is True
+    assert len(caplog.messages) == 1
+
+
+def test_a_button_that_cannot_be_read_is_an_error(
+    pins: Pins, panel: RpiGpioPanel, caplog: pytest.LogCaptureFixture
+) -> None:
+    from RPi import GPIO
+
+    GPIO.cleanup()  # by another part of the program
+    for _ in range(2):
+        with pytest.raises(OSError, match=r"^E-stop button on GPIO 17: "):
+            panel.update("idle", 0.5)
+    panel.close()
+
+
+def shown(pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: float) -> list[int]:
+    """The light after each tick."""
+    levels = []
+    for index in range(round(seconds / tick)):
+        panel.update(mode, 100.0 + index * tick)
+        levels.append(pins.level(LIGHT))
+    return levels
+
+
+def flashes(levels: list[int]) -> int:
+    """How many times the light went on."""
+    return sum(after > before for before, after in zip([0, *levels], levels, strict=False))
+
+
+def test_the_light_is_on_while_running(pins: Pins, panel: RpiGpioPanel) -> None:
+    assert all(shown(pins, panel, "running", 0.05, 2.0))
+
+
+@pytest.mark.parametrize("tick", [0.01, 0.05, 0.2])
+def test_the_light_flashes_each_second_while_idle(
+    pins: Pins, panel: RpiGpioPanel, tick: float
+) -> None:
+    levels = shown(pins, panel, "idle", tick, 10.0)
+    assert flashes(levels) == 10
+    assert sum(levels) == pytest.approx(0.2 * len(levels), abs=0.05 * len(levels))
+
+
+@pytest.mark.parametrize("mode", ["fault", "estop"])
+@pytest.mark.parametrize(("tick", "rate"), [(0.01, 5.0), (0.05, 5.0), (0.2, 2.5)])
+def test_the_light_flickers_after_a_fault(
+    pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, rate: float
+) -> None:
+    levels = shown(pins, panel, mode, tick, 10.0)
+    assert flashes(levels) == pytest.approx(10.0 * rate, rel=0.15)
+
+
+def test_the_light_is_written_to_only_when_it_changes(pins: Pins, panel: RpiGpioPanel) -> None:
+    shown(pins, panel, "running", 0.05, 5.0)
+    assert pins.writes(LIGHT) == [0, 1]
+
+
+def test_a_light_that_fails_is_reported_once_and_stops_nothing(
+    pins: Pins, make: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    from RPi import GPIO
+
+    panel = make(PanelSettings(led_gpio=LIGHT))
+    GPIO.cleanup()
+    for time in range(4):
+        assert panel.update("fault", 0.1 * time) is False
+    (message,) = caplog.messages
+    assert message.startswith("the status light on GPIO 27 stays dark: ")
+
+
+def test_close_switches_the_light_off_and_gives_back_only_its_own_pins(
+    pins: Pins, panel: RpiGpioPanel
+) -> None:
+    from RPi import GPIO
+
+    GPIO.setup(22, GPIO.OUT, initial=GPIO.HIGH)
+    presses = []
+    panel.on_press = lambda: presses.append(1)
+    panel.update("running", 0.0)
+    panel.close()
+    panel.close()
+    assert pins.writes(LIGHT)[-1] == 0
+    assert not pins.is_output(LIGHT)
+    assert pins.level(22) == 1
+    pins.set_level(BUTTON, OPEN)
+    assert presses == []
+
+
+def test_close_goes_on_when_a_step_fails(
+    pins: Pins, panel: RpiGpioPanel, caplog: pytest.LogCaptureFixture
+) -> None:
+    from RPi import GPIO
+
+    GPIO.cleanup(LIGHT)  # by another part of the program
+    panel.close()
+    assert caplog.messages[0].startswith("cannot switch off GPIO 27: ")
+    assert pins.pull(BUTTON) == "none"
+
+
+def test_a_pin_that_another_process_holds_is_named(pins: Pins) -> None:
+    pins.occupy(LIGHT)
+    with pytest.raises(StartupError, match=r"^GPIO 27 cannot be used for the panel: GPIO busy$"):
+        RpiGpioPanel(OPENS, VirtualClock())
+
+
+def test_without_pins_no_library_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "RPi", None)
+    panel = RpiGpioPanel(PanelSettings(), VirtualClock())
+    assert panel.update("running", 0.0) is False
+    panel.close()
+
+
+def test_a_missing_library_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "RPi", None)
+    with pytest.raises(StartupError, match=r"fishd\[rpi-lgpio\] .* or fishd\[rpi-gpio\]"):
+        RpiGpioPanel(PanelSettings(led_gpio=LIGHT), VirtualClock())

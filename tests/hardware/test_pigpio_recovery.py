@@ -1,0 +1,147 @@
+"""What the pigpio servo does about a past: killed predecessors, a lost pigpiod, a last resort."""
+
+import contextlib
+from collections.abc import Iterator
+
+import pytest
+from msgspec.structs import replace
+from pigpio_bench import FRAME, GPIO, PigpioBench, connect
+
+from fishd.errors import ServoError
+from fishd.hardware.calibration import ServoCalibration
+
+
+@pytest.fixture
+def bench() -> Iterator[PigpioBench]:
+    with contextlib.ExitStack() as stack:
+        yield PigpioBench(stack)
+
+
+def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(
+    bench: PigpioBench,
+) -> None:
+    bench.servo().write(0.5)  # and is never heard of again
+    bench.wait(0.1)
+    bench.servo().release()
+    started = bench.clock.now
+    bench.wait(2.0)
+    assert bench.width == 0
+    assert bench.scripts() == 1
+    assert all(width in (1500, 0) for _, width in bench.changes_after(started))
+
+
+def test_the_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(
+    bench: PigpioBench,
+) -> None:
+    bench.servo().write(0.5)
+    bench.wait(0.05)
+    with pytest.raises(ServoError, match="soft limits"):
+        bench.servo().write(9.0)  # no connection for what never reaches the wire
+    successor = bench.servo(calibration=ServoCalibration(trim=10))
+    connect(successor)
+    bench.wait(0.03)
+    assert bench.width == 1510
+    bench.wait(0.6)
+    assert bench.width == 0
+
+
+def test_pulses_that_went_on_in_a_frozen_pigpiod_stop_once_it_is_back(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.faults.inject("pigpiod-frozen")
+    with pytest.raises(ServoError):
+        servo.write(0.5)
+    bench.wait(1.0)
+    assert bench.width == 1800
+    bench.faults.clear()
+    connect(servo)
+    bench.wait(FRAME)
+    assert bench.width == 0
+    assert servo.counters() == {"servo_reconnects": 1}
+    bench.wait(1.0)
+    assert bench.width == 0
+
+
+def test_without_pigpiod_it_asks_at_most_twice_a_second_in_virtual_time(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    bench.faults.inject("pigpiod-gone")
+    with pytest.raises(ServoError, match="not connected: Connection refused"):
+        servo.write(0.5)
+    bench.faults.clear()
+    assert bench.width == 0  # pigpiod sees that it may go on
+    bench.wait(0.4)
+    with pytest.raises(ServoError, match="not connected: Connection refused"):
+        servo.write(0.5)
+    bench.wait(0.2)
+    servo.write(0.5)
+    assert bench.width == 1800
+    assert servo.counters() == {"servo_reconnects": 0}
+
+
+def test_killed_fishds_never_fill_pigpiod_with_scripts(bench: PigpioBench) -> None:
+    for _ in range(40):
+        bench.servo().write(0.1)
+    assert bench.scripts() == 1
+
+
+def test_scripts_of_others_and_of_other_pins_stay(bench: PigpioBench) -> None:
+    with bench.client() as client:
+        script = client.store_script(b"tag 0 mils 10 jmp 0")
+        bench.wait(0.01)
+        client.run_script(script, [20, GPIO, 1500])
+    neighbour = bench.servo(replace(bench.settings(), gpio=13))
+    neighbour.write(0.2)
+    bench.servo().write(0.5)
+    assert bench.scripts() == 3
+    neighbour.write(0.3)
+
+
+def test_the_last_resort_moves_a_swimming_servo_to_neutral_and_releases_it(
+    bench: PigpioBench,
+) -> None:
+    bench.servo().write(0.5)
+    bench.wait(0.1)
+    begun = bench.clock.now
+    assert bench.servo(calibration=ServoCalibration(trim=10)).neutralise() is True
+    assert bench.scripts() == 0
+    bench.wait(2.0)
+    assert [width for _, width in bench.changes_after(begun - 1e-9)] == [1510, 0]
+    assert 0.29 <= bench.changes_after(begun)[-1][0] - begun <= 0.35
+
+
+def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: PigpioBench) -> None:
+    assert bench.servo().neutralise() is False
+    killed = bench.servo()
+    killed.write(0.5)
+    bench.wait(2.0)  # the countdown has done its work
+    before = bench.clock.now
+    assert bench.servo().neutralise() is False
+    assert bench.clock.now == before
+    assert bench.changes_after(before) == []
+    assert bench.scripts() == 0
+
+
+def test_the_last_resort_works_on_hardware_pwm(bench: PigpioBench) -> None:
+    settings = bench.settings(hardware_pwm=True)
+    assert bench.servo(settings).neutralise() is False
+    bench.servo(settings).write(0.5)
+    assert bench.servo(settings).neutralise() is True
+    assert bench.width == 0
+    assert bench.servo(settings).neutralise() is False
+
+
+def test_the_last_resort_says_in_one_line_that_pigpiod_is_gone(bench: PigpioBench) -> None:
+    bench.faults.inject("pigpiod-gone")
+    with pytest.raises(ServoError, match=r"^pigpiod at 127\.0\.0\.1:\d+: Connection refused$"):
+        bench.servo().neutralise()
+
+
+def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
+    bench: PigpioBench,
+) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    assert bench.servo().neutralise() is True
+    with pytest.raises(ServoError, match="reconnecting"):
+        servo.write(0.5)
+    assert bench.width == 0

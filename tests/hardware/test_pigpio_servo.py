@@ -1,0 +1,217 @@
+"""The pigpio servo on the emulated pigpiod, with the true client, in virtual time."""
+
+import contextlib
+import math
+from collections.abc import Iterator
+
+import pytest
+from msgspec.structs import replace
+from pigpio_bench import FRAME, GPIO, TICK, PigpioBench
+
+from fishd.errors import ServoError
+from fishd.hardware.calibration import ServoCalibration
+
+
+@pytest.fixture
+def bench() -> Iterator[PigpioBench]:
+    with contextlib.ExitStack() as stack:
+        yield PigpioBench(stack)
+
+
+def test_a_write_makes_the_pulse_of_the_angle(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    assert bench.width == 1800
+    bench.wait(TICK)
+    servo.write(-0.5)
+    assert bench.width == 1200
+
+
+def test_a_pulse_is_rounded_to_the_microsecond_not_cut_off(bench: PigpioBench) -> None:
+    bench.servo().write(0.4999)  # 1799.94 µs
+    assert bench.width == 1800
+
+
+def test_trim_direction_and_scale_come_from_the_calibration(bench: PigpioBench) -> None:
+    servo = bench.servo(calibration=ServoCalibration(trim=20, direction=-1, scale=500))
+    servo.write(0.2)
+    assert bench.width == 1420
+
+
+def test_nothing_moves_before_the_first_write(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.release()
+    bench.wait(1.0)
+    assert bench.width == 0
+
+
+@pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf, 1.3, -1.3])
+def test_an_angle_that_is_not_finite_or_out_of_limits_never_reaches_the_wire(
+    bench: PigpioBench, angle: float
+) -> None:
+    servo = bench.servo()
+    servo.write(0.1)
+    with pytest.raises(ServoError, match="soft limits"):
+        servo.write(angle)
+    assert bench.width == 1560
+    bench.wait(TICK)
+    servo.write(0.2)
+    assert bench.width == 1620
+
+
+def test_a_recalibration_counts_from_the_next_write(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    servo.recalibrate(ServoCalibration(trim=30))
+    assert bench.width == 1800
+    servo.write(0.5)
+    assert bench.width == 1830
+    assert servo.calibration.trim == 30
+
+
+def test_a_calibration_whose_neutral_no_servo_takes_is_refused(bench: PigpioBench) -> None:
+    servo = bench.servo(replace(bench.settings(), centre=600.0))
+    with pytest.raises(ServoError, match="pulse of 200 µs"):
+        servo.recalibrate(ServoCalibration(trim=-400))
+    servo.write(0.0)
+    assert bench.width == 600
+
+
+def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_half_a_second_later(
+    bench: PigpioBench,
+) -> None:
+    servo = bench.servo(calibration=ServoCalibration(trim=25))
+    for _ in range(10):
+        servo.write(0.5)
+        bench.wait(TICK)
+    last = bench.clock.now - TICK
+    bench.wait(2.0)
+    (neutral, width), (off, nothing) = bench.changes_after(last)
+    assert (width, nothing) == (1525, 0)
+    assert 0.19 <= neutral - last <= 0.24
+    assert 0.49 <= off - neutral <= 0.54
+
+
+def test_the_countdown_knows_the_newest_neutral(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    servo.recalibrate(ServoCalibration(trim=-40.4))
+    servo.write(0.5)
+    bench.wait(0.3)
+    assert bench.width == 1460
+
+
+def test_regular_writes_keep_the_countdown_from_ending(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    for _ in range(100):
+        servo.write(0.3)
+        bench.wait(TICK)
+    assert [width for _, width in bench.daemon.history(GPIO)] == [1680]
+
+
+def test_a_slow_loop_has_three_ticks_before_the_countdown_ends(bench: PigpioBench) -> None:
+    servo = bench.servo(tick=0.2)
+    servo.write(0.5)
+    bench.wait(0.55)
+    assert bench.width == 1800
+    bench.wait(0.1)
+    assert bench.width == 1500
+
+
+def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.wait(0.4)
+    assert bench.width == 1500
+    for _ in range(20):
+        servo.write(0.5)
+        bench.wait(TICK)
+        assert bench.width == 1800
+
+
+def test_a_release_stops_the_pulses_and_disarms_the_countdown(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.wait(TICK)
+    servo.release()
+    servo.release()
+    released = bench.clock.now
+    bench.wait(2.0)
+    assert bench.width == 0
+    assert [width for _, width in bench.changes_after(released - FRAME)] == [0]
+
+
+def test_a_release_during_the_hold_at_neutral_stays_released(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.wait(0.4)
+    servo.release()
+    assert bench.width == 0
+    bench.wait(2.0)
+    assert bench.width == 0
+
+
+def test_writing_after_a_release_brings_pulses_back_with_their_countdown(
+    bench: PigpioBench,
+) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    servo.release()
+    bench.wait(1.0)
+    servo.write(-0.5)
+    assert bench.width == 1200
+    bench.wait(0.3)
+    assert bench.width == 1500
+
+
+def test_close_releases_and_leaves_no_script(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    servo.close()
+    servo.close()
+    assert bench.width == 0
+    assert bench.scripts() == 0
+    with pytest.raises(ServoError, match="closed"):
+        servo.write(0.0)
+
+
+def test_close_says_when_pulses_may_still_be_on(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.faults.inject("pigpiod-frozen")
+    with pytest.raises(ServoError, match="pigpiod at"):
+        servo.close()
+    servo.close()
+    bench.faults.clear()
+
+
+def test_hardware_pwm_makes_finer_pulses(bench: PigpioBench) -> None:
+    servo = bench.servo(bench.settings(hardware_pwm=True, frequency=250.0))
+    servo.write(0.50002)
+    assert bench.width == pytest.approx(1800.012, abs=0.005)
+    servo.release()
+    assert bench.width == 0
+
+
+def test_hardware_pwm_counts_down_too(bench: PigpioBench) -> None:
+    servo = bench.servo(bench.settings(hardware_pwm=True, frequency=333.0))
+    servo.write(0.5)
+    bench.wait(0.15)
+    assert bench.width == pytest.approx(1800, abs=0.01)
+    bench.wait(0.15)
+    assert bench.width == pytest.approx(1500, abs=0.01)
+    bench.wait(0.6)
+    assert bench.width == 0
+
+
+def test_hardware_pwm_never_cuts_a_pulse_short(bench: PigpioBench) -> None:
+    servo = bench.servo(bench.settings(hardware_pwm=True))
+    for _ in range(3):
+        servo.write(0.5)
+        bench.clock.now = (bench.clock.now // FRAME + 2) * FRAME + 0.0007  # inside of a pulse
+        servo.release()
+        bench.wait(0.9)
+    servo.write(0.5)
+    bench.wait(2.0)
+    widths = {width for _, width in bench.daemon.history(GPIO)}
+    assert widths == {1800, 1500, 0}

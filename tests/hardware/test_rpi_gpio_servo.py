@@ -1,0 +1,237 @@
+"""The servo on software PWM: the true rpi-lgpio on emulated pins."""
+
+import gc
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fishd.clock import VirtualClock
+from fishd.emulation.lgpio import EmulatedLgpio
+from fishd.emulation.pins import Pins
+from fishd.errors import ServoError, StartupError
+from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.rpi_gpio import RpiGpioServo
+from fishd.hardware.settings import ServoSettings
+
+SETTINGS = ServoSettings(driver="rpi-gpio", gpio=18)
+
+
+@pytest.fixture
+def pins() -> Iterator[Pins]:
+    pins = Pins()
+    with EmulatedLgpio(pins):
+        yield pins
+        gc.collect()  # what a PWM does when it goes must not come later
+
+
+@pytest.fixture
+def servo(pins: Pins) -> Iterator[RpiGpioServo]:
+    servo = RpiGpioServo(SETTINGS, ServoCalibration(), VirtualClock())
+    yield servo
+    servo.close()
+
+
+def width(pins: Pins, gpio: int = 18) -> float:
+    """The pulse that a pin sends [µs]."""
+    pwm = pins.pwm(gpio)
+    return 0.0 if pwm is None else 1e4 * pwm[1] / pwm[0]
+
+
+def test_an_angle_becomes_a_pulse(pins: Pins, servo: RpiGpioServo) -> None:
+    for angle, expected in ((0.5, 1800.0), (-0.5, 1200.0), (0.0, 1500.0)):
+        servo.write(angle)
+        assert width(pins) == pytest.approx(expected, abs=0.01)
+        frequency, _ = pins.pwm(18) or (0.0, 0.0)
+        assert frequency == 50.0
+
+
+def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
+    fast = RpiGpioServo(
+        ServoSettings(driver="rpi-gpio", gpio=4, frequency=200.0),
+        ServoCalibration(),
+        VirtualClock(),
+    )
+    fast.write(0.5)
+    assert width(pins, 4) == pytest.approx(1800.0)
+    assert pins.pwm(4) == (200.0, pytest.approx(36.0))
+    fast.close()
+
+
+def test_opening_claims_the_pin_low_without_pulses(pins: Pins, servo: RpiGpioServo) -> None:
+    assert pins.is_output(18)
+    assert pins.writes(18) == [0]
+    assert pins.pwm(18) is None
+
+
+def test_release_goes_on_without_pulses_and_write_begins_again(
+    pins: Pins, servo: RpiGpioServo
+) -> None:
+    servo.write(0.5)
+    servo.release()
+    servo.release()
+    # Not stopped: RPi.GPIO would begin again at 1 kHz.
+    assert pins.pwm(18) == (50.0, 0.0)
+    servo.write(0.5)
+    assert width(pins) == pytest.approx(1800.0)
+
+
+def test_a_release_without_pulses_does_nothing(pins: Pins, servo: RpiGpioServo) -> None:
+    servo.release()
+    assert pins.pwm(18) is None
+
+
+def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pins) -> None:
+    from RPi import GPIO
+
+    clock = VirtualClock()
+    servo = RpiGpioServo(SETTINGS, ServoCalibration(), clock)
+    GPIO.setup(23, GPIO.OUT, initial=GPIO.HIGH)
+    servo.write(0.5)
+    before = clock.now
+    servo.close()
+    servo.close()
+    assert clock.now - before >= 0.02
+    assert pins.pwm(18) is None
+    assert not pins.is_output(18)
+    assert pins.is_output(23)
+    assert pins.level(23) == 1
+
+
+def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pins) -> None:
+    pins.occupy(18)
+    servo = RpiGpioServo(SETTINGS, ServoCalibration(), VirtualClock())
+    for _ in range(2):
+        with pytest.raises(ServoError, match=r"^servo on GPIO 18: GPIO busy$"):
+            servo.write(0.0)
+    with pytest.raises(ServoError, match="GPIO busy"):
+        servo.neutralise()
+    servo.release()
+    pins.occupy(18, False)
+    servo.write(0.0)
+    assert width(pins) == pytest.approx(1500.0)
+    servo.close()
+
+
+def test_a_cleanup_of_all_pins_by_others_is_survived(pins: Pins, servo: RpiGpioServo) -> None:
+    from RPi import GPIO
+
+    servo.write(0.5)
+    GPIO.cleanup()
+    with pytest.raises(ServoError, match=r"^servo on GPIO 18: "):
+        servo.write(0.4)
+    servo.write(0.4)
+    assert width(pins) == pytest.approx(1740.0)
+    assert servo.counters() == {"servo_reconnects": 1}
+
+
+def test_the_last_resort_leaves_the_pin_low(pins: Pins, servo: RpiGpioServo) -> None:
+    assert servo.neutralise() is False
+    assert pins.is_output(18)
+    assert pins.level(18) == 0
+
+
+def test_another_calibration_holds_from_the_next_write_on(pins: Pins, servo: RpiGpioServo) -> None:
+    servo.write(0.2)
+    servo.recalibrate(ServoCalibration(direction=-1, trim=20.0))
+    servo.write(0.2)
+    assert width(pins) == pytest.approx(1400.0)
+    with pytest.raises(ServoError, match="needs a pulse of 2700 µs"):
+        RpiGpioServo(
+            ServoSettings(driver="rpi-gpio", gpio=4, centre=2400.0),
+            ServoCalibration(trim=300.0),
+            VirtualClock(),
+        )
+
+
+def test_an_angle_beyond_the_limits_changes_nothing(pins: Pins, servo: RpiGpioServo) -> None:
+    servo.write(0.2)
+    with pytest.raises(ServoError, match="soft limits"):
+        servo.write(1.3)
+    with pytest.raises(ServoError, match="soft limits"):
+        servo.write(float("nan"))
+    assert width(pins) == pytest.approx(1620.0)
+    servo.write(0.1)
+    assert servo.counters() == {"servo_reconnects": 0}
+
+
+def test_it_says_that_its_pulses_jitter(servo: RpiGpioServo) -> None:
+    (line,) = servo.degraded
+    assert "jitter" in line
+
+
+def test_a_warning_of_the_library_becomes_a_line_of_the_log(
+    pins: Pins, caplog: pytest.LogCaptureFixture
+) -> None:
+    from fishd.hardware import header
+
+    caplog.set_level("INFO")
+    gpio = header.load()
+    # A pull-up on a pin that has one already is what rpi-lgpio warns of.
+    header.claim(gpio, 2, gpio.IN, pull_up_down=gpio.PUD_UP)
+    assert caplog.messages == ["GPIO 2: A physical pull up resistor is fitted on this channel!"]
+    with pytest.warns(Warning, match="physical pull up"):  # and is still on for everybody else
+        gpio.setup(3, gpio.IN, pull_up_down=gpio.PUD_UP)
+    gpio.cleanup([2, 3])
+
+
+class TestALibraryThatCannotBeUsed:
+    """Each way of that is a line that says what to do."""
+
+    def start(self) -> str:
+        with pytest.raises(StartupError) as caught:
+            RpiGpioServo(SETTINGS, ServoCalibration(), VirtualClock())
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    def test_missing(self, pins: Pins, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "RPi", None)
+        assert "install fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio]" in self.start()
+
+    def test_twice(self, pins: Pins, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        info = tmp_path / "RPi_GPIO-0.7.1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: RPi.GPIO\nVersion: 0.7.1\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        assert self.start().startswith("RPi.GPIO and rpi-lgpio are both installed")
+
+    def test_not_on_a_pi(self, pins: Pins, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delenv("RPI_LGPIO_REVISION")
+        assert "This module can only be run on a Raspberry Pi" in self.start()
+
+    def test_without_permission(self, pins: Pins) -> None:
+        pins.present = False
+        assert self.start() == (
+            "the pins of the header cannot be used: can not open gpiochip; "
+            "fishd has to be in group gpio"
+        )
+
+    def test_in_a_folder_that_lgpio_may_not_write_to(
+        self, pins: Pins, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # What lgpio does on import, where it cannot make its pipe.
+        (tmp_path / "lgpio.py").write_text("open('/nowhere/.lgd-nfy-3', 'rb')\n")
+        monkeypatch.delitem(sys.modules, "lgpio")
+        monkeypatch.syspath_prepend(tmp_path)
+        assert self.start() == (
+            "rpi-lgpio cannot make its pipe in the working folder: No such file or directory; "
+            "start fishd in a folder that it may write to"
+        )
+
+    def test_numbered_otherwise_by_another_part(self, pins: Pins) -> None:
+        from RPi import GPIO
+
+        GPIO.setmode(GPIO.BOARD)
+        assert "A different mode has already been set" in self.start()
+
+
+def test_the_stand_in_leaves_no_trace() -> None:
+    before = {name: sys.modules.get(name) for name in ("lgpio", "RPi", "RPi.GPIO")}
+    with EmulatedLgpio(Pins()):
+        from RPi import GPIO
+
+        assert GPIO.RPI_INFO["TYPE"] == "Pi 4 Model B"
+    assert {name: sys.modules.get(name) for name in before} == before
+    assert "RPI_LGPIO_REVISION" not in os.environ

@@ -1,0 +1,142 @@
+"""The sampler: every value is of the channel it claims to be of, and at the right time."""
+
+from typing import Any
+
+import pytest
+from force_rig import STEP, ForceRig, take_pairs, volts
+
+from fishd.emulation.i2c import Write
+
+CONFIG = 1
+
+
+def starts(rig: ForceRig) -> list[tuple[float, int]]:
+    """From now on: when each conversion is asked for, and the bits of the multiplexer."""
+    found: list[tuple[float, int]] = []
+    transfer = rig.device.transfer
+
+    def recorded(address: int, messages: Any) -> list[bytes]:
+        for message in messages:
+            data = message.data if isinstance(message, Write) else b""
+            if len(data) == 3 and data[0] == CONFIG and data[1] & 0x80:
+                found.append((rig.clock.now, data[1] >> 4 & 7))
+        return transfer(address, messages)
+
+    rig.device.transfer = recorded
+    return found
+
+
+def test_the_channels_are_read_in_the_order_x_y_y_x() -> None:
+    with ForceRig() as rig:
+        sampler = rig.sampler()
+        found = starts(rig)
+        for _ in range(8):
+            sampler.step()
+    assert [mux for _, mux in found] == [0, 3, 3, 0, 0, 3, 3, 0]
+
+
+def test_the_order_cancels_the_lag_of_the_second_channel() -> None:
+    with ForceRig(noise=0.0) as rig:
+        rig.volts = {"A0-A1": lambda t: 0.5 * t, "A2-A3": lambda t: 0.5 * t}
+        differences = [pair.x - pair.y for pair in take_pairs(rig.sampler(), rig, 1.0)]
+    assert max(abs(difference) for difference in differences) >= 10
+    assert abs(sum(differences[: len(differences) // 2 * 2])) <= 2
+
+
+def test_the_sampler_sleeps_through_a_conversion_and_asks_once() -> None:
+    with ForceRig() as rig:
+        sampler = rig.sampler()
+        sampler.step()
+        polls = 0
+        transfer = rig.device.transfer
+
+        def counted(address: int, messages: Any) -> list[bytes]:
+            nonlocal polls
+            polls += 1
+            return transfer(address, messages)
+
+        rig.device.transfer = counted
+        sampler.step()
+    assert polls == 4  # start, config, pointer, conversion
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_chips_at_either_end_of_the_tolerance_are_read_without_an_error(seed: int) -> None:
+    with ForceRig(seed=seed) as rig:
+        sampler = rig.sampler()
+        rig.chip.rate_factor = 0.9 if seed % 2 else 1.1
+        assert len(take_pairs(sampler, rig, 0.5)) >= 130
+    assert sampler.errors == 0
+
+
+@pytest.mark.parametrize("data_rate", [8, 16, 32, 64, 128, 250, 475, 860])
+def test_every_data_rate_gives_right_values(data_rate: int) -> None:
+    with ForceRig() as rig:
+        pairs = take_pairs(rig.sampler(data_rate=data_rate), rig, 2.0)
+    assert len(pairs) >= 0.75 * data_rate * 2.0 / 2 * 0.7
+    assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
+
+
+def test_no_value_is_ever_of_the_other_channel_though_one_transfer_in_a_hundred_fails() -> None:
+    wrong = reads = 0
+    with ForceRig(seed=7) as rig:
+        sampler = rig.sampler()
+        rig.faults.error_rate = 0.01
+        while reads < 20_000:
+            for pair in take_pairs(sampler, rig, 5.0):
+                reads += 2
+                wrong += volts(pair) != pytest.approx((0.5, -0.25), abs=8 * STEP)
+    assert sampler.errors > 400
+    assert wrong == 0
+
+
+def test_after_an_error_no_conversion_begins_before_the_last_one_has_ended() -> None:
+    with ForceRig(seed=3) as rig:
+        sampler = rig.sampler()
+        found = starts(rig)
+        rig.faults.error_rate = 0.05
+        last_error = -1.0
+        for _ in range(3000):
+            errors = sampler.errors
+            count = len(found)
+            sampler.step()
+            if len(found) > count:
+                assert found[count][0] - last_error >= 1.25 / 860 + 1e-3
+            if sampler.errors > errors:
+                last_error = rig.clock.now
+    assert sampler.errors > 100
+
+
+def test_no_pair_is_made_of_samples_from_before_and_after_an_error() -> None:
+    with ForceRig(noise=0.0) as rig:
+        sampler = rig.sampler()
+        sampler.step()  # X of the first pair
+        rig.faults.inject("nack")
+        sampler.step()
+        rig.faults.clear()
+        rig.volts["A0-A1"] = 0.75
+        while not sampler.pairs:
+            sampler.step()
+        assert volts(sampler.pairs[0]) == pytest.approx((0.75, -0.25), abs=STEP)
+
+
+def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for() -> None:
+    with ForceRig() as rig:
+        rig.volts["A3"] = 1.9
+        rig.chip.write(bytes((1, 0b1111_0101, 0b0000_0011)))  # A3, 8 samples per second
+        sampler = rig.sampler()
+        pairs = take_pairs(sampler, rig, 1.0)
+    assert sampler.errors > 0
+    assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
+    assert len(pairs) > 100
+
+
+def test_a_conversion_that_ends_when_a_stuck_chip_recovers_is_not_believed() -> None:
+    """The start was ignored while it was stuck, so the code is an old one, of the other channel."""
+    with ForceRig() as rig:
+        sampler = rig.sampler()
+        for _ in range(200):
+            rig.faults.inject("stuck-busy", 0.0047)
+            pairs = take_pairs(sampler, rig, 0.02)
+            assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
+    assert sampler.errors >= 200

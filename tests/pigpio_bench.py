@@ -1,0 +1,78 @@
+"""What tests of the pigpio servo are built from: an emulated pigpiod in virtual time."""
+
+import contextlib
+
+from fishd.clock import VirtualClock
+from fishd.emulation.faults import Faults
+from fishd.emulation.pigpiod import Pigpiod
+from fishd.errors import ServoError
+from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.pigpio import PigpioServo
+from fishd.hardware.pigpio_client import Client, opened
+from fishd.hardware.settings import PigpioSettings, ServoSettings
+
+GPIO = 18
+FRAME = 0.02
+TICK = 0.05
+
+
+class PigpioBench:
+    """An emulated pigpiod, and servos on it."""
+
+    def __init__(self, stack: contextlib.ExitStack) -> None:
+        self.clock = VirtualClock()
+        self.faults = Faults(self.clock)
+        self.daemon = Pigpiod(self.clock, self.faults)
+        self.daemon.start()
+        stack.callback(self.daemon.close)
+        self._stack = stack
+
+    def settings(self, *, hardware_pwm: bool = False, frequency: float = 50.0) -> ServoSettings:
+        pigpio = PigpioSettings(port=self.daemon.port, hardware_pwm=hardware_pwm)
+        return ServoSettings(gpio=GPIO, frequency=frequency, pigpio=pigpio)
+
+    def servo(
+        self,
+        settings: ServoSettings | None = None,
+        calibration: ServoCalibration | None = None,
+        tick: float = TICK,
+    ) -> PigpioServo:
+        servo = PigpioServo(
+            settings or self.settings(),
+            calibration or ServoCalibration(),
+            self.clock,
+            threaded=False,
+            tick=tick,
+        )
+        self._stack.callback(self._close, servo)
+        return servo
+
+    @staticmethod
+    def _close(servo: PigpioServo) -> None:
+        with contextlib.suppress(ServoError):
+            servo.close()
+
+    @property
+    def width(self) -> float:
+        """The pulse in force one frame from now [µs]."""
+        return self.daemon.width(GPIO, self.clock.now + FRAME)
+
+    def wait(self, seconds: float) -> None:
+        self.clock.sleep(seconds)
+
+    def client(self) -> contextlib.AbstractContextManager[Client]:
+        return opened(PigpioSettings(port=self.daemon.port))
+
+    def scripts(self) -> int:
+        """How many scripts pigpiod holds."""
+        with self.client() as client:
+            return sum(bool(client.script_status(script)[1]) for script in range(32))
+
+    def changes_after(self, time: float) -> list[tuple[float, float]]:
+        return [(when, width) for when, width in self.daemon.history(GPIO) if when > time]
+
+
+def connect(servo: PigpioServo) -> None:
+    """Connect, but neither write nor release."""
+    with servo._link.session():
+        pass

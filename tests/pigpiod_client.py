@@ -1,0 +1,96 @@
+"""An emulated pigpiod with the true client on it, for tests of the emulation itself."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pigpio
+
+from fishd.clock import Clock, VirtualClock
+from fishd.emulation.faults import Faults
+from fishd.emulation.pigpiod import Pigpiod
+
+GPIO = 18
+PATIENCE = 20.0
+"""How long to wait for what another thread has to do, on a busy machine [s]."""
+
+
+class PigpiodBench:
+    """A pigpiod, on virtual time unless another clock is given, and its client."""
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self.clock = clock or VirtualClock()
+        self.faults = Faults(self.clock)
+        self.daemon = Pigpiod(self.clock, self.faults)
+        self.daemon.start()
+        self.pi = self.client()
+
+    def client(self) -> pigpio.pi:
+        return pigpio.pi("127.0.0.1", self.daemon.port, show_errors=False)
+
+    def sleep(self, seconds: float) -> None:
+        self.clock.sleep(seconds)
+
+    @property
+    def width(self) -> float:
+        """The pulse in force now [µs]."""
+        return self.daemon.width(GPIO, self.clock.monotonic())
+
+    @property
+    def settled_width(self) -> float:
+        """The pulse in force when the next frame has begun [µs]."""
+        self.sleep(0.02)
+        return self.width
+
+    def result(self, method: str, *arguments: object) -> int:
+        """What the client gets from a command, be it good or a negative error number."""
+        pigpio.exceptions = False
+        try:
+            return getattr(self.pi, method)(*arguments)
+        finally:
+            pigpio.exceptions = True
+
+    def stored(self, text: str) -> int:
+        """Store a script and wait until it is ready."""
+        number = self.pi.store_script(text.encode())
+        self.sleep(0.002)
+        return number
+
+
+def dispose(pi: pigpio.pi) -> None:
+    """Stop a client and wait for its thread, even if its daemon is gone and the thread spins."""
+    thread = pi._notify
+    with contextlib.suppress(OSError):
+        pi.stop()
+    if thread:
+        thread.join(PATIENCE)
+    pi.stop()
+
+
+@contextlib.contextmanager
+def pigpiod_bench(clock: Clock | None = None) -> Iterator[PigpiodBench]:
+    bench = PigpiodBench(clock)
+    try:
+        yield bench
+    finally:
+        bench.faults.clear()
+        dispose(bench.pi)
+        bench.daemon.close()
+
+
+def eventually(condition: Callable[[], bool]) -> bool:
+    """Wait until another thread has made it true."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.001)
+    return True
+
+
+def in_thread(action: Callable[[], object]) -> threading.Thread:
+    """Start what may hang."""
+    thread = threading.Thread(target=action, daemon=True)
+    thread.start()
+    return thread

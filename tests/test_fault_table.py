@@ -1,0 +1,181 @@
+"""Each row of the fault table on the virtual Pi: what broke, what the servo got, and recovery."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from harness import Scripted
+from lockstep_rig import NEUTRAL, LockstepRig, lockstep_rig
+
+SENSOR_FAULTS = {
+    "nack": "no chip",
+    "timeout": "",
+    "clock-stretch": "",
+    "bus-owned": "",
+    "arbitration-lost": "",
+    "unplugged": "",
+    "stuck-busy": "busy",
+}
+FADE = 0.45
+"""A fade from Φ to neutral, and the tick that releases [s]."""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[LockstepRig]:
+    with lockstep_rig(tmp_path) as rig:
+        rig.start("swing")
+        rig.run_for(3.0)
+        assert rig.mode == "running"
+        yield rig
+
+
+def assert_neutral_then_off(rig: LockstepRig, since: float, limit: float) -> None:
+    """The pulses came to neutral and then ended, within `limit` [s] of `since`."""
+    rig.run_for(since + limit - rig.now)
+    changes = rig.pulses_since(since)
+    *_, (_, last), (ended, off) = changes
+    assert off == 0.0
+    assert last == pytest.approx(NEUTRAL, abs=5)
+    assert ended - since <= limit
+    rig.run_for(1.0)
+    assert rig.pulses_since(ended)[1:] == []  # and never began again
+    assert not rig.recorder.ticks[-1].servo_on
+
+
+def assert_one_fault(rig: LockstepRig, code: str) -> None:
+    assert (rig.mode, rig.reason) == ("fault", code)
+    assert rig.recorder.kinds().count("fault") == 1
+    assert rig.loop.controller_name == "hold"
+
+
+def assert_recovers_by_clear_fault_only(rig: LockstepRig) -> None:
+    rig.run_for(2.0)
+    assert rig.mode == "fault"
+    assert rig.pulse == 0.0
+    rig.loop.clear_fault()
+    rig.run_for(1.0)
+    assert rig.mode == "idle", rig.loop.supervisor.reason
+    assert rig.pulse == pytest.approx(NEUTRAL, abs=5)
+    rig.start("swing")
+    rig.run_for(5.0)
+    assert rig.mode == "running"
+    assert rig.recorder.ticks[-1].thrust > 0.015
+
+
+@pytest.mark.parametrize("name", SENSOR_FAULTS)
+def test_a_force_sensor_that_is_lost_ends_in_neutral_and_recovers_after_a_clear(
+    rig: LockstepRig, name: str
+) -> None:
+    broke = rig.now
+    rig.pi.faults.inject(name)
+    # Two periods until the last sample is too old, three bad reads in a row.
+    assert rig.run_until_fault(1.0) <= 0.30
+    assert_one_fault(rig, "sensor-stale")
+    assert_neutral_then_off(rig, broke, limit=0.30 + FADE)
+    rig.pi.faults.clear()
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_reset_of_the_chip_is_survived(rig: LockstepRig) -> None:
+    for _ in range(20):
+        rig.pi.faults.inject("brown-out")
+        rig.run_for(0.2)
+        assert rig.recorder.ticks[-1].samples >= 8
+    assert rig.mode == "running"
+
+
+def test_a_clipped_force_is_a_fault_after_three_windows(rig: LockstepRig) -> None:
+    broke = rig.now
+    rig.pi.faults.inject("clipped")
+    assert rig.run_until_fault(1.0) == pytest.approx(0.15)
+    assert_one_fault(rig, "sensor-range")
+    assert rig.loop.supervisor.reason is not None
+    assert "clipped" in rig.loop.supervisor.reason.message
+    assert_neutral_then_off(rig, broke, limit=0.15 + FADE)
+    rig.pi.faults.clear()
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_frozen_force_is_a_fault_once_it_has_not_changed_for_long(rig: LockstepRig) -> None:
+    broke = rig.now
+    rig.pi.faults.inject("frozen-code")
+    assert 2.0 <= rig.run_until_fault(3.0) <= 2.0 + 0.25
+    assert_one_fault(rig, "sensor-range")
+    assert_neutral_then_off(rig, broke, limit=2.25 + FADE)
+    rig.pi.faults.clear()
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_pigpiod_that_is_gone_is_a_fault_and_its_pulses_come_back_only_after_a_clear(
+    rig: LockstepRig,
+) -> None:
+    broke = rig.now
+    rig.pi.faults.inject("pigpiod-gone", 1.0)
+    assert rig.run_until_fault(1.0) <= 0.10
+    assert_one_fault(rig, "servo-link")
+    rig.run_for(3.0)  # it has been back for two seconds
+    assert [width for _, width in rig.pulses_since(broke + 0.1)] in ([], [0.0])
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_pigpiod_that_restarts_is_a_fault_and_gets_its_script_again(rig: LockstepRig) -> None:
+    rig.pi.faults.inject("pigpiod-restart")
+    rig.run_until_fault(1.0)
+    assert_one_fault(rig, "servo-link")
+    assert_recovers_by_clear_fault_only(rig)
+    silent = rig.now
+    rig.robot.sensor.read(rig.now + 1.5)  # time goes on, and the loop hangs
+    widths = [width for _, width in rig.pulses_since(silent)]
+    assert widths[-2:] == [NEUTRAL, 0.0]
+
+
+def test_a_pigpiod_that_hangs_is_a_fault_and_is_released_when_it_wakes(rig: LockstepRig) -> None:
+    rig.pi.faults.inject("pigpiod-frozen", 1.0)
+    assert rig.run_until_fault(1.0) <= 0.10
+    assert_one_fault(rig, "servo-link")
+    assert rig.pulse != 0.0  # a daemon that hangs cannot be told to stop
+    rig.run_for(2.5)
+    assert rig.pulse == 0.0
+    assert "servo" in rig.recorder.kinds()
+    assert_recovers_by_clear_fault_only(rig)
+
+
+@pytest.mark.parametrize("answer", [float("nan"), float("inf"), None, ZeroDivisionError()])
+def test_a_controller_that_fails_ends_in_neutral(rig: LockstepRig, answer: object) -> None:
+    def act(_: object) -> float:
+        if isinstance(answer, Exception):
+            raise answer
+        return answer  # type: ignore[return-value]
+
+    broke = rig.now
+    rig.start(Scripted(act))
+    rig.run_for(0.1)
+    assert_one_fault(rig, "controller-error")
+    assert_neutral_then_off(rig, broke, limit=0.10 + FADE)
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_sensor_and_a_servo_that_fail_together_are_both_survived(rig: LockstepRig) -> None:
+    rig.pi.faults.inject("unplugged")
+    rig.pi.faults.inject("pigpiod-gone")
+    rig.run_until_fault(1.0)
+    rig.run_for(3.0)
+    rig.pi.faults.clear()
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_an_emergency_stop_ends_the_pulses_within_one_frame(rig: LockstepRig) -> None:
+    stopped = rig.now
+    rig.loop.estop("test")
+    rig.run_for(0.1)
+    (ended, width), *rest = rig.pulses_since(stopped)
+    assert (width, rest) == (0.0, [])
+    assert ended - stopped <= 0.025
+
+
+def test_swing_reaches_the_best_square_wave_through_the_whole_hardware_path(tmp_path: Path) -> None:
+    from fishd.simulation import simulate
+
+    with lockstep_rig(tmp_path, "simulation.noise=0.001", "force_sensor.full_scale=2.048") as rig:
+        config = rig.config
+    assert simulate(config, "swing", {"C": 0.6}, seconds=60.0).efficiency >= 0.95

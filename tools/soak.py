@@ -1,0 +1,225 @@
+"""Runs fishd for very long in virtual time while everything around it fails at random.
+
+    python tools/soak.py simulated --ticks 1000000   the loop, with a robot that fails in all ways
+    python tools/soak.py virtual-pi --ticks 20000    the whole hardware path, with injected faults
+    python tools/soak.py channels --reads 1000000    wrong-channel values with 1 % I2C errors
+    python tools/soak.py all --write docs/reliability.md
+
+Each ends with a line of figures, and with exit status 1 if a promise was broken: an exception that
+got out of a tick, an angle beyond the limits, memory that grows, a value of the wrong channel.
+"""
+
+import argparse
+import gc
+import itertools
+import logging
+import math
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from soak_troubles import BrokenPromise, Counting, Saboteur, misuse
+
+from fishd.build import build_loop
+from fishd.clock import Slot, VirtualClock, VirtualTicker
+from fishd.config import Config, load
+from fishd.emulation.ads1115 import Ads1115Chip
+from fishd.emulation.faults import FAULTS, INSTANTANEOUS, Faults
+from fishd.emulation.i2c import I2cBus
+from fishd.emulation.linux_i2c import LinuxI2c
+from fishd.errors import SensorError
+from fishd.hardware.ads1115 import open_force_sensor
+from fishd.hardware.calibration import ForceCalibration
+from fishd.hardware.settings import ForceSensorSettings
+from fishd.hardware.simulated import SimulatedFish
+from fishd.loop import ControlLoop
+from fishd.robots import open_lockstep
+
+PAGE = 4096
+REPORT = "<!-- soaks: written by tools/soak.py -->"
+
+
+def check(loop: ControlLoop) -> None:
+    """The angle in force is within limits."""
+    if not abs(loop.applied) <= 0.42 + 1e-9:
+        raise BrokenPromise(f"tick {loop.seq}: the angle in force is {loop.applied} rad")
+
+
+class Memory:
+    """Growth of this process from the end of the warm-up on."""
+
+    def __init__(self) -> None:
+        gc.collect()
+        self._before = self._now()
+
+    def growth(self) -> float:
+        """[MB]"""
+        gc.collect()
+        return (self._now() - self._before) * PAGE / 1e6
+
+    @staticmethod
+    def _now() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1])
+
+
+def soak_simulated(ticks: int, seed: int) -> str:
+    """The loop on a simulated fish whose robot, controllers and users misbehave."""
+    dice = random.Random(seed)
+    config = load(None, [f"simulation.seed={seed}"])
+    clock = VirtualClock()
+    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    saboteur = Saboteur(fish.robot(), dice)
+    publisher = Counting(lambda: dice.random() < 1e-4)
+    loop = build_loop(config, saboteur.robot(), clock, publisher)
+    memory = None
+    index = 0
+    for count in range(ticks):
+        missed = dice.randrange(1, 5) if dice.random() < 0.002 else 0
+        index += missed
+        deadline = index * config.tick
+        clock.now = deadline + (dice.expovariate(1e3) if missed else 0.0)
+        loop.tick(Slot(index, deadline, clock.now, missed))
+        index += 1
+        check(loop)
+        if dice.random() < 0.02:
+            misuse(loop, dice)
+        if count == ticks // 5:
+            memory = Memory()
+    return report(f"simulated fish, {ticks} ticks", publisher, memory)
+
+
+def soak_virtual_pi(ticks: int, seed: int) -> str:
+    """The whole hardware path in virtual time, with faults injected by name."""
+    dice = random.Random(seed)
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        config = virtual_pi_config(folder, seed)
+        clock = VirtualClock()
+        robot, pi = open_lockstep(config, stack)
+        publisher = Counting()
+        loop = build_loop(config, robot, clock, publisher)
+        memory = None
+        injected: Counter[str] = Counter()
+        width_limits = (1500 - 600 * 0.42 - 6, 1500 + 600 * 0.42 + 6)
+        for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
+            loop.tick(slot)
+            check(loop)
+            width = pi.pigpiod.width(config.virtual_pi.servo_gpio, slot.deadline)
+            if width and not width_limits[0] <= width <= width_limits[1]:
+                raise BrokenPromise(f"tick {loop.seq}: the servo got a pulse of {width} µs")
+            if dice.random() < 0.01:
+                name = dice.choice(tuple(FAULTS))
+                injected[name] += 1
+                pi.faults.inject(
+                    name, None if name in INSTANTANEOUS else dice.choice((0.02, 0.1, 0.5))
+                )
+            if dice.random() < 0.05:
+                misuse(loop, dice)
+            if slot.index == ticks // 5:
+                memory = Memory()
+        counters = robot.counters()
+    spelled = ", ".join(f"{count} {name}" for name, count in sorted(injected.items()))
+    survived = ", ".join(f"{count} {name}" for name, count in counters.items())
+    line = report(f"virtual Pi, {ticks} ticks", publisher, memory)
+    return f"{line}; injected: {spelled}; survived: {survived}"
+
+
+def soak_channels(reads: int, seed: int) -> str:
+    """Two channels far apart, 1 % of the transfers fail: is one ever taken for the other?"""
+    clock = VirtualClock()
+    faults = Faults(clock, seed)
+    faults.error_rate = 0.01
+    bus = I2cBus(clock, 400e3, faults)
+    volts = {0: 1.0, 3: -1.0}  # A0-A1 and A2-A3
+    bus.attach(72, Ads1115Chip(clock, lambda mux, start, end: volts[mux], faults, seed=seed))
+    i2c = LinuxI2c(bus.transfer, {1}, lambda seconds: setattr(bus, "timeout", seconds))
+    with ExitStack() as stack:
+        i2c.install()
+        stack.callback(i2c.remove)
+        settings = ForceSensorSettings(frozen_after=None)
+        sensor = open_force_sensor(settings, ForceCalibration(), clock, threaded=False, tick=0.004)
+        stack.callback(sensor.close)
+        pairs = failures = 0
+        now = 0.0
+        while 2 * pairs < reads:
+            now = max(now + 0.004, clock.monotonic())
+            try:
+                measurement = sensor.read(now)
+            except SensorError:
+                failures += 1
+                continue
+            if measurement.samples and not (
+                abs(measurement.fx - 1.0) < 0.01 and abs(measurement.fy + 1.0) < 0.01
+            ):
+                raise BrokenPromise(f"read {2 * pairs}: {measurement}")
+            pairs += measurement.samples
+        errors = sensor.counters()
+    survived = ", ".join(f"{count} {name}" for name, count in errors.items())
+    return (
+        f"channels, {2 * pairs} reads with 1 % failing transfers: no value of the wrong channel; "
+        f"survived: {survived}; {failures} windows without a pair"
+    )
+
+
+def virtual_pi_config(folder: str, seed: int) -> Config:
+    """The default virtual Pi, its state in `folder`."""
+    overrides = ["robot=virtual-pi", f"simulation.seed={seed}"]
+    return load(None, [*overrides, f"state_folder={folder}"])
+
+
+def report(what: str, publisher: Counting, memory: Memory | None) -> str:
+    """The figures of a soak as a line; raises `BrokenPromise` when memory grew."""
+    growth = memory.growth() if memory else math.nan
+    if growth >= 1.0:
+        raise BrokenPromise(f"{what}: memory grew by {growth:.2f} MB")
+    reasons = ", ".join(f"{count} {code}" for code, count in sorted(publisher.reasons.items()))
+    return (
+        f"{what}: no exception, every angle within limits, memory {growth:+.2f} MB; "
+        f"faults latched: {reasons or 'none'}"
+    )
+
+
+def main() -> int:
+    """Run the soaks that are asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("soak", choices=("simulated", "virtual-pi", "channels", "all"))
+    parser.add_argument("--ticks", type=int, help="ticks; default 1000000 and 20000")
+    parser.add_argument("--reads", type=int, default=1_000_000, help="conversions; default 1000000")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--write", type=Path, help="put the figures into this file")
+    options = parser.parse_args()
+    logging.disable(logging.CRITICAL)  # thousands of faults would be reported
+    soaks: dict[str, Callable[[], str]] = {
+        "simulated": lambda: soak_simulated(options.ticks or 1_000_000, options.seed),
+        "virtual-pi": lambda: soak_virtual_pi(options.ticks or 20_000, options.seed),
+        "channels": lambda: soak_channels(options.reads, options.seed),
+    }
+    lines = []
+    for name in soaks if options.soak == "all" else (options.soak,):
+        begun = time.perf_counter()
+        try:
+            line = soaks[name]()
+        except BrokenPromise as broken:
+            print(f"{name}: BROKEN: {broken}", file=sys.stderr)
+            return 1
+        lines.append(f"- {line} ({time.perf_counter() - begun:.0f} s)")
+        print(lines[-1], flush=True)
+    if options.write:
+        text = options.write.read_text(encoding="utf-8")
+        before, _, rest = text.partition(REPORT)
+        _, _, after = rest.partition(REPORT)
+        options.write.write_text(
+            f"{before}{REPORT}\n" + "\n".join(lines) + f"\n{REPORT}{after}", encoding="utf-8"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
