@@ -46,3 +46,14 @@ $(VENV)/installed: pyproject.toml $(VENV)/bin/python
 $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@ $(VENV)/installed
+
+.PHONY: install-pi uninstall-pi trial-systemd
+
+install-pi:  ## Install fishd on this Raspberry Pi, or renew it; needs sudo
+	tools/install_pi.sh
+
+uninstall-pi:  ## Remove it; an edited configuration and calibrations stay unless PURGE=1
+	tools/uninstall_pi.sh
+
+trial-systemd: $(VENV)/installed-dev  ## Start, hang and kill fishd under a real systemd; needs root
+	$(BIN)/python tools/systemd_trial --write docs/reliability.md

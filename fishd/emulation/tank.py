@@ -6,12 +6,11 @@ It swims lazily: only when the chip converts, or someone asks, does it catch up 
 import math
 import threading
 from collections.abc import Callable
-from typing import NamedTuple
 
 from fishd.emulation.settings import VirtualPiSettings
 from fishd.hardware.imperfections import Imperfections, SimulationSettings
 from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import TetheredFish, TrueWindow
+from fishd.plant.tethered import REST, TetheredFish, TrueWindow
 from fishd.signals import Truth
 
 STEP = 1e-4
