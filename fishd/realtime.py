@@ -1,10 +1,13 @@
 """What the operating system and the interpreter can do for a loop that must be on time."""
 
+import contextlib
 import ctypes
 import gc
 import logging
 import os
 import sys
+import threading
+from pathlib import Path
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +36,9 @@ def enter(priority: int, lock_memory: bool) -> bool:
             # Threads that are started later, to load a controller say, must not inherit this.
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, policy, os.sched_param(priority))
+            for thread in Path("/proc/self/task").iterdir():
+                if int(thread.name) != threading.get_native_id():
+                    _keep_running(int(thread.name), priority - 1)
             scheduled = True
         except OSError as error:
             refused.append(f"no real-time scheduling ({error.strerror})")
@@ -43,6 +49,15 @@ def enter(priority: int, lock_memory: bool) -> bool:
             " and ".join(refused),
         )
     return scheduled
+
+
+def _keep_running(thread: int, priority: int) -> None:
+    """Let no ordinary program stop a thread, which might hold the interpreter just then.
+
+    The loop would have to wait for it, however high its own priority is.
+    """
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(1, priority)))
 
 
 def quiet_garbage_collector() -> None:

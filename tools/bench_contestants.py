@@ -124,7 +124,7 @@ class CyclicTest:
 
 
 class Fishd:
-    """A real fishd that swings a simulated fish, with sockets of its own; a context manager."""
+    """A real fishd that swings a fish, with sockets of its own; a context manager."""
 
     def __init__(self, *overrides: str) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="bench-fishd-")
@@ -148,6 +148,11 @@ class Fishd:
         with self._log.open("wb") as log:
             self.started = time.time()
             self._process = subprocess.Popen(command, stderr=log)
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        return self._process.pid
 
     def __enter__(self) -> Self:
         return self

@@ -10,14 +10,13 @@ Everything stays on this machine and stops by itself.
 
 import argparse
 import json
-import os
 import shutil
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -30,17 +29,17 @@ from bench_contestants import (
     lateness,
     quantile,
 )
+from bench_machine import PRIORITY, fifo_permitted, machine, stress
 from msgspec import Struct
+from reports import put, table
 
 from fishd.signals import Percentiles, Tick, Timing
 from fishd.statistics import PHASES
 
-PRIORITY = 50
 TICK = 0.05
 """The tick that the robot swims with [s]."""
 FAST = 0.002
 """The shortest tick that fishd can be asked for [s]."""
-BEGIN, END = "<!-- bench_tick: begin -->", "<!-- bench_tick: end -->"
 FISHCTL = str(Path(sys.executable).with_name("fishctl"))
 
 
@@ -90,58 +89,6 @@ class Results(Struct, frozen=True):
     latencies: list[Latency]
     real_time_factor: float
     """Of `fishctl simulate` at 50 ms ticks."""
-
-
-def machine() -> dict[str, str]:
-    """What the numbers depend on."""
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    names = [line for line in cpuinfo.splitlines() if line.startswith(("model name", "Model"))]
-    kernel = os.uname()
-    virtual = "yes" if "hypervisor" in cpuinfo else "no hypervisor is visible"
-    if shutil.which("systemd-detect-virt"):
-        found = subprocess.run(["systemd-detect-virt"], stdout=subprocess.PIPE, text=True).stdout
-        virtual += f"; systemd-detect-virt says {found.strip()}"
-    load = "one busy Python process per core, as stress-ng is not installed"
-    if shutil.which("stress-ng"):
-        load = "stress-ng: one cpu worker per core, one io, one vm"
-    return {
-        "CPU": names[0].partition(":")[2].strip() if names else kernel.machine,
-        "Cores": str(os.cpu_count()),
-        "Kernel": f"{kernel.sysname} {kernel.release} {kernel.version}",
-        "Virtual machine": virtual,
-        "Python": sys.version.partition(" ")[0],
-        "Load": load,
-        "cyclictest": "installed" if shutil.which("cyclictest") else "left out, not installed",
-        "SCHED_FIFO": f"priority {PRIORITY}" if fifo_permitted() else "left out, not permitted",
-    }
-
-
-def fifo_permitted() -> bool:
-    """May processes that this one starts ask for real-time scheduling?"""
-    ask = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({PRIORITY}))"
-    return subprocess.run([sys.executable, "-c", ask], stderr=subprocess.DEVNULL).returncode == 0
-
-
-@contextmanager
-def stress(wanted: bool, limit: float) -> Iterator[None]:
-    """Keep every core busy; whatever happens to us, it ends after `limit` seconds."""
-    cores = os.cpu_count() or 1
-    commands: list[list[str]] = []
-    if wanted and shutil.which("stress-ng"):
-        load = ["--cpu", str(cores), "--io", "1", "--vm", "1", "--vm-bytes", "128M"]
-        commands = [["stress-ng", "--quiet", *load, "--timeout", f"{limit:.0f}s"]]
-    elif wanted:
-        spin = f"import time; end = time.monotonic() + {limit}\nwhile time.monotonic() < end: pass"
-        commands = [[sys.executable, "-c", spin]] * cores
-    processes = [subprocess.Popen(command) for command in commands]
-    try:
-        time.sleep(1.0 if wanted else 0.0)
-        yield
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait()
 
 
 def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Round:
@@ -287,7 +234,7 @@ def markdown(results: Results) -> str:
         ),
         "What fishd costs": ([*head, "CPU", "RSS [MB]", "peak RSS [MB]"], costs),
     }
-    return "\n\n".join(f"### {title}\n\n{_table(*table)}" for title, table in sections.items())
+    return "\n\n".join(f"### {title}\n\n{table(*content)}" for title, content in sections.items())
 
 
 def goals(results: Results) -> list[list[str]]:
@@ -365,20 +312,6 @@ def _percentiles(times: Percentiles) -> str:
     return f"{times.p50:.0f} / {times.p99:.0f}"
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def write(path: Path, tables: str) -> None:
-    """Replace what is between the two markers in a document."""
-    before, begin, rest = path.read_text(encoding="utf-8").partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        raise SystemExit(f"bench_tick: {path}: the markers {BEGIN} and {END} are needed")
-    path.write_text(f"{before}{BEGIN}\n\n{tables}\n{END}{after}", encoding="utf-8")
-
-
 def main() -> None:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -390,7 +323,7 @@ def main() -> None:
     seconds, runs = (5.0, 3) if options.quick else (options.seconds, 7)
     results = measure(seconds, runs)
     if options.write:
-        write(options.write, markdown(results))
+        put(options.write, "bench_tick", markdown(results))
     print(msgspec.json.encode(results).decode() if options.json else markdown(results))
 
 

@@ -23,6 +23,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+from reports import put
 from soak_troubles import BrokenPromise, Counting, Saboteur, misuse
 
 from fishd.build import build_loop
@@ -41,7 +42,6 @@ from fishd.loop import ControlLoop
 from fishd.robots import open_lockstep
 
 PAGE = 4096
-REPORT = "<!-- soaks: written by tools/soak.py -->"
 
 
 def check(loop: ControlLoop) -> None:
@@ -212,12 +212,7 @@ def main() -> int:
         lines.append(f"- {line} ({time.perf_counter() - begun:.0f} s)")
         print(lines[-1], flush=True)
     if options.write:
-        text = options.write.read_text(encoding="utf-8")
-        before, _, rest = text.partition(REPORT)
-        _, _, after = rest.partition(REPORT)
-        options.write.write_text(
-            f"{before}{REPORT}\n" + "\n".join(lines) + f"\n{REPORT}{after}", encoding="utf-8"
-        )
+        put(options.write, "soak", "\n".join(lines))
     return 0
 
 

@@ -84,8 +84,9 @@ class PigpioSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         float,
         Meta(
             ge=0.001,
-            le=0.01,
-            description="Longest that pigpiod may keep a tick waiting.",
+            le=0.1,
+            description="Longest that pigpiod may keep a tick waiting; then the link is lost. "
+            "More than 10 ms makes ticks late, but forgives a busy machine.",
             extra_json_schema={"unit": "s"},
         ),
     ] = 0.008
