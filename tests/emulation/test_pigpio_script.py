@@ -1,4 +1,4 @@
-"""Scripts of the emulated pigpiod: what they compute, how long they take, which are refused."""
+"""Scripts of the emulated pigpiod: what they compute, how long they take, when they wait."""
 
 import math
 from collections.abc import Callable
@@ -42,13 +42,6 @@ class Rig:
 def result(text: str, *parameters: int) -> int:
     """What a script leaves in p0."""
     return Rig(text, parameters).run().script.parameters[0]
-
-
-def refusal(text: str) -> int:
-    """The error number that a script is refused with."""
-    with pytest.raises(PigpioError) as caught:
-        parse(text)
-    return caught.value.number
 
 
 @pytest.mark.parametrize(
@@ -125,12 +118,6 @@ def test_a_third_operand_travels_as_extension() -> None:
     script.start(START, (0, 0, 0, 75_000))
     script.run(START + 1)
     assert seen == [(START, 86, 18, 50, (75_000).to_bytes(4, "little"))]
-
-
-@pytest.mark.parametrize("text", ["m 4 w", "m 4 r", "m 4 5", "pud 4 u"])
-def test_modes_and_pulls_are_letters(text: str) -> None:
-    expected = {"m 4 w": (0, 4, 1), "m 4 r": (0, 4, 0), "m 4 5": (0, 4, 2), "pud 4 u": (2, 4, 2)}
-    assert [call[1:] for call in Rig(text).run().calls] == [expected[text]]
 
 
 def test_delays_are_exact() -> None:
@@ -239,25 +226,6 @@ def test_it_does_the_same_however_often_it_is_looked_at(rounds: int, gaps: list[
     assert at_once.calls == in_pieces.calls
     assert len(at_once.calls) == (1 if rounds else 0)
     assert at_once.script.parameters == in_pieces.script.parameters
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["frob 1", "lda", "lda x", "s 18", "mils -1", "sta p10", "ld v150 1", "jmp p0 tag 0", "w -4 1"],
-)
-def test_a_command_that_makes_no_sense_is_refused(text: str) -> None:
-    assert refusal(text) == errors.BAD_SCRIPT_CMD
-
-
-@pytest.mark.parametrize("text", ["proc 1", "procr 0", "shell ls", "help", "lda 08"])
-def test_what_pigpiod_has_not_for_scripts_is_refused(text: str) -> None:
-    assert refusal(text) == errors.BAD_SCRIPT_CMD
-
-
-def test_tags_are_checked() -> None:
-    assert refusal("tag 1 tag 1") == errors.DUP_TAG
-    assert refusal("jmp 3") == errors.BAD_TAG
-    assert refusal(" ".join(f"tag {number}" for number in range(51))) == errors.TOO_MANY_TAGS
 
 
 def test_an_empty_script_halts_at_once() -> None:

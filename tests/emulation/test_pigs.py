@@ -1,5 +1,6 @@
 """Debian's `pigs`, a client in C, drives the emulated pigpiod in real time."""
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -26,13 +27,28 @@ def bench() -> Iterator[PigpiodBench]:
 
 def pigs(bench: PigpiodBench, *arguments: str) -> subprocess.CompletedProcess[str]:
     assert PIGS is not None
-    environment = os.environ | {
-        "PIGPIO_ADDR": "127.0.0.1",
-        "PIGPIO_PORT": str(bench.daemon.port),
-    }
     return subprocess.run(
-        [PIGS, *arguments], env=environment, capture_output=True, text=True, timeout=PATIENCE
+        [PIGS, *arguments],
+        env=environment(bench),
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
     )
+
+
+def environment(bench: PigpiodBench) -> dict[str, str]:
+    """Where pigs finds the daemon."""
+    return os.environ | {"PIGPIO_ADDR": "127.0.0.1", "PIGPIO_PORT": str(bench.daemon.port)}
+
+
+@contextlib.contextmanager
+def pigs_under_way(bench: PigpiodBench, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    assert PIGS is not None
+    with subprocess.Popen([PIGS, *arguments], env=environment(bench)) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def told(bench: PigpiodBench, *arguments: str) -> str:
@@ -55,30 +71,25 @@ def test_the_last_resort_moves_the_servo_to_neutral_and_lets_go(bench: PigpiodBe
 
 
 def test_a_delay_of_one_client_holds_up_no_other(bench: PigpiodBench) -> None:
-    assert PIGS is not None
-    with subprocess.Popen(
-        [PIGS, "mils", "60000"],
-        env=os.environ | {"PIGPIO_ADDR": "127.0.0.1", "PIGPIO_PORT": str(bench.daemon.port)},
-    ) as waiting:
-        try:
-            assert bench.pi.set_servo_pulsewidth(GPIO, 1500) == 0
-            assert told(bench, "gpw", "18") == "1500"
-            assert waiting.poll() is None
-        finally:
-            waiting.kill()
+    with pigs_under_way(bench, "s", "18", "1500", "mils", "60000") as waiting:
+        assert eventually(lambda: bench.width == 1500)
+        assert bench.pi.set_servo_pulsewidth(GPIO, 1600) == 0
+        assert told(bench, "gpw", "18") == "1600"
+        assert waiting.poll() is None
 
 
 def test_a_delay_is_one_of_the_daemons_clock() -> None:
+    def later() -> float:
+        bench.sleep(10.0)
+        return bench.width
+
     with pigpiod_bench(VirtualClock()) as bench:
-        assert PIGS is not None
-        with subprocess.Popen(
-            [PIGS, "s", "18", "1500", "mils", "60000", "s", "18", "1600"],
-            env=os.environ | {"PIGPIO_ADDR": "127.0.0.1", "PIGPIO_PORT": str(bench.daemon.port)},
-        ) as waiting:
-            assert eventually(lambda: bench.settled_width == 1500)
-            bench.sleep(60.0)
+        script = ("s", "18", "1500", "mils", "60000", "s", "18", "1600")
+        with pigs_under_way(bench, *script) as waiting:
+            assert eventually(lambda: later() == 1600)
             assert waiting.wait(PATIENCE) == 0
-        assert bench.settled_width == 1600
+        first, second = bench.daemon.history(GPIO)
+        assert second[0] - first[0] >= 60.0
 
 
 def test_values_are_read_back(bench: PigpiodBench) -> None:
