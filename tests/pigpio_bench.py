@@ -4,7 +4,7 @@ import contextlib
 
 from fishd.clock import VirtualClock
 from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod import Pigpiod
+from fishd.emulation.pigpiod.daemon import Pigpiod
 from fishd.errors import ServoError
 from fishd.hardware.calibration import ServoCalibration
 from fishd.hardware.pigpio import PigpioServo

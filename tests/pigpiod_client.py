@@ -9,7 +9,7 @@ import pigpio
 
 from fishd.clock import Clock, VirtualClock
 from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod import Pigpiod
+from fishd.emulation.pigpiod.daemon import Pigpiod
 
 GPIO = 18
 PATIENCE = 20.0

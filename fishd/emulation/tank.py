@@ -89,10 +89,11 @@ class Tank:
         """What the fish truly did since the previous call, or since the start."""
         with self._lock:
             duration = self._steps * STEP
-            swum = TrueWindow(duration, self._impulse / duration if duration else 0.0, self._fin_peak)
+            thrust = self._impulse / duration if duration else 0.0
+            window = TrueWindow(duration, thrust, self._fin_peak)
             self._steps, self._impulse = 0, 0.0
             self._fin_peak = abs(self._fish.state.alpha)
-        return swum
+        return window
 
     def _swim(self, until: int) -> tuple[float, float]:
         """Swim until a step; the impulses of F_x and F_y on the way [N s]."""

@@ -10,7 +10,7 @@ from fishd.clock import Clock
 from fishd.emulation.ads1115 import Ads1115Chip
 from fishd.emulation.faults import Faults
 from fishd.emulation.i2c import I2cBus
-from fishd.emulation.pigpiod import Pigpiod
+from fishd.emulation.pigpiod.daemon import Pigpiod
 from fishd.emulation.pins import Pins
 from fishd.emulation.settings import VirtualPiSettings
 from fishd.emulation.tank import Tank

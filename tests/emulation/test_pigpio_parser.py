@@ -2,9 +2,9 @@
 
 import pytest
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_errors import PigpioError
-from fishd.emulation.pigpio_parser import Instruction, Operand, parse
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.errors import PigpioError
+from fishd.emulation.pigpiod.parser import Instruction, Operand, parse
 
 
 def refusal(text: str) -> int:

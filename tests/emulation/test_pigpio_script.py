@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_errors import PigpioError
-from fishd.emulation.pigpio_parser import parse
-from fishd.emulation.pigpio_script import BURST, INITIALISING_TIME, Script, State
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.errors import PigpioError
+from fishd.emulation.pigpiod.parser import parse
+from fishd.emulation.pigpiod.script import BURST, INITIALISING_TIME, Script, State
 
 START = 1.0
 Call = tuple[float, int, int, int]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from pigpiod_client import GPIO, PigpiodBench, dispose, eventually, pigpiod_bench
 
-from fishd.emulation.pigpiod import Pigpiod
+from fishd.emulation.pigpiod.daemon import Pigpiod
 
 
 @pytest.fixture

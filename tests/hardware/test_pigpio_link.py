@@ -9,7 +9,7 @@ import pytest
 
 from fishd.clock import SystemClock, VirtualClock
 from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod import Pigpiod
+from fishd.emulation.pigpiod.daemon import Pigpiod
 from fishd.errors import ServoError
 from fishd.hardware.calibration import ServoCalibration
 from fishd.hardware.pigpio import PigpioServo

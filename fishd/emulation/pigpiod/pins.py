@@ -1,8 +1,8 @@
 """The GPIOs as pigpiod keeps them on a Pi 4: modes, pulls, levels, and what sends pulses where."""
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_errors import PigpioError
-from fishd.emulation.pigpio_pin import OUTPUT, PULL_UP, Pin, Use
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.errors import PigpioError
+from fishd.emulation.pigpiod.pin import OUTPUT, PULL_UP, Pin, Use
 
 GPIOS, USER_GPIOS = 54, 32
 PERMITTED = 0x0FFFFFFC

@@ -8,12 +8,12 @@ import math
 import struct
 from collections.abc import Callable
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_errors import PigpioError
-from fishd.emulation.pigpio_monitor import Monitor, Send
-from fishd.emulation.pigpio_parser import PARAMETERS, parse
-from fishd.emulation.pigpio_pins import Pins
-from fishd.emulation.pigpio_script import Script
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.errors import PigpioError
+from fishd.emulation.pigpiod.monitor import Monitor, Send
+from fishd.emulation.pigpiod.parser import PARAMETERS, parse
+from fishd.emulation.pigpiod.pins import Pins
+from fishd.emulation.pigpiod.script import Script
 
 VERSION = 79
 """The library's last release, which Raspberry Pi OS ships and whose Python module is 1.78."""

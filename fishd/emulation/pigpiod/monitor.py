@@ -4,9 +4,9 @@ import math
 import struct
 from collections.abc import Callable, Iterator
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_errors import PigpioError
-from fishd.emulation.pigpio_pins import USER_GPIOS, Pins
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.errors import PigpioError
+from fishd.emulation.pigpiod.pins import USER_GPIOS, Pins
 
 HANDLES = 32
 WATCHDOG, EVENT = 1 << 5, 1 << 7

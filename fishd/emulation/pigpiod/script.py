@@ -8,9 +8,9 @@ import math
 from collections.abc import Callable
 from enum import IntEnum
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_calculator import Calculator, StackError
-from fishd.emulation.pigpio_parser import Instruction
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.calculator import Calculator, StackError
+from fishd.emulation.pigpiod.parser import Instruction
 
 INSTRUCTION_TIME = 1e-6
 """Time that an instruction takes [s]; pigpiod on a Pi 4 is of that order."""

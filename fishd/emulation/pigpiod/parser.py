@@ -6,8 +6,8 @@ The language is that of the pigs man page, less the commands that the emulated p
 import re
 from typing import NamedTuple
 
-from fishd.emulation import pigpio_errors as errors
-from fishd.emulation.pigpio_errors import PigpioError
+from fishd.emulation.pigpiod import errors
+from fishd.emulation.pigpiod.errors import PigpioError
 
 PARAMETERS, VARIABLES, TAGS = 10, 150, 50
 """How many a script may have."""

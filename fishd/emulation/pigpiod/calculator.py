@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Callable
 
-from fishd.emulation.pigpio_parser import PARAMETERS, VARIABLES, Operand
+from fishd.emulation.pigpiod.parser import PARAMETERS, VARIABLES, Operand
 
 STACK = 256
 _NOTHING = Operand("", 0)

@@ -5,7 +5,7 @@ import math
 import socket
 import struct
 
-from fishd.emulation.pigpio_commands import MICS, MILS, OPEN_IN_BAND, Commands
+from fishd.emulation.pigpiod.commands import MICS, MILS, OPEN_IN_BAND, Commands
 
 LARGEST_EXTENSION = 65_535
 """pigpiod hangs up on a client that announces more than this [byte]."""

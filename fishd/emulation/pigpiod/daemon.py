@@ -13,8 +13,8 @@ import time
 
 from fishd.clock import Clock
 from fishd.emulation.faults import Faults
-from fishd.emulation.pigpio_commands import Commands
-from fishd.emulation.pigpio_connection import Connection
+from fishd.emulation.pigpiod.commands import Commands
+from fishd.emulation.pigpiod.connection import Connection
 
 POLL = 5e-3
 """How often the server looks at the clock while something is due, and at faults that last [s]."""
