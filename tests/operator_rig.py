@@ -1,21 +1,28 @@
 """What tests of the operator's verbs are built from: a virtual Pi, loads on its fish, dialogues."""
 
+import contextlib
+import multiprocessing
 import os
 import subprocess
+import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from multiprocessing.managers import BaseManager
 from pathlib import Path
+from typing import Any
 
 from processes import FISHCTL, PATIENCE, Daemon, running
 
+from fishd.client import Fish
 from fishd.clock import SystemClock
 from fishd.emulation.ads1115 import Ads1115Chip
+from fishd.emulation.i2c import Write
 from fishd.emulation.link_server import LinkServer
 from fishd.emulation.settings import VirtualPiSettings
 from fishd.emulation.virtual_pi import VirtualPi
 from fishd.hardware.imperfections import SimulationSettings
 from fishd.plant.parameters import PlantParameters
+from fishd.protocol import Calibrations
 
 SENSITIVITY_X, SENSITIVITY_Y = 2.0, 1.5
 """Of the sensor with loads on it [V/N]."""
@@ -23,33 +30,86 @@ CROSSTALK = 0.1
 """Share of the other voltage that shows on each channel."""
 ZERO_X, ZERO_Y = 0.3, -0.2
 """Voltages without a load [V]."""
+SERVO = 18
+"""Its GPIO."""
 _MUX_X, _MUX_Y = 0, 3  # A0-A1 and A2-A3
 
 
-class Bench:
-    """A virtual Pi that other processes reach, whose fish can be loaded, and fishctl for it."""
+class LoadedPi:
+    """A virtual Pi whose fish can be loaded; lives in a process of its own."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.load = (0.0, 0.0)
-        """Force on the fish [N]."""
-        self.shaking = 0.0
-        """Amplitude of a force that comes and goes [N]."""
-        socket = folder / "virtual-pi"
+    def __init__(self, socket: str) -> None:
+        self._load = (0.0, 0.0)
+        self._shaking = 0.0
         # Its own chip moves aside for the one that feels the loads.
-        settings = VirtualPiSettings(socket=str(socket), pigpio_port=0, address=0x49)
+        settings = VirtualPiSettings(socket=socket, pigpio_port=0, address=0x49)
         clock = SystemClock()
-        self.pi = VirtualPi(settings, PlantParameters(), SimulationSettings(), 0.05, clock)
-        self.pi.bus.attach(0x48, Ads1115Chip(clock, self._volts, self.pi.faults))
-        self.server = LinkServer(self.pi, socket)
+        self._pi = VirtualPi(
+            settings, PlantParameters(), SimulationSettings(noise=2e-4), 0.05, clock
+        )
+        self._pi.bus.attach(0x48, Ads1115Chip(clock, self._volts, self._pi.faults))
+        self._server = LinkServer(self._pi, Path(socket))
+        self._server.start()
+
+    def close(self) -> None:
+        self._server.close()
 
     def _volts(self, mux: int, begin: float, end: float) -> float:
-        x, y = self.load
-        x += self.shaking * (1 if end % 0.5 < 0.25 else -1)
+        x, y = self._load
+        x += self._shaking * (1 if end % 0.5 < 0.25 else -1)
         vx = SENSITIVITY_X * (x + CROSSTALK * y)
         vy = SENSITIVITY_Y * (y + CROSSTALK * x)
-        fish = self.pi.tank.volts(mux, begin, end)
+        fish = self._pi.tank.volts(mux, begin, end)
         return {_MUX_X: vx + ZERO_X, _MUX_Y: vy + ZERO_Y}[mux] + fish
+
+    def load(self, fx: float, fy: float, shaking: float = 0.0) -> None:
+        """Pull at the fish [N], with a force along x that comes and goes, ±shaking."""
+        self._load, self._shaking = (fx, fy), shaking
+
+    def write_register(self, register: int, value: int) -> None:
+        """Do to the chip what another program might."""
+        self._pi.bus.transfer(0x48, [Write(bytes([register, *value.to_bytes(2, "big")]))])
+
+    def inject(self, fault: str) -> None:
+        self._pi.faults.inject(fault)
+
+    def clear(self) -> None:
+        self._pi.faults.clear()
+
+    def port(self) -> int:
+        return self._pi.pigpiod.port
+
+    def pulse(self) -> float:
+        """The servo pulse now [µs]; 0 for none."""
+        return self._pi.pigpiod.width(SERVO, time.monotonic())
+
+    def widths(self) -> list[float]:
+        """The pulses that the servo has got, one after the other [µs]."""
+        return [width for _, width in self._pi.pigpiod.history(SERVO)]
+
+
+class _Manager(BaseManager):
+    pass
+
+
+_Manager.register("LoadedPi", LoadedPi)
+
+
+def _be_prompt() -> None:
+    """fishd gives pigpiod a few milliseconds; the real one has a priority of its own, too."""
+    sys.setswitchinterval(2e-4)
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
+
+
+class Bench:
+    """A virtual Pi that other processes reach, and what they have to be told about it."""
+
+    def __init__(self, folder: Path, pi: Any) -> None:
+        """pi: a `LoadedPi`, in its process"""
+        self.folder = folder
+        self.pi = pi
+        self._port = pi.port()
 
     @property
     def settings(self) -> list[str]:
@@ -57,16 +117,11 @@ class Bench:
         pairs = {
             "robot": "virtual-pi",
             "virtual_pi.socket": self.folder / "virtual-pi",
-            "servo.pigpio.port": self.pi.pigpiod.port,
+            "servo.pigpio.port": self._port,
             "state_folder": self.folder / "state",
             "force_sensor.tare_limit": 0.5,
         }
         return [word for key, value in pairs.items() for word in ("--set", f"{key}={value}")]
-
-    @property
-    def pulse(self) -> float:
-        """The servo pulse now [µs]; 0 for none."""
-        return self.pi.pigpiod.width(18, time.monotonic())
 
     def files(self, kind: str) -> list[Path]:
         """Calibration files, oldest first."""
@@ -75,23 +130,36 @@ class Bench:
     def wait_for_pulse(self, lowest: float, highest: float) -> None:
         """Until the pulse is within these [µs]."""
         deadline = time.monotonic() + PATIENCE
-        while not lowest <= self.pulse <= highest:
-            assert time.monotonic() < deadline, f"the pulse is {self.pulse} µs"
+        while not lowest <= (pulse := self.pi.pulse()) <= highest:
+            assert time.monotonic() < deadline, f"the pulse is {pulse} µs"
             time.sleep(0.01)
 
-    @contextmanager
+    @contextlib.contextmanager
     def daemon(self, *arguments: str) -> Iterator[Daemon]:
         """A fishd on this virtual Pi."""
         with running(self.folder, *self.settings, *arguments) as daemon:
             yield daemon
 
 
-@contextmanager
-def bench(folder: Path) -> Iterator[Bench]:
-    """A virtual Pi that runs in this process."""
-    found = Bench(folder)
-    with found.server:
-        yield found
+@contextlib.contextmanager
+def pi_process() -> Iterator[Any]:
+    """A process in which a `LoadedPi` can be made, one after the other."""
+    manager = _Manager(ctx=multiprocessing.get_context("spawn"))
+    manager.start(initializer=_be_prompt)
+    try:
+        yield manager
+    finally:
+        manager.shutdown()
+
+
+@contextlib.contextmanager
+def bench(process: Any, folder: Path) -> Iterator[Bench]:
+    """A virtual Pi that runs as long as this, in a `pi_process`."""
+    pi = process.LoadedPi(str(folder / "virtual-pi"))
+    try:
+        yield Bench(folder, pi)
+    finally:
+        pi.close()
 
 
 class Dialogue:
@@ -111,6 +179,14 @@ class Dialogue:
         os.set_blocking(self._out, False)
         self.text = ""
         self._seen = 0
+
+    def close(self) -> None:
+        """End it, whatever it is doing; may be called after `finish`."""
+        self.process.kill()
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe:
+                pipe.close()
+        self.process.wait(PATIENCE)
 
     def expect(self, text: str) -> str:
         """Wait until this turns up in what is new; returns all that is new up to there."""
@@ -143,3 +219,26 @@ class Dialogue:
         self.text += self.process.stdout.read().decode()
         self.process.stdout.close()
         return self.process.wait(PATIENCE)
+
+
+Talk = Callable[..., Dialogue]
+"""Begins a `Dialogue` with a fishctl that is gone after the test."""
+
+
+def forces(daemon: Daemon, seconds: float = 0.3) -> tuple[float, float]:
+    """F_x and F_y as the daemon measures them now [N]."""
+    with Fish(daemon.endpoint) as fish:
+        sample = fish.sample_force(seconds)
+    return sample.fx, sample.fy
+
+
+def calibrations(daemon: Daemon) -> Calibrations:
+    """What is in force."""
+    with Fish(daemon.endpoint) as fish:
+        return fish.calibrations()
+
+
+def fishctl_alone(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """fishctl where no daemon runs."""
+    command = [FISHCTL, "--endpoint", f"ipc://{folder}/nobody", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fishd.calibrating import WORST_CONDITION, Load, PoorLoads, fit, missing_loads
@@ -33,6 +33,7 @@ def sensor(gx: float, gy: float, cx: float = 0.0, cy: float = 0.0) -> "np.ndarra
     return np.array([[gx, cx * gx], [cy * gy, gy]])
 
 
+@settings(deadline=None)
 @given(gains, gains, crosstalk, crosstalk, zeros, zeros)
 def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
     gx: float, gy: float, cx: float, cy: float, x0: float, y0: float
@@ -47,6 +48,7 @@ def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
     assert calibration.loads == 5
 
 
+@settings(deadline=None)
 @given(crosstalk, crosstalk, st.integers(0, 2**32 - 1))
 def test_with_noise_it_is_recovered_within_what_the_noise_permits(
     cx: float, cy: float, seed: int
@@ -81,6 +83,7 @@ def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gai
     assert fit(measured(cross, sensor(1, 8))).calibration.condition == pytest.approx(8.0)
 
 
+@settings(deadline=None)
 @given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 def test_the_condition_number_depends_neither_on_units_nor_on_an_offset(
     unit: float, offset: float
@@ -103,6 +106,7 @@ def test_a_plan_without_one_of_its_loads_is_refused_by_the_name_of_that_load(
         fit(measured(plan, sensor(1, 1)))
 
 
+@settings(deadline=None)
 @given(st.floats(-3, 3), st.lists(st.floats(-1, 1), min_size=3, max_size=9))
 def test_loads_on_one_line_are_refused_whatever_its_direction(
     angle: float, sizes: list[float]

@@ -4,8 +4,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import Scripted
+from harness import Recorder, Scripted
 from lockstep_rig import NEUTRAL, LockstepRig, lockstep_rig
+
+from fishd.controllers.swing import Swing
+from fishd.estimators.lateral_force import LateralForceEstimator
+from fishd.guard import Guard
+from fishd.hardware.ads1115 import Ads1115Sensor
+from fishd.hardware.pigpio import PigpioServo
+from fishd.simulation import simulate
 
 SENSOR_FAULTS = {
     "nack": "no chip",
@@ -155,6 +162,43 @@ def test_a_controller_that_fails_ends_in_neutral(rig: LockstepRig, answer: objec
     assert_recovers_by_clear_fault_only(rig)
 
 
+@pytest.mark.parametrize(
+    ("part", "method", "reason"),
+    [
+        (Ads1115Sensor, "read", "sensor-stale"),
+        (LateralForceEstimator, "update", "estimate-error"),
+        (Swing, "update", "controller-error"),
+        (Guard, "apply", "controller-error"),
+        (Recorder, "tick", "publish-error"),
+    ],
+)
+def test_an_exception_in_any_phase_ends_in_neutral_and_the_loop_goes_on(
+    rig: LockstepRig, monkeypatch: pytest.MonkeyPatch, part: type, method: str, reason: str
+) -> None:
+    broke = rig.now
+    with monkeypatch.context() as broken:
+        broken.setattr(part, method, lambda *_: 1 / 0)
+        rig.run_until_fault(1.0)
+        if part is Ads1115Sensor:  # which is what moves time on
+            monkeypatch.undo()
+    assert_one_fault(rig, reason)
+    rig.run_for(1.0)
+    assert_neutral_then_off(rig, broke, limit=1.5)
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_servo_whose_driver_fails_is_released(
+    rig: LockstepRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as broken:
+        broken.setattr(PigpioServo, "write", lambda *_: 1 / 0)
+        rig.run_until_fault(0.2)
+        rig.run_for(0.1)
+        assert rig.pulse == 0.0
+    assert_one_fault(rig, "servo-link")
+    assert_recovers_by_clear_fault_only(rig)
+
+
 def test_a_sensor_and_a_servo_that_fail_together_are_both_survived(rig: LockstepRig) -> None:
     rig.pi.faults.inject("unplugged")
     rig.pi.faults.inject("pigpiod-gone")
@@ -174,8 +218,6 @@ def test_an_emergency_stop_ends_the_pulses_within_one_frame(rig: LockstepRig) ->
 
 
 def test_swing_reaches_the_best_square_wave_through_the_whole_hardware_path(tmp_path: Path) -> None:
-    from fishd.simulation import simulate
-
     with lockstep_rig(tmp_path, "simulation.noise=0.001", "force_sensor.full_scale=2.048") as rig:
         config = rig.config
     assert simulate(config, "swing", {"C": 0.6}, seconds=60.0).efficiency >= 0.95

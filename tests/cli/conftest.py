@@ -1,0 +1,40 @@
+"""A virtual Pi, a fishd on it, and somebody who talks to fishctl."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from operator_rig import Bench, Dialogue, Talk, bench, pi_process
+from processes import Daemon
+
+
+@pytest.fixture(scope="session")
+def process() -> Iterator[Any]:
+    with pi_process() as process:
+        yield process
+
+
+@pytest.fixture
+def pi(process: Any, tmp_path: Path) -> Iterator[Bench]:
+    with bench(process, tmp_path) as found:
+        yield found
+
+
+@pytest.fixture
+def daemon(pi: Bench) -> Iterator[Daemon]:
+    with pi.daemon() as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def talk() -> Iterator[Talk]:
+    with ExitStack() as stack:
+
+        def begin(daemon: Daemon, *arguments: str) -> Dialogue:
+            dialogue = Dialogue(daemon, *arguments)
+            stack.callback(dialogue.close)
+            return dialogue
+
+        yield begin

@@ -1,0 +1,183 @@
+"""`fishctl calibrate force` as an operator does it: a real fishd, a virtual Pi under load."""
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from operator_rig import (
+    CROSSTALK,
+    SENSITIVITY_X,
+    SENSITIVITY_Y,
+    Bench,
+    Dialogue,
+    Talk,
+    calibrations,
+    fishctl_alone,
+    forces,
+)
+from processes import Daemon
+
+from fishd.client import Fish
+
+GRAM = 9.80665e-3
+PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
+
+
+def measure(dialogue: Dialogue, pi: Bench, fx: float, fy: float, size: str | None = None) -> None:
+    """Hang a load when it is asked for, and let it be measured."""
+    if size is not None:
+        dialogue.answer("load [", size)
+    dialogue.expect("Enter when it is still")
+    pi.pi.load(fx, fy)
+    dialogue.answer(":")
+    dialogue.answer("r to measure it again:")
+
+
+def test_five_guided_loads_make_true_forces_of_voltages(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    record = pi.folder / "loads.csv"
+    dialogue = talk(
+        daemon, "calibrate", "force", "--unit", "g", "--seconds", "0.3", "--record", str(record)
+    )
+    plan = dialogue.expect("-y")
+    assert all(name in plan for name in ("zero", "+x", "-x", "+y"))
+    measure(dialogue, pi, 0.0, 0.0)
+    measure(dialogue, pi, +20 * GRAM, 0.0, "20")
+    measure(dialogue, pi, -20 * GRAM, 0.0, "")  # as before
+    measure(dialogue, pi, 0.0, +30 * GRAM, "30")
+    measure(dialogue, pi, 0.0, -30 * GRAM, "30")
+    dialogue.answer("Another load", "10 10")
+    measure(dialogue, pi, 10 * GRAM, 10 * GRAM)
+    dialogue.answer("Another load", "")
+    fit = dialogue.answer("save it?", "y")
+    assert dialogue.finish() == 0
+    assert "over 6 loads" in fit
+    assert float(re.search(r"residual ([\d.]+) mN", fit)[1]) < 2.0  # type: ignore[index]
+    assert float(re.search(r"condition number ([\d.]+)", fit)[1]) < 3.0  # type: ignore[index]
+    assert dialogue.text.endswith(f"saved in {pi.files('force')[-1]}\n")
+    for load in ((0.1, -0.2), (-0.05, 0.05), (0.0, 0.0)):
+        pi.pi.load(*load)
+        assert forces(daemon) == pytest.approx(load, abs=3e-3)
+    assert len(record.read_text().splitlines()) == 7
+
+
+def test_a_load_can_be_measured_again_and_one_that_shook_is_pointed_out(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.6")
+    measure(dialogue, pi, 0.0, 0.0)
+    pi.pi.load(0.0, 0.0, shaking=0.1)
+    dialogue.answer("load [N]", "0.2")
+    dialogue.answer("Enter when it is still")
+    assert "not still" in dialogue.answer("r to measure it again:", "r")
+    pi.pi.load(0.0, 0.0)
+    measure(dialogue, pi, 0.2, 0.0, "0.2")
+    assert "not still" not in dialogue.expect("backward")
+    dialogue.process.send_signal(signal.SIGINT)
+    assert dialogue.finish() == 130
+    assert "nothing was changed" in dialogue.text
+
+
+def test_a_load_that_is_clipped_is_not_to_be_believed(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.3")
+    dialogue.expect("Enter when it is still")
+    pi.pi.load(2.0, 0.0)
+    dialogue.answer(":")
+    assert "not to be believed" in dialogue.expect("Enter to go on")
+    assert dialogue.finish() == 130
+
+
+def test_a_sensor_that_comes_back_costs_none_of_the_loads_before(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.3")
+    measure(dialogue, pi, 0.0, 0.0)
+    dialogue.answer("load [N]", "0.2")
+    pi.pi.inject("unplugged")
+    dialogue.answer("Enter when it is still")
+    dialogue.expect("not measured: the force sensor gave nothing")
+    pi.pi.clear()
+    measure(dialogue, pi, 0.2, 0.0, "")
+    dialogue.expect("backward")
+    assert dialogue.finish() == 130
+
+
+@pytest.mark.parametrize("how", ["ctrl-c", "end of input", "no"])
+def test_whoever_does_not_say_yes_changes_nothing(
+    talk: Talk, pi: Bench, daemon: Daemon, how: str
+) -> None:
+    before = calibrations(daemon)
+    measured = pi.folder / "measured.csv"
+    measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
+    dialogue = talk(daemon, "calibrate", "force", "--loads", str(measured))
+    dialogue.expect("save it?")
+    if how == "ctrl-c":
+        dialogue.process.send_signal(signal.SIGINT)
+        dialogue.process.wait(20)
+    elif how == "no":
+        dialogue.answer("", "n")
+    assert dialogue.finish() == (1 if how == "no" else 130)
+    assert "nothing was changed" in dialogue.text
+    assert calibrations(daemon) == before
+    assert pi.files("force") == []
+
+
+def test_loads_measured_earlier_are_fitted_without_a_question(pi: Bench, daemon: Daemon) -> None:
+    measured = pi.folder / "measured.csv"
+    lines = [f"{x / GRAM}, {y / GRAM}, {2 * x + 0.3}, {1.5 * y - 0.2}, ignored" for x, y in PLAN]
+    measured.write_text("\n".join(["fx_g, fy_g, vx_V, vy_V, remark", *lines, ""]))
+    ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    with Fish(daemon.endpoint) as fish:
+        found = fish.calibrations().force
+    assert (found.xx, found.xy, found.x0) == pytest.approx((0.5, 0.0, -0.15))
+    assert (found.yx, found.yy, found.y0) == pytest.approx((0.0, 1 / 1.5, 0.2 / 1.5))
+    assert (found.loads, found.residual) == (5, pytest.approx(0.0, abs=1e-12))
+
+
+def test_a_plan_of_ones_own_is_gone_through_load_by_load(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    plan = pi.folder / "plan.csv"
+    plan.write_text("fx,fy\n" + "".join(f"{x / GRAM},{y / GRAM}\n" for x, y in PLAN))
+    dialogue = talk(
+        daemon, "calibrate", "force", "--loads", str(plan), "--unit", "g", "--seconds", "0.3",
+        "--yes",
+    )  # fmt: skip
+    for load in PLAN:
+        measure(dialogue, pi, *load)
+    dialogue.answer("Another load")
+    assert dialogue.finish() == 0
+    with Fish(daemon.endpoint) as fish:
+        found = fish.calibrations().force
+    determinant = 1 - CROSSTALK**2
+    assert found.xx == pytest.approx(1 / SENSITIVITY_X / determinant, rel=0.02)
+    assert found.yy == pytest.approx(1 / SENSITIVITY_Y / determinant, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("fx_N,fy_N,vx_V,vy_V\n0,0,0,0\n1,0,1,0\n", r"a load along -x is missing"),
+        ("fx_N,fy_N\n0,0\n1,0\n-1,0\n2,0\n3,0\n", r"a load along \+y is missing"),
+        ("fx_N,fy_N,vx_V\n0,0,0\n", r":1: vx_V and vy_V are needed"),
+        ("force,volts\n0,0\n", r":1: one column fx_N or fx_g is needed"),
+        ("fx_N,fy_N\n0,0\n0.1,\n", r":3: fy_N: '' is not a number"),
+        ("fx_N,fy_N\n0,nan\n", r":2: fy_N: 'nan' is not a number"),
+        ("fx_N,fy_N\n", r"there is no load in it"),
+        (None, r"cannot be read: No such file"),
+    ],
+)
+def test_a_file_of_loads_that_is_no_good_is_refused_in_one_line(
+    tmp_path: Path, text: str | None, complaint: str
+) -> None:
+    path = tmp_path / "loads.csv"
+    if text is not None:
+        path.write_text(text)
+    ended = fishctl_alone(tmp_path, "calibrate", "force", "--loads", str(path), "--yes")
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert re.fullmatch(rf"fishctl: {path}[^\n]*{complaint}[^\n]*\n", ended.stderr)

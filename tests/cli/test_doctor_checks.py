@@ -1,0 +1,234 @@
+"""Checks of `fishctl doctor` that look at a Raspberry Pi's own files, on a tree of such files."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fishd.cli.checks import CHECKS
+from fishd.cli.checks.base import Context, Result
+from fishd.config import load
+
+Examine = Callable[..., Result | None]
+
+
+@pytest.fixture
+def root() -> Iterator[Path]:
+    """A tree that every user may enter."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def examine(root: Path) -> Examine:
+    """Make one check on the tree, for robot pi."""
+
+    def make(name: str, *overrides: str) -> Result | None:
+        settings = ["robot=pi", f"state_folder={root}/state", *overrides]
+        context = Context(load(None, settings), None, f"ipc://{root}/nobody", root)
+        return next(check for check in CHECKS if check.name == name).function(context)
+
+    return make
+
+
+def put(root: Path, path: str, content: str | bytes = "") -> Path:
+    file = root / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(content.encode() if isinstance(content, str) else content)
+    return file
+
+
+def level(result: Result | None) -> str:
+    assert result is not None
+    assert bool(result.mend) == (result.level in ("warning", "FAIL"))
+    return result.level
+
+
+def test_the_i2c_bus_must_be_there(root: Path, examine: Examine) -> None:
+    assert level(examine("i2c bus")) == "FAIL"
+    put(root, "dev/i2c-1")
+    assert level(examine("i2c bus")) == "ok"
+    other = examine("i2c bus", "force_sensor.bus=3")
+    assert level(other) == "FAIL"
+    assert other is not None
+    assert "there is i2c-1" in other.message
+
+
+def test_the_i2c_bus_must_be_accessible_to_this_user(root: Path, examine: Examine) -> None:
+    device = put(root, "dev/i2c-1")
+    device.chmod(0)
+    group = device.group()  # while Python's own files may still be read
+    if os.geteuid() == 0:
+        os.setresuid(65534, 65534, 0)
+        try:
+            found = examine("i2c bus")
+        finally:
+            os.setresuid(0, 0, 0)
+    else:
+        found = examine("i2c bus")
+    assert level(found) == "FAIL"
+    assert found is not None
+    assert f"usermod -aG {group}" in found.mend
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(400_000, "ok"), (100_000, "warning")])
+def test_a_slow_bus_is_a_warning(root: Path, examine: Examine, speed: int, expected: str) -> None:
+    assert level(examine("i2c speed")) == "skipped"
+    place = "sys/class/i2c-adapter/i2c-1/of_node/clock-frequency"
+    put(root, place, speed.to_bytes(4, "big"))
+    assert level(examine("i2c speed")) == expected
+
+
+def test_a_machine_that_is_no_raspberry_pi_is_pointed_out(root: Path, examine: Examine) -> None:
+    assert level(examine("model")) == "warning"
+    put(root, "proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.5\0")
+    assert examine("model") == ("ok", "Raspberry Pi 4 Model B Rev 1.5", "")
+
+
+def test_pigpio_on_a_pi_5_fails_before_anything_is_tried(root: Path, examine: Examine) -> None:
+    put(root, "proc/device-tree/model", "Raspberry Pi 5 Model B Rev 1.0\0")
+    found = examine("pigpiod")
+    assert level(found) == "FAIL"
+    assert found is not None
+    assert "sysfs-pwm" in found.mend
+    assert examine("pigpiod", "servo.driver=sysfs-pwm") is None
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected", "word"),
+    [
+        ("0", "ok", "no under-voltage"),
+        ("1", "FAIL", "under-voltage"),
+        ("50005", "FAIL", "under-voltage"),
+        ("4", "warning", "the Pi is throttled"),
+        ("8", "warning", "too hot"),
+        ("50000", "warning", "has been under-voltage and throttled"),
+    ],
+)
+def test_the_firmwares_word_on_power_is_understood(
+    root: Path, examine: Examine, flags: str, expected: str, word: str
+) -> None:
+    put(root, "sys/devices/platform/soc/soc:firmware/get_throttled", f"{flags}\n")
+    found = examine("power")
+    assert level(found) == expected
+    assert found is not None
+    assert word in found.message
+
+
+def test_without_the_firmware_the_kernels_alarm_is_asked(root: Path, examine: Examine) -> None:
+    assert level(examine("power")) == "skipped"
+    put(root, "sys/class/hwmon/hwmon0/name", "cpu_thermal\n")
+    put(root, "sys/class/hwmon/hwmon1/name", "rpi_volt\n")
+    put(root, "sys/class/hwmon/hwmon1/in0_lcrit_alarm", "0\n")
+    assert level(examine("power")) == "ok"
+    put(root, "sys/class/hwmon/hwmon1/in0_lcrit_alarm", "1\n")
+    assert level(examine("power")) == "FAIL"
+
+
+def test_a_governor_that_slows_any_processor_down_is_a_warning(
+    root: Path, examine: Examine
+) -> None:
+    assert level(examine("governor")) == "skipped"
+    for cpu in range(4):
+        put(root, f"sys/devices/system/cpu/cpu{cpu}/cpufreq/scaling_governor", "performance\n")
+    assert level(examine("governor")) == "ok"
+    put(root, "sys/devices/system/cpu/cpu2/cpufreq/scaling_governor", "ondemand\n")
+    assert level(examine("governor")) == "warning"
+
+
+def test_a_clock_that_systemd_has_synchronised_is_well(root: Path, examine: Examine) -> None:
+    put(root, "run/systemd/timesync/synchronized")
+    assert level(examine("clock")) == "ok"
+
+
+def test_a_gpio_pin_of_somebody_else_is_a_warning(root: Path, examine: Examine) -> None:
+    assert level(examine("gpio pins")) == "skipped"
+    put(
+        root,
+        "sys/kernel/debug/gpio",
+        "gpiochip0: GPIOs 512-565, parent: platform/fe200000.gpio, pinctrl-bcm2711:\n"
+        " gpio-529 (GPIO17              )\n"
+        " gpio-530 (GPIO18              |pps-gpio            ) in  lo\n"
+        " gpio-539 (GPIO27              |sysfs               ) out lo\n",
+    )
+    found = examine("gpio pins")
+    assert level(found) == "warning"
+    assert found is not None
+    assert found.message == "GPIO18 (servo.gpio) is used by pps-gpio"
+    assert level(examine("gpio pins", "servo.gpio=17")) == "ok"
+    assert level(examine("gpio pins", "servo.gpio=17", "panel.led_gpio=27")) == "warning"
+
+
+def pwm_channel(root: Path) -> Path:
+    """A Pi 5's channel of GPIO 18, exported."""
+    chip = root / "sys/class/pwm/pwmchip2"
+    device = root / "devices/1f00098000.pwm"
+    device.mkdir(parents=True)
+    chip.mkdir(parents=True)
+    (chip / "device").symlink_to(device)
+    for name in ("period", "duty_cycle", "enable"):
+        put(chip, f"pwm2/{name}", "0\n")
+    return chip / "pwm2"
+
+
+def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) -> None:
+    driver = "servo.driver=sysfs-pwm"
+    assert examine("pwm") is None
+    missing = examine("pwm", driver)
+    assert level(missing) == "FAIL"
+    channel = pwm_channel(root)
+    assert level(examine("pwm", driver)) == "ok"
+    (channel / "enable").write_text("1\n")
+    (channel / "duty_cycle").write_text("1500000\n")
+    left_on = examine("pwm", driver)
+    assert level(left_on) == "warning"
+    assert left_on is not None
+    assert left_on.mend == "fishctl release"
+    assert (channel / "duty_cycle").read_text() == "1500000\n"
+
+
+def test_calibrations_are_asked_for_and_a_broken_file_fails(root: Path, examine: Examine) -> None:
+    assert level(examine("calibrations")) == "warning"
+    put(root, "state/pi/force-2026-01-02.yaml", "xx: 2.0\nyy: 2.0\ndate: '2026-01-02'\n")
+    found = examine("calibrations")
+    assert level(found) == "warning"
+    assert found is not None
+    assert found.mend == "fishctl calibrate servo"
+    put(root, "state/pi/servo-2026-01-03.yaml", "trim: 10.0\ndate: '2026-01-03'\n")
+    assert examine("calibrations") == ("ok", "force of 2026-01-02, servo of 2026-01-03", "")
+    put(root, "state/pi/force-2026-02-02.yaml", "xx: a lot\n")
+    assert level(examine("calibrations")) == "FAIL"
+
+
+def test_the_state_folder_must_be_one_that_can_be_written_to(root: Path, examine: Examine) -> None:
+    assert level(examine("state folder")) == "ok"
+    assert not (root / "state").exists()
+    put(root, "state", "a file")
+    assert level(examine("state folder")) == "FAIL"
+
+
+def test_the_unit_must_be_installed_and_enabled(root: Path, examine: Examine) -> None:
+    assert level(examine("systemd")) == "skipped"
+    (root / "run/systemd/system").mkdir(parents=True)
+    assert level(examine("systemd")) == "warning"
+    unit = put(root, "etc/systemd/system/fishd.service", "[Service]\n")
+    not_enabled = examine("systemd")
+    assert level(not_enabled) == "warning"
+    assert not_enabled is not None
+    assert "enable --now" in not_enabled.mend
+    wants = root / "etc/systemd/system/multi-user.target.wants"
+    wants.mkdir()
+    (wants / "fishd.service").symlink_to(unit)
+    assert level(examine("systemd")) == "ok"
+
+
+def test_pins_are_used_without_a_package_for_them_only_in_vain(
+    root: Path, examine: Examine
+) -> None:
+    assert examine("gpio package") is None
+    assert level(examine("gpio package", "panel.estop_gpio=4")) == "ok"  # rpi-lgpio is here

@@ -1,0 +1,50 @@
+"""`fishctl tare`, and what none of the verbs about calibrations can do, on a real fishd."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+from operator_rig import Bench, fishctl_alone, forces
+from processes import Daemon, running
+
+
+def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(
+    pi: Bench, daemon: Daemon
+) -> None:
+    before = forces(daemon)
+    assert math.hypot(*before) > 0.3  # the voltages of the bridge without a load
+    ended = daemon.fishctl("tare", "--seconds", "0.3")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert re.search(r"before +x0 +\+0\.00 mN", ended.stdout)
+    assert str(pi.files("force")[-1]) in ended.stdout
+    assert forces(daemon) == pytest.approx((0.0, 0.0), abs=2e-3)
+
+
+def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(pi: Bench, daemon: Daemon) -> None:
+    pi.pi.load(0.0, 0.0, shaking=0.1)
+    restless = daemon.fishctl("tare", "--seconds", "1.2")
+    pi.pi.load(0.5, 0.0)
+    large = daemon.fishctl("tare", "--seconds", "0.3")
+    pi.pi.load(0.0, 0.0)
+    daemon.fishctl("set-controller", "swing")
+    swimming = daemon.fishctl("tare", "--seconds", "0.3")
+    for ended, code in ((restless, "not-still"), (large, "too-large"), (swimming, "running")):
+        assert (ended.returncode, ended.stdout) == (1, "")
+        assert re.fullmatch(rf"fishctl: [^\n]+ \[{code}\]\n", ended.stderr)
+    assert pi.files("force") == []
+
+
+def test_a_simulated_fish_has_nothing_to_tare_or_to_calibrate(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon:
+        for verb in (("tare",), ("calibrate", "force"), ("calibrate", "servo")):
+            ended = daemon.fishctl(*verb)
+            assert ended.returncode == 1
+            assert re.fullmatch(r"fishctl: a simulated fish .* \[simulated\]\n", ended.stderr)
+
+
+def test_without_a_daemon_nothing_can_be_calibrated(tmp_path: Path) -> None:
+    for verb in (("tare",), ("calibrate", "force"), ("calibrate", "servo")):
+        ended = fishctl_alone(tmp_path, *verb)
+        assert ended.returncode == 1
+        assert re.fullmatch(r"fishctl: no fishd at [^\n]*\n", ended.stderr)

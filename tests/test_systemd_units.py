@@ -1,0 +1,220 @@
+"""What systemd itself says about the files of systemd/: units, users, folders, udev rules."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SYSTEMD = Path(__file__).resolve().parents[1] / "systemd"
+UNITS = ("fishd.service", "fishd-failure.service")
+MOST_EXPOSED = 2.0
+"""`systemd-analyze security`: 0 is shut, 10 is open."""
+SHIPPED_UNITS = Path("/usr/lib/systemd/system")
+
+PIGPIOD = """\
+[Unit]
+Description=As Debian ships it
+[Service]
+ExecStart=/usr/bin/pigpiod -l
+ExecStop=/bin/systemctl kill pigpiod
+Type=forking
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def need(tool: str, package: str) -> None:
+    if shutil.which(tool) is None:
+        pytest.skip(f"{tool} is not installed: apt install {package}")
+
+
+def call(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A root folder with the units of fishd among those of systemd, and what they start."""
+    need("systemd-analyze", "systemd")
+    own = tmp_path / "etc/systemd/system"
+    shutil.copytree(SYSTEMD, own)
+    shutil.copytree(SHIPPED_UNITS, tmp_path / "usr/lib/systemd/system", symlinks=True)
+    (tmp_path / "usr/lib/systemd/system/pigpiod.service").write_text(PIGPIOD)
+    programs = (
+        "opt/fishd/bin/fishd",
+        "opt/fishd/bin/fishctl",
+        "usr/bin/pigpiod",
+        "bin/sh",
+        "bin/systemctl",
+    )
+    for program in programs:
+        (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / program).touch(0o755)
+    return tmp_path
+
+
+def complaints(root: Path, *units: str) -> str:
+    """All that `systemd-analyze verify` says; its exit status is 0 for many mistakes."""
+    return call("systemd-analyze", "verify", "--man=no", f"--root={root}", *units).stderr
+
+
+def setting(unit: str, key: str) -> list[str]:
+    """The values of a key, in order."""
+    return re.findall(rf"^{key}=(.*)$", (SYSTEMD / unit).read_text(), flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("unit", [*UNITS, "pigpiod.service"])
+def test_systemd_has_nothing_to_say_against_a_unit(root: Path, unit: str) -> None:
+    assert complaints(root, unit) == ""
+
+
+def test_a_misspelt_key_would_be_found(root: Path) -> None:
+    unit = root / "etc/systemd/system/fishd.service"
+    unit.write_text(unit.read_text().replace("WatchdogSec=", "WatchdogSeconds="))
+    assert "WatchdogSeconds" in complaints(root, "fishd.service")
+
+
+def test_a_pi_without_pigpiod_is_no_error(root: Path) -> None:
+    (root / "usr/lib/systemd/system/pigpiod.service").unlink()
+    assert complaints(root, "fishd.service") == ""
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_unit_is_hardly_exposed(unit: str) -> None:
+    need("systemd-analyze", "systemd")
+    threshold = f"--threshold={MOST_EXPOSED * 10:.0f}"
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", threshold]
+    done = call(*command, SYSTEMD / unit)
+    score = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    assert score, done.stderr
+    assert float(score[1]) <= MOST_EXPOSED
+    assert done.returncode == 0
+
+
+def test_what_the_hardware_needs_stays_open() -> None:
+    need("systemd-analyze", "systemd")
+    command = ["systemd-analyze", "security", "--offline=true", "--json=short"]
+    rows = json.loads(call(*command, SYSTEMD / "fishd.service").stdout)
+    open_ = {row["json_field"] for row in rows if row["set"] is False}
+    assert {
+        "PrivateDevices",  # would hide I2C
+        "ProtectKernelTunables",  # would make the kernel's PWM read-only
+        "ProcSubset",  # would hide /proc/cpuinfo from board detection
+        "RestrictRealtime",  # would forbid SCHED_FIFO
+        "SystemCallFilter_resources",
+        "MemoryDenyWriteExecute",  # would break controllers that are compiled as they run
+        "RestrictAddressFamilies_AF_UNIX",
+        "RestrictAddressFamilies_AF_INET_INET6",
+    } <= open_
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_devices_of_the_robot_are_allowed_and_no_others(unit: str) -> None:
+    assert setting(unit, "DevicePolicy") == ["closed"]
+    devices = {line.split()[0] for line in setting(unit, "DeviceAllow")}
+    assert devices == {"char-i2c", "char-gpiochip", "char-*gpiomem*"}
+    assert setting(unit, "SupplementaryGroups") == ["i2c gpio"]
+
+
+def test_a_wrong_config_is_not_tried_again() -> None:
+    from fishd.daemon import EX_CONFIG
+
+    assert setting("fishd.service", "Restart") == ["on-failure"]
+    assert setting("fishd.service", "RestartPreventExitStatus") == [str(EX_CONFIG)]
+
+
+def test_the_servo_is_released_however_the_daemon_ends() -> None:
+    (release,) = setting("fishd.service", "ExecStopPost")
+    (start,) = setting("fishd.service", "ExecStart")
+    assert release.startswith("/opt/fishd/bin/fishctl release --config ")
+    assert release.rpartition(" ")[2] == start.rpartition(" ")[2]
+
+
+def test_the_daemon_and_the_unit_agree_on_real_time() -> None:
+    from fishd.config import Config
+
+    priority = int(setting("fishd.service", "LimitRTPRIO")[0])
+    assert priority >= Config().realtime.priority
+    assert int(setting("pigpiod.service.d/fishd.conf", "CPUSchedulingPriority")[0]) > priority
+
+
+def test_the_config_for_the_pi_is_valid_and_at_rest() -> None:
+    from fishd.config import load
+
+    config = load(SYSTEMD.parent / "config/pi.yaml")
+    assert config.robot == "pi"
+    assert config.start.controller is None
+    (state,) = setting("fishd.service", "StateDirectory")
+    assert config.state_folder == f"/var/lib/{state}"
+
+
+def test_the_user_of_the_service_is_made_with_the_groups_of_the_devices(tmp_path: Path) -> None:
+    need("systemd-sysusers", "systemd")
+    folder = tmp_path / "etc/sysusers.d"
+    folder.mkdir(parents=True)
+    shutil.copy(SYSTEMD / "sysusers.d/fishd.conf", folder)
+    done = call("systemd-sysusers", "--dry-run", f"--root={tmp_path}", "fishd.conf")
+    assert done.returncode == 0, done.stderr
+    for made in ("group 'i2c'", "group 'gpio'", "group 'fishd'", "user 'fishd'"):
+        assert f"Creating {made}" in done.stdout + done.stderr
+    assert setting("fishd.service", "User") == ["fishd"]
+
+
+def test_the_folders_are_made_as_the_service_wants_them(tmp_path: Path) -> None:
+    need("systemd-tmpfiles", "systemd")
+    if os.geteuid() != 0:
+        pytest.skip("needs root: folders get another owner")
+    for kind in ("sysusers.d", "tmpfiles.d"):
+        (tmp_path / "etc" / kind).mkdir(parents=True)
+        shutil.copy(SYSTEMD / kind / "fishd.conf", tmp_path / "etc" / kind)
+    assert call("systemd-sysusers", f"--root={tmp_path}", "fishd.conf").returncode == 0
+    done = call("systemd-tmpfiles", "--create", f"--root={tmp_path}", "fishd.conf")
+    assert (done.returncode, done.stderr) == (0, "")
+    state = (tmp_path / "var/lib/fishd").stat()
+    assert f"{state.st_mode & 0o7777:04o}" == setting("fishd.service", "StateDirectoryMode")[0]
+    assert state.st_uid != 0
+    assert (tmp_path / "etc/fishd").stat().st_uid == 0
+
+
+def test_udev_has_nothing_to_say_against_the_rules() -> None:
+    need("udevadm", "udev")
+    if call("udevadm", "verify", "--help").returncode != 0:
+        pytest.skip("this udevadm cannot verify: systemd 254 or later is needed")
+    rules = SYSTEMD / "udev/rules.d/60-fishd.rules"
+    done = call("udevadm", "verify", "--resolve-names=never", rules)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_each_subsystem_of_the_robot_has_a_rule() -> None:
+    text = (SYSTEMD / "udev/rules.d/60-fishd.rules").read_text()
+    rules = [line for line in text.splitlines() if line and not line.startswith("#")]
+    subsystems = [re.match(r'SUBSYSTEM=="([^"]+)"', rule)[1] for rule in rules]  # type: ignore[index]
+    assert subsystems == ["i2c-dev", "gpio", "*gpiomem", "pwm"]
+
+
+def test_the_pwm_rule_hands_a_channel_to_the_group(tmp_path: Path) -> None:
+    """The rule's own command, on a folder like that of a chip with an exported channel."""
+    text = (SYSTEMD / "udev/rules.d/60-fishd.rules").read_text()
+    command = re.search(r"RUN\+=\"/bin/sh -c '([^']+)'\"", text)
+    assert command
+    chip = tmp_path / "pwmchip0"
+    (chip / "pwm2").mkdir(parents=True)
+    for name, mode in (("export", 0o200), ("npwm", 0o444), ("pwm2/enable", 0o644)):
+        (chip / name).touch(mode)
+        (chip / name).chmod(mode)
+    own = command[1].replace("/sys%p", str(chip)).replace("gpio", str(os.getgid()))
+    subprocess.run(["/bin/sh", "-c", own], check=True)
+    modes = {p.name: p.stat().st_mode & 0o777 for p in chip.rglob("*") if p.is_file()}
+    assert modes == {"export": 0o220, "npwm": 0o444, "enable": 0o664}
+
+
+def test_pigpiod_listens_where_fishd_asks() -> None:
+    from fishd.hardware.settings import PigpioSettings
+
+    words = setting("pigpiod.service.d/fishd.conf", "ExecStart")[-1].split()
+    assert words[words.index("-n") + 1] == PigpioSettings().host
+    assert "-l" in words
