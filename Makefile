@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: help run test lint docs bench clean
 
 help:  ## List what there is to make
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
 
 run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
 	$(BIN)/fishd --config config/simulated.yaml --print-status
@@ -45,6 +45,8 @@ $(VENV)/installed: pyproject.toml $(VENV)/bin/python
 
 $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@# Tests run it on a stand-in for lgpio, which has no wheel for every Python.
+	$(BIN)/python -m pip install --quiet --no-deps 'rpi-lgpio>=0.6,<1'
 	@touch $@ $(VENV)/installed
 
 .PHONY: install-pi uninstall-pi trial-systemd

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from fishd.clock import Clock, Slot
 from fishd.controllers.base import Controller, Limits
@@ -67,7 +68,7 @@ class ControlLoop:
         self._now = clock.monotonic
         self._notify = notify
         self._lost = False
-        self._measurement: Measurement | None = None
+        self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
         self._index = -1
         self._overran = False
         self._latest_problem = ""
@@ -163,8 +164,8 @@ class ControlLoop:
                 self._fall()
         except Exception as error:
             problem = f"the force sensor cannot be read: {_named(error)}"
-            measurement = self._measurement or Measurement(slot.deadline, 0.0, 0.0, 0)
-        self._measurement = measurement
+            measurement = self._measurement  # once more, and nothing of it is new
+        self._measurement = replace(measurement, samples=0, suspect="")
         age = slot.now - measurement.time
         if problem is None and age > STALE * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"

@@ -26,6 +26,7 @@ from fishd.emulation.link import RemotePi
 from fishd.emulation.link_server import LinkServer
 from fishd.emulation.punctual_clock import PunctualClock
 from fishd.emulation.virtual_pi import PiState, VirtualPi
+from fishd.hardware.settings import PanelSettings
 
 CHIP_PRIORITY = 60
 """SCHED_FIFO priority of a virtual Pi, above that of the fishd that drives it."""
@@ -77,6 +78,8 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     settings = config.virtual_pi
     path = virtual_pi_socket(settings.socket)
     pi = VirtualPi(settings, config.plant, config.simulation, config.tick, PunctualClock())
+    if config.panel.estop_gpio is not None:
+        pi.set_level(config.panel.estop_gpio, _level(config.panel, pressed=False))
     with _signals() as stopped, LinkServer(pi, path):
         click.echo(
             f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
@@ -174,7 +177,12 @@ def _set_button(config: Config, pressed: bool) -> None:
     if panel.estop_gpio is None:
         complain("fishctl", "panel.estop_gpio is null: the configuration has no E-stop button", 1)
     with _remote(config) as pi:
-        pi.set_level(panel.estop_gpio, int(pressed == (panel.estop_pressed == "high")))
+        pi.set_level(panel.estop_gpio, _level(panel, pressed))
+
+
+def _level(panel: PanelSettings, pressed: bool) -> int:
+    """What the E-stop button drives its pin to."""
+    return int(pressed == (panel.estop_pressed == "high"))
 
 
 def _line(state: PiState) -> str:

@@ -1,0 +1,180 @@
+#!/usr/bin/env bash
+# Installs fishd on a Raspberry Pi, or renews it; run by `sudo make install-pi`.
+#
+# PYTHON       the Python to use, python3 if not set
+# FISHD_WHEEL  a wheel to install instead of building one from this checkout
+# FISHD_GPIO   rpi-gpio or rpi-lgpio, if not what suits this Pi; or none, for a robot without E-stop
+#              button and status light
+# DESTDIR      a folder to install into, without touching the running system
+# pip's own variables work too: PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER installs without a network.
+set -euo pipefail
+umask 022
+checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+# shellcheck source=tools/pi_layout.sh
+source "$checkout/tools/pi_layout.sh"
+PYTHON=${PYTHON:-python3}
+venv=$DESTDIR$HOME_FOLDER
+
+# Which package provides RPi: RPi.GPIO fails on a Pi 5, and its edges from kernel 6.6 on.
+gpio_extra() {
+  local model=$1 debian=$2 kernel=$3 major minor
+  IFS=.- read -r major minor _ <<<"$kernel"
+  if [[ $model =~ (Pi|Module)\ 5|Pi\ 500 ]] || ((debian >= 13 || major > 6 || (major == 6 && minor >= 6))); then
+    echo rpi-lgpio
+  else
+    echo rpi-gpio
+  fi
+}
+
+pi_model() { tr -d '\0' 2>/dev/null </proc/device-tree/model || true; }
+
+debian_version() {
+  local version
+  version=$(sed -n 's/^VERSION_ID="\{0,1\}\([0-9]\{1,\}\).*/\1/p' /etc/os-release 2>/dev/null || true)
+  echo "${version:-0}"
+}
+
+check_python() {
+  "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
+    fail "Python 3.11 or later is needed; name one with PYTHON=..., or use Debian 12 or later"
+  "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null ||
+    fail "Python cannot make virtual environments: sudo apt install python3-venv"
+  if real_system && [[ $("$PYTHON" -c 'import sys; print(sys.base_prefix)') =~ ^/(home|root)/ ]]; then
+    fail "$PYTHON is in a home folder, where the service cannot see it; PYTHON=/usr/bin/python3?"
+  fi
+}
+
+# A Python that was upgraded, or taken away, leaves a folder behind that no longer runs.
+make_venv() {
+  local version
+  version=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+  if [[ $("$venv/bin/python" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) == "$version" ]]; then
+    step "$HOME_FOLDER: has Python $version"
+    return
+  fi
+  rm -rf "${venv:?}"/{bin,lib,lib64,include,pyvenv.cfg}
+  "$PYTHON" -m venv "$venv"
+  step "$HOME_FOLDER: made with Python $version"
+}
+
+# -I: not what lies in the folder that this is started from.
+pip() { "$venv/bin/python" -I -m pip --quiet --disable-pip-version-check "$@"; }
+
+install_package() {
+  local extra=$1 extras hint other wheel=${FISHD_WHEEL:-}
+  if [[ -z $wheel ]]; then
+    pip wheel --no-deps --wheel-dir "$workspace" "$checkout" || fail "building fishd failed"
+    wheel=$(echo "$workspace"/fishd-*.whl)
+  fi
+  # Both packages put their files into the same folder RPi: one at a time.
+  other=$([[ $extra == rpi-gpio ]] && echo rpi-lgpio || echo RPi.GPIO)
+  if pip show "$other" >/dev/null 2>&1; then
+    pip uninstall --yes "$other"
+    step "$other: removed, it excludes $extra"
+  fi
+  extras=pi hint="gcc python3-dev"
+  if [[ $extra != none ]]; then extras+=,$extra; fi
+  # No ready-made lgpio for Python 3.13; liblgpio-dev is in Raspberry Pi OS, not in Debian.
+  if [[ $extra == rpi-lgpio ]]; then hint+=" swig liblgpio-dev"; fi
+  pip install "${wheel}[$extras]" ||
+    fail "pip failed; to build what it has no wheel of: sudo apt install $hint; or leave $extra out with FISHD_GPIO=none, it is for E-stop button and status light"
+  pip install --force-reinstall --no-deps "$wheel" # the same version may have other contents
+  step "fishd $("$venv/bin/python" -I -c 'import fishd; print(fishd.__version__)') with the extras $extras"
+}
+
+# What is in the folder must not know of DESTDIR, it will be gone when the folder is in its place.
+forget_destdir() {
+  real_system && return
+  local file
+  while IFS= read -r file; do
+    sed -i "s|$DESTDIR||g" "$file"
+  done < <(grep -rlI --exclude-dir=__pycache__ -F "$DESTDIR" "$venv/bin" "$venv/pyvenv.cfg" || true)
+}
+
+put() { install -D -m 0644 "$1" "$DESTDIR$2"; }
+
+install_config() {
+  local new=$checkout/config/pi.yaml there=$DESTDIR$CONFIG as_installed=$DESTDIR$CONFIG_AS_INSTALLED
+  if [[ -e $there ]] && ! cmp -s "$there" "$as_installed" && ! cmp -s "$there" "$new"; then
+    if cmp -s "$new" "$as_installed"; then
+      step "$CONFIG: yours, kept"
+    else
+      put "$new" "$CONFIG.new"
+      put "$new" "$CONFIG_AS_INSTALLED"
+      step "$CONFIG: yours, kept; what is new is in $CONFIG.new"
+    fi
+    return
+  fi
+  put "$new" "$CONFIG"
+  put "$new" "$CONFIG_AS_INSTALLED"
+  rm -f "$there.new"
+  step "$CONFIG: installed"
+}
+
+install_files() {
+  local entry source target
+  mkdir -p "$DESTDIR$COMMANDS"
+  for source in fishd fishctl; do
+    ln -sfn "$HOME_FOLDER/bin/$source" "$DESTDIR$COMMANDS/$source"
+    step "$COMMANDS/$source: installed"
+  done
+  for entry in "${SYSTEM_FILES[@]}"; do
+    read -r source target <<<"$entry"
+    put "$checkout/systemd/$source" "$target"
+    step "$target: installed"
+  done
+}
+
+take_effect() {
+  systemd-sysusers /etc/sysusers.d/fishd.conf
+  systemd-tmpfiles --create /etc/tmpfiles.d/fishd.conf
+  step "user fishd, groups i2c and gpio: there"
+  systemctl daemon-reload
+  if systemctl --quiet is-active systemd-udevd; then
+    modprobe i2c-dev 2>/dev/null || step "module i2c-dev: not loaded; see 'fishctl doctor'"
+    udevadm control --reload
+    udevadm trigger --subsystem-match=i2c-dev --subsystem-match=gpio --subsystem-match=pwm
+    step "udev: has the new rules"
+  fi
+  systemctl --quiet enable fishd.service
+  step "fishd.service: enabled, starts with the next boot"
+}
+
+say_what_next() {
+  if systemctl --quiet is-active pigpiod; then
+    step "pigpiod runs as before; for its new options: sudo systemctl restart pigpiod"
+  elif ! command -v pigpiod >/dev/null; then
+    step "there is no pigpiod: sudo apt install pigpio, or servo.driver: sysfs-pwm in $CONFIG"
+  fi
+  step "who may use fishctl: sudo usermod -aG fishd USER, then log in again"
+  if systemctl --quiet is-active fishd; then
+    step "the old fishd runs on; for the new one: sudo systemctl restart fishd"
+  else
+    step "look it over: sudo -u fishd fishctl doctor --config $CONFIG; then: sudo systemctl start fishd"
+  fi
+}
+
+main() {
+  local extra
+  need_root
+  check_python
+  workspace=$(mktemp -d)
+  trap 'rm -rf "$workspace"' EXIT
+  extra=${FISHD_GPIO:-$(gpio_extra "$(pi_model)" "$(debian_version)" "$(uname -r)")}
+  [[ $extra =~ ^(rpi-gpio|rpi-lgpio|none)$ ]] || fail "FISHD_GPIO=$extra: rpi-gpio, rpi-lgpio or none"
+  make_venv
+  install_package "$extra"
+  forget_destdir
+  install_config
+  install_files
+  if systemd_runs; then
+    take_effect
+    say_what_next
+  else
+    step "systemd does not run here: nothing was started or enabled"
+  fi
+}
+
+if [[ ${BASH_SOURCE[0]} == "$0" ]]; then
+  main
+fi

@@ -1,0 +1,80 @@
+"""The root folder of a small Debian with fishd's checkout and its wheels in it, ready to boot."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+_SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
+"""Debian's release with the same Python as this one, so that wheels of compiled code fit."""
+_TOOLS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container", "git": "git"}
+_PACKAGES = "systemd,systemd-sysv,dbus,make,python3,python3-venv"
+
+
+class CannotTry(Exception):
+    """What this machine lacks, as one line."""
+
+
+def check_machine() -> None:
+    """Raises `CannotTry` when a root folder could not be made or booted here."""
+    if os.geteuid() != 0:
+        raise CannotTry("to boot a root folder needs root: sudo make trial-systemd")
+    for tool, package in _TOOLS.items():
+        if shutil.which(tool) is None:
+            raise CannotTry(f"{tool} is missing: sudo apt install {package}")
+    if sys.version_info[:2] not in _SUITES:
+        raise CannotTry("run this with Python 3.11 or 3.13: a release of Debian must have the same")
+
+
+def build(work: Path, base: Path | None) -> Path:
+    """Make the folder `work`/root and return it.
+
+    base: keeps the bare Debian from one trial to the next; made when it is not there
+    """
+    root = work / "root"
+    if base is None:
+        _debootstrap(root)
+    else:
+        if not base.exists():
+            _debootstrap(base)
+        subprocess.run(["cp", "--archive", base, root], check=True)
+    checkout = root / "root" / "fishd"
+    checkout.mkdir()
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        check=True,
+    ).stdout.decode()
+    for name in filter(None, listed.split("\0")):
+        if (CHECKOUT / name).is_file():
+            (checkout / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(CHECKOUT / name, checkout / name)
+    _wheels(root / "root" / "wheels")
+    return root
+
+
+def _debootstrap(folder: Path) -> None:
+    suite = _SUITES[sys.version_info[:2]]
+    _say(f"making a Debian {suite}; takes a minute")
+    subprocess.run(
+        ["debootstrap", "--variant=minbase", f"--include={_PACKAGES}", suite, folder],
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+
+
+def _wheels(folder: Path) -> None:
+    """Everything that installing fishd takes: there is no network inside."""
+    _say("collecting wheels")
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    wanted = [f"{CHECKOUT}[pi]", "hatchling"]
+    subprocess.run([*pip, "wheel", "--wheel-dir", folder, *wanted], check=True)
+    for own in folder.glob("fishd-*.whl"):
+        own.unlink()  # the installation builds its own
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

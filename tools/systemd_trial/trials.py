@@ -1,0 +1,181 @@
+"""What is tried on the booted system, and what must come of it.
+
+Each trial returns a row of the report; raises `Broken` where a promise of fishd is not kept.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from container import Broken, Container, Entry, wait_for
+
+NEUTRAL = 1500.0
+"""Pulse of a straight fin in the trial's configuration [us]."""
+NEUTRAL_LIMIT = 0.3
+"""Longest time from the daemon's sudden death to a neutral servo [s]."""
+CONFIG = "etc/fishd/fishd.yaml"
+_UNIT = "fishd.service"
+
+
+class Row(NamedTuple):
+    """One trial; times [s] count from what was done to the daemon."""
+
+    what: str
+    neutral: float | None
+    off: float | None
+    again: float | None
+    """Until the restarted daemon was ready."""
+    outcome: str
+
+
+class Rig:
+    """The container with fishd and its virtual Pi, and the pulses that reach the servo."""
+
+    def __init__(self, container: Container, pulses: Path) -> None:
+        """pulses: the file that watch_pulses.py writes"""
+        self.container = container
+        self._pulses = pulses
+
+    def systemctl(self, *words: str, check: bool = True) -> str:
+        """Run systemctl inside."""
+        return self.container.run("systemctl", *words, check=check)
+
+    def swim(self) -> None:
+        """Have a fresh fishd that swims, whatever was before."""
+        self.systemctl("stop", _UNIT, check=False)
+        self.systemctl("reset-failed", _UNIT, "fishd-failure.service", check=False)
+        begun = time.monotonic()
+        self.systemctl("start", _UNIT)
+        time.sleep(1.5)
+        faults = [e.message for e in self.container.journal(begun) if " fault: " in e.message]
+        if faults or self.pulse() in (0.0, NEUTRAL):
+            raise Broken(f"the fish does not swim: {', '.join(faults) or 'no pulses'}")
+
+    def pulse(self) -> float:
+        """The pulse of now [us]; 0: none."""
+        return self.pulses()[-1][1]
+
+    def pulses(self) -> list[tuple[float, float]]:
+        """Time [s] and pulse [us] at each change."""
+        lines = self._pulses.read_text().splitlines(keepends=True)
+        return [(float(t), float(p)) for t, p in (x.split() for x in lines if x.endswith("\n"))]
+
+    def signal(self, name: str) -> float:
+        """Send a signal to the daemon; when [s]."""
+        now = time.monotonic()
+        self.systemctl("kill", "--kill-whom=main", f"--signal={name}", _UNIT)
+        return now
+
+    def when(self, since: float, words: str, unit: str = _UNIT) -> float:
+        """Time from `since` until the journal has a line with these words; waits for it [s]."""
+
+        def found() -> list[Entry]:
+            entries = self.container.journal(since)
+            return [e for e in entries if words in e.message and e.unit == unit]
+
+        wait_for(lambda: bool(found()), f"the journal does not say '{words}'")
+        return found()[0].time - since
+
+    def settled(self, since: float) -> tuple[float, float]:
+        """Time from `since` until the servo was neutral for good, and until its pulses ended."""
+        wait_for(lambda: any(t > since and p == 0 for t, p in self.pulses()), "pulses go on")
+        changes = [(t, p) for t, p in self.pulses() if t > since]
+        last = next(i for i, (_, pulse) in enumerate(changes) if pulse == 0)
+        if last == 0 or changes[last - 1][1] != NEUTRAL:
+            raise Broken("the pulses ended before the servo was neutral")
+        return changes[last - 1][0] - since, changes[last][0] - since
+
+
+def start(rig: Rig) -> Row:
+    """From the start of the unit to READY=1, which the first tick sends."""
+    rig.systemctl("stop", _UNIT)
+    begun = time.monotonic()
+    rig.systemctl("start", _UNIT)
+    ready = rig.when(begun, "Started fishd.service")
+    rig.swim()
+    loop = rig.container.run("fishctl", "status")
+    if "real-time scheduling" not in loop:
+        raise Broken("the daemon has no real-time scheduling")
+    return Row("`systemctl start`", None, None, ready, "ready with the first tick")
+
+
+def stop(rig: Rig) -> Row:
+    """SIGTERM: fade, release, done."""
+    begun = time.monotonic()
+    rig.systemctl("stop", _UNIT)
+    ended = rig.when(begun, "Stopped fishd.service")
+    if rig.container.show(_UNIT, "Result") != "success":
+        raise Broken("a clean stop counts as a failure")
+    return Row("`systemctl stop`", *rig.settled(begun), None, f"stopped after {ended:.2f} s")
+
+
+def killed(rig: Rig) -> Row:
+    """kill -9: the script in pigpiod, then ExecStopPost, then a restart."""
+    return _survived(rig, "kill −9", rig.signal("SIGKILL"), "Main process exited", "ended")
+
+
+def hung(rig: Rig) -> Row:
+    """A process that stands still: nothing feeds the watchdog."""
+    return _survived(rig, "hang (SIGSTOP)", rig.signal("SIGSTOP"), "Watchdog timeout", "watchdog")
+
+
+def _survived(rig: Rig, what: str, begun: float, sign: str, name: str) -> Row:
+    noticed = rig.when(begun, sign)
+    neutral, off = rig.settled(begun)
+    again = rig.when(begun, "Started fishd.service")
+    if neutral > NEUTRAL_LIMIT:
+        raise Broken(f"{what}: neutral after {neutral:.3f} s; {NEUTRAL_LIMIT} s are promised")
+    return Row(what, neutral, off, again, f"{name} after {noticed:.2f} s, released, restarted")
+
+
+def killed_again_and_again(rig: Rig) -> Row:
+    """A daemon that always dies is given up, and the failure unit says so."""
+    begun = time.monotonic()
+    while (state := rig.container.show(_UNIT, "ActiveState")) != "failed":
+        if time.monotonic() > begun + 120:
+            raise Broken("a daemon that always dies is restarted for ever")
+        if state == "active":
+            rig.signal("SIGKILL")
+        time.sleep(0.1)
+    said = rig.when(begun, "fishd has failed", "fishd-failure.service")
+    starts = [e for e in rig.container.journal(begun) if e.message.startswith("Started fishd.")]
+    if said < starts[-1].time - begun:
+        raise Broken("the failure unit has acted before fishd was given up")
+    if rig.pulse() != 0:
+        raise Broken("pulses go on after the service was given up")
+    outcome = (
+        f"given up after {len(starts)} restarts, {said:.0f} s; failure unit has run, pulses off"
+    )
+    return Row("kill −9, again and again", None, None, None, outcome)
+
+
+def wrong_config(rig: Rig) -> Row:
+    """Exit status 78, once; the failure unit says so."""
+    config = rig.container.root / CONFIG
+    good = config.read_text()
+    rig.systemctl("stop", _UNIT)
+    begun = time.monotonic()
+    config.write_text(good + "tik: 0.05\n")
+    try:
+        rig.systemctl("start", _UNIT, check=False)
+        rig.when(begun, "fishd has failed", "fishd-failure.service")
+        time.sleep(4.0)  # several times RestartSec
+        status = rig.container.show(_UNIT, "ExecMainStatus")
+        restarts = rig.container.show(_UNIT, "NRestarts")
+    finally:
+        config.write_text(good)
+    if (status, restarts) != ("78", "0"):
+        raise Broken(f"a wrong configuration: exit status {status}, {restarts} restarts")
+    rig.when(begun, "did you mean 'tick'?")
+    return Row("wrong configuration", None, None, None, "exit 78, no restart; failure unit has run")
+
+
+TRIALS: tuple[Callable[[Rig], Row], ...] = (
+    start,
+    stop,
+    killed,
+    hung,
+    killed_again_and_again,
+    wrong_config,
+)

@@ -1,0 +1,84 @@
+#!/usr/bin/env bash
+# Removes what install_pi.sh has put on a Raspberry Pi; run by `sudo make uninstall-pi`.
+#
+# An edited configuration and the calibrations stay; PURGE=1 removes them too, and the user.
+# DESTDIR   a folder that fishd was installed into
+set -euo pipefail
+# shellcheck source=tools/pi_layout.sh
+source "$(dirname "${BASH_SOURCE[0]}")/pi_layout.sh"
+PURGE=${PURGE:-0}
+
+remove() {
+  if [[ -e $DESTDIR$1 || -L $DESTDIR$1 ]]; then
+    rm -rf "${DESTDIR}${1:?}"
+    step "$1: removed"
+  fi
+}
+
+remove_if_empty() { rmdir "$DESTDIR$1" 2>/dev/null || true; }
+
+stop_service() {
+  if systemctl --quiet is-active fishd; then
+    systemctl stop fishd.service
+    step "fishd.service: stopped, the servo is released"
+  fi
+  systemctl --quiet disable fishd.service 2>/dev/null || true
+}
+
+remove_config() {
+  local there=$DESTDIR$CONFIG
+  if [[ $PURGE == 1 ]] || cmp -s "$there" "$DESTDIR$CONFIG_AS_INSTALLED"; then
+    remove "$CONFIG"
+  elif [[ -e $there ]]; then
+    step "$CONFIG: yours, kept; PURGE=1 removes it"
+  fi
+  remove "$CONFIG.new"
+  remove_if_empty "$(dirname "$CONFIG")"
+}
+
+remove_files() {
+  local entry target
+  for entry in "${SYSTEM_FILES[@]}"; do
+    read -r _ target <<<"$entry"
+    remove "$target"
+  done
+  remove_if_empty /etc/systemd/system/pigpiod.service.d
+  remove "$COMMANDS/fishd"
+  remove "$COMMANDS/fishctl"
+  remove "$HOME_FOLDER"
+}
+
+remove_state() {
+  remove_if_empty "$STATE_FOLDER"
+  if [[ $PURGE == 1 ]]; then
+    remove "$STATE_FOLDER"
+    remove /etc/systemd/system/fishd.service.d
+  elif [[ -e $DESTDIR$STATE_FOLDER ]]; then
+    step "$STATE_FOLDER: calibrations, kept; PURGE=1 removes them"
+  fi
+}
+
+remove_user() {
+  if getent passwd fishd >/dev/null; then
+    userdel fishd
+    step "user fishd: removed"
+  fi
+}
+
+main() {
+  need_root
+  if systemd_runs; then stop_service; fi
+  remove_config
+  remove_files
+  remove_state
+  if systemd_runs; then
+    systemctl daemon-reload
+    if systemctl --quiet is-active systemd-udevd; then udevadm control --reload; fi
+    if systemctl --quiet is-active pigpiod; then
+      step "pigpiod runs on; for its own options again: sudo systemctl restart pigpiod"
+    fi
+  fi
+  if real_system && [[ $PURGE == 1 ]]; then remove_user; fi
+}
+
+main
