@@ -8,6 +8,7 @@ import errno
 import os
 import socket
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ class Transfer(Request, frozen=True):
     address: int
     messages: tuple[bytes | int, ...]
     """Bytes to write, or the number of bytes to read."""
+    asked: float
+    """When [s, monotonic]."""
 
 
 class SetTimeout(Request, frozen=True):
@@ -119,7 +122,7 @@ class RemotePi:
     def transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
         """Carry out one I2C transfer; the bytes of each read. Raises OSError as the kernel does."""
         spoken = tuple(m.data if isinstance(m, Write) else m.length for m in messages)
-        replies: list[bytes] = self._ask(Transfer(address, spoken))
+        replies: list[bytes] = self._ask(Transfer(address, spoken, time.monotonic()))
         return replies
 
     def set_timeout(self, seconds: float) -> None:

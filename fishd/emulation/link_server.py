@@ -122,8 +122,8 @@ class LinkServer:
     def _perform(self, request: AnyRequest) -> Any:
         pi = self._pi
         match request:
-            case Transfer(address, messages):
-                return pi.bus.transfer(address, [_message(spoken) for spoken in messages])
+            case Transfer(address, messages, asked):
+                return pi.bus.transfer(address, [_message(spoken) for spoken in messages], asked)
             case SetTimeout(seconds):
                 pi.bus.timeout = seconds
             case Inject(name, seconds):

@@ -16,8 +16,11 @@ from fishd.hardware.settings import ForceSensorSettings
 from fishd.hardware.window import Evaluation, VoltageWatch
 from fishd.signals import Measurement
 
-HOLD = 2.5e-3
-"""How long before a read no conversion begins any more, at most a quarter of a tick [s]."""
+HOLD = 2.2e-3
+"""How long before a read all conversions have ended, at most an eighth of a tick [s].
+
+As long as the ticker is awake before a deadline: two threads of one interpreter delay each other.
+"""
 CLOSE_LIMIT = 0.5
 """How long to wait for the thread to end [s]."""
 
@@ -55,7 +58,7 @@ class Ads1115Sensor:
         clock: of the bus; in virtual time one of its own, which reads move on
         threaded: sample in a thread, which needs a clock that moves by itself
         tick: time between two reads [s]
-        hold_before: how long before a read to keep out of its way [s], at most a quarter of a tick
+        hold_before: how long before a read to keep out of its way [s], at most an eighth of a tick
 
         Raises `StartupError` where the driver is not installed.
         """
@@ -63,7 +66,8 @@ class Ads1115Sensor:
         """What turns voltages into forces."""
         self._clock = clock
         self._tick = tick
-        self._hold = min(hold_before, 0.25 * tick)
+        self._hold = min(hold_before, 0.125 * tick)
+        self._step_time = 0.0
         self._place = f"the ADS1115 at {settings.address:#04x} on /dev/i2c-{settings.bus}"
         self._sampler = Sampler(settings, clock)
         self._evaluation = Evaluation(settings)
@@ -137,9 +141,19 @@ class Ads1115Sensor:
     def _catch_up(self, now: float) -> None:
         """Sample until `now` as the thread would have done."""
         clock, sampler = self._clock, self._sampler
-        while max(clock.monotonic(), sampler.ready_at) <= now - self._hold:
-            sampler.step()
+        while max(clock.monotonic(), sampler.ready_at) <= now - self._hold - self._step_time:
+            self._step()
         clock.sleep(now - clock.monotonic())
+
+    def _step(self) -> None:
+        """Convert once, and learn how long that takes here: the longest of late, slowly forgotten.
+
+        What takes longer than an eighth of a tick is no conversion but an error.
+        """
+        begun = self._clock.monotonic()
+        self._sampler.step()
+        took = min(self._clock.monotonic() - begun, 0.125 * self._tick)
+        self._step_time = max(took, self._step_time + 0.01 * (took - self._step_time))
 
     def _run(self) -> None:
         """Sample until closed; what the thread does."""
@@ -149,7 +163,7 @@ class Ads1115Sensor:
             if pause > 0.0:
                 self._closing.wait(pause)
             else:
-                sampler.step()
+                self._step()
         sampler.close()
 
     def _pause(self) -> float:
@@ -158,6 +172,6 @@ class Ads1115Sensor:
         That is around an expected read, until it has come and had some time.
         """
         late = self._clock.monotonic() - self._next_read
-        if not -self._hold <= late < self._hold:
+        if not -self._hold - self._step_time <= late < self._hold:
             return 0.0
         return 0.25 * self._hold - min(late, 0.0)

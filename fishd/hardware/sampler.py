@@ -96,7 +96,7 @@ class Sampler:
         bus, self._bus = self._bus, None
         if bus is not None:
             del self._chip, self._x, self._y
-            bus.deinit()
+            self._driver.close_bus(bus)
 
     def _open(self) -> None:
         settings = self._settings
@@ -104,7 +104,7 @@ class Sampler:
         try:
             self._chip = self._driver.SingleShot(bus, settings, self._clock)
         except BaseException:
-            bus.deinit()
+            self._driver.close_bus(bus)
             raise
         self._x = self._chip.input(settings.channel_x)
         self._y = self._chip.input(settings.channel_y)

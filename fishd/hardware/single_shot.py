@@ -37,6 +37,12 @@ def open_bus(number: int) -> Any:
     return bus
 
 
+def close_bus(bus: Any) -> None:
+    """Close it now; the library would leave that to the garbage collector."""
+    bus._i2c._i2c_bus.close()
+    bus.deinit()
+
+
 class _StrictFile:
     """A device file on which a lost transfer is an error.
 
@@ -80,9 +86,11 @@ class SingleShot(ADS1115):  # type: ignore[misc]
                 address=settings.address,
             )
         except ValueError as error:
-            if isinstance(cause := error.__context__, OSError):
-                raise OSError(cause.errno, cause.strerror) from None
-            raise
+            # No name for the cause: its traceback would keep this frame, and this frame the cause.
+            number = getattr(error.__context__, "errno", None)
+            if number is None:
+                raise
+            raise OSError(number, os.strerror(number)) from None
 
     def input(self, channel: Channel) -> Any:
         """One input, whose `value` is converted when it is asked for."""
