@@ -283,6 +283,11 @@ def _check_hardware(config: Config) -> None:
         raise Problem(
             ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"
         )
+    if config.robot == "virtual-pi" and servo.driver != "pigpio":
+        raise Problem(
+            ("servo", "driver"),
+            f"'{servo.driver}' is not valid: the virtual Pi has pigpiod, and no other pulses",
+        )
     virtual = config.virtual_pi
     if virtual.servo_scale == 0.0:
         raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")

@@ -16,7 +16,7 @@ from fishd.clock import SystemClock, Ticker
 from fishd.config import Config, load
 from fishd.console import complain, run, status_line
 from fishd.controllers import registry
-from fishd.errors import ConfigError, StartupError
+from fishd.errors import ConfigError, FishdError
 from fishd.logs import LogWriter
 from fishd.notify import SystemdNotifier
 from fishd.operations import Operations
@@ -198,7 +198,10 @@ def fishd(
     logs = LogWriter(log_format)
     try:
         asyncio.run(swim(config, sys.stdout.isatty() if print_status is None else print_status))
-    except StartupError as error:
+    except ConfigError as error:  # in a calibration file
+        log.critical("%s", error)
+        sys.exit(EX_CONFIG)
+    except FishdError as error:
         log.critical("%s", error)
         sys.exit(1)
     except Exception:

@@ -165,7 +165,7 @@ class ControlLoop:
         except Exception as error:
             problem = f"the force sensor cannot be read: {_named(error)}"
             measurement = self._measurement  # once more, and nothing of it is new
-        self._measurement = replace(measurement, samples=0, suspect="")
+        self._measurement = replace(measurement, samples=0, suspect="", extremes=None)
         age = slot.now - measurement.time
         if problem is None and age > STALE * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
@@ -211,8 +211,7 @@ class ControlLoop:
         fading = self.servo_on and not self._lost and not neutral
         try:
             if mode is Mode.ESTOP or (mode is Mode.FAULT and not fading):
-                if self.servo_on or self._lost:
-                    self.robot.servo.release()
+                self.robot.servo.release()  # in every tick: so a servo that is lost is noticed
                 self.servo_on = False
             else:
                 self.robot.servo.write(self.applied)

@@ -95,7 +95,7 @@ class Operations:
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
-            degraded=loop.robot.degraded,
+            degraded=loop.robot.degraded(),
             counters=loop.robot.counters(),
             realtime=self._realtime,
             telemetry=self._telemetry,

@@ -81,7 +81,7 @@ class Reporter:
         busy: time that the tick has taken so far [s]
         missed: slots skipped since start
         """
-        now = slot.now
+        now, extremes = slot.now, measurement.extremes
         self._publisher.tick(
             Tick(
                 t=self._clock.wall(),
@@ -97,6 +97,10 @@ class Reporter:
                 thrust=observation.thrust,
                 frequency=observation.frequency,
                 samples=measurement.samples,
+                fx_min=extremes.fx_min if extremes else UNSET,
+                fx_max=extremes.fx_max if extremes else UNSET,
+                fy_min=extremes.fy_min if extremes else UNSET,
+                fy_max=extremes.fy_max if extremes else UNSET,
                 age_ms=(now - measurement.time) * 1e3,
                 lateness_us=(now - slot.deadline) * 1e6,
                 busy_us=busy * 1e6,

@@ -149,9 +149,11 @@ def _assemble(
     stack.callback(servo.close)  # last in, first out: whatever fails, this is done first
     if threaded:
         _await_first_sample(sensor.read, clock)
-    degraded = list(getattr(servo, "degraded", ()))
-    if not found:
-        degraded.append("the force is not calibrated: fishctl calibrate force")
+
+    def degraded() -> tuple[str, ...]:
+        uncalibrated = "the force is not calibrated: fishctl calibrate force"
+        return servo.degraded + (() if sensor.calibration.date else (uncalibrated,))
+
     return Robot(
         name=config.robot,
         sensor=sensor,
@@ -159,7 +161,7 @@ def _assemble(
         truth=truth,
         panel=panel,
         bench=Bench(sensor, servo),
-        degraded=tuple(degraded),
+        degraded=degraded,
         counters=lambda: {**sensor.counters(), **servo.counters()},
     )
 

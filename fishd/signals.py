@@ -11,6 +11,15 @@ from msgspec import UNSET, Struct, UnsetType
 from fishd.schema import Field
 
 
+class Extremes(Struct, frozen=True, gc=False):
+    """Lowest and highest single samples of a window [N]."""
+
+    fx_min: float
+    fx_max: float
+    fy_min: float
+    fy_max: float
+
+
 class Measurement(Struct, frozen=True, gc=False):
     """What the force sensor says about the window since the previous read."""
 
@@ -24,6 +33,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """How many pairs of samples the means are taken over."""
     suspect: str = ""
     """Why these forces are not to be believed, such as a clipped sample; empty where they are."""
+    extremes: Extremes | None = None
+    """What the means are taken over, as far as the sensor tells."""
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -97,6 +108,11 @@ class Tick(Struct, frozen=True, gc=False):
     """Time from the start of the tick until this record was sealed, publishing excluded [µs]."""
     missed: int
     """Slots skipped since start because a tick or the machine was late."""
+    fx_min: float | UnsetType = UNSET
+    """Lowest sample of F_x since the previous tick; left out by a simulated fish [N]."""
+    fx_max: float | UnsetType = UNSET
+    fy_min: float | UnsetType = UNSET
+    fy_max: float | UnsetType = UNSET
     alpha: float | UnsetType = UNSET
     """True fin angle, simulated fish only [rad]."""
     alpha_rate: float | UnsetType = UNSET

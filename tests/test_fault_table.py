@@ -12,6 +12,7 @@ from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.ads1115 import Ads1115Sensor
 from fishd.hardware.pigpio import PigpioServo
+from fishd.signals import Tick
 from fishd.simulation import simulate
 
 SENSOR_FAULTS = {
@@ -23,8 +24,8 @@ SENSOR_FAULTS = {
     "unplugged": "",
     "stuck-busy": "busy",
 }
-FADE = 0.45
-"""A fade from Φ to neutral, and the tick that releases [s]."""
+FADE = 0.47
+"""A fade from Φ to neutral, the tick that releases, and the frame that ends then [s]."""
 
 
 @pytest.fixture
@@ -101,6 +102,22 @@ def test_a_clipped_force_is_a_fault_after_three_windows(rig: LockstepRig) -> Non
     assert_neutral_then_off(rig, broke, limit=0.15 + FADE)
     rig.pi.faults.clear()
     assert_recovers_by_clear_fault_only(rig)
+
+
+def test_the_extremes_of_a_window_enclose_its_mean(rig: LockstepRig) -> None:
+    for tick in rig.run_for(2.0):
+        assert tick.fx_min < tick.fx < tick.fx_max
+        assert tick.fy_min < tick.fy < tick.fy_max
+
+
+def test_a_force_beyond_its_limit_is_a_fault(tmp_path: Path) -> None:
+    with lockstep_rig(tmp_path, "force_sensor.force_limit=0.1") as rig:
+        rig.start("square")
+        rig.run_until_fault(5.0)
+        assert_one_fault(rig, "sensor-range")
+        assert rig.loop.supervisor.reason is not None
+        assert "force_sensor.force_limit" in rig.loop.supervisor.reason.message
+        assert_neutral_then_off(rig, rig.now, limit=FADE)
 
 
 def test_a_frozen_force_is_a_fault_once_it_has_not_changed_for_long(rig: LockstepRig) -> None:
@@ -196,6 +213,37 @@ def test_a_servo_whose_driver_fails_is_released(
         rig.run_for(0.1)
         assert rig.pulse == 0.0
     assert_one_fault(rig, "servo-link")
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_a_controller_that_takes_half_the_period_ends_in_neutral(rig: LockstepRig) -> None:
+    def dawdle(_: object) -> float:
+        rig.clock.now += 0.026
+        return 0.4
+
+    broke = rig.now
+    rig.start(Scripted(dawdle))
+    assert rig.run_until_fault(1.0) == pytest.approx(0.15)
+    assert_one_fault(rig, "controller-slow")
+    assert_neutral_then_off(rig, broke, limit=0.15 + FADE)
+    assert_recovers_by_clear_fault_only(rig)
+
+
+def test_too_many_overruns_end_in_neutral(
+    rig: LockstepRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep = Recorder.tick
+
+    def dawdle(recorder: Recorder, tick: Tick) -> None:
+        rig.clock.now += 0.051
+        keep(recorder, tick)
+
+    broke = rig.now
+    with monkeypatch.context() as slow:
+        slow.setattr(Recorder, "tick", dawdle)
+        assert rig.run_until_fault(3.0) == pytest.approx(21 * 0.05)
+    assert_one_fault(rig, "overrun")
+    assert_neutral_then_off(rig, broke, limit=21 * 0.05 + FADE)
     assert_recovers_by_clear_fault_only(rig)
 
 

@@ -99,10 +99,10 @@ def test_a_servo_that_was_lost_is_released_when_it_is_back_and_driven_only_after
     robot.log.clear()
     robot.write_error = robot.release_error = None
     rig.run(20)
-    assert robot.log == [None]
+    assert set(robot.log) == {None}
     rig.loop.clear_fault()
     rig.run(1)
-    assert robot.log[1:] == [0.0]
+    assert robot.log[-1] == 0.0
 
 
 def test_every_tick_feeds_the_watchdog_whatever_the_mode_is() -> None:

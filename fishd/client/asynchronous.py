@@ -92,9 +92,7 @@ class AsyncFish(Connection):
 
     async def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
         """Put another calibration of the servo in force, and save it or not."""
-        return await self._call(
-            Calibrations, "calibrate-servo", calibration=calibration, save=save
-        )
+        return await self._call(Calibrations, "calibrate-servo", calibration=calibration, save=save)
 
     def ticks(self) -> AsyncIterator[Tick]:
         """Every tick from the first iteration on; raises `NoDaemon` when none comes in time."""

@@ -76,6 +76,8 @@ class CalibratedServo(Servo, Protocol):
     """A servo whose pulses can be calibrated."""
 
     calibration: ServoCalibration
+    degraded: tuple[str, ...]
+    """Why its pulses are not as good as they could be, a line each."""
 
     def recalibrate(self, calibration: ServoCalibration) -> None:
         """Use another calibration from the next write on."""
@@ -109,8 +111,8 @@ class Robot:
     panel: Panel | None = None
     bench: "Bench | None" = None
     """What can be calibrated; None for a simulated fish, which has nothing to calibrate."""
-    degraded: tuple[str, ...] = ()
-    """What keeps this robot from being as good as it could be, a line each."""
+    degraded: Callable[[], tuple[str, ...]] = tuple
+    """What keeps this robot from being as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
     """Errors that were survived, such as failed I2C transfers, since start."""
 

@@ -3,12 +3,11 @@
 A countdown script inside pigpiod ends the pulses when fishd no longer writes, whatever ended it.
 """
 
-import msgspec
 import pigpio
 
 from fishd.clock import Clock
 from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.calibration import ServoCalibration, calibrated
 from fishd.hardware.pigpio_client import ANSWER, Client, opened
 from fishd.hardware.pigpio_link import PigpioLink
 from fishd.hardware.pigpio_pulses import (
@@ -31,6 +30,8 @@ class PigpioServo:
     """A servo on pigpiod; write, release and close may be called from any thread."""
 
     calibration: ServoCalibration
+
+    degraded: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -65,14 +66,7 @@ class PigpioServo:
 
         Raises `ServoError`, and keeps the old one, if its neutral is no pulse for a servo.
         """
-        settings = msgspec.structs.replace(
-            self._settings,
-            trim=calibration.trim,
-            direction=calibration.direction,
-            scale=calibration.scale,
-            lowest=calibration.lowest,
-            highest=calibration.highest,
-        )
+        settings = calibrated(self._settings, calibration)
         self._neutral = pulse_width(settings, 0.0)
         self._settings = settings
         self.calibration = calibration

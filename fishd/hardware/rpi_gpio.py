@@ -14,7 +14,9 @@ from fishd.hardware.settings import ServoSettings
 class RpiGpioServo:
     """A servo on any pin of the header."""
 
-    degraded = ("software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",)
+    degraded: tuple[str, ...] = (
+        "software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",
+    )
 
     def __init__(
         self, settings: ServoSettings, calibration: ServoCalibration, clock: Clock

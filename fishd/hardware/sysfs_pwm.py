@@ -22,6 +22,8 @@ NEUTRAL_HOLD = 0.3
 class SysfsPwmServo:
     """A servo on one channel of the kernel's PWM."""
 
+    degraded: tuple[str, ...] = ()
+
     def __init__(
         self,
         settings: ServoSettings,
@@ -108,6 +110,9 @@ class SysfsPwmServo:
             self.release()
             if self._owned:
                 self._switch_off()
+        except ServoError:
+            if self._owned:  # else there never were pulses of ours
+                raise
         finally:
             self._channel.close()
             if self._owned or self._channel.exported:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from fishd.hardware.calibration import ForceCalibration, ForceSample
 from fishd.hardware.sampler import Pair
 from fishd.hardware.settings import Channel, ForceSensorSettings
-from fishd.signals import Measurement
+from fishd.signals import Extremes, Measurement
 
 STEPS = 32768
 """Of the ADC, from zero to full scale."""
@@ -30,22 +30,32 @@ class Evaluation:
         newest = times[-1]
         # Both channels see every window, else one that is not asked could not tell that it froze.
         doubt_x, doubt_y = self._x.doubt(xs, newest), self._y.doubt(ys, newest)
-        suspect = doubt_x or doubt_y or self._beyond_limit(xs, ys, calibration)
-        return Measurement(newest, fx, fy, len(pairs), suspect)
+        extremes = self._extremes(xs, ys, calibration)
+        suspect = doubt_x or doubt_y or self._beyond_limit(extremes)
+        return Measurement(newest, fx, fy, len(pairs), suspect, extremes)
 
     def interrupt(self) -> None:
         """Note that samples stopped coming in, so that nobody takes that for a frozen code."""
         self._x.forget()
         self._y.forget()
 
-    def _beyond_limit(
+    def _extremes(
         self, xs: Sequence[int], ys: Sequence[int], calibration: ForceCalibration
-    ) -> str:
-        forces, step, limit = calibration.forces, self.step, self._limit
-        for x, y in zip(xs, ys, strict=True):
-            fx, fy = forces(x * step, y * step)
-            if not (-limit <= fx <= limit and -limit <= fy <= limit):
-                name, force = ("F_y", fy) if -limit <= fx <= limit else ("F_x", fx)
+    ) -> Extremes:
+        step, forces = self.step, calibration.forces
+        fxs, fys = zip(
+            *[forces(x * step, y * step) for x, y in zip(xs, ys, strict=True)], strict=True
+        )
+        return Extremes(min(fxs), max(fxs), min(fys), max(fys))
+
+    def _beyond_limit(self, found: Extremes) -> str:
+        limit = self._limit
+        for name, low, high in (
+            ("F_x", found.fx_min, found.fx_max),
+            ("F_y", found.fy_min, found.fy_max),
+        ):
+            if not (low >= -limit and high <= limit):
+                force = high if high > limit else low
                 return f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
         return ""
 

@@ -65,4 +65,4 @@ def test_a_force_beyond_the_limit_is_suspected_though_the_mean_is_within() -> No
 def test_the_limit_is_of_forces_and_not_of_voltages() -> None:
     with ForceRig() as rig:
         ticks = Ticks(rig.sensor(ForceCalibration(xx=100.0), force_limit=10.0))
-        assert ticks.next().suspect.startswith("F_x is +50 N")
+        assert ticks.next().suspect.startswith("F_x is +50.")

@@ -146,8 +146,7 @@ def test_permissions_that_never_come_are_an_error_of_each_write() -> None:
     for _ in range(2):
         with pytest.raises(ServoError, match="udev rule"):
             servo.write(0.0)
-    with pytest.raises(ServoError):
-        servo.close()
+    servo.close()  # without a word: there never were pulses
     assert bench.exported() == []
 
 

@@ -37,7 +37,7 @@ def bus(context: Context) -> Result:
         seen = f"; there is {', '.join(others)}: set force_sensor.bus" if others else ""
         return fail(
             f"/dev/i2c-{number} does not exist{seen}",
-            "dtparam=i2c_arm=on in /boot/firmware/config.txt and i2c-dev in /etc/modules; restart",
+            "dtparam=i2c_arm=on in /boot/firmware/config.txt, module i2c-dev loaded; restart",
         )
     if not os.access(device, os.R_OK | os.W_OK):
         group = device.group()
@@ -153,10 +153,10 @@ def _enough(per_tick: float, context: Context, details: str) -> Result:
     """Compare with what a healthy bus gives at this data rate and tick."""
     config = context.config
     expected = FEWEST_PAIRS * config.force_sensor.data_rate / 860 * config.tick / 0.05
-    message = f"{per_tick:.0f} pairs of samples per tick, {details}"
+    message = f"{per_tick:.1f} pairs of samples per tick, {details}"
     if per_tick < expected:
         return warning(
-            f"{message}: fewer than the {expected:.0f} of a healthy 400 kbit/s bus",
+            f"{message}: fewer than the {expected:.1f} of a healthy 400 kbit/s bus",
             "make the bus faster, and stop what else uses it or loads the processor",
         )
     return ok(message)

@@ -62,7 +62,7 @@ def pwm(context: Context) -> Result | None:
         duty = channel.read("enable") and channel.read("duty_cycle")
     except ServoError as error:
         return fail(
-            str(error), "do as it says, and restart; 'make install-pi' gives group pwm its files"
+            str(error), "do as it says, and restart; 'make install-pi' gives group gpio its files"
         )
     finally:
         channel.close()

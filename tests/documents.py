@@ -1,0 +1,34 @@
+"""The documentation as tests read it: prose, blocks, code, tables."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+"""A fenced block: its kind, and what is in it."""
+_SPAN = re.compile(r"`([^`\n]+)`")
+
+
+def text_of(document: Path) -> str:
+    return document.read_text(encoding="utf-8")
+
+
+def prose_of(document: Path) -> str:
+    return FENCE.sub("", text_of(document))
+
+
+def code_of(document: Path) -> Iterator[str]:
+    """Each line of a fenced block, continued ones joined, and each code span."""
+    for _, block in FENCE.findall(text_of(document)):
+        yield from block.replace("\\\n", " ").splitlines()
+    yield from _SPAN.findall(prose_of(document))
+
+
+def first_cells(document: Path, heading: str) -> list[str]:
+    """The code in the first column of the tables below a heading, down to the next one."""
+    section = re.split(rf"^#+ {re.escape(heading)}$", text_of(document), flags=re.MULTILINE)[1]
+    section = re.split(r"^#", section, flags=re.MULTILINE)[0]
+    return re.findall(r"^\| `([^`]+)`", section, re.MULTILINE)
