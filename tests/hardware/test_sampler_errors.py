@@ -1,8 +1,8 @@
 """Errors of the bus and the chip: what the sampler says and does while they last, and after."""
 
 import gc
-import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -148,10 +148,10 @@ def test_opening_the_bus_again_and_again_leaves_nothing_behind(fault: str) -> No
         gc.collect()
         gc.disable()
         try:
-            before = len(os.listdir("/proc/self/fd"))
+            before = len(list(Path("/proc/self/fd").iterdir()))
             for _ in range(100):
                 sampler.step()
-            assert len(os.listdir("/proc/self/fd")) <= before
+            assert len(list(Path("/proc/self/fd").iterdir())) <= before
             assert gc.collect() == 0
         finally:
             gc.enable()
