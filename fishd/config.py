@@ -3,7 +3,6 @@
 Each section is a struct of the part that it configures; this module only puts them together.
 """
 
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,25 +11,22 @@ import msgspec
 from msgspec import Meta, Struct
 
 from fishd import strict_yaml
-from fishd.controllers import registry
+from fishd.config_checks import (
+    check_addresses,
+    check_force_sensor,
+    check_pins,
+    check_servo,
+    check_start,
+    check_virtual_pi,
+)
 from fishd.controllers.base import Limits
 from fishd.emulation.settings import VirtualPiSettings
-from fishd.errors import ConfigError, ParameterError, UnknownController
+from fishd.errors import ConfigError
 from fishd.estimators.lateral_force import EstimatorSettings
-from fishd.hardware import pulses
 from fishd.hardware.imperfections import SimulationSettings
-from fishd.hardware.settings import (
-    FULL_SCALES,
-    ForceSensorSettings,
-    PanelSettings,
-    ServoSettings,
-)
+from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
 from fishd.plant.parameters import PlantParameters
 from fishd.schema import Problem, convert, without_empty_sections
-
-_ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
-PWM_PINS = (12, 13, 18, 19)
-_LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -187,9 +183,12 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
         sources[key] = f"--set {override}"
     try:
         config = convert(without_empty_sections(document.data, Config), Config)
-        _check_start(config)
-        _check_addresses(config)
-        _check_hardware(config)
+        check_start(config.start.controller, config.start.parameters, config.limits)
+        check_addresses(config.telemetry.address, config.control.address)
+        check_force_sensor(config.force_sensor)
+        check_servo(config.servo)
+        check_pins(config.force_sensor, config.servo, config.panel)
+        check_virtual_pi(config.robot, config.servo, config.virtual_pi)
     except Problem as problem:
         raise ConfigError(_located(problem, sources)) from None
     return config
@@ -236,92 +235,6 @@ def _value(text: str, dotted: str, override: str) -> Any:
         return strict_yaml.parse(text, name=dotted).data if text else ""
     except strict_yaml.YamlProblem as problem:
         raise ConfigError(f"--set {override}: {problem}") from None
-
-
-def _check_start(config: Config) -> None:
-    start = config.start
-    if start.controller is None:
-        if start.parameters:
-            raise Problem(("start", "parameters"), "there is no start.controller to take these")
-        return
-    try:
-        registry.check(start.controller, start.parameters, config.limits)
-    except UnknownController as error:
-        raise Problem(("start", "controller"), str(error)) from None
-    except ParameterError as error:
-        raise Problem(("start", "parameters", *error.path), str(error)) from None
-
-
-def _check_addresses(config: Config) -> None:
-    telemetry, address = config.telemetry.address, config.control.address
-    if not _is_address(telemetry):
-        raise Problem(
-            ("telemetry", "address"),
-            f"'{telemetry}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
-        )
-    if address is None:
-        return
-    if not (_is_address(address) and _LOCAL.match(address)):
-        raise Problem(
-            ("control", "address"),
-            f"'{address}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
-            "who can send requests can move the fish, so they are taken from this machine only",
-        )
-    if address == telemetry:
-        raise Problem(("control", "address"), f"'{address}' is the address of telemetry already")
-
-
-def _check_hardware(config: Config) -> None:
-    sensor, servo = config.force_sensor, config.servo
-    if sensor.full_scale not in FULL_SCALES:
-        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES)
-        raise Problem(
-            ("force_sensor", "full_scale"),
-            f"{sensor.full_scale:g} is not valid: one of {permitted} V is needed",
-        )
-    if sensor.channel_x == sensor.channel_y:
-        raise Problem(
-            ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"
-        )
-    if config.robot == "virtual-pi" and servo.driver != "pigpio":
-        raise Problem(
-            ("servo", "driver"),
-            f"'{servo.driver}' is not valid: the virtual Pi has pigpiod, and no other pulses",
-        )
-    virtual = config.virtual_pi
-    if virtual.servo_scale == 0.0:
-        raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")
-    if virtual.channel_x == virtual.channel_y:
-        raise Problem(
-            ("virtual_pi", "channel_y"), f"'{virtual.channel_y}' is what channel_x is wired to"
-        )
-    low, high = pulses.reach(servo)
-    if not low <= 0.0 <= high:
-        raise Problem(
-            ("servo", "trim"),
-            f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to 2500 µs",
-        )
-    if servo.driver == "pigpio" and servo.frequency != 50.0 and not servo.pigpio.hardware_pwm:
-        raise Problem(
-            ("servo", "frequency"),
-            f"{servo.frequency:g} is not valid: pigpiod's servo pulses come at 50 Hz; for others "
-            "set servo.pigpio.hardware_pwm: true",
-        )
-    if servo.pigpio.hardware_pwm and servo.driver == "pigpio" and servo.gpio not in PWM_PINS:
-        raise Problem(
-            ("servo", "gpio"),
-            f"{servo.gpio} is not valid: hardware PWM comes out of GPIO 12, 13, 18 or 19 only",
-        )
-    pins = {"servo.gpio": servo.gpio, "panel.estop_gpio": config.panel.estop_gpio}
-    for key, pin in (*pins.items(), ("panel.led_gpio", config.panel.led_gpio)):
-        taken = [other for other, used in pins.items() if used == pin and other != key]
-        if pin is not None and taken and key != "servo.gpio":
-            raise Problem(tuple(key.split(".")), f"{pin} is the pin of {taken[0]} already")
-
-
-def _is_address(text: str) -> bool:
-    found = _ADDRESS.fullmatch(text)
-    return found is not None and int(found["port"] or 0) < 65536
 
 
 def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:

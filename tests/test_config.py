@@ -179,3 +179,32 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
     except YamlProblem as error:
         problem = error
     assert problem is None or (problem.line >= 1 and "\n" not in str(problem))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "words"),
+    [
+        (["force_sensor.full_scale=2"], "force_sensor.full_scale", "2.048"),
+        (["force_sensor.channel_y=A0-A1"], "force_sensor.channel_y", "channel_x"),
+        (["servo.centre=2300", "servo.trim=400"], "servo.trim", "2700 µs"),
+        (["servo.frequency=100"], "servo.frequency", "hardware_pwm"),
+        (["servo.gpio=17", "servo.pigpio.hardware_pwm=true"], "servo.gpio", "12, 13, 18 or 19"),
+        (["panel.led_gpio=18"], "panel.led_gpio", "servo.gpio"),
+        (["panel.estop_gpio=3"], "panel.estop_gpio", "I2C"),
+        (["panel.estop_gpio=5", "panel.led_gpio=5"], "panel.led_gpio", "panel.estop_gpio"),
+        (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
+        (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
+        (["virtual_pi.channel_y=A0-A1"], "virtual_pi.channel_y", "channel_x"),
+    ],
+)
+def test_hardware_that_does_not_go_together_is_refused_by_key(
+    overrides: list[str], key: str, words: str
+) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(None, overrides)
+    assert f"{key}: " in str(refusal.value)
+    assert words in str(refusal.value)
+
+
+def test_pins_of_another_bus_are_free() -> None:
+    assert load(None, ["force_sensor.bus=3", "panel.estop_gpio=3"]).panel.estop_gpio == 3

@@ -1,0 +1,132 @@
+"""What no single key can tell: values of a configuration that do not go together.
+
+Each check raises `Problem` with the key to blame and what would be right.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.emulation.settings import VirtualPiSettings
+from fishd.errors import ParameterError, UnknownController
+from fishd.hardware import pulses
+from fishd.hardware.settings import (
+    FULL_SCALES,
+    ForceSensorSettings,
+    PanelSettings,
+    ServoSettings,
+)
+from fishd.schema import Problem
+
+PWM_PINS = (12, 13, 18, 19)
+I2C_PINS = (2, 3)
+"""SDA and SCL of bus 1."""
+_ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
+_LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
+
+
+def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
+    """The controller to start with is there and takes its parameters."""
+    if controller is None:
+        if parameters:
+            raise Problem(("start", "parameters"), "there is no start.controller to take these")
+        return
+    try:
+        registry.check(controller, parameters, limits)
+    except UnknownController as error:
+        raise Problem(("start", "controller"), str(error)) from None
+    except ParameterError as error:
+        raise Problem(("start", "parameters", *error.path), str(error)) from None
+
+
+def check_addresses(telemetry: str, control: str | None) -> None:
+    """Both are addresses, not the same, and requests come from this machine only."""
+    if not _is_address(telemetry):
+        raise Problem(
+            ("telemetry", "address"),
+            f"'{telemetry}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
+        )
+    if control is None:
+        return
+    if not (_is_address(control) and _LOCAL.match(control)):
+        raise Problem(
+            ("control", "address"),
+            f"'{control}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
+            "who can send requests can move the fish, so they are taken from this machine only",
+        )
+    if control == telemetry:
+        raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
+
+
+def check_force_sensor(sensor: ForceSensorSettings) -> None:
+    """The ADC has the range, and each force an input of its own."""
+    if sensor.full_scale not in FULL_SCALES:
+        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES)
+        raise Problem(
+            ("force_sensor", "full_scale"),
+            f"{sensor.full_scale:g} is not valid: one of {permitted} V is needed",
+        )
+    if sensor.channel_x == sensor.channel_y:
+        raise Problem(
+            ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"
+        )
+
+
+def check_servo(servo: ServoSettings) -> None:
+    """Neutral is a pulse, and the driver can send it on that pin at that frequency."""
+    low, high = pulses.reach(servo)
+    if not low <= 0.0 <= high:
+        raise Problem(
+            ("servo", "trim"),
+            f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to 2500 µs",
+        )
+    if servo.driver != "pigpio":
+        return
+    if servo.frequency != 50.0 and not servo.pigpio.hardware_pwm:
+        raise Problem(
+            ("servo", "frequency"),
+            f"{servo.frequency:g} is not valid: pigpiod's servo pulses come at 50 Hz; for others "
+            "set servo.pigpio.hardware_pwm: true",
+        )
+    if servo.pigpio.hardware_pwm and servo.gpio not in PWM_PINS:
+        raise Problem(
+            ("servo", "gpio"),
+            f"{servo.gpio} is not valid: hardware PWM comes out of GPIO 12, 13, 18 or 19 only",
+        )
+
+
+def check_pins(sensor: ForceSensorSettings, servo: ServoSettings, panel: PanelSettings) -> None:
+    """No pin has two jobs."""
+    jobs = dict.fromkeys(I2C_PINS, "the I2C bus") if sensor.bus == 1 else {}
+    for section, name, pin in (
+        ("servo", "gpio", servo.gpio),
+        ("panel", "estop_gpio", panel.estop_gpio),
+        ("panel", "led_gpio", panel.led_gpio),
+    ):
+        if pin is None:
+            continue
+        if pin in jobs:
+            raise Problem((section, name), f"{pin} is the pin of {jobs[pin]} already")
+        jobs[pin] = f"{section}.{name}"
+
+
+def check_virtual_pi(robot: str, servo: ServoSettings, pi: VirtualPiSettings) -> None:
+    """The virtual Pi can be built, and has what the servo needs."""
+    if robot == "virtual-pi" and servo.driver != "pigpio":
+        raise Problem(
+            ("servo", "driver"),
+            f"'{servo.driver}' is not valid: the virtual Pi has pigpiod, and no other pulses",
+        )
+    if pi.servo_scale == 0.0:
+        raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")
+    if pi.channel_x == pi.channel_y:
+        raise Problem(
+            ("virtual_pi", "channel_y"), f"'{pi.channel_y}' is what channel_x is wired to"
+        )
+
+
+def _is_address(text: str) -> bool:
+    found = _ADDRESS.fullmatch(text)
+    return found is not None and int(found["port"] or 0) < 65536
