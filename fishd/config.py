@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 from fishd import strict_yaml
 from fishd.config_checks import (
     check_addresses,
+    check_data_rate,
     check_force_sensor,
     check_pins,
     check_servo,
@@ -186,6 +187,8 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
         check_start(config.start.controller, config.start.parameters, config.limits)
         check_addresses(config.telemetry.address, config.control.address)
         check_force_sensor(config.force_sensor)
+        if config.robot != "simulated":
+            check_data_rate(config.force_sensor, config.tick)
         check_servo(config.servo)
         check_pins(config.force_sensor, config.servo, config.panel)
         check_virtual_pi(config.robot, config.servo, config.virtual_pi)

@@ -21,6 +21,8 @@ from fishd.hardware.settings import (
 from fishd.schema import Problem
 
 PWM_PINS = (12, 13, 18, 19)
+SLOWEST_CONVERSION = 1.25
+"""Of the ADC with its tolerance and its transfers, in units of 1 / data rate."""
 I2C_PINS = (2, 3)
 """SDA and SCL of bus 1."""
 _ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
@@ -58,6 +60,17 @@ def check_addresses(telemetry: str, control: str | None) -> None:
         )
     if control == telemetry:
         raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
+
+
+def check_data_rate(sensor: ForceSensorSettings, tick: float) -> None:
+    """A pair of samples comes in each tick [s]."""
+    slowest = 2 * SLOWEST_CONVERSION / sensor.data_rate
+    if slowest > tick:
+        raise Problem(
+            ("force_sensor", "data_rate"),
+            f"{sensor.data_rate} is not valid: a pair of samples would take up to "
+            f"{slowest * 1e3:.1f} ms, longer than a tick of {tick * 1e3:g} ms",
+        )
 
 
 def check_force_sensor(sensor: ForceSensorSettings) -> None:

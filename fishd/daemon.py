@@ -17,7 +17,9 @@ from fishd.config import Config, load
 from fishd.console import complain, run, status_line
 from fishd.controllers import registry
 from fishd.errors import ConfigError, FishdError
+from fishd.hardware.pulses import REST
 from fishd.logs import LogWriter
+from fishd.loop import SETTLING
 from fishd.notify import SystemdNotifier
 from fishd.operations import Operations
 from fishd.rehearsal import rehearsal
@@ -31,8 +33,6 @@ console = logging.getLogger("console")
 EX_CONFIG = 78
 FADE_LIMIT = 0.5
 """Longest time from a signal to exit that fading to neutral may take [s]."""
-REST_TIME = 0.3
-"""Time at neutral before the pulses end, where there was no fade [s]."""
 HOUSEKEEPING = 1.0
 """Time between two status messages [s]."""
 
@@ -119,9 +119,9 @@ class Daemon:
             log.info("stopping: fading to neutral")
             self._notifier.stopping()
             self._loop.stop()
-            deadline = self._clock.monotonic() + FADE_LIMIT
+            deadline = self._clock.monotonic() + FADE_LIMIT + SETTLING
             async for slot in ticker:
-                if self._loop.applied == 0.0 or slot.now > deadline:
+                if self._loop.neutral_for > SETTLING or slot.now > deadline:
                     break
                 self._loop.tick(slot)
         finally:
@@ -131,7 +131,7 @@ class Daemon:
         """Where fishd failed and could not fade: neutral, and time to get there."""
         if self._loop.servo_on and self._loop.applied != 0.0:
             self._loop.robot.servo.write(0.0)
-            self._clock.sleep(REST_TIME)
+            self._clock.sleep(REST)
 
     def _on_press(self) -> None:
         """The E-stop button was pressed, says a thread of the driver: do not wait for a tick."""

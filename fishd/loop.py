@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 UPDATE_BUDGET = 0.5
 """Share of the period that a controller's update may take."""
+SETTLING = 0.1
+"""How long a servo stays at neutral before its pulses end [s]."""
 STALE = 2.0
 """A newest sample older than this many periods counts as a failed read."""
 
@@ -56,6 +58,8 @@ class ControlLoop:
         """Number of the latest tick."""
         self.applied = 0.0
         """The instruction angle in force [rad]."""
+        self.neutral_for = 0.0
+        """How long the instruction angle has been zero [s]."""
         self.servo_on = False
         """False while the servo gets no pulses."""
         self.observation: Observation | None = None
@@ -87,9 +91,10 @@ class ControlLoop:
         read = now()
         self.observation = observation = self._estimate(measurement, slot, dt)
         estimated = now()
-        previous, self.applied = self.applied, self._update(observation)
+        self.applied = self._update(observation)
+        self.neutral_for = 0.0 if self.applied else self.neutral_for + dt
         updated = now()
-        self._write(neutral=self.applied == previous == 0.0)
+        self._write(neutral=self.neutral_for > SETTLING)
         written = now()
         self._publish(slot, measurement, observation, written - started)
         marks = (started, read, estimated, updated, written, now())
@@ -220,8 +225,12 @@ class ControlLoop:
                 self.reporter.event("servo", "the servo can be reached again")
             self._lost = False
         except Exception as error:
+            latched, lost = self.supervisor.reason, self._lost
             self._lost = True
             self._fail("servo-link", "the servo cannot be driven", error)
+            if latched and not lost:  # which the fault or the stop that is latched does not say
+                message = f"it may still have pulses, and cannot be released: {_named(error)}"
+                self.reporter.event("servo", message, "error")
 
     def _publish(
         self, slot: Slot, measurement: Measurement, observation: Observation, busy: float

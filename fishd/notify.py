@@ -12,7 +12,7 @@ _FEEDS_PER_LIMIT = 8
 
 
 class SystemdNotifier:
-    """Sends without waiting; what cannot be sent is dropped, the watchdog will see to it."""
+    """Sends without waiting; what cannot be sent is dropped, and sent again with the next tick."""
 
     def __init__(self) -> None:
         path = os.environ.get("NOTIFY_SOCKET", "")
@@ -29,9 +29,9 @@ class SystemdNotifier:
         """
         if now < self._next_feed or not self._address:
             return
-        self._next_feed = now + self._feed_period
-        self._send("WATCHDOG=1" if self._ready else "READY=1\nWATCHDOG=1")
-        self._ready = True
+        if self._send("WATCHDOG=1" if self._ready else "READY=1\nWATCHDOG=1"):
+            self._ready = True
+            self._next_feed = now + self._feed_period
 
     def status(self, line: str) -> None:
         """What `systemctl status` shows."""
@@ -45,12 +45,15 @@ class SystemdNotifier:
         """Close the socket; may be called twice."""
         self._socket.close()
 
-    def _send(self, state: str) -> None:
-        if self._address:
-            try:
-                self._socket.sendto(state.encode(), self._address)
-            except OSError:
-                return
+    def _send(self, state: str) -> bool:
+        """True when systemd has got it."""
+        if not self._address:
+            return False
+        try:
+            self._socket.sendto(state.encode(), self._address)
+        except OSError:
+            return False
+        return True
 
 
 def _watchdog_limit() -> float:

@@ -133,11 +133,11 @@ def _assemble(
     threaded: bool,
     truth: Callable[[], Truth] | None = None,
 ) -> Robot:
-    from fishd.hardware.ads1115 import open_force_sensor
+    from fishd.hardware.ads1115 import Ads1115Sensor
 
     panel = _open_panel(config, clock, stack)
     found = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
-    sensor = open_force_sensor(
+    sensor = Ads1115Sensor(
         config.force_sensor,
         found[0] if found else ForceCalibration(),
         clock,

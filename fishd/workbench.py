@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from fishd.clock import Clock
 from fishd.config import Config
-from fishd.errors import Refused
+from fishd.errors import ConfigError, Refused
 from fishd.hardware import pulses
 from fishd.hardware.base import Bench
 from fishd.hardware.calibration import (
@@ -41,6 +41,8 @@ class Workbench:
         self._folder = CalibrationFolder(folder)
         self._sensor = config.force_sensor
         self._servo = config.servo
+        self._changing = asyncio.Lock()
+        """Held while a calibration is replaced: the newest file must be the one in force."""
         self._force_file = self._file(ForceCalibration)
         self._servo_file = self._file(ServoCalibration)
         self.operations: Operations = {
@@ -71,47 +73,70 @@ class Workbench:
 
     async def _tare(self, wanted: SampleForce) -> Calibrations:
         sample = await self._sample_force(wanted)
-        bench = self._resting_bench()
-        before = bench.sensor.calibration
-        restless = max(
-            math.hypot(before.xx * sample.vx_std, before.xy * sample.vy_std),
-            math.hypot(before.yx * sample.vx_std, before.yy * sample.vy_std),
-        )
         if sample.suspect:
             raise Refused("suspect", f"the forces are not to be believed: {sample.suspect}")
-        if restless > self._sensor.still:
-            raise Refused(
-                "not-still",
-                f"the force varies by {restless * 1e3:.1f} mN rms, more than the "
-                f"{self._sensor.still * 1e3:g} mN of force_sensor.still; wait until the water and "
-                "the fish are still",
+        async with self._changing:
+            before = self._resting_bench().sensor.calibration
+            restless = max(
+                math.hypot(before.xx * sample.vx_std, before.xy * sample.vy_std),
+                math.hypot(before.yx * sample.vx_std, before.yy * sample.vy_std),
             )
-        x0, y0 = before.x0 - sample.fx, before.y0 - sample.fy
-        if max(abs(sample.fx), abs(sample.fy)) > self._sensor.tare_limit:
-            raise Refused(
-                "too-large",
-                f"({sample.fx:.3f}, {sample.fy:.3f}) N is more than force_sensor.tare_limit, "
-                f"{self._sensor.tare_limit:g} N; something pushes the fish, or the sensor needs "
-                "'fishctl calibrate force'",
+            if restless > self._sensor.still:
+                raise Refused(
+                    "not-still",
+                    f"the force varies by {restless * 1e3:.1f} mN rms, more than the "
+                    f"{self._sensor.still * 1e3:g} mN of force_sensor.still; wait until the water "
+                    "and the fish are still",
+                )
+            # From voltages: another tare since may have changed what they mean.
+            fx, fy = before.forces(sample.vx, sample.vy)
+            if max(abs(fx), abs(fy)) > self._sensor.tare_limit:
+                raise Refused(
+                    "too-large",
+                    f"({fx:.3f}, {fy:.3f}) N is more than force_sensor.tare_limit, "
+                    f"{self._sensor.tare_limit:g} N; something pushes the fish, or the sensor "
+                    "needs 'fishctl calibrate force'",
+                )
+            date = self._date().isoformat(timespec="seconds")
+            return await self._adopt_force(
+                msgspec.structs.replace(before, x0=before.x0 - fx, y0=before.y0 - fy, tared=date)
             )
-        tared = msgspec.structs.replace(before, x0=x0, y0=y0, tared=self._date().isoformat())
-        return await self._calibrate_force(CalibrateForce(tared))
 
     async def _calibrate_force(self, wanted: CalibrateForce) -> Calibrations:
-        bench = self._resting_bench()
         calibration = wanted.calibration
         numbers = (calibration.xx, calibration.xy, calibration.yx, calibration.yy)
         if calibration.xx * calibration.yy - calibration.xy * calibration.yx == 0.0:
             raise Refused("bad-arguments", f"the matrix {numbers} says the same of both forces")
+        async with self._changing:
+            return await self._adopt_force(calibration)
+
+    async def _adopt_force(self, calibration: ForceCalibration) -> Calibrations:
+        self._resting_bench()
         saved, path = await self._save(calibration)
-        bench.sensor.recalibrate(saved)
+        # The newest file is in force from the next start on, so it is now, whatever else began.
+        self._bench().sensor.recalibrate(saved)
         self._force_file = str(path)
         self._announce("force sensor", path)
         return await self._calibrations(NoArguments())
 
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
-        bench = self._resting_bench()
-        calibration = wanted.calibration
+        async with self._changing:
+            calibration = wanted.calibration
+            self._check_servo(calibration)
+            path = None
+            if wanted.save:
+                calibration, path = await self._save(calibration)
+                self._check_servo(calibration)
+            self._bench().servo.recalibrate(calibration)
+            self._loop.guard.restrict(*pulses.reach(calibrated(self._servo, calibration)))
+            if path:
+                self._servo_file = str(path)
+                self._announce("servo", path)
+            return await self._calibrations(NoArguments())
+
+    def _check_servo(self, calibration: ServoCalibration) -> None:
+        """Raise `Refused` unless the calibration can be put in force just now."""
+        present = self._resting_bench().servo.calibration
         servo = calibrated(self._servo, calibration)
         lowest, highest = pulses.reach(servo)
         if not lowest <= 0.0 <= highest:
@@ -120,15 +145,14 @@ class Workbench:
                 f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to "
                 "2500 µs",
             )
-        path = None
-        if wanted.save:
-            calibration, path = await self._save(calibration)
-        bench.servo.recalibrate(calibration)
-        self._loop.guard.restrict(lowest, highest)
-        if path:
-            self._servo_file = str(path)
-            self._announce("servo", path)
-        return await self._calibrations(NoArguments())
+        angle = self._loop.applied
+        same = (calibration.direction, calibration.scale) == (present.direction, present.scale)
+        if not (lowest <= angle <= highest and (same or angle == 0.0)):
+            raise Refused(
+                "not-neutral",
+                f"the tail is at {angle:+.3f} rad and would jump; bring it to neutral with "
+                "'fishctl stop'",
+            )
 
     def _bench(self) -> Bench:
         bench = self._loop.robot.bench
@@ -151,6 +175,8 @@ class Workbench:
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:
             return await asyncio.to_thread(self._folder.save, calibration, self._date())
+        except ConfigError as error:
+            raise Refused("not-saved", str(error)) from None
         except OSError as error:
             raise Refused(
                 "not-saved", f"{self._folder.folder}: cannot be written: {error.strerror}"

@@ -184,8 +184,10 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
 @pytest.mark.parametrize(
     ("overrides", "key", "words"),
     [
-        (["force_sensor.full_scale=2"], "force_sensor.full_scale", "2.048"),
-        (["force_sensor.channel_y=A0-A1"], "force_sensor.channel_y", "channel_x"),
+        (["robot=pi", "force_sensor.full_scale=2"], "force_sensor.full_scale", "2.048"),
+        (["robot=pi", "force_sensor.channel_y=A0-A1"], "force_sensor.channel_y", "channel_x"),
+        (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
+        (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),
         (["servo.centre=2300", "servo.trim=400"], "servo.trim", "2700 µs"),
         (["servo.frequency=100"], "servo.frequency", "hardware_pwm"),
         (["servo.gpio=17", "servo.pigpio.hardware_pwm=true"], "servo.gpio", "12, 13, 18 or 19"),

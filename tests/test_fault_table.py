@@ -24,8 +24,8 @@ SENSOR_FAULTS = {
     "unplugged": "",
     "stuck-busy": "busy",
 }
-FADE = 0.47
-"""A fade from Φ to neutral, the tick that releases, and the frame that ends then [s]."""
+FADE = 0.57
+"""A fade from Φ to neutral, the time that the servo settles, and the last frame [s]."""
 
 
 @pytest.fixture

@@ -246,6 +246,8 @@ def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
     robot.release_error = ServoError("stuck")
     rig.loop.estop("test")
     assert rig.run(3)[-1].servo_on
+    warnings = [event.message for event in rig.recorder.events if event.kind == "servo"]
+    assert warnings == ["it may still have pulses, and cannot be released: stuck"]
     robot.release_error = None
     assert not rig.run(1)[-1].servo_on
     assert robot.log[-1] is None

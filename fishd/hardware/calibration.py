@@ -104,6 +104,7 @@ class ForceSample(Struct, frozen=True):
 
 C = TypeVar("C", ForceCalibration, ServoCalibration)
 
+_STAMP = "%Y-%m-%dT%H%M%S.%fZ"
 _NAMES: dict[type[Struct], str] = {ForceCalibration: "force", ServoCalibration: "servo"}
 
 
@@ -116,12 +117,13 @@ class CalibrationFolder:
     def newest(self, kind: type[C]) -> tuple[C, Path] | None:
         """The calibration in force and its file; None where none was ever saved.
 
-        Raises `ConfigError` where the newest file is broken: an older one would be wrong silently.
+        Raises `ConfigError` where the newest file, or the folder, cannot be read: an older one, or
+        none, would be wrong silently.
         """
-        files = sorted(self.folder.glob(f"{_NAMES[kind]}-*.yaml"))
-        if not files:
+        names = self._names(kind)
+        if not names:
             return None
-        path = files[-1]
+        path = self.folder / names[-1]
         try:
             return convert(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
         except strict_yaml.YamlProblem as problem:
@@ -134,19 +136,41 @@ class CalibrationFolder:
     def save(self, calibration: C, now: datetime.datetime) -> tuple[C, Path]:
         """Write a new file, dated `now`; the calibration with its date, and the path.
 
-        Raises OSError when it cannot be written; an older file is never touched.
+        Raises OSError when it cannot be written, and `ConfigError` as `newest` does. An older file
+        is never touched, and the new one sorts after it, even where the clock went back.
         """
         import yaml
 
         dated = msgspec.structs.replace(calibration, date=now.isoformat(timespec="seconds"))
         self.folder.mkdir(parents=True, exist_ok=True)
-        stem = f"{_NAMES[type(calibration)]}-{now:%Y-%m-%dT%H%M%S.%f}"
+        stem = f"{_NAMES[type(calibration)]}-{now.astimezone(datetime.UTC):{_STAMP}}"
+        names = self._names(type(calibration))
+        if names and stem <= Path(names[-1]).stem:
+            stem = f"{Path(names[-1]).stem}+"
         path = self.folder / f"{stem}.yaml"
         text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
         temporary = path.with_suffix(".part")
-        with temporary.open("x", encoding="utf-8") as file:
+        with temporary.open("w", encoding="utf-8") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        temporary.rename(path)
+        path.hardlink_to(temporary)  # unlike a rename, never onto another file
+        temporary.unlink()
+        folder = os.open(self.folder, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # else a power cut takes the name away again
+        finally:
+            os.close(folder)
         return dated, path
+
+    def _names(self, kind: type[C]) -> list[str]:
+        """The files of a kind, oldest first."""
+        try:
+            found = os.listdir(self.folder)
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise ConfigError(f"{self.folder}: cannot be read: {error.strerror}") from None
+        start = f"{_NAMES[kind]}-"
+        names = [name for name in found if name.startswith(start) and name.endswith(".yaml")]
+        return sorted(names, key=lambda name: Path(name).stem)

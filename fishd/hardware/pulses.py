@@ -5,6 +5,8 @@ from fishd.hardware.settings import ServoSettings
 
 SHORTEST, LONGEST = 500.0, 2500.0
 """No servo is sent a pulse outside of this [µs]."""
+REST = 0.3
+"""Time at neutral before the pulses end, for a servo that did not get there slowly [s]."""
 
 
 def pulse_width(servo: ServoSettings, angle: float) -> float:

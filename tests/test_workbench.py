@@ -1,0 +1,155 @@
+"""Requests about calibrations, on the virtual Pi in virtual time."""
+
+import asyncio
+from collections.abc import Awaitable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lockstep_rig import LockstepRig, lockstep_rig
+from msgspec.structs import replace
+
+from fishd.errors import Refused
+from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.protocol import CalibrateForce, CalibrateServo, NoArguments, SampleForce
+from fishd.robots import state_folder
+from fishd.workbench import Workbench
+
+ANOTHER_BUS = ("force_sensor.bus=2", "virtual_pi.bus=2")
+BRIEFLY = SampleForce(seconds=0.2)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[LockstepRig]:
+    with lockstep_rig(tmp_path, "virtual_pi.zero_x=0.2", "simulation.noise=0.0002") as rig:
+        rig.run_for(0.5)
+        yield rig
+
+
+def perform(rig: LockstepRig, bench: Workbench, *requests: tuple[str, Any]) -> list[Any]:
+    """Answers to requests that are made at the same time, while the loop ticks."""
+
+    async def answer(name: str, arguments: Any) -> Any:
+        return await bench.operations[name][1](arguments)
+
+    async def run() -> list[Any]:
+        answers: Awaitable[list[Any]] = asyncio.gather(*(answer(*request) for request in requests))
+        task = asyncio.ensure_future(answers)
+        while not task.done():
+            rig.run_for(rig.config.tick)
+            await asyncio.sleep(0)
+        return await task
+
+    return asyncio.run(run())
+
+
+def workbench(rig: LockstepRig) -> Workbench:
+    return Workbench(rig.loop, rig.clock, rig.config, state_folder(rig.config))
+
+
+def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+    (after,) = perform(rig, bench, ("tare", BRIEFLY))
+    assert after.force.x0 == pytest.approx(-0.2, abs=1e-3)
+    assert (after.force.xx, after.force.yy) == (1.0, 1.0)
+    assert after.force.tared
+    assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
+    assert Path(after.force_file).exists()
+
+
+def test_two_tares_at_the_same_time_are_one(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+    perform(rig, bench, ("tare", BRIEFLY), ("tare", BRIEFLY), ("tare", SampleForce(seconds=0.3)))
+    assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
+    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    assert found.force.x0 == pytest.approx(-0.2, abs=1e-3)
+
+
+def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path: Path) -> None:
+    force, servo = ForceCalibration(xx=2.0), ServoCalibration(trim=30.0)
+    requests = (
+        ("calibrate-force", CalibrateForce(force)),
+        ("calibrate-servo", CalibrateServo(servo, save=True)),
+    )
+    perform(rig, workbench(rig), *requests)
+    assert rig.run_for(0.5)[-1].fx == pytest.approx(0.4, abs=5e-3)
+    assert rig.pulse == pytest.approx(1530.0)
+    with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
+        again.run_for(0.2)
+        assert again.pulse == pytest.approx(1530.0)
+        assert again.robot.bench is not None
+        assert again.robot.bench.sensor.calibration.xx == 2.0
+
+
+def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
+    rig: LockstepRig, tmp_path: Path
+) -> None:
+    perform(rig, workbench(rig), ("calibrate-servo", CalibrateServo(ServoCalibration(trim=30.0))))
+    rig.run_for(0.2)
+    assert rig.pulse == pytest.approx(1530.0)
+    with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
+        again.run_for(0.2)
+        assert again.pulse == pytest.approx(1500.0)
+
+
+def test_new_soft_limits_hold_for_the_next_command(rig: LockstepRig) -> None:
+    calibration = ServoCalibration(lowest=-0.1, highest=0.2)
+    perform(rig, workbench(rig), ("calibrate-servo", CalibrateServo(calibration)))
+    rig.start("square")
+    angles = [tick.phi_c for tick in rig.run_for(3.0)]
+    assert (min(angles), max(angles)) == (-0.1, 0.2)
+    assert rig.mode == "running"
+
+
+@pytest.mark.parametrize(
+    "change", [{"direction": -1}, {"scale": 900.0}, {"highest": 0.1}], ids=lambda c: next(iter(c))
+)
+def test_a_calibration_that_would_make_the_tail_jump_is_refused(
+    rig: LockstepRig, change: dict[str, Any]
+) -> None:
+    rig.start("hold", angle=0.3)
+    rig.run_for(1.0)
+    wanted = CalibrateServo(replace(ServoCalibration(), **change))
+    with pytest.raises(Refused) as refusal:
+        perform(rig, workbench(rig), ("calibrate-servo", wanted))
+    assert refusal.value.code == "not-neutral"
+    rig.run_for(0.5)
+    assert rig.mode == "running"
+    assert rig.pulse == pytest.approx(1680.0)
+
+
+def test_nothing_is_measured_or_calibrated_while_the_fish_swims(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+    rig.start("swing")
+    for request in (
+        ("tare", BRIEFLY),
+        ("sample-force", BRIEFLY),
+        ("calibrate-force", CalibrateForce(ForceCalibration())),
+        ("calibrate-servo", CalibrateServo(ServoCalibration())),
+    ):
+        with pytest.raises(Refused) as refusal:
+            perform(rig, bench, request)
+        assert refusal.value.code == "running"
+
+
+def test_a_calibration_that_cannot_be_written_is_not_in_force(
+    rig: LockstepRig, tmp_path: Path
+) -> None:
+    folder = state_folder(rig.config)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    bench = workbench(rig)
+    folder.write_text("in the way")
+    with pytest.raises(Refused) as refusal:
+        perform(rig, bench, ("calibrate-force", CalibrateForce(ForceCalibration(xx=5.0))))
+    assert refusal.value.code == "not-saved"
+    assert rig.robot.bench is not None
+    assert rig.robot.bench.sensor.calibration.xx == 1.0
+
+
+@pytest.mark.parametrize("matrix", [{"xx": 0.0}, {"yy": 0.0}])
+def test_a_matrix_that_says_the_same_of_both_forces_is_refused(
+    rig: LockstepRig, matrix: dict[str, float]
+) -> None:
+    request = ("calibrate-force", CalibrateForce(ForceCalibration(**matrix)))
+    with pytest.raises(Refused, match="says the same"):
+        perform(rig, workbench(rig), request)
