@@ -58,8 +58,9 @@ def find_control() -> str:
     given = os.environ.get(ENDPOINT_VARIABLE)
     if given:
         return given
-    own = _private_socket("control")
-    return f"ipc://{_SERVICE if _SERVICE.exists() and not own.exists() else own}"
+    own = f"ipc://{_private_socket('control')}"
+    # The socket of a daemon that was killed is still there.
+    return f"ipc://{_SERVICE}" if _SERVICE.exists() and is_deserted(own) else own
 
 
 def _private_socket(name: str) -> Path:
@@ -125,7 +126,8 @@ def is_deserted(address: str) -> bool:
         return False
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
-        return probe.connect_ex(str(socket_path(address))) in (errno.ENOENT, errno.ECONNREFUSED)
+        nobody = (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED)
+        return probe.connect_ex(str(socket_path(address))) in nobody
 
 
 def bind(server: "zmq.Socket[Any]", address: str, key: str) -> None:

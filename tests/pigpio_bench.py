@@ -2,6 +2,8 @@
 
 import contextlib
 
+import pigpio
+
 from fishd.clock import VirtualClock
 from fishd.emulation.faults import Faults
 from fishd.emulation.pigpiod.daemon import Pigpiod
@@ -67,6 +69,32 @@ class PigpioBench:
         """How many scripts pigpiod holds."""
         with self.client() as client:
             return sum(bool(client.script_status(script)[1]) for script in range(32))
+
+    def refuse(self, command: int, value: int) -> None:
+        """From now on pigpiod refuses this command with this second parameter."""
+        commands = self.daemon._commands
+        execute = commands.execute
+
+        def refusing(
+            time: float, number: int, p1: int, p2: int, extension: bytes
+        ) -> tuple[int, bytes]:
+            if (number, p2) == (command, value):
+                return pigpio.PI_NOT_PERMITTED, b""
+            return execute(time, number, p1, p2, extension)
+
+        commands.execute = refusing  # type: ignore[method-assign]
+
+    def hang_up_in_next_sleep(self) -> None:
+        """Pigpiod ends all connections while fishd sleeps the next time; pulses go on."""
+        sleep = self.clock.sleep
+
+        def hang_up(seconds: float) -> None:
+            self.clock.sleep = sleep  # type: ignore[method-assign]
+            for connection in list(self.daemon._connections.values()):
+                connection.hang_up()
+            sleep(seconds)
+
+        self.clock.sleep = hang_up  # type: ignore[method-assign]
 
     def changes_after(self, time: float) -> list[tuple[float, float]]:
         return [(when, width) for when, width in self.daemon.history(GPIO) if when > time]

@@ -34,7 +34,7 @@ def test_a_broken_promise_is_noticed(tmp_path: Path) -> None:
     """The same soak on a guard that lets everything through."""
     sabotage = (
         f"import sys; sys.path.insert(0, {str(TOOL.parent)!r}); sys.argv[1:] = "
-        "['simulated', '--ticks', '2000']\n"
+        "['simulated', '--ticks', '20000']\n"
         "from fishd.guard import Guard\n"
         "Guard.apply = lambda self, command, previous: float(command)\n"
         "import soak; sys.exit(soak.main())"

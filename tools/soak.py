@@ -6,7 +6,8 @@
     python tools/soak.py all --write docs/reliability.md
 
 Each ends with a line of figures, and with exit status 1 if a promise was broken: an exception that
-got out of a tick, an angle beyond the limits, memory that grows, a value of the wrong channel.
+got out of a tick, an angle beyond the limits, pulses that go on in fault or estop, memory that
+grows, a value of the wrong channel.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from reports import put
-from soak_troubles import BrokenPromise, Counting, Saboteur, misuse
+from soak_troubles import BrokenPromise, Counting, Rest, Saboteur, misuse
 
 from fishd.build import build_loop
 from fishd.clock import Slot, VirtualClock, VirtualTicker
@@ -34,7 +35,7 @@ from fishd.emulation.faults import FAULTS, INSTANTANEOUS, Faults
 from fishd.emulation.i2c import I2cBus
 from fishd.emulation.linux_i2c import LinuxI2c
 from fishd.errors import SensorError
-from fishd.hardware.ads1115 import open_force_sensor
+from fishd.hardware.ads1115 import Ads1115Sensor
 from fishd.hardware.calibration import ForceCalibration
 from fishd.hardware.settings import ForceSensorSettings
 from fishd.hardware.simulated import SimulatedFish
@@ -76,6 +77,7 @@ def soak_simulated(ticks: int, seed: int) -> str:
     saboteur = Saboteur(fish.robot(), dice)
     publisher = Counting(lambda: dice.random() < 1e-4)
     loop = build_loop(config, saboteur.robot(), clock, publisher)
+    rest = Rest(loop)
     memory = None
     index = 0
     for count in range(ticks):
@@ -86,6 +88,7 @@ def soak_simulated(ticks: int, seed: int) -> str:
         loop.tick(Slot(index, deadline, clock.now, missed))
         index += 1
         check(loop)
+        rest.check(saboteur.in_trouble, saboteur.servo_on)
         if dice.random() < 0.02:
             misuse(loop, dice)
         if count == ticks // 5:
@@ -103,6 +106,7 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
         robot, pi = open_lockstep(config, stack)
         publisher = Counting()
         loop = build_loop(config, robot, clock, publisher)
+        rest = Rest(loop, patience=30)  # one attempt to connect to pigpiod takes up to ten
         memory = None
         injected: Counter[str] = Counter()
         width_limits = (1500 - 600 * 0.42 - 6, 1500 + 600 * 0.42 + 6)
@@ -112,6 +116,8 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
             width = pi.pigpiod.width(config.virtual_pi.servo_gpio, slot.deadline)
             if width and not width_limits[0] <= width <= width_limits[1]:
                 raise BrokenPromise(f"tick {loop.seq}: the servo got a pulse of {width} µs")
+            lost = any(pi.faults.active(name) for name in FAULTS if name.startswith("pigpiod"))
+            rest.check(lost, width > 0.0)
             if dice.random() < 0.01:
                 name = dice.choice(tuple(FAULTS))
                 injected[name] += 1
@@ -142,7 +148,7 @@ def soak_channels(reads: int, seed: int) -> str:
         i2c.install()
         stack.callback(i2c.remove)
         settings = ForceSensorSettings(frozen_after=None)
-        sensor = open_force_sensor(settings, ForceCalibration(), clock, threaded=False, tick=0.004)
+        sensor = Ads1115Sensor(settings, ForceCalibration(), clock, threaded=False, tick=0.004)
         stack.callback(sensor.close)
         pairs = failures = 0
         now = 0.0

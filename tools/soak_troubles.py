@@ -1,6 +1,7 @@
 """The trouble that `soak.py` makes: robots, controllers, subscribers and users that misbehave."""
 
 import dataclasses
+import itertools
 import math
 import random
 from collections import Counter
@@ -12,7 +13,8 @@ from fishd.controllers.base import Controller
 from fishd.errors import FishdError, SensorError, ServoError
 from fishd.hardware.base import Robot
 from fishd.loop import ControlLoop
-from fishd.signals import Event, Measurement, Observation, Tick
+from fishd.signals import Event, Measurement, Observation, Reason, Tick
+from fishd.supervisor import Mode
 
 
 class BrokenPromise(BaseException):
@@ -47,11 +49,19 @@ class Saboteur:
         self._dice = dice
         self._trouble = ""
         self._until = 0.0
-        self.written = 0
+        self._failing: tuple[str, ...] = ()
+        self._victims = itertools.cycle((("write", "release"), ("release",), ("write",)))
+        self.servo_on = False
+        """The latest that reached the servo was a write, not a release."""
 
     def robot(self) -> Robot:
         """The robot with this in between."""
         return dataclasses.replace(self._robot, sensor=self, servo=self)
+
+    @property
+    def in_trouble(self) -> bool:
+        """The servo cannot be written to, or not be released."""
+        return self._trouble.startswith("servo")
 
     def read(self, now: float) -> Measurement:
         """Read, or fail."""
@@ -61,6 +71,7 @@ class Saboteur:
             if self._dice.random() < 0.004:
                 kinds = ("silent", "bug", "stale", "suspect", "nan", "servo", "servo-bug")
                 self._trouble = self._dice.choice(kinds)
+                self._failing = next(self._victims)
                 self._until = now + self._dice.uniform(0.0, 0.4)
         match self._trouble:
             case "silent":
@@ -79,24 +90,54 @@ class Saboteur:
         """Write, or fail."""
         if not abs(angle) <= 0.42 + 1e-9:
             raise BrokenPromise(f"the servo was sent {angle} rad")
-        self._fail()
-        self.written += 1
+        self._fail("write")
         self._robot.servo.write(angle)
+        self.servo_on = True
 
     def release(self) -> None:
         """Release, or fail."""
-        self._fail()
+        self._fail("release")
         self._robot.servo.release()
+        self.servo_on = False
 
     def close(self) -> None:
         """Let go."""
         self._robot.servo.close()
 
-    def _fail(self) -> None:
+    def _fail(self, action: str) -> None:
+        if action not in self._failing:
+            return
         if self._trouble == "servo":
             raise ServoError("pigpiod is gone")
         if self._trouble == "servo-bug":
             raise AttributeError("'NoneType' object has no attribute 'send'")
+
+
+class Rest:
+    """The promise that in fault and estop the pulses end, as soon as the servo can be reached."""
+
+    LIMITS = {Mode.ESTOP: 10, Mode.FAULT: 12}  # noqa: RUF012 - never changed
+    """Ticks that may pass first; a fault fades to neutral before."""
+
+    def __init__(self, loop: ControlLoop, patience: int = 0) -> None:
+        """`patience`: ticks that a lost servo may take to come back."""
+        self._loop = loop
+        self._patience = patience
+        self._reason: Reason | None = None
+        self._ticks = 0
+
+    def check(self, in_trouble: bool, servo_on: bool) -> None:
+        """Once per tick; whether the servo cannot be reached, and whether it has pulses."""
+        loop = self._loop
+        reason = loop.supervisor.reason
+        if in_trouble or reason is None or reason is not self._reason:
+            self._ticks = 0
+        self._reason = reason
+        self._ticks += 1
+        mode = loop.supervisor.mode
+        late = self._ticks > self.LIMITS.get(mode, math.inf) + self._patience
+        if late and (servo_on or loop.servo_on):
+            raise BrokenPromise(f"tick {loop.seq}: {self._ticks} ticks in {mode}, and still pulses")
 
 
 class Drunk(Controller[Any]):

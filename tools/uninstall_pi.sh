@@ -7,6 +7,7 @@ set -euo pipefail
 # shellcheck source=tools/pi_layout.sh
 source "$(dirname "${BASH_SOURCE[0]}")/pi_layout.sh"
 PURGE=${PURGE:-0}
+NOT_LOADED=5 # exit status of systemctl where there is no such unit
 
 remove() {
   if [[ -e $DESTDIR$1 || -L $DESTDIR$1 ]]; then
@@ -18,10 +19,14 @@ remove() {
 remove_if_empty() { rmdir "$DESTDIR$1" 2>/dev/null || true; }
 
 stop_service() {
-  if systemctl --quiet is-active fishd; then
-    systemctl stop fishd.service
-    step "fishd.service: stopped, the servo is released"
-  fi
+  local status=0
+  # Whether it is active or not: one that waits for its restart is not, and would come back.
+  systemctl stop fishd.service 2>/dev/null || status=$?
+  case $status in
+    0) step "fishd.service: stopped, the servo is released" ;;
+    "$NOT_LOADED") ;;
+    *) fail "fishd.service cannot be stopped; see 'systemctl status fishd'" ;;
+  esac
   systemctl --quiet disable fishd.service 2>/dev/null || true
 }
 

@@ -8,8 +8,11 @@ from msgspec.structs import replace
 
 from fishd.cli.config import load_or_exit, set_option
 from fishd.config import Config
-from fishd.errors import ConfigError
+from fishd.errors import ConfigError, ServoError
 from fishd.hardware.base import CalibratedServo
+
+_NO_FOLDER = "/proc/self/no-calibrations"
+"""Nobody can make it: as on a machine where nothing was ever calibrated."""
 
 
 @click.command()
@@ -44,6 +47,8 @@ def _open(config: Config) -> CalibratedServo:
     clock = SystemClock()
     try:
         return open_servo(config, clock, threaded=False)
-    except ConfigError as error:
+    except ServoError:
+        raise
+    except (ConfigError, OSError) as error:
         click.echo(f"fishctl: {error}; going on without it", err=True)
-        return open_servo(replace(config, state_folder=os.devnull), clock, threaded=False)
+        return open_servo(replace(config, state_folder=_NO_FOLDER), clock, threaded=False)

@@ -30,7 +30,7 @@ DATA_RATES = (8, 16, 32, 64, 128, 250, 475, 860)
 POWER_UP = 25e-6
 """Time to wake up before a conversion [s]."""
 
-_BUSY_BIT, _SINGLE_SHOT = 0x8000, 0x0100
+_IDLE_BIT, _SINGLE_SHOT = 0x8000, 0x0100
 _REMEMBERED = 4  # conversions made up for in continuous mode: the longest queue of the comparator
 
 
@@ -134,7 +134,7 @@ class Ads1115Chip:
             return self._code & 0xFFFF
         if self._pointer == CONFIG:
             busy = self._conversion is not None or self._faults.active("stuck-busy")
-            return self._config | (0 if busy else _BUSY_BIT)
+            return self._config | (0 if busy else _IDLE_BIT)
         compare = self._comparator
         return (compare.low if self._pointer == LOW_THRESHOLD else compare.high) & 0xFFFF
 
@@ -146,7 +146,7 @@ class Ads1115Chip:
             self._comparator.high = signed
         elif self._pointer == CONFIG:
             self._config = word & 0x7FFF
-            wanted = word & _BUSY_BIT or not word & _SINGLE_SHOT
+            wanted = word & _IDLE_BIT or not word & _SINGLE_SHOT
             # A chip that is busy ignores the start, but keeps the new config for the next one.
             if wanted and self._conversion is None and not self._faults.active("stuck-busy"):
                 self._begin(now + POWER_UP)

@@ -52,9 +52,12 @@ class LinkServer:
                 stack.enter_context(self._pi)
                 self._path.unlink(missing_ok=True)  # of one that was killed
                 listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-                listener.bind(str(self._path))
+                mask = os.umask(0o177)  # for this user alone, from the first moment
+                try:
+                    listener.bind(str(self._path))
+                finally:
+                    os.umask(mask)
                 stack.callback(self._path.unlink, missing_ok=True)
-                self._path.chmod(0o600)
                 listener.listen()
             except OSError as error:
                 raise StartupError(

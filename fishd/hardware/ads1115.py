@@ -25,18 +25,6 @@ CLOSE_LIMIT = 0.5
 """How long to wait for the thread to end [s]."""
 
 
-def open_force_sensor(
-    settings: ForceSensorSettings,
-    calibration: ForceCalibration,
-    clock: Clock,
-    *,
-    threaded: bool,
-    tick: float,
-) -> "Ads1115Sensor":
-    """The force sensor as configured; see `Ads1115Sensor`."""
-    return Ads1115Sensor(settings, calibration, clock, threaded=threaded, tick=tick)
-
-
 class Ads1115Sensor:
     """A force sensor that measures voltages, and can be calibrated.
 
@@ -51,14 +39,12 @@ class Ads1115Sensor:
         *,
         threaded: bool,
         tick: float,
-        hold_before: float = HOLD,
     ) -> None:
         """Begin to sample; a bus or a chip that is missing may come later.
 
         clock: of the bus; in virtual time one of its own, which reads move on
         threaded: sample in a thread, which needs a clock that moves by itself
         tick: time between two reads [s]
-        hold_before: how long before a read to keep out of its way [s], at most an eighth of a tick
 
         Raises `StartupError` where the driver is not installed.
         """
@@ -66,7 +52,7 @@ class Ads1115Sensor:
         """What turns voltages into forces."""
         self._clock = clock
         self._tick = tick
-        self._hold = min(hold_before, 0.125 * tick)
+        self._hold = min(HOLD, 0.125 * tick)
         self._step_time = 0.0
         self._place = f"the ADS1115 at {settings.address:#04x} on /dev/i2c-{settings.bus}"
         self._sampler = Sampler(settings, clock)
@@ -88,22 +74,22 @@ class Ads1115Sensor:
         """What was measured since the previous read; in real time it waits for nothing.
 
         Without a new pair of samples it is the previous measurement, its time included, of no
-        samples. Raises `SensorError`, with what to check, while the chip cannot be read, before
-        the first pair, and once closed.
+        samples and under no suspicion. Raises `SensorError`, with what to check, while the chip
+        cannot be read, before the first pair, and once closed.
         """
         if self._closing.is_set():
             raise SensorError(f"{self._place} is closed")
         if self._thread is None:
             self._catch_up(now)
         self._next_read = now + self._tick
-        pairs = self._take()
+        pairs = self._take(now)
         if pairs:
             measurement = self._evaluation.measure(pairs, self.calibration)
             if self._watches:
                 self._watches = [watch for watch in self._watches if not watch.closed]
                 for watch in self._watches:
                     watch.add(pairs, measurement.suspect)
-            self._latest = replace(measurement, samples=0)
+            self._latest = replace(measurement, samples=0, suspect="", extremes=None)
             return measurement
         if trouble := self._sampler.trouble:
             self._evaluation.interrupt()
@@ -133,10 +119,16 @@ class Ads1115Sensor:
         else:
             self._thread.join(CLOSE_LIMIT)
 
-    def _take(self) -> list[Pair]:
-        """All that has come in; a deque needs no lock for that, so the tick waits for nobody."""
+    def _take(self, now: float) -> list[Pair]:
+        """All that has come in; a deque needs no lock for that, so the tick waits for nobody.
+
+        In virtual time the bus may have run ahead: what ended after `now` is for the next read.
+        """
         pairs = self._sampler.pairs
-        return [pairs.popleft() for _ in range(len(pairs))]
+        count = len(pairs)
+        if self._thread is None:
+            count = sum(pair.time <= now for pair in pairs)
+        return [pairs.popleft() for _ in range(count)]
 
     def _catch_up(self, now: float) -> None:
         """Sample until `now` as the thread would have done."""

@@ -166,7 +166,7 @@ class CalibrationFolder:
     def _names(self, kind: type[C]) -> list[str]:
         """The files of a kind, oldest first."""
         try:
-            found = os.listdir(self.folder)
+            found = [path.name for path in self.folder.iterdir()]
         except FileNotFoundError:
             return []
         except OSError as error:

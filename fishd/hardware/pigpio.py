@@ -3,6 +3,8 @@
 A countdown script inside pigpiod ends the pulses when fishd no longer writes, whatever ended it.
 """
 
+from contextlib import suppress
+
 import pigpio
 
 from fishd.clock import Clock
@@ -19,11 +21,8 @@ from fishd.hardware.pigpio_pulses import (
     ServoPulses,
     counts,
 )
-from fishd.hardware.pulses import pulse_width
+from fishd.hardware.pulses import REST, pulse_width
 from fishd.hardware.settings import ServoSettings
-
-HOLD = 0.3
-"""How long the last resort holds the servo at neutral [s]."""
 
 
 class PigpioServo:
@@ -111,20 +110,30 @@ class PigpioServo:
         """Last resort, from another process than fishd: neutral for 0.3 s, then off.
 
         False if there are no pulses: then nothing moves. Removes fishd's scripts, so that a fishd
-        that still lives gets a fault. Ends this object's own link. Raises `ServoError`.
+        that still lives gets a fault. Ends this object's own link. Raises `ServoError` when a step
+        fails; the pulses are stopped all the same, if they can be.
         """
         self._closed = True
         self._link.close()
+        try:
+            return self._neutralise()
+        except BaseException:
+            # The countdowns may be disarmed by now: nothing else would end the pulses.
+            with suppress(ServoError), opened(self._settings.pigpio) as client:
+                self._pulses.send(client, OFF)
+                self._delete(client, self._disarm_leftovers(client))
+            raise
+
+    def _neutralise(self) -> bool:
         with opened(self._settings.pigpio) as client:
             leftovers = self._disarm_leftovers(client)
             energised = self._pulses.on(client)
             if energised:
                 self._pulses.send(client, self._neutral)
-                self._clock.sleep(HOLD)
+                self._clock.sleep(REST)
                 client.within(ANSWER)
                 self._pulses.send(client, OFF)
-            for script in leftovers:
-                client.delete_script(script)
+            self._delete(client, leftovers)
         return energised
 
     def _countdown(self, count: int, width: float) -> list[int]:
@@ -146,6 +155,11 @@ class PigpioServo:
                 leftovers.append(script)
         return leftovers
 
+    @staticmethod
+    def _delete(client: Client, scripts: list[int]) -> None:
+        for script in scripts:
+            client.delete_script(script)
+
     def _prepare(self, client: Client) -> None:
         """Put a new connection in order: no pulses go on unless the loop writes again."""
         leftovers = self._disarm_leftovers(client)
@@ -156,8 +170,7 @@ class PigpioServo:
             countdown = self._countdown(self._counts, OFF)
         elif leftovers and self._pulses.on(client):
             countdown = self._countdown(1, self._neutral)
-        for script in leftovers:
-            client.delete_script(script)
+        self._delete(client, leftovers)
         self._script = client.store_script(self._pulses.script)
         while client.script_status(self._script)[0] == pigpio.PI_SCRIPT_INITING:
             self._clock.sleep(0.001)

@@ -35,8 +35,8 @@ class PigpioLink:
     ) -> None:
         """Wait up to 2 s for the first connection; without one, go on trying.
 
-        prepare: called with every new client before anyone else has it; may raise what a client
-            raises
+        prepare: called with every new client before anyone else has it; if it raises, the client
+            is thrown away
         threaded: connect in a thread of its own. Otherwise within `session`, at most once per
             0.5 s of `clock`, and with time limits that suit virtual time
         """
@@ -130,7 +130,7 @@ class PigpioLink:
             allowed = preparation
             client.within(preparation)
             self._prepare(client)
-        except FAILURES as error:
+        except Exception as error:  # whatever it is, the next attempt may do better
             self._reason = reason(error, allowed)
             if client:
                 client.dispose()

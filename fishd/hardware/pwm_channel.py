@@ -2,6 +2,7 @@
 
 import errno
 import os
+from contextlib import suppress
 from typing import Protocol
 
 from fishd.clock import Clock
@@ -109,9 +110,9 @@ class PwmChannel:
 
     def close(self) -> None:
         """Close the files; the channel stays as it is."""
-        for fd in self._fds.values():
-            self._files.close(fd)
-        self._fds.clear()
+        while self._fds:
+            with suppress(OSError):  # it is closed all the same
+                self._files.close(self._fds.popitem()[1])
 
     def unexport(self) -> None:
         """Make the channel's files disappear; nothing if they have."""

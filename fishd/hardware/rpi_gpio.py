@@ -137,9 +137,11 @@ class RpiGpioServo:
     def _give_back(self) -> None:
         """Only the own pin: cleanup() without one takes those of everybody."""
         try:
-            if self._pwm is not None:
-                self._pwm.stop()
-            self._pwm = None  # while it may still write to the pin
-            self._gpio.cleanup(self._settings.gpio)
+            try:
+                if self._pwm is not None:
+                    self._pwm.stop()
+            finally:
+                self._pwm = None  # while it may still write to the pin
+                self._gpio.cleanup(self._settings.gpio)
         except Exception as error:
             raise self._failure(error) from None

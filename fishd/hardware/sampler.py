@@ -92,7 +92,7 @@ class Sampler:
             self.trouble = ""
 
     def close(self) -> None:
-        """Let go of the bus; may be called twice."""
+        """Let go of the bus; never raises, may be called twice."""
         bus, self._bus = self._bus, None
         if bus is not None:
             del self._chip, self._x, self._y

@@ -4,6 +4,7 @@ The sampler imports this only when it is made: the driver is no part of fishd's 
 """
 
 import errno
+import logging
 import os
 from typing import Any
 
@@ -14,11 +15,13 @@ from Adafruit_PureIO import smbus
 from fishd.clock import Clock
 from fishd.hardware.settings import Channel, ForceSensorSettings
 
+log = logging.getLogger(__name__)
+
 SLOWEST, TOO_SLOW = 1.1, 1.25
 """Times of a conversion, as multiples of 1/data rate: the chip's tolerance, and what is wrong."""
 
 _CONFIG = 1
-_BUSY_BIT = 0x8000
+_IDLE_BIT = 0x8000
 _WAKE_UP = 25e-6  # of the chip, before a conversion [s]
 _GAINS = {6.144: 2 / 3, 4.096: 1, 2.048: 2, 1.024: 4, 0.512: 8, 0.256: 16}
 _I2C_TIMEOUT = 0x0702
@@ -38,8 +41,13 @@ def open_bus(number: int) -> Any:
 
 
 def close_bus(bus: Any) -> None:
-    """Close it now; the library would leave that to the garbage collector."""
-    bus._i2c._i2c_bus.close()
+    """Close it now; the library would leave that to the garbage collector. Raises no OSError."""
+    driver = bus._i2c._i2c_bus
+    try:
+        driver.close()
+    except OSError as error:  # Linux has closed it all the same
+        log.warning("closing an I2C bus failed: %s", error)
+        driver._device = None  # else it would be closed once more
     bus.deinit()
 
 
@@ -98,22 +106,22 @@ class SingleShot(ADS1115):  # type: ignore[misc]
 
     def check_idle(self) -> None:
         """Raise TimeoutError while a conversion is under way: a start would be ignored."""
-        if not self._read_register(_CONFIG) & _BUSY_BIT:
+        if not self._read_register(_CONFIG) & _IDLE_BIT:
             raise TimeoutError("the ADS1115 stays busy: switch its power off and on")
 
     def _read(self, pin: int) -> int:
         """Convert and return the code; raises OSError where it might not be that of `pin`."""
         clock = self._clock
         self._write_config(pin)
-        settings = (self.buf[1] << 8 | self.buf[2]) & ~_BUSY_BIT
+        settings = (self.buf[1] << 8 | self.buf[2]) & ~_IDLE_BIT
         started = clock.monotonic()
         clock.sleep(self._sleep)
         while True:
             asked = clock.monotonic()
             config = self._read_register(_CONFIG, fast=True)
-            if config & ~_BUSY_BIT != settings:
+            if config & ~_IDLE_BIT != settings:
                 raise OSError("the ADS1115 was reset while it converted: check its power")
-            if config & _BUSY_BIT:
+            if config & _IDLE_BIT:
                 break
             # What ends later than this is no conversion that was started here.
             if asked - started > self._limit:

@@ -9,14 +9,12 @@ from contextlib import suppress
 from fishd.clock import Clock
 from fishd.errors import ServoError
 from fishd.hardware.calibration import ServoCalibration, calibrated
-from fishd.hardware.pulses import pulse_width
+from fishd.hardware.pulses import REST, pulse_width
 from fishd.hardware.pwm_channel import Files, PwmChannel
 from fishd.hardware.settings import ServoSettings
 
 PATIENCE = 2.0
 """How long udev may take to hand over the files of a new channel [s]; ticks do not wait for it."""
-NEUTRAL_HOLD = 0.3
-"""How long the last resort holds neutral before it stops the pulses [s]."""
 
 
 class SysfsPwmServo:
@@ -107,9 +105,12 @@ class SysfsPwmServo:
             return
         self._closed = True
         try:
-            self.release()
-            if self._owned:
-                self._switch_off()
+            try:
+                self.release()
+            finally:
+                if self._owned:
+                    self._channel.open(patience=0.0)  # a release that fails closes it
+                    self._switch_off()
         except ServoError:
             if self._owned:  # else there never were pulses of ours
                 raise
@@ -122,15 +123,20 @@ class SysfsPwmServo:
         """Send a servo that gets pulses to neutral and stop them; False where there are none.
 
         The last resort when fishd is dead. Should it be alive, its next write fails, because
-        its pulses are off. Raises `ServoError`.
+        its pulses are off. Raises `ServoError` when a step fails; the pulses are stopped all the
+        same, if they can be.
         """
         self._channel.open(PATIENCE)
         if not self._pulses_are_on():
             return False
-        self._channel.write("duty_cycle", self._neutral)
-        self._clock.sleep(NEUTRAL_HOLD)
-        self._channel.write("duty_cycle", 0)
-        self._switch_off()
+        try:
+            self._channel.write("duty_cycle", self._neutral)
+            self._clock.sleep(REST)
+        finally:
+            try:
+                self._channel.write("duty_cycle", 0)
+            finally:
+                self._switch_off()
         return True
 
     def _begin(self, duty: int) -> None:
@@ -164,10 +170,12 @@ class SysfsPwmServo:
         return bool(self._channel.read("enable") and self._channel.read("duty_cycle"))
 
     def _switch_off(self) -> None:
-        """Switch the channel off after the last pulse, whose duty cycle was 0."""
-        if self._channel.read("enable"):
-            self._clock.sleep(self._period)
-            self._channel.write("enable", 0)
+        """Switch the channel off, once the last pulse before a duty cycle of 0 has ended."""
+        with suppress(ServoError):  # one that cannot be read may be on
+            if not self._channel.read("enable"):
+                return
+        self._clock.sleep(self._period)
+        self._channel.write("enable", 0)
 
     def _lose(self) -> None:
         """Forget a channel that has failed, so that it is opened again."""

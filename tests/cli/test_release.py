@@ -81,6 +81,16 @@ def test_a_broken_calibration_does_not_keep_the_servo_energised(
     assert pi.pi.widths()[-1] == 0
 
 
+def test_an_unreadable_state_folder_does_not_keep_the_servo_energised(
+    pi: Bench, other_program: pigpio.pi
+) -> None:
+    (pi.folder / "file").write_text("")
+    ended = release(*pi.settings, "--set", f"state_folder={pi.folder}/file/state")
+    assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
+    assert re.fullmatch(r"fishctl: [^\n]+/file/state[^\n]+; going on without it\n", ended.stderr)
+    assert pi.pi.widths()[-3:] == [1750, 1500, 0]
+
+
 @pytest.mark.parametrize("fault", ["pigpiod-frozen", "pigpiod-gone"])
 def test_a_pigpiod_that_does_not_answer_is_one_line_and_no_long_wait(pi: Bench, fault: str) -> None:
     pi.pi.inject(fault)

@@ -151,6 +151,21 @@ def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time() -> No
     assert all((a.time, a.fx, a.fy) == (b.time, b.fx, b.fy) for a, b in repeated)
 
 
+@pytest.mark.parametrize("data_rate", [8, 16, 32])
+def test_no_measurement_is_newer_than_its_tick_though_a_conversion_outlasts_it(
+    data_rate: int,
+) -> None:
+    with ForceRig(noise=0.0) as rig:
+        rig.volts["A0-A1"] = lambda t: 0.1 * t
+        found = Ticks(rig.sensor(data_rate=data_rate)).run(5.0)
+    ages = [
+        index * TICK - item.time for index, item in enumerate(found, 1) if not isinstance(item, str)
+    ]
+    assert min(ages) >= 0.0
+    assert len(ages) > 90
+    assert sum(item.samples for item in found if not isinstance(item, str)) >= 2 * data_rate
+
+
 def test_a_bus_that_is_missing_at_start_may_come_later() -> None:
     rig = ForceRig()
     ticks = Ticks(rig.sensor(bus=ABSENT_BUS))

@@ -66,3 +66,14 @@ def test_the_limit_is_of_forces_and_not_of_voltages() -> None:
     with ForceRig() as rig:
         ticks = Ticks(rig.sensor(ForceCalibration(xx=100.0), force_limit=10.0))
         assert ticks.next().suspect.startswith("F_x is +50.")
+
+
+def test_a_suspicion_is_of_the_window_it_came_with_and_not_of_reads_without_a_sample() -> None:
+    with ForceRig() as rig:
+        rig.volts["A0-A1"] = lambda t: 3.0 if t < 0.1 else 0.5  # in the first conversion only
+        found = Ticks(rig.sensor(data_rate=8)).run(1.5)
+    read = [item for item in found if not isinstance(item, str)]
+    assert "is clipped" in read[0].suspect
+    assert [measured.samples for measured in read[1:4]] == [0, 0, 0]
+    assert not any(measured.suspect or measured.extremes for measured in read[1:4])
+    assert not any(measured.suspect for measured in read[1:])

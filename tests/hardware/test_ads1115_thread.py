@@ -8,14 +8,14 @@ from force_rig import TICK, ForceRig
 
 from fishd.clock import SystemClock
 from fishd.errors import SensorError
-from fishd.hardware.ads1115 import CLOSE_LIMIT, Ads1115Sensor, open_force_sensor
+from fishd.hardware.ads1115 import CLOSE_LIMIT, Ads1115Sensor
 from fishd.hardware.calibration import ForceCalibration
 from fishd.hardware.settings import ForceSensorSettings
 from fishd.signals import Measurement
 
 
 def threaded() -> Ads1115Sensor:
-    return open_force_sensor(
+    return Ads1115Sensor(
         ForceSensorSettings(), ForceCalibration(), SystemClock(), threaded=True, tick=TICK
     )
 

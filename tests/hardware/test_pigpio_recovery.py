@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
+import pigpio
 import pytest
 from msgspec.structs import replace
 from pigpio_bench import FRAME, GPIO, PigpioBench, connect
@@ -128,6 +129,41 @@ def test_the_last_resort_works_on_hardware_pwm(bench: PigpioBench) -> None:
     assert bench.servo(settings).neutralise() is True
     assert bench.width == 0
     assert bench.servo(settings).neutralise() is False
+
+
+def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: PigpioBench) -> None:
+    bench.servo().write(0.5)
+    bench.wait(0.1)
+    bench.refuse(pigpio._PI_CMD_SERVO, 1500)
+    with pytest.raises(ServoError, match="no permission"):
+        bench.servo().neutralise()
+    assert bench.width == 0
+    assert bench.scripts() == 0
+
+
+def test_the_last_resort_stops_the_pulses_though_its_connection_breaks(bench: PigpioBench) -> None:
+    bench.servo().write(0.5)
+    bench.wait(0.1)
+    rescue = bench.servo()
+    bench.hang_up_in_next_sleep()
+    with pytest.raises(ServoError, match="pigpiod at"):
+        rescue.neutralise()
+    assert bench.width == 0
+    assert bench.scripts() == 0
+
+
+def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: PigpioBench) -> None:
+    bench.servo().write(0.5)
+    rescue = bench.servo()
+
+    def interrupt(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    bench.clock.sleep = interrupt  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        rescue.neutralise()
+    del bench.clock.sleep
+    assert bench.width == 0
 
 
 def test_the_last_resort_says_in_one_line_that_pigpiod_is_gone(bench: PigpioBench) -> None:

@@ -171,6 +171,36 @@ def test_sampling_leaves_no_garbage() -> None:
             gc.enable()
 
 
+def test_a_bus_that_cannot_even_be_closed_is_opened_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with ForceRig() as rig:
+        from Adafruit_PureIO import smbus
+
+        emulated = smbus.open
+
+        def stubborn(*arguments: Any, **options: Any) -> Any:
+            file = emulated(*arguments, **options)
+            close = file.close
+
+            def fail() -> None:
+                close()
+                raise OSError(5, "Input/output error")
+
+            file.close = fail
+            return file
+
+        monkeypatch.setattr(smbus, "open", stubborn)
+        sampler = rig.sampler()
+        take_pairs(sampler, rig, 0.1)
+        rig.faults.inject("unplugged", 1.0)
+        for _ in range(10):
+            sampler.step()
+        assert sampler.trouble.startswith("nothing answers at 0x48")
+        assert take_pairs(sampler, rig, 2.0)
+        sampler.close()
+
+
 def test_a_hanging_bus_keeps_the_sampler_for_20_ms_and_not_for_the_kernels_whole_second() -> None:
     with ForceRig() as rig:
         sampler = rig.sampler()

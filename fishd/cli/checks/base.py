@@ -6,15 +6,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from fishd.client import Fish
+from fishd.cli.checks.daemon import Running, Unreachable, ask
 from fishd.config import Config
-from fishd.errors import FishError, Refused
-from fishd.protocol import Calibrations
-from fishd.signals import Status, Tick
 
 Level = Literal["ok", "warning", "FAIL", "skipped"]
-PATIENCE = 1.0
-"""How long a daemon may take to answer [s]."""
 
 
 class Result(NamedTuple):
@@ -37,15 +32,37 @@ class Context:
     """Where /sys, /proc, /dev and so on are looked for."""
 
     @cached_property
-    def running(self) -> "Running | None":
-        """What the daemon says; None where no daemon answers."""
-        try:
-            with Fish(self.endpoint, timeout=PATIENCE) as fish:
-                return Running(
-                    fish.status(), _latest_tick(fish), _calibrations(fish), fish.endpoint
-                )
-        except FishError:
-            return None
+    def daemon(self) -> Running | Unreachable | None:
+        """What the daemon says, or why it cannot be asked; None where there certainly is none.
+
+        That is about the endpoint: a fishd at another one is not known of.
+        """
+        return ask(self.endpoint)
+
+    @property
+    def running(self) -> Running | None:
+        """What the daemon says; None where none answers."""
+        return self.daemon if isinstance(self.daemon, Running) else None
+
+    def occupied(self, by_fishd: str) -> Result | None:
+        """Why a check leaves the hardware alone; None where no fishd uses it.
+
+        by_fishd: what to say of a running fishd
+        """
+        if isinstance(self.daemon, Unreachable):
+            return skipped(f"{self.daemon.why}; {self.reach(self.daemon)}")
+        return skipped(f"fishd is running and {by_fishd}") if self.daemon else None
+
+    def reach(self, daemon: Unreachable) -> str:
+        """What to do so that the daemon can be asked."""
+        if daemon.forbidden:
+            return f"{self.as_fishd}, or name another with --endpoint"
+        return "stop what hangs there, or name the fishd with --endpoint"
+
+    @property
+    def as_fishd(self) -> str:
+        """The command that makes these checks as the user of the service."""
+        return "sudo -u fishd fishctl doctor" + (f" --config {self.file}" if self.file else "")
 
     def path(self, absolute: str) -> Path:
         """A path of this machine, below `root`."""
@@ -62,17 +79,6 @@ class Context:
     def model(self) -> str:
         """What this machine calls itself, such as Raspberry Pi 5 Model B; empty if unknown."""
         return self.text("/proc/device-tree/model")
-
-
-class Running(NamedTuple):
-    """What a running daemon says."""
-
-    status: Status
-    tick: Tick | None
-    """The latest; None where telemetry is silent."""
-    calibrations: Calibrations | None
-    """None for a robot that has none."""
-    endpoint: str
 
 
 class Check(NamedTuple):
@@ -102,17 +108,3 @@ def fail(message: str, mend: str) -> Result:
 def skipped(message: str) -> Result:
     """It cannot be told, or was not tried."""
     return Result("skipped", message)
-
-
-def _latest_tick(fish: Fish) -> Tick | None:
-    try:
-        return next(fish.ticks())
-    except FishError:
-        return None
-
-
-def _calibrations(fish: Fish) -> Calibrations | None:
-    try:
-        return fish.calibrations()
-    except Refused:
-        return None

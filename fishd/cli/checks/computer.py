@@ -1,5 +1,6 @@
 """Checks of the computer: model, power, disk, and the folder of calibrations."""
 
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -75,9 +76,9 @@ def state(context: Context) -> Result:
     if not os.access(there, os.W_OK | os.X_OK):
         return fail(
             f"{folder}: no permission to write to {there}",
-            "run this as the user of fishd (sudo -u fishd fishctl doctor), or set state_folder",
+            f"run this as the user of fishd ({context.as_fishd}), or set state_folder",
         )
-    return ok(f"{folder}" + ("" if folder.exists() else ", which will be made when it is needed"))
+    return ok(f"{folder}" + ("" if there == folder else ", which will be made when it is needed"))
 
 
 def disk(context: Context) -> Result:
@@ -102,7 +103,7 @@ def calibrations(context: Context) -> Result:
             newest_force = folder.newest(ForceCalibration)
             newest_servo = folder.newest(ServoCalibration)
         except ConfigError as error:
-            return fail(str(error), "mend that file, or remove it: the one before is then in force")
+            return _unreadable(context, folder.folder, str(error))
         force = newest_force[0].date if newest_force else ""
         servo = newest_servo[0].date if newest_servo else ""
     if not force:
@@ -117,9 +118,25 @@ def calibrations(context: Context) -> Result:
     return ok(f"force of {force}, servo of {servo}")
 
 
+def _unreadable(context: Context, folder: Path, complaint: str) -> Result:
+    if os.strerror(errno.EACCES) in complaint:
+        return warning(complaint, f"run this as the user of fishd: {context.as_fishd}")
+    if not _nearest(folder).is_dir():
+        return fail(complaint, "as for 'state folder'")
+    return fail(complaint, "mend that file, or remove it: the one before is then in force")
+
+
 def _nearest(folder: Path) -> Path:
-    """The folder, or the nearest above it that exists."""
-    return next(path for path in (folder, *folder.parents) if path.exists())
+    """The folder, or the nearest above it that this user can see."""
+    return next(path for path in (folder, *folder.parents) if _is_seen(path))
+
+
+def _is_seen(path: Path) -> bool:
+    try:
+        path.stat()
+    except OSError:  # not there, below a file, or below a folder that may not be entered
+        return False
+    return True
 
 
 CHECKS = (

@@ -66,8 +66,8 @@ def speed(context: Context) -> Result:
 
 def chip(context: Context) -> Result:
     """An ADS1115 has 16 bits in its threshold where the ADS1015 has 12."""
-    if context.running:
-        return skipped("fishd is running and owns the bus; see force")
+    if occupied := context.occupied("owns the bus; see force"):
+        return occupied
     settings = context.config.force_sensor
     place = f"{settings.address:#04x} on /dev/i2c-{settings.bus}"
     try:
@@ -97,13 +97,15 @@ def force(context: Context) -> Result:
     """What the running daemon measures; without one, the same driver for a second."""
     if context.running:
         return _force_of_daemon(context)
-    from fishd.hardware.ads1115 import open_force_sensor
+    if occupied := context.occupied("owns the bus"):
+        return occupied
+    from fishd.hardware.ads1115 import Ads1115Sensor
 
     tick = context.config.tick
     try:
         with plugged_in(context), ExitStack() as stack:
             settings = context.config.force_sensor
-            sensor = open_force_sensor(
+            sensor = Ads1115Sensor(
                 settings, ForceCalibration(), SystemClock(), threaded=True, tick=tick
             )
             stack.callback(sensor.close)
@@ -194,19 +196,18 @@ def plugged_in(context: Context) -> Iterator[None]:
 
 def _registers(number: int, address: int) -> tuple[int, int]:
     """The chip's config and high threshold; nothing of it is changed. Raises OSError."""
-    from fishd.hardware.single_shot import open_bus
+    from fishd.hardware.single_shot import close_bus, open_bus
 
     bus = open_bus(number)
-    bus.try_lock()
     try:
+        bus.try_lock()
         values = []
         for register in (_CONFIG, _HIGH_THRESHOLD):
             word = bytearray(2)
             bus.writeto_then_readfrom(address, bytes([register]), word)
             values.append(int.from_bytes(word, "big"))
     finally:
-        bus.unlock()
-        bus.deinit()
+        close_bus(bus)
     return values[0], values[1]
 
 

@@ -7,6 +7,7 @@ import zmq
 
 from fishd import addresses
 from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
+from fishd.cli.checks.daemon import Unreachable
 from fishd.errors import StartupError
 
 UNIT = "fishd.service"
@@ -15,9 +16,11 @@ _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/l
 
 def daemon(context: Context) -> Result:
     """Whether one runs, and what it is doing."""
-    if context.running is None:
+    if context.daemon is None:
         return ok("no fishd is running")
-    status, endpoint = context.running.status, context.running.endpoint
+    if isinstance(context.daemon, Unreachable):
+        return warning(context.daemon.why, context.reach(context.daemon))
+    status, endpoint = context.daemon.status, context.daemon.endpoint
     message = f"fishd {status.version} (pid {status.pid}), robot {status.robot}, {status.mode}"
     if status.robot != context.config.robot:
         return warning(
@@ -66,14 +69,17 @@ def unit(context: Context) -> Result:
 
 def _address(context: Context, address: str, key: str, kind: int) -> Result:
     running = context.running
+    if isinstance(context.daemon, Unreachable):  # to bind could take its socket away
+        return skipped("not tried; see daemon")
     if running and address in (running.status.telemetry, running.endpoint):
         return ok(f"{address} is served by the running fishd")
     context_of_sockets: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     with ExitStack() as stack:
         stack.callback(context_of_sockets.destroy, linger=0)
+        server = stack.enter_context(context_of_sockets.socket(kind))
         try:
             stack.enter_context(addresses.claimed(address))
-            addresses.bind(context_of_sockets.socket(kind), address, key)
+            addresses.bind(server, address, key)
         except StartupError as error:
             return fail(str(error), f"stop what uses it, or set {key} to another address")
     return ok(f"{address} is free")

@@ -11,8 +11,6 @@ from fishd.errors import ServoError
 
 SLOW_ANSWER = 5e-3
 """An answer of pigpiod that takes longer may keep a tick waiting [s]."""
-EXPORT_PATIENCE = 2.0
-"""How long udev may take to hand over a new PWM channel [s]."""
 _LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
 
 
@@ -51,14 +49,15 @@ def pwm(context: Context) -> Result | None:
     settings = context.config.servo
     if settings.driver != "sysfs-pwm":
         return None
-    if context.running:
-        return skipped("fishd is running and owns the channel; see daemon")
+    if occupied := context.occupied("owns the channel; see daemon"):
+        return occupied
     from fishd.hardware.pwm_channel import PwmChannel
+    from fishd.hardware.sysfs_pwm import PATIENCE
 
     root = str(context.path(settings.sysfs.root))
     channel = PwmChannel(replace(settings, sysfs=replace(settings.sysfs, root=root)), SystemClock())
     try:
-        channel.open(EXPORT_PATIENCE)
+        channel.open(PATIENCE)
         duty = channel.read("enable") and channel.read("duty_cycle")
     except ServoError as error:
         return fail(
@@ -82,8 +81,8 @@ def pins(context: Context) -> Result | None:
     text = context.text("/sys/kernel/debug/gpio")
     if not text:
         return skipped("only root can see who uses GPIO pins: sudo fishctl doctor")
-    if context.running:
-        return skipped("fishd is running and uses its pins")
+    if occupied := context.occupied("uses its pins"):
+        return occupied
     users = {int(found["pin"]): found["user"].strip() for found in _LINE.finditer(text)}
     taken = [
         f"GPIO{pin} ({key}) is used by {users[pin]}"

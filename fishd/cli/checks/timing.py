@@ -85,7 +85,7 @@ def clock(context: Context) -> Result:
 
 
 def _kernel_is_synchronised() -> bool:
-    # struct timex begins with modes, three longs and status; zero modes only ask.
+    # struct timex: modes, padded to a long, four longs, then status; zero modes only ask.
     timex = ctypes.create_string_buffer(512)
     state = ctypes.CDLL(None).adjtimex(timex)
     at = 5 * ctypes.sizeof(ctypes.c_long)

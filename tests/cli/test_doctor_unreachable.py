@@ -1,0 +1,136 @@
+"""`fishctl doctor` where it may not look, and beside a fishd that it cannot ask."""
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from operator_rig import Bench
+from test_doctor import doctor, free_telemetry
+
+from fishd.cli.checks import computer, examine
+from fishd.cli.checks.base import Context
+from fishd.config import load
+
+HARDWARE = ("adc", "force", "pwm", "gpio pins")
+AS_FISHD = "sudo -u fishd fishctl doctor"
+
+
+@pytest.fixture
+def root() -> Iterator[Path]:
+    """A folder that every user may enter."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@contextlib.contextmanager
+def unprivileged() -> Iterator[None]:
+    """As somebody whom permissions bind."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.setresuid(65534, 65534, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+def findings(root: Path, endpoint: str, *overrides: str) -> dict[str, tuple[str, str, str]]:
+    settings = ["robot=pi", "servo.driver=sysfs-pwm", "telemetry.address=tcp://127.0.0.1:0"]
+    (root / "sys/kernel/debug").mkdir(parents=True, exist_ok=True)
+    (root / "sys/kernel/debug/gpio").write_text("gpiochip0: GPIOs 512-565\n")
+    context = Context(load(None, [*settings, *overrides]), None, endpoint, root)
+    list(examine(Context(load(None, settings), None, f"ipc://{root}/nobody", root)))  # imports
+    with unprivileged():
+        return dict(examine(context))
+
+
+def test_beside_a_fishd_that_hangs_no_hardware_is_touched(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        daemon.process.send_signal(signal.SIGSTOP)
+        try:
+            status, found = doctor(pi.folder, *pi.settings)
+        finally:
+            daemon.process.send_signal(signal.SIGCONT)
+        assert status == 0
+        assert found["adc"] == found["force"]
+        assert found["adc"][0] == "skipped"
+        assert f"no answer from {daemon.endpoint}" in found["adc"][1]
+        assert "--endpoint" in found["adc"][1]
+        assert found["daemon"][0] == "warning"
+        assert daemon.fishctl("status").returncode == 0  # its socket is still there
+
+
+def test_beside_a_fishd_that_may_not_be_asked_no_hardware_is_touched(root: Path) -> None:
+    path = root / "control"
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+        server.listen()
+        path.chmod(0)
+        found = findings(root, f"ipc://{path}", f"state_folder={root}/state")
+    assert path.is_socket()
+    for name in HARDWARE:
+        level, message, _ = found[name]
+        assert (level, name) == ("skipped", name)
+        assert "may not ask" in message
+        assert AS_FISHD in message
+    assert found["daemon"][0] == "warning"
+    assert found["daemon"][2].startswith(AS_FISHD)
+
+
+def test_a_socket_in_a_folder_that_may_not_be_entered_may_be_that_of_a_fishd(root: Path) -> None:
+    (root / "locked").mkdir(mode=0)
+    found = findings(root, f"ipc://{root}/locked/control", f"state_folder={root}/state")
+    assert {found[name][0] for name in HARDWARE} == {"skipped"}
+
+
+@pytest.mark.parametrize("scheme", ["ipc", "tcp"])
+def test_what_a_daemon_that_was_killed_leaves_behind_is_no_daemon(
+    tmp_path: Path, scheme: str
+) -> None:
+    if scheme == "ipc":
+        with socket.socket(socket.AF_UNIX) as left:
+            left.bind(str(tmp_path / "old"))
+        endpoint = f"ipc://{tmp_path}/old"
+    else:
+        with socket.create_server(("127.0.0.1", 0)) as left:
+            endpoint = f"tcp://127.0.0.1:{left.getsockname()[1]}"
+    _, found = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
+    assert found["daemon"] == ("ok", "no fishd is running")
+
+
+def test_a_program_that_does_not_answer_is_not_taken_for_nobody(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        endpoint = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        _, found = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
+    assert found["daemon"][0] == "warning"
+    assert endpoint in found["daemon"][1]
+
+
+def test_a_state_folder_that_may_not_be_entered_says_as_whom_to_look(root: Path) -> None:
+    (root / "locked").mkdir(mode=0)
+    found = findings(root, f"ipc://{root}/nobody", f"state_folder={root}/locked/state")
+    assert found["state folder"][0] == "FAIL"
+    assert found["calibrations"][0] == "warning"
+    for name in ("state folder", "calibrations"):
+        assert AS_FISHD in found[name][2]
+    assert found["disk"][0] in ("ok", "warning")
+    assert not any("broke off" in found[check.name][1] for check in computer.CHECKS)
+
+
+def test_a_state_folder_below_a_file_fails(root: Path) -> None:
+    (root / "file").write_text("")
+    found = findings(root, f"ipc://{root}/nobody", f"state_folder={root}/file/state")
+    for name in ("state folder", "calibrations"):
+        level, message, mend = found[name]
+        assert (level, name) == ("FAIL", name)
+        assert str(root / "file") in message
+        assert "state" in mend

@@ -1,0 +1,120 @@
+"""The servo on the kernel's PWM when single writes and reads fail: no step skips the next."""
+
+import errno
+import os
+
+import pytest
+
+from fishd.clock import VirtualClock
+from fishd.emulation.sysfs_pwm import SysfsPwm
+from fishd.errors import ServoError
+from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.settings import ServoSettings
+from fishd.hardware.sysfs_pwm import SysfsPwmServo
+
+PI5 = "1f00098000.pwm"
+NEUTRAL = 1_500_000
+
+
+class BrokenPwm(SysfsPwm):
+    """A kernel that fails at some files: at every read, or when it is sent a certain number."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        super().__init__(clock, {PI5: 4})
+        self.unwritable: set[tuple[str, int]] = set()
+        self.unreadable: set[str] = set()
+        self._names: dict[int, str] = {}
+
+    def open(self, path: str, flags: int, /) -> int:
+        fd = super().open(path, flags)
+        self._names[fd] = path.rpartition("/")[2]
+        return fd
+
+    def pread(self, fd: int, length: int, offset: int, /) -> bytes:
+        if self._names[fd] in self.unreadable:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().pread(fd, length, offset)
+
+    def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
+        if (self._names[fd], int(data)) in self.unwritable:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().pwrite(fd, data, offset)
+
+
+class Bench:
+    """Such a kernel, with the pulses of a fishd at 0.5 rad on it."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.kernel = BrokenPwm(self.clock)
+        self.fishd = self.servo()
+        self.fishd.write(0.5)
+        self.clock.sleep(0.1)
+        assert self.width() == 1800.0
+
+    def servo(self) -> SysfsPwmServo:
+        settings = ServoSettings(driver="sysfs-pwm")
+        return SysfsPwmServo(settings, ServoCalibration(), self.clock, self.kernel)
+
+    def width(self) -> float:
+        """The pulse in force two periods from now [µs]."""
+        self.clock.sleep(0.04)
+        return self.kernel.pulses(PI5, 2).width(self.clock.now)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.mark.parametrize(
+    "unwritable",
+    [
+        {("duty_cycle", NEUTRAL)},
+        {("duty_cycle", 0)},
+        {("duty_cycle", NEUTRAL), ("duty_cycle", 0)},
+        {("enable", 0)},
+    ],
+)
+def test_the_last_resort_stops_the_pulses_whatever_step_fails(
+    bench: Bench, unwritable: set[tuple[str, int]]
+) -> None:
+    rescue = bench.servo()
+    bench.kernel.unwritable = unwritable
+    with pytest.raises(ServoError, match="Input/output error"):
+        rescue.neutralise()
+    assert bench.width() == 0.0
+
+
+def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Bench) -> None:
+    rescue = bench.servo()
+    sleep = bench.clock.sleep
+
+    def interrupt(seconds: float) -> None:
+        bench.clock.sleep = sleep  # type: ignore[method-assign]
+        raise KeyboardInterrupt
+
+    bench.clock.sleep = interrupt  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        rescue.neutralise()
+    assert bench.width() == 0.0
+
+
+@pytest.mark.parametrize("unreadable", [{"duty_cycle"}, {"enable"}])
+def test_close_switches_off_a_channel_that_cannot_be_released(
+    bench: Bench, unreadable: set[str]
+) -> None:
+    bench.kernel.unreadable = unreadable
+    with pytest.raises(ServoError, match="Input/output error"):
+        bench.fishd.close()
+    channel = bench.kernel._chips[PI5][2]
+    assert channel.state.enable == 0
+    assert bench.width() == 0.0
+    assert channel.exported_at is None
+
+
+def test_close_switches_off_a_channel_that_takes_no_duty_cycle(bench: Bench) -> None:
+    bench.kernel.unwritable = {("duty_cycle", 0)}
+    with pytest.raises(ServoError, match="Input/output error"):
+        bench.fishd.close()
+    assert bench.kernel._chips[PI5][2].state.enable == 0
