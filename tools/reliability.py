@@ -115,7 +115,7 @@ def swimming(
             "virtual_pi.socket": folder / "virtual-pi",
             "servo.pigpio.port": pi.pigpiod.port,
             "servo.pigpio.timeout": 0.05,  # a stall of the machine is not what is measured here
-            "state_folder": folder,
+            "state_folder": folder / "state",
             "control.address": endpoint,
             "telemetry.address": f"ipc://{folder}/telemetry",
             "start.controller": "square",
