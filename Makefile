@@ -1,5 +1,7 @@
 # Everything runs from a virtual environment in this folder; `make clean` removes it.
 PYTHON ?= python3
+# What `make test` and `make lint` install; without `learn`, its tests are skipped.
+EXTRAS ?= dev,learn,cluster
 VENV ?= .venv
 BIN := $(VENV)/bin
 
@@ -44,7 +46,7 @@ $(VENV)/installed: pyproject.toml $(VENV)/bin/python
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --constraint tools/constraints.txt --editable '.[$(EXTRAS)]'
 	@# Tests run it on a stand-in for lgpio, which has no wheel for every Python.
 	$(BIN)/python -m pip install --quiet --no-deps 'rpi-lgpio>=0.6,<1'
 	@touch $@ $(VENV)/installed

@@ -4,6 +4,8 @@
     ├── ConfigError      (ValueError)   the configuration file or a --set is wrong
     ├── ParameterError   (ValueError)   a controller's parameter is wrong
     ├── UnknownController (LookupError) no controller has that name
+    ├── PolicyError      (ValueError)   a policy file cannot be used
+    ├── ControllerFault  (RuntimeError) a controller cannot go on, and knows why; see its `code`
     ├── StartupError     (RuntimeError) the daemon cannot start, such as address in use
     ├── SensorError      (OSError)      the force sensor cannot be read
     ├── ServoError       (OSError)      the servo cannot be driven
@@ -36,6 +38,18 @@ class ParameterError(FishdError, ValueError):
 
 class UnknownController(FishdError, LookupError):
     """No installed package offers a controller of that name."""
+
+
+class PolicyError(FishdError, ValueError):
+    """A policy file is no such file, or does not fit this robot."""
+
+
+class ControllerFault(FishdError, RuntimeError):
+    """A controller cannot go on; raised from `update`, it latches a fault with this `code`."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 class StartupError(FishdError, RuntimeError):

@@ -8,7 +8,7 @@ Everything else here is called between two ticks, by the thread that ticks.
 import logging
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from fishd.clock import Clock, Slot
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.hold import Hold, HoldParameters
-from fishd.errors import FishdError, SensorError
+from fishd.errors import ControllerFault, FishdError, SensorError
 from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
@@ -33,6 +33,15 @@ SETTLING = 0.1
 """How long a servo stays at neutral before its pulses end [s]."""
 STALE = 2.0
 """A newest sample older than this many periods counts as a failed read."""
+
+
+class Turn(NamedTuple):
+    """Half a turn of the loop: what was read, and times at the start and after each phase [s]."""
+
+    slot: Slot
+    measurement: Measurement
+    observation: Observation
+    marks: tuple[float, float, float]
 
 
 class ControlLoop:
@@ -64,9 +73,9 @@ class ControlLoop:
         """False while the servo gets no pulses."""
         self.observation: Observation | None = None
         """What the latest tick observed."""
-        self.controller: Controller[Any]
-        self.controller_name: str
-        self._fresh: bool
+        self.controller: Controller[Any] = Hold(HoldParameters(), limits)
+        self.controller_name = "hold"
+        self._fresh = False
         self._estimator = estimator
         self.guard = guard
         self._now = clock.monotonic
@@ -76,10 +85,16 @@ class ControlLoop:
         self._index = -1
         self._overran = False
         self._latest_problem = ""
-        self._rest()
 
     def tick(self, slot: Slot) -> None:
         """One turn of the loop."""
+        self.act(self.observe(slot))
+
+    def observe(self, slot: Slot) -> Turn:
+        """First half of a turn: read and estimate. `act` must follow, with what this returns.
+
+        Between the two, `observation` is what the controller will be shown.
+        """
         now = self._now
         started = now()
         self.seq += 1
@@ -89,10 +104,16 @@ class ControlLoop:
         self._attend_panel(slot)
         measurement = self._read(slot)
         read = now()
-        self.observation = observation = self._estimate(measurement, slot, dt)
-        estimated = now()
+        observation = self._estimate(measurement, slot, dt)
+        self.observation = observation
+        return Turn(slot, measurement, observation, (started, read, now()))
+
+    def act(self, turn: Turn) -> None:
+        """Second half of a turn: let the controller choose, drive the servo, publish."""
+        now = self._now
+        slot, measurement, observation, (started, read, estimated) = turn
         self.applied = self._update(observation)
-        self.neutral_for = 0.0 if self.applied else self.neutral_for + dt
+        self.neutral_for = 0.0 if self.applied else self.neutral_for + observation.dt
         updated = now()
         self._write(neutral=self.neutral_for > SETTLING)
         written = now()
@@ -109,7 +130,7 @@ class ControlLoop:
         """
         before = self.supervisor.mode
         self.supervisor.start()
-        self.controller_name, self.controller, self._fresh = name, controller, True
+        self._swap(name, controller, fresh=True)
         self.reporter.controller(name, controller.parameters, "controller", "takes over with")
         self.reporter.mode(before, self.supervisor)
 
@@ -142,11 +163,21 @@ class ControlLoop:
         self.reporter.mode(before, self.supervisor, level="error")
         self._write(neutral=False)
 
+    def close(self) -> None:
+        """Let go of the controller in command; nothing ticks after this."""
+        self._rest()
+
     def _rest(self) -> None:
         """Put `hold` in command, at neutral."""
-        self.controller_name = "hold"
-        self.controller = Hold(HoldParameters(), self.limits)
-        self._fresh = False
+        self._swap("hold", Hold(HoldParameters(), self.limits), fresh=False)
+
+    def _swap(self, name: str, controller: Controller[Any], *, fresh: bool) -> None:
+        former = self.controller
+        self.controller_name, self.controller, self._fresh = name, controller, fresh
+        try:
+            former.close()
+        except Exception:
+            log.exception("the controller before %s could not be closed", name)
 
     def _attend_panel(self, slot: Slot) -> None:
         """Show the mode on the operator's panel, and stop at once while its button is pressed."""
@@ -199,6 +230,9 @@ class ControlLoop:
                 self.controller.activate(observation)
                 self._fresh = False
             applied = self.guard.apply(self.controller.update(observation), self.applied)
+        except ControllerFault as error:
+            self._fail(error.code, f"controller {self.controller_name} gave up", error)
+            return self.guard.fade(self.applied)
         except Exception as error:
             self._fail("controller-error", f"controller {self.controller_name} failed", error)
             return self.guard.fade(self.applied)

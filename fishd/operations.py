@@ -128,10 +128,15 @@ class Operations:
         finally:
             self._loading -= 1
         if decision != self._decisions:
+            controller.close()
             raise Refused(
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
-        self._loop.set_controller(wanted.name, controller)
+        try:
+            self._loop.set_controller(wanted.name, controller)
+        except Refused:  # a fault since
+            controller.close()
+            raise
         return self._state()
 
     async def _set_parameter(self, wanted: protocol.SetParameter) -> State:

@@ -23,7 +23,7 @@ class Field(Struct, frozen=True):
 
     name: str
     kind: str
-    """number, integer, text, boolean, choice or section"""
+    """number, integer, text, boolean, choice, section or list"""
     unit: str
     description: str
     default: Scalar
@@ -49,6 +49,7 @@ _KINDS: dict[type[inspect.Type], str] = {
     inspect.LiteralType: "choice",
     inspect.StructType: "section",
     inspect.DictType: "section",
+    inspect.VarTupleType: "list",
 }
 
 
@@ -91,8 +92,9 @@ def wanted(field: Field) -> str:
         "boolean": "true or false",
         "choice": "one of",
         "section": "a section (a mapping of keys to values)",
+        "list": "a list",
     }[field.kind]
-    preposition = {"choice": "", "text": "of "}.get(field.kind, "in ")
+    preposition = {"choice": "", "text": "of ", "list": "of "}.get(field.kind, "in ")
     within = preposition + field.interval
     unit = "" if field.unit in ("", "1") else field.unit
     words = " ".join(word for word in (kind, within if field.interval else "", unit) if word)
@@ -143,6 +145,8 @@ def _interval(kind: inspect.Type) -> str:
         return f"up to {kind.max_length} printable characters"
     if isinstance(kind, inspect.LiteralType):
         return " | ".join(str(value) for value in kind.values)
+    if isinstance(kind, inspect.VarTupleType):
+        return _interval(kind.item_type)
     if not isinstance(kind, inspect.FloatType | inspect.IntType):
         return ""
     low = f"({kind.gt:g}" if kind.gt is not None else f"[{kind.ge:g}" if kind.ge is not None else ""
@@ -159,6 +163,7 @@ def _explain(
     text = str(error)
     complaint, _, where = text.partition(" - at `$")
     path = tuple(re.findall(r"[^.\[\]`]+", where))
+    path = path[: next((n for n, key in enumerate(path) if key.isdigit()), None)]  # of a list
     unknown = re.search(r"unknown field `(.*)`", complaint)
     if unknown:
         key = unknown.group(1)

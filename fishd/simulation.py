@@ -162,6 +162,7 @@ def simulate(
     with ExitStack() as stack:
         robot, take_window = _swimmer(config, stack)
         loop = build_loop(config, robot, clock, EncodingPublisher())
+        stack.callback(loop.close)
         loop.set_controller(name, controller)
         for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
             if slot.index == first:  # the first ticks build what later ones reuse

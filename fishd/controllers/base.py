@@ -16,6 +16,8 @@ class Limits(Struct, frozen=True):
     """Φ: commands beyond ±Φ are clamped by the guard [rad]."""
     tick: float
     """Period of the loop [s]."""
+    virtual: bool = False
+    """Time stands still while a controller thinks, so it may wait for others as long as it must."""
 
 
 P = TypeVar("P", bound=Struct)
@@ -60,11 +62,15 @@ class Controller(ABC, Generic[P]):
         """Take new, already checked parameters while running; called between two updates."""
         self.parameters = parameters
 
+    def close(self) -> None:
+        """Let go of everything: called once, when it is out of command for good."""
+
     @abstractmethod
     def update(self, observation: Observation) -> float:
         """The instruction angle from now until the next tick [rad].
 
-        Called once a tick; must return within half a period, and never block.
+        Called once a tick; must return within half a period. Whatever it raises is a fault, of the
+        code `controller-error`, or of its own where that is a `ControllerFault`.
         """
 
 

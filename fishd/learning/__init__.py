@@ -1,0 +1,1 @@
+"""Learning to swim: Gymnasium environments, PPO training, export and comparison (extra: learn)."""

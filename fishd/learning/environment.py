@@ -1,0 +1,124 @@
+"""The Gymnasium environment: swim for thrust, one step a tick.
+
+| | | |
+|---|---|---|
+| observation | F_y, Ḟ_y, φ_c, fin velocity | each over its scale (`scales.features`) |
+| action | φ_c/Φ in [-1, 1] | in force from the tick that it answers until the next |
+| reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
+
+An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from fishd.config import Config
+from fishd.learning.link import Link
+from fishd.learning.scales import features, thrust_scale
+from fishd.learning.settings import EnvironmentSettings
+from fishd.policies.card import Layout
+from fishd.signals import Observation
+
+Vector = NDArray[np.float32]
+
+_FARTHEST = 1e6
+"""Bound of the observation space: finite, as tools expect, and never reached."""
+
+
+class SwimEnv(gymnasium.Env[Vector, Vector]):
+    """One fish that swims for thrust.
+
+    `info` of each step holds `thrust` (mean F_x in the tick that followed [N]), `lost` (ticks in
+    which another angle than the action's was in force: such an episode is truncated), `paused` (how
+    long the fish has waited at neutral since the step before [s], mostly 0) and `tank_time` (how
+    long it has been in the agent's command [s]).
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
+
+    def __init__(self, link: Link, config: Config, settings: EnvironmentSettings) -> None:
+        """
+        link: to what swims
+        config: the fish that the scales are made for
+        """
+        self.link = link
+        self.features = features(config, settings)
+        self.settings = settings
+        self._layout = Layout(self.features)
+        self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
+        shape = (len(self.features),)
+        self.observation_space = gymnasium.spaces.Box(-_FARTHEST, _FARTHEST, shape, np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._steps = 0
+        self._begun = False
+        self._latest: Observation
+        self.tank_time = 0.0
+        """How long the agent has been in command of a fish, pauses included [s]."""
+        self._paused = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Vector, dict[str, Any]]:
+        """Begin an episode: up to `longest_start` ticks at a random angle come first.
+
+        With a seed, and where episodes differ by their randomisation, a new fish begins at rest, if
+        the link can do that. Otherwise the fish swims on from where it is.
+        """
+        super().reset(seed=seed)
+        link, draw = self.link, self.np_random
+        fish = int(draw.integers(2**31))
+        if link.restartable and (seed is not None or link.varies):
+            self._latest = link.restart(fish)
+        elif not self._begun:
+            self._latest = link.start()
+        self._begun = True
+        self._steps = 0
+        angle = link.amplitude * float(draw.uniform(-1.0, 1.0))
+        lost = sum(
+            self._advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
+        )
+        return self._layout.vector(self._latest), self._info(lost)
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Put an instruction angle in force for one tick; raises `LinkLost`."""
+        lost = self._advance(max(-1.0, min(1.0, float(action[0]))) * self.link.amplitude)
+        self._steps += 1
+        reward = self._reward_per_newton * self._latest.fx
+        truncated = self._steps >= self.settings.episode or lost > 0
+        info = self._info(lost)
+        self._paused = 0.0
+        return self._layout.vector(self._latest), reward, False, truncated, info
+
+    def pause(self, seconds: float) -> None:
+        """Let the fish wait at neutral, for `seconds` at most, while the agent learns."""
+        self.link.pause(seconds)
+
+    def resume(self) -> Vector:
+        """End the pause; the observation that the next action answers.
+
+        The one before the pause is void: an action in answer to it would be judged by a fish that
+        has come to rest meanwhile.
+        """
+        before = self._latest.time
+        self._latest = self.link.resume()
+        waited = self._latest.time - before
+        self._paused += waited
+        self.tank_time += waited
+        return self._layout.vector(self._latest)
+
+    def close(self) -> None:
+        """Leave the fish at neutral."""
+        self.link.close()
+
+    def _advance(self, angle: float) -> int:
+        """One tick; how many were lost on the way."""
+        before = self._latest.time
+        self._latest, lost = self.link.step(angle)
+        self.tank_time += self._latest.time - before
+        return lost
+
+    def _info(self, lost: int) -> dict[str, Any]:
+        return {"thrust": self._latest.fx, "lost": lost, "paused": self._paused}

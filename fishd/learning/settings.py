@@ -1,0 +1,157 @@
+"""The settings of a training, from a YAML file: every hyper-parameter, with bounds and units."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
+
+from fishd import strict_yaml
+from fishd.errors import ConfigError
+from fishd.policies.card import FeatureName
+from fishd.schema import Problem, convert, without_empty_sections
+
+Share = Annotated[float, Meta(ge=0, lt=1)]
+
+
+class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the agent sees, and what it is rewarded for."""
+
+    observation: Annotated[
+        tuple[FeatureName, ...],
+        Meta(description="What the agent sees, in order.", min_length=1),
+    ] = ("fy", "fy_rate", "instruction_angle", "fin_velocity")
+    force_scale: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(
+            description="F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant.",
+            extra_json_schema={"unit": "N"},
+        ),
+    ] = None
+    thrust_scale: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(
+            description="F_x whose reward is `reward_scale`; null: the best square wave's thrust.",
+            extra_json_schema={"unit": "N"},
+        ),
+    ] = None
+    reward_scale: Annotated[float, Meta(gt=0, le=1000, description="Reward for thrust_scale.")] = (
+        0.3
+    )
+    episode: Annotated[
+        int,
+        Meta(ge=2, description="Steps of an episode.", extra_json_schema={"unit": "ticks"}),
+    ] = 768
+    longest_start: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=1000,
+            description="An episode begins after up to so many ticks at a random angle.",
+            extra_json_schema={"unit": "ticks"},
+        ),
+    ] = 10
+
+
+class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """By how much fish and rig differ from episode to episode, to be ready for the real one.
+
+    A share s multiplies a parameter by (1 + s)^u with u uniform in [-1, 1].
+    """
+
+    omega0: Share = 0.0
+    xi: Share = 0.0
+    servo_speed: Share = 0.0
+    coupling: Share = 0.0
+    noise: Share = 0.0
+    offset: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=10,
+            description="Offset of F_y, uniform in ±offset about the configured one.",
+            extra_json_schema={"unit": "N"},
+        ),
+    ] = 0.0
+
+
+class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Hyper-parameters of PPO, named as stable-baselines3 names them."""
+
+    n_steps: Annotated[int, Meta(ge=2, description="Steps between two updates.")] = 128
+    batch_size: Annotated[int, Meta(ge=2, description="Size of a minibatch.")] = 64
+    n_epochs: Annotated[int, Meta(ge=1, description="Passes over the steps of an update.")] = 10
+    gamma: Annotated[float, Meta(ge=0, le=1, description="Discount factor.")] = 0.9
+    gae_lambda: Annotated[
+        float, Meta(ge=0, le=1, description="Bias against variance of the advantages.")
+    ] = 0.95
+    learning_rate: Annotated[float, Meta(gt=0, le=1, description="At the first step.")] = 3e-3
+    final_learning_rate: Annotated[
+        float, Meta(gt=0, le=1, description="From `decay_steps` on; linear until then.")
+    ] = 3e-4
+    decay_steps: Annotated[int, Meta(ge=1)] = 10_000
+    clip_range: Annotated[float, Meta(gt=0, le=1)] = 0.2
+    ent_coef: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    vf_coef: Annotated[float, Meta(ge=0, le=10)] = 0.5
+    max_grad_norm: Annotated[float, Meta(gt=0, le=100)] = 0.5
+    target_kl: Annotated[float, Meta(gt=0, le=10)] | None = None
+    log_std_init: Annotated[
+        float, Meta(ge=-5, le=2, description="Log of the exploration's deviation, in units of Φ.")
+    ] = 0.7
+    hidden: Annotated[
+        tuple[Annotated[int, Meta(ge=1, le=1024)], ...],
+        Meta(description="Sizes of the hidden layers, of policy and value each."),
+    ] = (64, 64)
+    activation: Literal["tanh", "relu"] = "tanh"
+
+
+class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The deterministic evaluations during training."""
+
+    every: Annotated[
+        int, Meta(ge=0, description="An evaluation after so many updates; 0 for none.")
+    ] = 1
+    seconds: Annotated[
+        float,
+        Meta(gt=0, le=3600, description="Its length.", extra_json_schema={"unit": "s"}),
+    ] = 20.0
+    settle: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=3600,
+            description="Time at its beginning that is not judged.",
+            extra_json_schema={"unit": "s"},
+        ),
+    ] = 5.0
+
+
+class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole training; the defaults suit the default fish."""
+
+    steps: Annotated[int, Meta(ge=1, description="Control steps to learn from.")] = 8000
+    seed: Annotated[int, Meta(ge=0, description="Of networks, exploration and start.")] = 0
+    checkpoint_every: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 5000
+    environment: EnvironmentSettings = EnvironmentSettings()
+    randomisation: Randomisation = Randomisation()
+    ppo: PpoSettings = PpoSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+
+
+def load(path: Path | None) -> TrainingSettings:
+    """The settings in a file, or the defaults; raises `ConfigError` that names file and key."""
+    if path is None:
+        return TrainingSettings()
+    try:
+        document = strict_yaml.parse(path.read_text(encoding="utf-8"))
+        data: Any = document.data
+        if not isinstance(data, dict):
+            raise ConfigError(f"{path}:1: keys and values are needed, such as 'steps: 8000'")
+        return convert(without_empty_sections(data, TrainingSettings), TrainingSettings)
+    except strict_yaml.YamlProblem as problem:
+        raise ConfigError(f"{path}:{problem.line}: {problem}") from None
+    except Problem as problem:
+        line = document.lines.get(problem.path)
+        where = f"{path}:{line}" if line else f"{path}"
+        raise ConfigError(f"{where}: {'.'.join(problem.path)}: {problem}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None

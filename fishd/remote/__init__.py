@@ -1,0 +1,1 @@
+"""An agent in another process, on another machine perhaps, that chooses the instruction angle."""
