@@ -15,6 +15,7 @@ from fishd.config_checks import (
     check_addresses,
     check_data_rate,
     check_force_sensor,
+    check_lockstep,
     check_pins,
     check_servo,
     check_start,
@@ -125,6 +126,13 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         ),
     ] = 0.4
     start: Annotated[Start, Meta(description="What the fish does at once.")] = Start()
+    lockstep: Annotated[
+        bool,
+        Meta(
+            description="Virtual time, for a simulated fish: while remote is in command, each "
+            "tick waits for its agent, and the next one follows at once."
+        ),
+    ] = False
     estimator: Annotated[
         EstimatorSettings, Meta(description="Fin velocity from the lateral force.")
     ] = EstimatorSettings()
@@ -166,7 +174,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     @property
     def limits(self) -> Limits:
         """What controllers must respect."""
-        return Limits(amplitude=self.amplitude_limit, tick=self.tick)
+        return Limits(amplitude=self.amplitude_limit, tick=self.tick, virtual=self.lockstep)
 
 
 def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
@@ -191,6 +199,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
             check_data_rate(config.force_sensor, config.tick)
         check_servo(config.servo)
         check_pins(config.force_sensor, config.servo, config.panel)
+        check_lockstep(config.robot, config.lockstep)
         check_virtual_pi(config.robot, config.servo, config.virtual_pi)
     except Problem as problem:
         raise ConfigError(_located(problem, sources)) from None

@@ -125,6 +125,16 @@ def check_pins(sensor: ForceSensorSettings, servo: ServoSettings, panel: PanelSe
         jobs[pin] = f"{section}.{name}"
 
 
+def check_lockstep(robot: str, lockstep: bool) -> None:
+    """Only a fish that is simulated can wait."""
+    if lockstep and robot != "simulated":
+        raise Problem(
+            ("lockstep",),
+            f"true is not valid with robot: {robot}, whose time cannot stand still; "
+            "robot: simulated is needed",
+        )
+
+
 def check_virtual_pi(robot: str, servo: ServoSettings, pi: VirtualPiSettings) -> None:
     """The virtual Pi can be built, and has what the servo needs."""
     if robot == "virtual-pi" and servo.driver != "pigpio":

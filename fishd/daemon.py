@@ -5,6 +5,7 @@ import itertools
 import logging
 import signal
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -12,16 +13,18 @@ import click
 import zmq
 
 from fishd import __version__, addresses, build, realtime, robots
-from fishd.clock import SystemClock, Ticker
+from fishd.clock import SystemClock, Ticker, VirtualClock
 from fishd.config import Config, load
 from fishd.console import complain, run, status_line
 from fishd.controllers import registry
 from fishd.errors import ConfigError, FishdError
 from fishd.hardware.pulses import REST
+from fishd.lockstep import Lockstep
 from fishd.logs import LogWriter
 from fishd.loop import SETTLING
 from fishd.notify import SystemdNotifier
 from fishd.operations import Operations
+from fishd.policies.runtime import preload
 from fishd.rehearsal import rehearsal
 from fishd.server import ControlServer
 from fishd.telemetry import Telemetry
@@ -48,8 +51,10 @@ class Daemon:
     def __init__(self, config: Config, print_status: bool) -> None:
         self._config = config
         self._print_status = print_status
-        self._clock = SystemClock()
+        self._clock = VirtualClock() if config.lockstep else SystemClock()
         self._events = asyncio.get_running_loop()
+        self._chores = itertools.cycle((self._report, realtime.collect_garbage))
+        self._next_chore = 0.0
         self._stack = ExitStack()
 
     def __enter__(self) -> "Daemon":
@@ -60,20 +65,25 @@ class Daemon:
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claimed(address))
             stack.enter_context(addresses.claimed(config.telemetry.address))
-            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            # That of the whole process, so that its one thread is on time for controllers too.
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
             stack.callback(context.destroy, linger=100)  # with every socket that is still open
             self._telemetry = Telemetry(context, config.telemetry.address)
-            self._rehearse = rehearsal(config, context)
+            self._rehearse = None if config.lockstep else rehearsal(config, context)
             controllers = registry.describe_all()  # imports what other packages offer
+            preload()  # of what would hold up the ticks later
             robot = robots.open_robot(config, self._clock, stack)
             self._loop = build.build_loop(
                 config, robot, self._clock, self._telemetry, self._notifier.ticked
             )
+            stack.callback(self._loop.close)
             stack.callback(self._come_to_rest)
             if robot.panel:
                 robot.panel.on_press = self._on_press
             workbench = Workbench(self._loop, self._clock, config, robots.state_folder(config))
-            fifo = realtime.enter(config.realtime.priority, config.realtime.lock_memory)
+            fifo = not config.lockstep and realtime.enter(
+                config.realtime.priority, config.realtime.lock_memory
+            )
             self._operations = Operations(
                 self._loop, self._clock, workbench, controllers, self._telemetry.address, fifo
             )
@@ -87,10 +97,11 @@ class Daemon:
     async def run(self, stopping: asyncio.Event) -> None:
         """Tick until `stopping` is set, then fade to neutral."""
         log.info(
-            "fishd %s drives the %s robot every %g ms; control %s, telemetry %s",
+            "fishd %s drives the %s robot every %g ms%s; control %s, telemetry %s",
             __version__,
             self._loop.robot.name,
             self._config.tick * 1e3,
+            " of virtual time" if self._config.lockstep else "",
             self._server.address,
             self._telemetry.address,
         )
@@ -103,15 +114,26 @@ class Daemon:
             self._server.close()
 
     async def _tick_until(self, stopping: asyncio.Event, server: asyncio.Task[None]) -> None:
-        ticker = Ticker(self._config.tick, self._rehearse)
-        chores = itertools.cycle((self._report, realtime.collect_garbage))
-        next_chore = 0.0
+        clock = self._clock
+        lockstep = (
+            Lockstep(self._loop, clock, self._config.tick)
+            if isinstance(clock, VirtualClock)
+            else None
+        )
+        ticker = lockstep or Ticker(self._config.tick, self._rehearse and self._rehearse_tick)
+
+        def glance() -> None:
+            self._do_chores()
+            if stopping.is_set() or server.done():
+                self._loop.stop()
+
         try:
             async for slot in ticker:
-                self._loop.tick(slot)
-                if slot.now >= next_chore:
-                    next_chore = slot.now + HOUSEKEEPING / 2
-                    next(chores)()  # one at a time, to fit between two ticks of 2 ms
+                if lockstep:
+                    await lockstep.tick(slot, glance)
+                else:
+                    self._loop.tick(slot)
+                self._do_chores()
                 if server.done():
                     server.result()
                 if stopping.is_set():
@@ -126,6 +148,18 @@ class Daemon:
                 self._loop.tick(slot)
         finally:
             ticker.close()
+
+    def _do_chores(self) -> None:
+        """One at a time, to fit between two ticks of 2 ms."""
+        now = time.monotonic()
+        if now >= self._next_chore:
+            self._next_chore = now + HOUSEKEEPING / 2
+            next(self._chores)()
+
+    def _rehearse_tick(self) -> None:
+        assert self._rehearse
+        self._rehearse()
+        self._loop.rehearse()
 
     def _come_to_rest(self) -> None:
         """Where fishd failed and could not fade: neutral, and time to get there."""

@@ -123,6 +123,13 @@ class ControlLoop:
         self._check_overrun(slot, marks)
         self._notify(started)
 
+    def rehearse(self) -> None:
+        """Let the controller in command warm up for the next tick, which is imminent."""
+        try:
+            self.controller.rehearse()
+        except Exception as error:
+            self._fail("controller-error", f"controller {self.controller_name} failed", error)
+
     def set_controller(self, name: str, controller: Controller[Any]) -> None:
         """Put a ready-made controller in command from the next tick on.
 

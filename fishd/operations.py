@@ -3,7 +3,7 @@
 import asyncio
 import os
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import msgspec
 from msgspec import Struct
@@ -13,14 +13,19 @@ from fishd.clock import Clock
 from fishd.controllers import registry
 from fishd.errors import ParameterError, Refused, UnknownController
 from fishd.loop import ControlLoop
+from fishd.policies import library
+from fishd.policies.info import PolicyInfo
 from fishd.protocol import State
-from fishd.schema import Problem, convert, nearest
+from fishd.schema import Problem, convert, fields_of, nearest
 from fishd.signals import ControllerInfo, Status
 from fishd.supervisor import Mode
 from fishd.workbench import Workbench
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 MOST_LOADING = 4
-"""Controllers that may be on their way into memory at once."""
+"""Requests that may be reading files at once, each in a thread of its own."""
 
 
 class Operations:
@@ -51,6 +56,7 @@ class Operations:
         self._operations: dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]] = {
             "status": (protocol.NoArguments, self._status),
             "controllers": (protocol.NoArguments, self._list_controllers),
+            "policies": (protocol.NoArguments, self._list_policies),
             "set-controller": (protocol.SetController, self._set_controller),
             "set-parameter": (protocol.SetParameter, self._set_parameter),
             "stop": (protocol.NoArguments, self._stop),
@@ -107,15 +113,17 @@ class Operations:
     async def _list_controllers(self, _: protocol.NoArguments) -> list[ControllerInfo]:
         return self._controllers
 
+    async def _list_policies(self, _: protocol.NoArguments) -> list[PolicyInfo]:
+        self._check_busy()
+        limits = self._loop.limits
+        return await self._aside(library.describe_all, limits.tick, limits.amplitude)
+
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
-        if self._loading >= MOST_LOADING:
-            raise Refused("busy", f"{self._loading} controllers are being loaded; try again")
+        self._check_busy()
         decision = self._decide()
-        self._loading += 1
         try:
-            # In a thread: a controller may load files and warm up, the tick must not wait for it.
-            controller = await asyncio.to_thread(
+            controller = await self._aside(
                 registry.create, wanted.name, wanted.parameters, self._loop.limits
             )
         except UnknownController as error:
@@ -125,8 +133,6 @@ class Operations:
         except Exception as error:
             what = f"controller '{wanted.name}' cannot start: {type(error).__name__}: {error}"
             raise Refused("controller-error", what) from error
-        finally:
-            self._loading -= 1
         if decision != self._decisions:
             controller.close()
             raise Refused(
@@ -148,6 +154,9 @@ class Operations:
                 f"no controller is running (mode {loop.supervisor.mode}); "
                 "start one with 'fishctl set-controller'",
             )
+        for field in fields_of(type(loop.controller.parameters)):
+            if field.file and field.name in wanted.parameters:  # no tick waits for a file
+                raise Refused("bad-parameter", _why_not_in_flight(loop.controller_name, field.name))
         try:
             loop.retune(registry.merged(loop.controller, loop.controller_name, wanted.parameters))
         except ParameterError as error:
@@ -176,6 +185,18 @@ class Operations:
         self._loop.reporter.event("mark", wanted.text)
         return self._state()
 
+    def _check_busy(self) -> None:
+        if self._loading >= MOST_LOADING:
+            raise Refused("busy", f"{self._loading} requests are reading files; try again")
+
+    async def _aside(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call in a thread what may load files and warm up: the tick must not wait for it."""
+        self._loading += 1
+        try:
+            return await asyncio.to_thread(function, *args, **kwargs)
+        finally:
+            self._loading -= 1
+
     def _decide(self) -> int:
         """Count a decision on who is in command; one that loads slowly must not undo a newer."""
         self._decisions += 1
@@ -190,3 +211,10 @@ class Operations:
             controller=loop.controller_name,
             parameters=msgspec.structs.asdict(loop.controller.parameters),
         )
+
+
+def _why_not_in_flight(controller: str, parameter: str) -> str:
+    return (
+        f"{controller}: {parameter}: it cannot change in flight; start the controller again: "
+        f"'fishctl set-controller {controller} --{parameter.replace('_', '-')} …'"
+    )

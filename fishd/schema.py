@@ -18,7 +18,7 @@ T = TypeVar("T")
 Scalar = bool | int | float | str | None
 
 
-class Field(Struct, frozen=True):
+class Field(Struct, frozen=True, omit_defaults=True):
     """One field of a struct, as a person or an option parser wants to know it."""
 
     name: str
@@ -31,6 +31,10 @@ class Field(Struct, frozen=True):
     """Permitted values: an interval such as `(0, 2]`, or choices such as `a | b`; empty for any."""
     optional: bool
     """True where null is permitted."""
+    required: bool = False
+    """True where there is no default."""
+    file: str = ""
+    """Suffix, such as `.onnx`, where a text may be the path of a file: see `names_file`."""
 
 
 class Problem(Exception):
@@ -85,6 +89,8 @@ def convert(data: Any, target: type[T], *, prefix: tuple[str, ...] = ()) -> T:
 
 def wanted(field: Field) -> str:
     """What a field takes, in words: `a number in [0, 1] rad (or null)`."""
+    if field.file:
+        return f"a name or the path of a *{field.file} file" + (" (or null)" * field.optional)
     kind = {
         "number": "a number",
         "integer": "a whole number",
@@ -99,6 +105,11 @@ def wanted(field: Field) -> str:
     unit = "" if field.unit in ("", "1") else field.unit
     words = " ".join(word for word in (kind, within if field.interval else "", unit) if word)
     return words + (" (or null)" if field.optional else "")
+
+
+def names_file(text: str, suffix: str) -> bool:
+    """Is a text that may be the name of something, or the path of a file, the latter?"""
+    return "/" in text or text.endswith(suffix)
 
 
 def nearest(word: str, words: list[str]) -> str:
@@ -120,10 +131,10 @@ def leaves(struct: type[Struct], prefix: str = "") -> list[str]:
 
 
 def _describe(field: inspect.Field) -> Field:
-    about, unit, kind, optional = "", "", field.type, False
+    kind, optional = field.type, False
+    extra: dict[str, Any] = {}
     if isinstance(kind, inspect.Metadata):
-        about = (kind.extra_json_schema or {}).get("description", "")
-        unit = (kind.extra_json_schema or {}).get("unit", "")
+        extra = kind.extra_json_schema or {}
         kind = kind.type
     if isinstance(kind, inspect.UnionType):
         optional = True
@@ -132,11 +143,13 @@ def _describe(field: inspect.Field) -> Field:
     return Field(
         name=field.encode_name,
         kind=_KINDS.get(type(kind), "text"),
-        unit=unit,
-        description=about,
+        unit=extra.get("unit", ""),
+        description=extra.get("description", ""),
         default=default,
         interval=_interval(kind),
         optional=optional,
+        required=field.required,
+        file=extra.get("file", ""),
     )
 
 
@@ -162,8 +175,10 @@ def _explain(
     """Turn msgspec's first complaint into a path and one readable sentence."""
     text = str(error)
     complaint, _, where = text.partition(" - at `$")
-    path = tuple(re.findall(r"[^.\[\]`]+", where))
-    path = path[: next((n for n, key in enumerate(path) if key.isdigit()), None)]  # of a list
+    keys = re.findall(r"[^.\[\]`]+", where)
+    while keys and keys[-1].isdigit():  # an element of a list is shown with all of the list
+        keys.pop()
+    path = tuple(key for key in keys if not key.isdigit())
     unknown = re.search(r"unknown field `(.*)`", complaint)
     if unknown:
         key = unknown.group(1)
@@ -183,21 +198,28 @@ def _explain(
         key = missing.group(1)
         return (*path, key), f"is missing: {_wanted(target, (*path, key))}"
     value = data
-    for key in path:
-        value = value[key] if isinstance(value, Mapping) else value
+    for key in keys:
+        if isinstance(value, Mapping):
+            value = value[key]
+        elif isinstance(value, list | tuple):
+            value = value[int(key)]
     return path, f"{_shown(value)} is not valid: {_wanted(target, path)}"
 
 
 def _struct_at(target: type[Struct], path: tuple[str, ...]) -> type[Struct]:
     for key in path:
-        target = next(part for name, part in _sections(target) if name == key)
+        target = next(part for name, part in _sections(target, in_lists=True) if name == key)
     return target
 
 
-def _sections(target: type[Struct]) -> Iterator[tuple[str, type[Struct]]]:
-    """The fields of a struct that are structs themselves."""
+def _sections(
+    target: type[Struct], *, in_lists: bool = False
+) -> Iterator[tuple[str, type[Struct]]]:
+    """The fields of a struct that are structs themselves, or lists of them where wanted."""
     for field in cast(inspect.StructType, inspect.type_info(target)).fields:
         kind = field.type.type if isinstance(field.type, inspect.Metadata) else field.type
+        if in_lists and isinstance(kind, inspect.VarTupleType):
+            kind = kind.item_type
         if isinstance(kind, inspect.StructType):
             yield field.name, kind.cls
 

@@ -5,21 +5,23 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from fishd.build import build_loop
 from fishd.clock import VirtualClock, VirtualTicker
 from fishd.config import Config
 from fishd.controllers import registry
-from fishd.controllers.base import amplitude_of
+from fishd.controllers.base import Controller, amplitude_of
 from fishd.errors import ParameterError
 from fishd.hardware.base import Robot
 from fishd.hardware.simulated import SimulatedFish
 from fishd.plant.optimum import best_square_wave
 from fishd.plant.tethered import TrueWindow
+from fishd.reporting import Publisher
 from fishd.robots import open_lockstep
 from fishd.signals import Event, Reason, Tick
 
@@ -40,6 +42,10 @@ class Report(Struct, frozen=True):
     """Tail beats per second; 0 when the tail does not beat [Hz]."""
     fin_amplitude: float
     """Largest fin angle of each half beat, mean over half beats [rad]."""
+    fullness: float
+    """Mean |φ_c|/Φ: 1 where the command uses all of the amplitude all of the time."""
+    squareness: float
+    """Mean |φ_c| over the rms of φ_c: square wave 1, sine 0.900, triangle 0.866; 0 without any."""
     efficiency: float
     """`mean_thrust` over `best_square_thrust`; 0 where no square wave moves the fin at all."""
     best_square_thrust: float
@@ -80,28 +86,47 @@ class Beats:
                 self._began = True
                 self._open = _Sums()
         self._side = side
-        self._open.add(window)
+        self._open.add(angle, window)
 
-    def figures(self) -> tuple[float, float, float]:
-        """Mean thrust [N], frequency [Hz], fin amplitude [rad]."""
+    def figures(self) -> "Figures":
+        """What the beats came to."""
         sums = self._whole
+        frequency = 0.5 * sums.halves / sums.duration if sums.halves else 0.0
         if not sums.halves:
             sums = self._open
             sums.close_half()
-            return sums.impulse / sums.duration, 0.0, sums.peaks / sums.halves
-        frequency = 0.5 * sums.halves / sums.duration
-        return sums.impulse / sums.duration, frequency, sums.peaks / sums.halves
+        mean = sums.angle / sums.duration
+        rms = math.sqrt(sums.angle_squared / sums.duration)
+        return Figures(
+            thrust=sums.impulse / sums.duration,
+            frequency=frequency,
+            fin_amplitude=sums.peaks / sums.halves,
+            mean_angle=mean,
+            squareness=mean / rms if rms else 0.0,
+        )
+
+
+class Figures(NamedTuple):
+    """Means over beats."""
+
+    thrust: float  # N
+    frequency: float  # Hz
+    fin_amplitude: float  # rad
+    mean_angle: float  # of |φ_c|, rad
+    squareness: float  # mean |φ_c| over rms φ_c
 
 
 class _Sums:
     def __init__(self) -> None:
-        self.duration = self.impulse = self.peaks = 0.0
+        self.duration = self.impulse = self.peaks = self.angle = self.angle_squared = 0.0
         self.halves = 0
         self._peak = 0.0
 
-    def add(self, window: TrueWindow) -> None:
+    def add(self, angle: float, window: TrueWindow) -> None:
         self.duration += window.duration
         self.impulse += window.thrust * window.duration
+        self.angle += abs(angle) * window.duration
+        self.angle_squared += angle**2 * window.duration
         self._peak = max(self._peak, window.fin_peak)
 
     def close_half(self) -> None:
@@ -113,6 +138,8 @@ class _Sums:
         self.duration += other.duration
         self.impulse += other.impulse
         self.peaks += other.peaks
+        self.angle += other.angle
+        self.angle_squared += other.angle_squared
         self.halves += other.halves
         return self
 
@@ -143,6 +170,23 @@ def simulate(
 
     Raises `UnknownController` and `ParameterError`.
     """
+    controller = registry.create(name, parameters, replace(config.limits, virtual=True))
+    return judge(config, name, controller, seconds, settle, EncodingPublisher())
+
+
+def judge(
+    config: Config,
+    name: str,
+    controller: Controller[Any],
+    seconds: float,
+    settle: float,
+    publisher: Publisher,
+) -> Report:
+    """As `simulate`, with a controller that is ready made, or is no part of fishd.
+
+    publisher: gets the record of every tick
+    Raises `ParameterError` where the lengths do not fit one another.
+    """
     if not (0.0 <= settle < LONGEST and 0.0 < seconds < LONGEST):  # neither is NaN, say
         raise ParameterError(
             f"a run of {seconds:g} s with {settle:g} s to settle: numbers from 0 to {LONGEST:g} s "
@@ -156,12 +200,11 @@ def simulate(
             f"{settle:g} s that it may take to settle"
         )
     clock = VirtualClock()
-    controller = registry.create(name, parameters, config.limits)
     beats = Beats()
     begun = 0.0
     with ExitStack() as stack:
         robot, take_window = _swimmer(config, stack)
-        loop = build_loop(config, robot, clock, EncodingPublisher())
+        loop = build_loop(config, robot, clock, publisher)
         stack.callback(loop.close)
         loop.set_controller(name, controller)
         for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
@@ -176,15 +219,17 @@ def simulate(
 
     amplitude = amplitude_of(controller.parameters, config.limits)
     best = best_square_wave(config.plant, amplitude)
-    mean_thrust, frequency, fin_amplitude = beats.figures()
+    figures = beats.figures()
     return Report(
         controller=name,
         parameters=msgspec.structs.asdict(controller.parameters),
         amplitude=amplitude,
-        mean_thrust=mean_thrust,
-        frequency=frequency,
-        fin_amplitude=fin_amplitude,
-        efficiency=mean_thrust / best.thrust if best.thrust > 0.0 else 0.0,
+        mean_thrust=figures.thrust,
+        frequency=figures.frequency,
+        fin_amplitude=figures.fin_amplitude,
+        fullness=figures.mean_angle / amplitude,
+        squareness=figures.squareness,
+        efficiency=figures.thrust / best.thrust if best.thrust > 0.0 else 0.0,
         best_square_thrust=best.thrust,
         best_square_frequency=best.frequency,
         ticks=ticks,

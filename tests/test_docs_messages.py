@@ -19,7 +19,7 @@ def sources() -> Iterator[str]:
 
 def reason_codes() -> set[str]:
     """Every code that a fault or an emergency stop can have, in the loop's sources."""
-    code = re.compile(r"(?:\bfail\(|_fail\(|Reason\(code=)\s*\"([a-z-]+)\"")
+    code = re.compile(r"(?:\bfail\(|_fail\(|Reason\(code=|ControllerFault\()\s*\"([a-z-]+)\"")
     return {found for text in sources() for found in code.findall(text)}
 
 

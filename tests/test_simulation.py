@@ -9,10 +9,11 @@ import pytest
 from processes import FISHCTL
 
 from fishd.config import load
+from fishd.controllers import registry
 from fishd.errors import ParameterError
 from fishd.plant.optimum import square_wave
 from fishd.plant.tethered import TrueWindow
-from fishd.simulation import Beats, Report, simulate
+from fishd.simulation import Beats, EncodingPublisher, Report, judge, simulate
 
 REALISTIC = ["simulation.offset_y=0.02", "simulation.drift=0.02", "simulation.rotation=0.1"]
 
@@ -108,8 +109,35 @@ def test_only_whole_beats_are_counted() -> None:
     beats = Beats()
     for angle, thrust in [(1.0, 9.0)] * 3 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
         beats.add(angle, TrueWindow(0.5, thrust, 0.1 * thrust))
-    thrust, frequency, fin = beats.figures()
-    assert (thrust, frequency, fin) == pytest.approx((1.5, 1.0, 0.15))
+    found = beats.figures()
+    assert found[:3] == pytest.approx((1.5, 1.0, 0.15))
+
+
+@pytest.mark.parametrize(
+    ("waveform", "fullness", "squareness"),
+    [("square", 1.0, 1.0), ("sine", 2.0 / math.pi, 0.9003), ("triangle", 0.5, 0.8660)],
+)
+def test_fullness_and_squareness_tell_the_waveforms_apart(
+    waveform: str, fullness: float, squareness: float
+) -> None:
+    amplitude = 0.3
+    report = simulate(
+        load(None, ["tick=0.005"]), waveform, {"frequency": 1.0, "amplitude": amplitude}, 30
+    )
+    assert report.fullness == pytest.approx(fullness, abs=1e-3)
+    assert report.squareness == pytest.approx(squareness, abs=1e-3)
+
+
+def test_a_fish_at_neutral_is_neither_full_nor_square() -> None:
+    report = simulate(load(), "hold", {}, 20)
+    assert (report.fullness, report.squareness) == (0.0, 0.0)
+
+
+def test_a_ready_made_controller_gets_the_same_report_as_one_by_name() -> None:
+    config = load(None, REALISTIC)
+    controller = registry.create("swing", {"C": 0.5}, config.limits)
+    ready_made = judge(config, "swing", controller, 30, 10, EncodingPublisher())
+    assert physics(ready_made) == physics(simulate(config, "swing", {"C": 0.5}, 30))
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

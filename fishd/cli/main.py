@@ -15,6 +15,7 @@ VERBS = {
     "status": ("control", "status", "Show what the daemon is doing, and how well."),
     "watch": ("watch", "watch", "Watch force, command and timing live."),
     "controllers": ("control", "controllers", "List the controllers and their parameters."),
+    "policies": ("policies", "policies", "List the named policies, or show one."),
     "set-controller": ("control", "set_controller", "Put another controller in command."),
     "set-parameter": ("control", "set_parameter", "Change parameters while the fish swims."),
     "stop": ("control", "stop", "Fade to neutral and stay there."),
@@ -27,6 +28,7 @@ VERBS = {
     "release": ("release", "release", "Last resort without the daemon: neutral, then no pulses."),
     "virtual-pi": ("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     "simulate": ("simulate", "simulate", "Swim a simulated fish in virtual time."),
+    "learn": ("learn", "learn", "Train policies, write them to files, compare them."),
     "config": ("config", "config", "Check, show and explain the configuration."),
     "completion": ("completion", "completion", "Print the completion script of a shell."),
 }

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import click
+from click.shell_completion import CompletionItem
 
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.errors import FishError, UnknownController
-from fishd.schema import Field, spelled, wanted
+from fishd.schema import Field, names_file, spelled, wanted
 from fishd.signals import ControllerInfo
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -43,10 +45,24 @@ class ParameterType(click.ParamType[Any]):
             return value
         if field.optional and value.lower() in ("null", "none", "default"):
             return None
+        if field.file and names_file(value, field.file):
+            return str(Path(value).expanduser().absolute())  # fishd may run in another folder
         try:
             return _PARSERS.get(field.kind, str)(value)
         except ValueError:
             self.fail(f"'{value}' is not valid: {wanted(field)} is needed", param, ctx)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Files, and the names of policies, where the parameter takes them."""
+        if not self.field.file:
+            return []
+        from fishd.policies import library
+
+        names = library.names() if self.field.file == library.SUFFIX else []
+        matching = [CompletionItem(name) for name in names if name.startswith(incomplete)]
+        return [*matching, CompletionItem(incomplete, type="file")]
 
 
 def _finite(text: str) -> float:
@@ -74,7 +90,7 @@ def parameter_options(info: ControllerInfo) -> list[click.Parameter]:
         click.Option(
             [_PREFIX + field.name, "--" + field.name.replace("_", "-")],
             type=ParameterType(field),
-            metavar=field.kind.upper(),
+            metavar="NAME|FILE" if field.file else field.kind.upper(),
             help=describe(field),
             default=None,
         )
@@ -95,8 +111,8 @@ def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str
 def describe(field: Field) -> str:
     """Description, permitted values, unit and default of a parameter in one line."""
     permitted = wanted(field)
-    default = spelled(field.default)
-    return f"{field.description} {permitted[0].upper()}{permitted[1:]}; default {default}."
+    default = "required" if field.required else f"default {spelled(field.default)}"
+    return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
 
 
 class ControllerGroup(click.Group):

@@ -79,6 +79,11 @@ def _text(report: "Report") -> str:
         ("frequency", f"{report.frequency:.3f} Hz"),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
         (
+            "command",
+            f"{report.fullness:.1%} of ±{report.amplitude:g} rad on average, "
+            f"squareness {report.squareness:.3f}",
+        ),
+        (
             "efficiency",
             f"{report.efficiency:.1%} of the best square wave at ±{report.amplitude:g} rad",
         ),

@@ -6,6 +6,7 @@
             print(tick.t, tick.thrust)
 
 `AsyncFish` offers the same to asyncio. A socket belongs to one thread, and so does a `Fish`.
+`Agent` chooses the instruction angle itself, tick by tick.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -14,13 +15,18 @@ from fishd.client.synchronous import Fish
 from fishd.errors import FishError, NoDaemon, Refused
 
 if TYPE_CHECKING:
+    from fishd.client.agent import Agent
     from fishd.client.asynchronous import AsyncFish
 
-__all__ = ["AsyncFish", "Fish", "FishError", "NoDaemon", "Refused"]
+__all__ = ["Agent", "AsyncFish", "Fish", "FishError", "NoDaemon", "Refused"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import asyncio only for those who use it: it would double the time that fishctl takes."""
+    """Import what few use only for those: asyncio would double the time that fishctl takes."""
+    if name == "Agent":
+        from fishd.client.agent import Agent
+
+        return Agent
     if name == "AsyncFish":
         from fishd.client.asynchronous import AsyncFish
 

@@ -11,6 +11,7 @@ import zmq.asyncio
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
 from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.policies.info import PolicyInfo
 from fishd.protocol import Calibrations, State
 from fishd.signals import ControllerInfo, Event, Status, Tick
 
@@ -49,6 +50,10 @@ class AsyncFish(Connection):
     async def controllers(self) -> list[ControllerInfo]:
         """The controllers that the daemon knows, with their parameters."""
         return await self._call(list[ControllerInfo], "controllers")
+
+    async def policies(self) -> list[PolicyInfo]:
+        """The named policies that the daemon finds, with what their files say about themselves."""
+        return await self._call(list[PolicyInfo], "policies")
 
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
         """Put another controller in command; parameters left out take their defaults."""

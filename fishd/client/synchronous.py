@@ -10,6 +10,7 @@ import zmq
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
 from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.policies.info import PolicyInfo
 from fishd.protocol import Calibrations, State
 from fishd.signals import ControllerInfo, Event, Status, Tick
 
@@ -56,6 +57,10 @@ class Fish(Connection):
     def controllers(self) -> list[ControllerInfo]:
         """The controllers that the daemon knows, with their parameters."""
         return self._call(list[ControllerInfo], "controllers")
+
+    def policies(self) -> list[PolicyInfo]:
+        """The named policies that the daemon finds, with what their files say about themselves."""
+        return self._call(list[PolicyInfo], "policies")
 
     def set_controller(self, name: str, /, **parameters: Any) -> State:
         """Put another controller in command; parameters left out take their defaults."""

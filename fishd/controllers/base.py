@@ -62,6 +62,13 @@ class Controller(ABC, Generic[P]):
         """Take new, already checked parameters while running; called between two updates."""
         self.parameters = parameters
 
+    def rehearse(self) -> None:
+        """Do what `update` does, without any effect, so that it finds warm caches.
+
+        Called up to once a tick, just before it; only what takes `update` long from cold is worth
+        it.
+        """
+
     def close(self) -> None:
         """Let go of everything: called once, when it is out of command for good."""
 

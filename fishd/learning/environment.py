@@ -28,6 +28,13 @@ _FARTHEST = 1e6
 """Bound of the observation space: finite, as tools expect, and never reached."""
 
 
+def spaces(features: int) -> tuple[gymnasium.Space[Vector], gymnasium.Space[Vector]]:
+    """Observation and action space of an agent that sees so many features."""
+    seen: Any = gymnasium.spaces.Box(-_FARTHEST, _FARTHEST, (features,), np.float32)
+    done: Any = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    return seen, done
+
+
 class SwimEnv(gymnasium.Env[Vector, Vector]):
     """One fish that swims for thrust.
 
@@ -49,14 +56,15 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.settings = settings
         self._layout = Layout(self.features)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
-        shape = (len(self.features),)
-        self.observation_space = gymnasium.spaces.Box(-_FARTHEST, _FARTHEST, shape, np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space, self.action_space = spaces(len(self.features))
         self._steps = 0
         self._begun = False
-        self._latest: Observation
+        self.latest: Observation
+        """What was observed last, once an episode has begun."""
         self.tank_time = 0.0
         """How long the agent has been in command of a fish, pauses included [s]."""
+        self.lost = 0
+        """Ticks in which another angle than the agent's was in force."""
         self._paused = 0.0
 
     def reset(
@@ -71,26 +79,37 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         link, draw = self.link, self.np_random
         fish = int(draw.integers(2**31))
         if link.restartable and (seed is not None or link.varies):
-            self._latest = link.restart(fish)
+            self.latest = link.restart(fish)
         elif not self._begun:
-            self._latest = link.start()
+            self.latest = link.start()
         self._begun = True
         self._steps = 0
         angle = link.amplitude * float(draw.uniform(-1.0, 1.0))
         lost = sum(
-            self._advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
+            self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
         )
-        return self._layout.vector(self._latest), self._info(lost)
+        return self._layout.vector(self.latest), self._info(lost)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Put an instruction angle in force for one tick; raises `LinkLost`."""
-        lost = self._advance(max(-1.0, min(1.0, float(action[0]))) * self.link.amplitude)
+        lost = self.advance(max(-1.0, min(1.0, float(action[0]))) * self.link.amplitude)
         self._steps += 1
-        reward = self._reward_per_newton * self._latest.fx
+        reward = self._reward_per_newton * self.latest.fx
         truncated = self._steps >= self.settings.episode or lost > 0
         info = self._info(lost)
         self._paused = 0.0
-        return self._layout.vector(self._latest), reward, False, truncated, info
+        return self._layout.vector(self.latest), reward, False, truncated, info
+
+    def advance(self, angle: float) -> int:
+        """Swim one tick at an angle [rad], outside of any episode; how many were lost on the way.
+
+        Raises `LinkLost`.
+        """
+        before = self.latest.time
+        self.latest, lost = self.link.step(angle)
+        self.tank_time += self.latest.time - before
+        self.lost += lost
+        return lost
 
     def pause(self, seconds: float) -> None:
         """Let the fish wait at neutral, for `seconds` at most, while the agent learns."""
@@ -102,23 +121,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         The one before the pause is void: an action in answer to it would be judged by a fish that
         has come to rest meanwhile.
         """
-        before = self._latest.time
-        self._latest = self.link.resume()
-        waited = self._latest.time - before
+        before = self.latest.time
+        self.latest = self.link.resume()
+        waited = self.latest.time - before
         self._paused += waited
         self.tank_time += waited
-        return self._layout.vector(self._latest)
+        return self._layout.vector(self.latest)
 
     def close(self) -> None:
         """Leave the fish at neutral."""
         self.link.close()
 
-    def _advance(self, angle: float) -> int:
-        """One tick; how many were lost on the way."""
-        before = self._latest.time
-        self._latest, lost = self.link.step(angle)
-        self.tank_time += self._latest.time - before
-        return lost
-
     def _info(self, lost: int) -> dict[str, Any]:
-        return {"thrust": self._latest.fx, "lost": lost, "paused": self._paused}
+        return {"thrust": self.latest.fx, "lost": lost, "paused": self._paused}

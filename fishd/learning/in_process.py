@@ -1,9 +1,7 @@
 """A simulated fish in this process, on the virtual clock: the robot's own loop, far faster."""
 
-import math
 from collections.abc import Iterator
 
-import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -14,6 +12,7 @@ from fishd.controllers.base import Controller
 from fishd.hardware.simulated import SimulatedFish
 from fishd.learning.link import LinkLost, Sensed
 from fishd.learning.settings import Randomisation
+from fishd.learning.variation import drawn
 from fishd.loop import ControlLoop, Turn
 from fishd.plant.tethered import TrueWindow
 from fishd.signals import Event, Observation, Tick
@@ -81,7 +80,8 @@ class InProcess:
 
     def restart(self, seed: int) -> Observation:
         """A new fish at rest; without a randomisation always the same."""
-        self._begin(self._drawn(seed))
+        spread = self._randomisation
+        self._begin(drawn(self._nominal, spread, seed) if spread else self._nominal)
         return self.start()
 
     def step(self, angle: float) -> Sensed:
@@ -118,30 +118,3 @@ class InProcess:
         self._loop.set_controller("agent", self._puppet)
         self._slots = iter(VirtualTicker(clock, config.tick))
         self._turn = self._loop.observe(next(self._slots))
-
-    def _drawn(self, seed: int) -> Config:
-        spread = self._randomisation
-        if spread is None:
-            return self._nominal
-        draw = np.random.default_rng(seed)
-
-        def varied(value: float, share: float) -> float:
-            return value * math.exp(draw.uniform(-1.0, 1.0) * math.log1p(share))
-
-        plant, rig = self._nominal.plant, self._nominal.simulation
-        return replace(
-            self._nominal,
-            plant=replace(
-                plant,
-                omega0=varied(plant.omega0, spread.omega0),
-                xi=varied(plant.xi, spread.xi),
-                servo_speed=varied(plant.servo_speed, spread.servo_speed),
-                coupling=varied(plant.coupling, spread.coupling),
-            ),
-            simulation=replace(
-                rig,
-                noise=varied(rig.noise, spread.noise),
-                offset_y=rig.offset_y + spread.offset * draw.uniform(-1.0, 1.0),
-                seed=int(draw.integers(2**31)),
-            ),
-        )

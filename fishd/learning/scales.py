@@ -34,4 +34,4 @@ def thrust_scale(config: Config, settings: EnvironmentSettings) -> float:
     """The thrust that is rewarded with `reward_scale` [N]."""
     if settings.thrust_scale is not None:
         return settings.thrust_scale
-    return best_square_wave(config.plant, config.amplitude_limit).thrust
+    return float(best_square_wave(config.plant, config.amplitude_limit).thrust)

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import msgspec
+import yaml
 from msgspec import Meta, Struct
 
 from fishd import strict_yaml
@@ -80,7 +82,7 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     n_steps: Annotated[int, Meta(ge=2, description="Steps between two updates.")] = 128
     batch_size: Annotated[int, Meta(ge=2, description="Size of a minibatch.")] = 64
     n_epochs: Annotated[int, Meta(ge=1, description="Passes over the steps of an update.")] = 10
-    gamma: Annotated[float, Meta(ge=0, le=1, description="Discount factor.")] = 0.9
+    gamma: Annotated[float, Meta(ge=0, le=1, description="Discount factor.")] = 0.95
     gae_lambda: Annotated[
         float, Meta(ge=0, le=1, description="Bias against variance of the advantages.")
     ] = 0.95
@@ -97,6 +99,12 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     log_std_init: Annotated[
         float, Meta(ge=-5, le=2, description="Log of the exploration's deviation, in units of Φ.")
     ] = 0.7
+    symmetric: Annotated[
+        bool,
+        Meta(
+            description="Build into the networks that left and right are alike; not with F_x seen."
+        ),
+    ] = True
     hidden: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1024)], ...],
         Meta(description="Sizes of the hidden layers, of policy and value each."),
@@ -123,6 +131,15 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             extra_json_schema={"unit": "s"},
         ),
     ] = 5.0
+    others: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=100,
+            description="In simulation, so many other fish are tried too, at the edges of the "
+            "randomisation; the policy counts as the best that does best on its worst fish.",
+        ),
+    ] = 0
 
 
 class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -146,7 +163,9 @@ def load(path: Path | None) -> TrainingSettings:
         data: Any = document.data
         if not isinstance(data, dict):
             raise ConfigError(f"{path}:1: keys and values are needed, such as 'steps: 8000'")
-        return convert(without_empty_sections(data, TrainingSettings), TrainingSettings)
+        settings = convert(without_empty_sections(data, TrainingSettings), TrainingSettings)
+        _check(settings)
+        return settings
     except strict_yaml.YamlProblem as problem:
         raise ConfigError(f"{path}:{problem.line}: {problem}") from None
     except Problem as problem:
@@ -155,3 +174,30 @@ def load(path: Path | None) -> TrainingSettings:
         raise ConfigError(f"{where}: {'.'.join(problem.path)}: {problem}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
+
+
+def to_yaml(settings: TrainingSettings) -> str:
+    """All settings, defaults included, as YAML that `load` reads back."""
+    return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False, default_flow_style=False)
+
+
+def _check(settings: TrainingSettings) -> None:
+    """Refuse values that are valid one by one but not together."""
+    ppo, evaluation = settings.ppo, settings.evaluation
+    if ppo.n_steps % ppo.batch_size:
+        raise Problem(
+            ("ppo", "batch_size"),
+            f"{ppo.batch_size} is not valid: n_steps, {ppo.n_steps}, must be a multiple of it",
+        )
+    if ppo.symmetric and "fx" in settings.environment.observation:
+        raise Problem(
+            ("ppo", "symmetric"),
+            "true is not valid where environment.observation has fx, which is the same for a "
+            "mirrored fish; false is needed",
+        )
+    if evaluation.settle >= evaluation.seconds:
+        raise Problem(
+            ("evaluation", "settle"),
+            f"{evaluation.settle:g} s is not valid: less than seconds, {evaluation.seconds:g} s, "
+            "is needed",
+        )

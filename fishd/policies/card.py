@@ -17,8 +17,14 @@ from fishd.errors import PolicyError
 from fishd.schema import Problem, convert
 from fishd.signals import Observation
 
+KEY = "fishd.card"
+"""Under which the card is in the metadata of an ONNX file."""
+
 FORMAT = 1
 """Version of the card; a file with another one is refused."""
+
+SAME_TICK = 1e-9
+"""Largest difference between two ticks that are the same [s]."""
 
 FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle"]
 """Fields of `Observation` that a policy may see."""
@@ -39,13 +45,21 @@ class Layout:
 
     def __init__(self, features: tuple[Feature, ...]) -> None:
         self.features = features
-        self._values = [attrgetter(feature.name) for feature in features]
-        self._factors = [1.0 / feature.scale for feature in features]
+        self._inputs = [
+            (place, attrgetter(feature.name), 1.0 / feature.scale)
+            for place, feature in enumerate(features)
+        ]
 
     def vector(self, observation: Observation) -> NDArray[np.float32]:
         """The input, shape (number of features,), dimensionless."""
-        pairs = zip(self._values, self._factors, strict=True)
-        return np.array([value(observation) * factor for value, factor in pairs], np.float32)
+        row = np.empty(len(self._inputs), np.float32)
+        self.write(observation, row)
+        return row
+
+    def write(self, observation: Observation, row: NDArray[np.float32]) -> None:
+        """The same into an array that is there already, where microseconds count."""
+        for place, value, factor in self._inputs:
+            row[place] = value(observation) * factor
 
 
 class Provenance(Struct, frozen=True, kw_only=True):
@@ -86,6 +100,19 @@ class Card(Struct, frozen=True, kw_only=True):
     """Φ: an output of ±1 is an instruction angle of ±Φ [rad]."""
     provenance: Provenance
 
+    def check_fit(self, tick: float, amplitude: float) -> None:
+        """Raises `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad]."""
+        if abs(self.tick - tick) > SAME_TICK:
+            raise PolicyError(
+                f"it was trained at a tick of {self.tick * 1e3:g} ms, this robot's is "
+                f"{tick * 1e3:g} ms; set tick: {self.tick:g}, or train one at this tick"
+            )
+        if self.amplitude > amplitude:
+            raise PolicyError(
+                f"it commands up to ±{self.amplitude:g} rad, beyond the robot's amplitude_limit, "
+                f"{amplitude:g} rad; set amplitude_limit: {self.amplitude:g}, or train one for less"
+            )
+
 
 def encode(card: Card) -> str:
     """The card as JSON."""
@@ -96,7 +123,7 @@ def decode(text: str) -> Card:
     """The card in `text`; raises `PolicyError` that names what is missing or wrong."""
     try:
         data = msgspec.json.decode(text)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PolicyError(f"its card is no JSON: {error}") from None
     found = data.get("format") if isinstance(data, dict) else None
     if found != FORMAT:

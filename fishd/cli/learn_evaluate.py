@@ -1,0 +1,117 @@
+"""The verb that compares policies and controllers on the same simulated fish."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fishd.cli.config import load_or_exit, set_option
+from fishd.cli.options import json_option
+from fishd.cli.output import print_json
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fishd.learning.comparison import Standing
+
+_HEADS = ("mN", "Hz", "|φ_c|/Φ", "square")
+
+
+@click.command()
+@click.argument("contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...")
+@click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path),
+    help="YAML file of the fish; without it, the defaults.",
+)
+@set_option
+@click.option("--seconds", type=float, default=60.0, show_default=True, help="Length of each run.")
+@click.option(
+    "--settle",
+    type=float,
+    default=10.0,
+    show_default=True,
+    help="Time before figures are taken [s].",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    help="Runs of each contestant, with different noise.",
+)
+@click.option(
+    "--png",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Draw command, fin, force and efficiency into this file.",
+)
+@json_option
+def evaluate(
+    contestants: tuple[str, ...],
+    file: Path | None,
+    overrides: tuple[str, ...],
+    seconds: float,
+    settle: float,
+    seeds: int,
+    png: Path | None,
+    as_json: bool,
+) -> int:
+    """Compare policies and controllers on the same simulated fish.
+
+    A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
+    with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. Without any: the
+    best square wave, swing, and the named policies that are made for this fish.
+    """
+    from fishd.learning import comparison
+
+    config = load_or_exit(file, overrides)
+    chosen = [comparison.parse(text) for text in contestants]
+    chosen = chosen or comparison.default_contestants(config)
+    standings, traces = comparison.compare(config, chosen, seconds, settle, seeds)
+    if png:
+        from fishd.learning.figures import picture
+
+        picture(png, standings, traces, config.amplitude_limit)
+    if as_json:
+        print_json(standings)
+    else:
+        from rich.console import Console
+
+        Console().print(_table(standings))
+    faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
+    for contestant, fault in faults:
+        click.echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
+    return 1 if faults else 0
+
+
+def _table(standings: "list[Standing]") -> "Table":
+    from rich.table import Table
+
+    runs = standings[0].runs
+    best = {
+        (run.best_square_thrust, run.best_square_frequency)
+        for standing in standings
+        for run in standing.runs
+    }
+    caption = None
+    if len(best) == 1:
+        ((thrust, frequency),) = best
+        caption = f"The best square wave: {thrust * 1e3:.2f} mN at {frequency:.3f} Hz."
+    several = len(runs) > 1
+    table = Table(caption=caption, caption_justify="left", box=None, pad_edge=False)
+    table.add_column("contestant", overflow="fold")
+    for head in ("efficiency", *(["lowest – highest"] if several else []), *_HEADS):
+        table.add_column(head, justify="right", no_wrap=True)
+    for standing in standings:
+        spread = f"{standing.lowest_efficiency:.1%} – {standing.highest_efficiency:.1%}"
+        table.add_row(
+            standing.contestant,
+            f"{standing.efficiency:.1%}",
+            *([spread] if several else []),
+            f"{standing.thrust * 1e3:.2f}",
+            f"{standing.frequency:.3f}",
+            f"{standing.fullness:.3f}",
+            f"{standing.squareness:.3f}",
+        )
+    return table

@@ -1,0 +1,249 @@
+"""The verb that trains."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+from msgspec.structs import replace
+
+from fishd.cli.config import EX_CONFIG, load_or_exit, set_option
+from fishd.cli.options import endpoint_option
+from fishd.config import Config
+from fishd.console import complain
+from fishd.errors import ConfigError
+
+if TYPE_CHECKING:
+    from fishd.learning.settings import TrainingSettings
+    from fishd.learning.training import Job, Outcome
+
+INTERRUPTED = 130
+
+
+@click.command()
+@click.option(
+    "--on",
+    type=click.Choice(["simulation", "robot"]),
+    help="A fish simulated here in virtual time, or the one of the fishd that runs, real or not. "
+    "[default: simulation; with --resume, as before]",
+)
+@click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path),
+    help="Configuration of the fish; for a robot, the file that its fishd was started with.",
+)
+@set_option
+@click.option(
+    "--settings",
+    "settings_file",
+    type=click.Path(path_type=Path),
+    help="YAML file of the training, such as config/learning.yaml; without it, the defaults.",
+)
+@click.option("--steps", type=click.IntRange(min=1), help="Control steps to learn from, in all.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the training.")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Run folder, which must be new. [default: runs/ppo-DATE-TIME]",
+)
+@click.option(
+    "--resume",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Go on with the run in this folder, from its newest checkpoint and with its settings.",
+)
+@click.option(
+    "--from",
+    "parent",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Begin with the networks of another run, its best, or of one of its checkpoints: "
+    "to fine-tune on the robot what was trained in simulation.",
+)
+@endpoint_option
+@click.option("--seeds", type=click.IntRange(min=1), help="Train with so many seeds, in parallel.")
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="With --seeds: processes. [default: one per core]"
+)
+@click.option(
+    "--cluster", metavar="ADDRESS", help="With --seeds: Dask scheduler that runs them instead."
+)
+def ppo(
+    on: Literal["simulation", "robot"] | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    settings_file: Path | None,
+    steps: int | None,
+    seed: int | None,
+    folder: Path | None,
+    resume: Path | None,
+    parent: Path | None,
+    endpoint: str | None,
+    seeds: int | None,
+    jobs: int | None,
+    cluster: str | None,
+) -> int:
+    """Train a policy with PPO: checkpoints, tables and TensorBoard logs in a run folder.
+
+    Ctrl-C leaves the fish at neutral and a checkpoint from which --resume goes on.
+    """
+    own = {"--config": file, "--set": overrides, "--settings": settings_file, "--seed": seed}
+    new = {"--folder": folder, "--from": parent}
+    if resume:
+        _refuse("goes on as the run began", {**own, **new, "--seeds": seeds})
+    if seeds is None:
+        _refuse("is for several trainings, of --seeds", {"--jobs": jobs, "--cluster": cluster})
+    elif on == "robot":
+        raise click.UsageError("--seeds is for simulated fish: there is only one robot")
+    if resume:
+        job = _resumed(resume, on, endpoint, steps)
+    else:
+        config, settings = _chosen(on, file, overrides, settings_file, endpoint, parent)
+        settings = _changed(settings, steps=steps, seed=seed)
+        job = _new(config, settings, folder, on, endpoint, parent)
+    if seeds is not None:
+        from fishd.cli.learn_seeds import train_seeds
+
+        return train_seeds(job, seeds, jobs, cluster)
+    return _train(job)
+
+
+def _refuse(why: str, options: dict[str, Any]) -> None:
+    given = [name for name, value in options.items() if value not in (None, ())]
+    if given:
+        raise click.UsageError(f"{given[0]} cannot be given here: this {why}")
+
+
+def _chosen(
+    on: str | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    settings_file: Path | None,
+    endpoint: str | None,
+    parent: Path | None,
+) -> tuple[Config, "TrainingSettings"]:
+    """Configuration and settings of a new run; those of its parent where none are given."""
+    from fishd.learning import runs
+    from fishd.learning import settings as training
+    from fishd.learning.links import daemon_config
+
+    try:
+        settings = training.load(settings_file)
+        if parent and not settings_file:
+            settings = runs.read(_run_of(parent))[1]
+        if on == "robot":
+            return daemon_config(endpoint, file, overrides), settings
+    except ConfigError as error:
+        complain("fishctl", str(error), EX_CONFIG)
+    return load_or_exit(file, overrides), settings
+
+
+def _new(
+    config: Config,
+    settings: "TrainingSettings",
+    folder: Path | None,
+    on: Literal["simulation", "robot"] | None,
+    endpoint: str | None,
+    parent: Path | None,
+) -> "Job":
+    from fishd.learning import checkpoints, runs
+    from fishd.learning.training import Job
+
+    return Job(
+        config=config,
+        settings=settings,
+        folder=folder or runs.default_folder(),
+        on=on or "simulation",
+        endpoint=endpoint,
+        parent=checkpoints.find(parent) if parent else None,
+    )
+
+
+def _resumed(
+    folder: Path,
+    on: Literal["simulation", "robot"] | None,
+    endpoint: str | None,
+    steps: int | None,
+) -> "Job":
+    from fishd.learning import checkpoints, runs
+    from fishd.learning.training import Job
+
+    try:
+        config, settings = runs.read(folder)
+    except ConfigError as error:
+        complain("fishctl", str(error), EX_CONFIG)
+    before = checkpoints.read_state(checkpoints.newest(folder)).on
+    return Job(
+        config=config,
+        settings=_changed(settings, steps=steps),
+        folder=folder,
+        on=on or before,
+        endpoint=endpoint,
+        resume=True,
+    )
+
+
+def _train(job: "Job") -> int:
+    from fishd.learning.progress import on_terminal
+    from fishd.learning.training import train
+
+    try:
+        with _until_signalled() as stop, on_terminal() as show:
+            outcome = train(job, show, stop)
+    except ConfigError as error:
+        complain("fishctl", str(error), EX_CONFIG)
+    return _report(outcome, job.endpoint)
+
+
+def _report(outcome: "Outcome", endpoint: str | None) -> int:
+    """Say how it ended; the exit status."""
+    from fishd.learning.progress import described, minutes
+
+    again = f"fishctl learn ppo --resume {outcome.folder}"
+    if endpoint:
+        again += f" --endpoint {endpoint}"
+    if outcome.ended in ("lost", "diverged"):
+        click.echo(f"fishctl: {outcome.message}; to go on: {again}", err=True)
+        return 1
+    if outcome.ended == "interrupted":
+        click.echo(f"fishctl: stopped after {outcome.steps} steps; to go on: {again}", err=True)
+        return INTERRUPTED
+    click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time")
+    if outcome.best_evaluation:
+        click.echo(f"best: {described(outcome.best_evaluation).strip()}")
+    click.echo(f"to write it to a policy file: fishctl learn export {outcome.folder}")
+    return 0
+
+
+def _changed(settings: "TrainingSettings", **given: int | None) -> "TrainingSettings":
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})
+
+
+def _run_of(path: Path) -> Path:
+    """The run folder of a run or of one of its checkpoints."""
+    from fishd.learning.runs import SETTINGS
+
+    return path if (path / SETTINGS).exists() else path.parent
+
+
+@contextmanager
+def _until_signalled() -> Iterator[Callable[[], bool]]:
+    """Tells whether SIGINT or SIGTERM has come; a second one ends the program as ever."""
+    asked = threading.Event()
+
+    def ask(number: int, _: object) -> None:
+        asked.set()
+        signal.signal(number, former[signal.Signals(number)])
+
+    former = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    for number in former:
+        signal.signal(number, ask)
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)

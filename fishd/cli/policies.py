@@ -1,0 +1,121 @@
+"""The verb that lists the named policies, and shows what a policy file says about itself."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fishd.addresses import ENDPOINT_VARIABLE
+from fishd.cli.control import daemon_options
+from fishd.cli.output import print_json
+from fishd.client import Fish
+from fishd.errors import NoDaemon, PolicyError
+from fishd.policies import library
+from fishd.policies.info import PolicyInfo
+from fishd.schema import names_file
+
+HEAD = ("name", "Φ [rad]", "tick", "trained in", "steps", "efficiency", "created", "folder")
+
+
+@click.group(invoke_without_command=True)
+@daemon_options
+@click.pass_context
+def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
+    """List the policies that have a name, for 'fishctl set-controller ppo --policy NAME'.
+
+    Efficiency is the thrust over that of the best square wave, as last evaluated in the training.
+    """
+    if ctx.invoked_subcommand:
+        ctx.find_root().obj = endpoint
+        return
+    known = _known(endpoint)
+    if as_json:
+        print_json(known)
+    elif known:
+        click.echo(_table(known))
+    else:
+        click.echo(f"none; put {library.SUFFIX} files into {library.folders()[0]}", err=True)
+
+
+@policies.command()
+@click.argument("policy", metavar="NAME|FILE")
+@daemon_options
+@click.pass_context
+def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -> None:
+    """Print all that a policy file says about itself: its inputs, and how it was trained."""
+    if names_file(policy, library.SUFFIX):
+        found = library.describe(policy)
+    else:
+        known = {info.name: info for info in _known(endpoint)}
+        if policy not in known:
+            raise PolicyError(library.unknown(policy, sorted(known)))
+        found = known[policy]
+    if found.card is None:
+        raise PolicyError(f"{found.file}: {found.problem}")
+    if as_json or (ctx.parent and ctx.parent.params["as_json"]):
+        print_json(found)
+    else:
+        click.echo(_as_text(found), nl=False)
+
+
+def _known(endpoint: str | None) -> list[PolicyInfo]:
+    """Those that the daemon finds; without one, those of this user and machine."""
+    try:
+        with Fish(endpoint) as fish:
+            return fish.policies()
+    except NoDaemon:
+        if endpoint or os.environ.get(ENDPOINT_VARIABLE):
+            raise
+        click.echo("fishctl: no fishd is running; these policies are found from here", err=True)
+        return library.describe_all()
+
+
+def _table(known: list[PolicyInfo]) -> str:
+    rows = [HEAD, *(_row(info) for info in known)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD) - 1)]
+    lines = []
+    for row, info in zip(rows, (None, *known), strict=True):
+        cells = (f"{cell:<{width}}" for cell, width in zip(row, (*widths, 0), strict=True))
+        lines.append("  ".join(cells).rstrip())
+        if info and info.problem:
+            lines.append(f"    not here: {_printable(info.problem)}")
+    return "\n".join(lines)
+
+
+def _row(info: PolicyInfo) -> tuple[str, ...]:
+    folder = str(Path(info.file).parent)
+    if info.card is None:
+        return (info.name, *["–"] * (len(HEAD) - 2), folder)
+    card: dict[str, Any] = info.card
+    past = card["provenance"]
+    efficiency = past["efficiency"]
+    cells = (
+        info.name,
+        f"{card['amplitude']:g}",
+        f"{card['tick'] * 1e3:g} ms",
+        past["on"],
+        str(past["steps"]),
+        "–" if efficiency is None else f"{efficiency:.1%}",
+        past["created"][:10],
+        folder,
+    )
+    return tuple(_printable(cell) for cell in cells)
+
+
+def _as_text(info: PolicyInfo) -> str:
+    import yaml
+
+    head = {"name": info.name, "file": info.file}
+    problem = {"problem": info.problem} if info.problem else {}
+    # YAML escapes what a stranger's file could tell a terminal.
+    return yaml.safe_dump(
+        {**head, **problem, **(info.card or {})},
+        sort_keys=False,
+        allow_unicode=True,
+        default_flow_style=False,
+    )
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -1,0 +1,225 @@
+"""Checkpoints: folders from which a training goes on, or a policy is exported.
+
+`step-005120` was due, or is the last of a run; `best-004096` swam best in an evaluation. In each:
+`model.zip` (stable-baselines3: policy, value, optimiser), `card.json` (what a policy file carries)
+and `state.json` (counts, evaluations, random numbers). One is written under a temporary name and
+renamed: whatever kills the writer, no half a checkpoint is ever taken for a whole one.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, cast
+from zipfile import BadZipFile
+
+import msgspec
+import numpy as np
+import torch
+from msgspec import Struct
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from fishd.errors import FishdError, PolicyError
+from fishd.learning.ppo import make_policy
+from fishd.learning.settings import TrainingSettings
+from fishd.policies.card import Card, decode, encode
+
+MODEL, CARD, STATE = "model.zip", "card.json", "state.json"
+
+
+class CheckpointError(FishdError, RuntimeError):
+    """There is no checkpoint where one is needed, or it cannot be read."""
+
+
+class Evaluation(Struct, frozen=True):
+    """How the policy swam without exploration."""
+
+    steps: int
+    """Control steps that it had learned from."""
+    tank_time: float
+    """Time in the tank until then [s]."""
+    thrust: float
+    """Mean thrust [N]; on a robot as measured."""
+    efficiency: float
+    """Over the thrust of the configured fish's best square wave."""
+    frequency: float
+    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    fullness: float
+    """Mean |φ_c|/Φ."""
+    stalled: bool
+    """It does not swim at all."""
+    worst: float | None = None
+    """Lowest efficiency on this and on other fish, where others were tried."""
+
+    @property
+    def merit(self) -> float:
+        """What the best policy is chosen by."""
+        return self.efficiency if self.worst is None else self.worst
+
+
+class State(Struct, frozen=True):
+    """What a training must know to go on, beside the networks and their optimiser."""
+
+    on: Literal["simulation", "robot"]
+    steps: int
+    updates: int
+    """Passes over rollouts so far, as stable-baselines3 counts them."""
+    tank_time: float
+    """[s]"""
+    rollouts: int
+    """Updates so far."""
+    latest: Evaluation | None
+    best: Evaluation | None
+    random: dict[str, Any]
+    """Of torch, numpy and the environment."""
+
+
+def save(folder: Path, kind: str, model: PPO, card: Card, state: State) -> Path:
+    """Write a checkpoint; kind: step or best, of which only the newest is kept."""
+    name = f"{kind}-{state.steps:06d}"
+    final, part = folder / name, folder / f".{name}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    model.save(part / MODEL)
+    (part / CARD).write_text(_indented(encode(card)), encoding="utf-8")
+    (part / STATE).write_text(json.dumps(msgspec.to_builtins(state)), encoding="utf-8")
+    if final.exists():  # a run that was stopped before it learned any more
+        _discard(final)
+    part.rename(final)
+    if kind == "best":
+        for other in folder.glob("best-*"):
+            if other != final:
+                _discard(other)
+    return final
+
+
+def newest(folder: Path) -> Path:
+    """The checkpoint with most steps in a run folder; raises `CheckpointError`."""
+    return _last(folder, "step-*", "best-*")
+
+
+def best(folder: Path) -> Path | None:
+    """The checkpoint that swam best, where there was an evaluation in which it swam at all."""
+    found = sorted(folder.glob("best-*"), key=_steps)
+    return found[-1] if found else None
+
+
+def find(path: Path, *, latest: bool = False) -> Path:
+    """The checkpoint that is meant by a run folder, its best where there is one, or by itself.
+
+    latest: the newest of a run rather than its best
+
+    Raises `CheckpointError`.
+    """
+    if (path / MODEL).is_file():
+        return path
+    return (None if latest else best(path)) or newest(path)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what a killed writer left half-written, or half-removed."""
+    for left in (*folder.glob(".*.part"), *folder.glob(".*.old")):
+        shutil.rmtree(left)
+
+
+def read_card(checkpoint: Path) -> Card:
+    """Raises `CheckpointError`."""
+    try:
+        return decode(_text(checkpoint / CARD))
+    except PolicyError as error:
+        raise CheckpointError(f"{checkpoint / CARD}: {error}") from None
+
+
+def read_state(checkpoint: Path) -> State:
+    """Raises `CheckpointError`."""
+    try:
+        return msgspec.convert(json.loads(_text(checkpoint / STATE)), State)
+    except ValueError as error:
+        raise CheckpointError(f"{checkpoint / STATE}: {error}") from None
+
+
+def load_parameters(model: PPO, checkpoint: Path, *, optimiser: bool = True) -> None:
+    """Put networks, and optimiser, into a model of the same shape; raises `CheckpointError`."""
+    fresh = model.get_parameters()["policy.optimizer"]
+    with _readable(checkpoint / MODEL) as path:
+        model.set_parameters(str(path), exact_match=True, device="cpu")
+    if not optimiser:
+        model.policy.optimizer.load_state_dict(fresh)
+
+
+def load_policy(checkpoint: Path) -> ActorCriticPolicy:
+    """The networks of a checkpoint; raises `CheckpointError`."""
+    card = read_card(checkpoint)
+    with _readable(checkpoint / MODEL) as path:
+        settings = msgspec.convert(card.provenance.settings, TrainingSettings)
+        policy = make_policy(settings.ppo, len(card.observation))
+        _, parameters, _ = load_from_zip_file(path, device="cpu", load_data=False)
+        policy.load_state_dict(cast(dict[str, Any], parameters["policy"]))
+    policy.set_training_mode(False)
+    return policy
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[Path]:
+    """Where a file of the wrong kind or shape is read."""
+    try:
+        yield path
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such file") from None
+    except (RuntimeError, ValueError, KeyError, OSError, BadZipFile) as error:
+        why = " ".join(str(error).split())[:200]
+        raise CheckpointError(f"{path}: does not fit these settings: {why}") from None
+
+
+def random_state(generator: np.random.Generator) -> dict[str, Any]:
+    """The state of all random numbers of a training, for JSON; generator: the environment's."""
+    _, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
+    return {
+        "torch": torch.get_rng_state().numpy().tobytes().hex(),
+        "numpy": [np.asarray(keys).tolist(), int(position), int(has_gauss), float(gauss)],
+        "environment": dict(generator.bit_generator.state),
+    }
+
+
+def restore_random_state(state: dict[str, Any], generator: np.random.Generator) -> None:
+    """The reverse of `random_state`."""
+    torch.set_rng_state(torch.frombuffer(bytearray.fromhex(state["torch"]), dtype=torch.uint8))
+    keys, position, has_gauss, gauss = state["numpy"]
+    np.random.set_state(("MT19937", np.array(keys, np.uint32), position, has_gauss, gauss))
+    generator.bit_generator.state = state["environment"]
+
+
+def _discard(checkpoint: Path) -> None:
+    """Remove a checkpoint; killed in between, it leaves none that looks whole."""
+    old = checkpoint.with_name(f".{checkpoint.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    checkpoint.rename(old)
+    shutil.rmtree(old)
+
+
+def _last(folder: Path, *patterns: str) -> Path:
+    found = sorted((path for p in patterns for path in folder.glob(p)), key=_steps)
+    if not found:
+        raise CheckpointError(f"{folder}: no checkpoint is in there")
+    return found[-1]
+
+
+def _steps(path: Path) -> tuple[int, bool]:
+    number = path.name.partition("-")[2]
+    return int(number) if number.isdigit() else -1, path.name.startswith("step")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from None
+
+
+def _indented(text: str) -> str:
+    return msgspec.json.format(text, indent=2) + "\n"

@@ -1,0 +1,65 @@
+"""What training on a Dask cluster takes: a scheduler, a way to say stop, folders that travel."""
+
+import io
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from fishd.errors import FishdError
+
+_POLL = 1.0
+"""Time between two questions to the scheduler whether to stop [s]."""
+
+
+@contextmanager
+def scheduler(address: str | None) -> Iterator[Any]:
+    """A connection to the scheduler, and an event there that says stop; None without address."""
+    if address is None:
+        yield None
+        return
+    from distributed import Client, Event
+
+    try:
+        client = Client(address, timeout=10, name="fishctl learn")
+    except (OSError, ValueError, TimeoutError) as error:
+        raise FishdError(f"no Dask scheduler answers at {address}: {error}") from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise FishdError(f"the Dask scheduler at {address} has no workers")
+        yield Event(f"fishd-stop-{uuid4().hex}", client=client)
+
+
+def asked(name: str) -> Callable[[], bool]:
+    """Has the one who waits for the outcome said stop? On a Dask worker."""
+    from distributed import Event, get_client
+
+    event = Event(name, client=get_client())
+    was_asked, next_look = False, 0.0
+
+    def stop() -> bool:
+        nonlocal was_asked, next_look
+        if not was_asked and time.monotonic() >= next_look:
+            was_asked = event.is_set()
+            next_look = time.monotonic() + _POLL
+        return was_asked
+
+    return stop
+
+
+def packed(folder: Path) -> bytes:
+    """All files of a folder as one zip archive."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder))
+    return buffer.getvalue()
+
+
+def unpack(files: bytes, folder: Path) -> None:
+    """Write the files of such an archive into a folder."""
+    with zipfile.ZipFile(io.BytesIO(files)) as archive:
+        archive.extractall(folder)

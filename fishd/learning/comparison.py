@@ -1,0 +1,177 @@
+"""Policies and controllers on the same fish: who swims best, and how square is the command?"""
+
+import statistics
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from fishd import strict_yaml
+from fishd.config import Config, Start
+from fishd.controllers import registry
+from fishd.errors import ParameterError, PolicyError
+from fishd.learning.evaluation import best_on_grid
+from fishd.policies import library
+from fishd.signals import Event, Tick
+from fishd.simulation import Report, judge
+
+TRACE = 3.0
+"""How much of the end of a run a picture shows [s]."""
+_BEAT = 2.0
+"""So much more is kept, that there is an upward reversal to begin with [s]."""
+
+
+class Contestant(NamedTuple):
+    """A controller with its parameters, and what people call it."""
+
+    label: str
+    controller: str
+    parameters: dict[str, Any]
+
+
+class Trace(NamedTuple):
+    """The end of a run, tick by tick."""
+
+    time: list[float]  # s, 0 at the end
+    command: list[float]  # φ_c in force from `time` on, rad
+    thrust: list[float]  # F_x as measured, mean over the tick before `time`, N
+    fin: list[float]  # true α at `time`, rad
+
+
+class Standing(Struct, frozen=True, kw_only=True):
+    """How a contestant did: medians over its runs, which differ in the noise of the sensor."""
+
+    contestant: str
+    controller: str
+    parameters: dict[str, Any]
+    efficiency: float
+    """Thrust over that of the best square wave."""
+    lowest_efficiency: float
+    highest_efficiency: float
+    thrust: float
+    """[N]"""
+    frequency: float
+    """[Hz]"""
+    fullness: float
+    """Mean |φ_c|/Φ."""
+    squareness: float
+    """Mean |φ_c| over the rms of φ_c: square 1, sine 0.900, triangle 0.866."""
+    faults: list[str]
+    """Why runs ended in mode fault, if any did."""
+    runs: list[Report]
+
+
+def parse(text: str) -> Contestant:
+    """`swing:C=0.6`, `square:frequency=1.7,amplitude=0.3`, the name of a policy, a policy file.
+
+    Raises `ParameterError`; who that is, `compare` looks up.
+    """
+    name, _, values = text.partition(":")
+    if name not in registry.names():
+        return Contestant(text, "ppo", {"policy": text})
+    parameters = {}
+    for pair in filter(None, values.split(",")):
+        key, equals, value = pair.partition("=")
+        if not (key and equals and value):
+            raise ParameterError(f"{text}: '{pair}' is not valid: NAME=VALUE is needed")
+        try:
+            parameters[key] = strict_yaml.parse(value, key).data
+        except strict_yaml.YamlProblem as problem:
+            raise ParameterError(f"{text}: {problem}") from None
+    return Contestant(text, name, parameters)
+
+
+def default_contestants(config: Config) -> list[Contestant]:
+    """The best square wave on the grid of ticks, `swing`, and the named policies that fit."""
+    best = best_on_grid(config).frequency
+    found = [
+        Contestant(f"square {best:.3f} Hz", "square", {"frequency": best}),
+        Contestant("swing", "swing", {}),
+    ]
+    for name in library.names():
+        try:
+            controller = registry.create("ppo", {"policy": name}, config.limits)
+        except (ParameterError, PolicyError):  # made for another amplitude or tick
+            continue
+        controller.close()
+        found.append(Contestant(name, "ppo", {"policy": name}))
+    return found
+
+
+def compare(
+    config: Config,
+    contestants: Sequence[Contestant],
+    seconds: float,
+    settle: float,
+    runs: int = 1,
+    done: Callable[[], None] = lambda: None,
+) -> tuple[list[Standing], list[Trace]]:
+    """Let each swim the fish of `config`; standings and last traces, in the order given.
+
+    runs: each contestant swims so many times, with noise of seed, seed + 1, ...
+    done: called after every run
+    Raises `ParameterError` (`PolicyError` for a file that is no policy for this fish) and
+    `UnknownController`, before anything swims.
+    """
+    limits = replace(config.limits, virtual=True)
+    for _, name, parameters in contestants:
+        registry.create(name, parameters, limits).close()
+    standings, traces = [], []
+    for label, name, parameters in contestants:
+        reports = []
+        end = _End(config.tick)
+        for run in range(runs):
+            noise = replace(config.simulation, seed=config.simulation.seed + run)
+            fish = replace(config, simulation=noise, start=Start())
+            controller = registry.create(name, parameters, limits)
+            reports.append(judge(fish, name, controller, seconds, settle, end))
+            done()
+        standings.append(_standing(label, reports))
+        traces.append(end.trace())
+    return standings, traces
+
+
+def _standing(label: str, reports: list[Report]) -> Standing:
+    def median(values: Iterable[float]) -> float:
+        return float(statistics.median(values))
+
+    efficiencies = [report.efficiency for report in reports]
+    return Standing(
+        contestant=label,
+        controller=reports[0].controller,
+        parameters=reports[0].parameters,
+        efficiency=median(efficiencies),
+        lowest_efficiency=min(efficiencies),
+        highest_efficiency=max(efficiencies),
+        thrust=median(report.mean_thrust for report in reports),
+        frequency=median(report.frequency for report in reports),
+        fullness=median(report.fullness for report in reports),
+        squareness=median(report.squareness for report in reports),
+        faults=[report.reason.message for report in reports if report.reason],
+        runs=reports,
+    )
+
+
+class _End:
+    """A publisher that keeps the latest ticks."""
+
+    def __init__(self, tick: float) -> None:
+        self._ticks: deque[Tick] = deque(maxlen=max(2, round((TRACE + _BEAT) / tick) + 1))
+
+    def tick(self, tick: Tick) -> None:
+        """Keep it, and forget the oldest."""
+        self._ticks.append(tick)
+
+    def event(self, event: Event) -> None:
+        """Drop: a fault is in the report."""
+
+    def trace(self) -> Trace:
+        ticks = self._ticks
+        return Trace(
+            [tick.t - ticks[-1].t for tick in ticks],
+            [tick.phi_c for tick in ticks],
+            [tick.fx for tick in ticks],
+            [tick.alpha if isinstance(tick.alpha, float) else 0.0 for tick in ticks],
+        )

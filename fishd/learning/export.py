@@ -1,0 +1,130 @@
+"""From a checkpoint to the one file that the controller `ppo` runs."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from fishd.config import Config
+from fishd.errors import FishdError, PolicyError
+from fishd.learning import checkpoints, runs
+from fishd.learning.ppo import Deterministic, layers_of
+from fishd.learning.settings import TrainingSettings
+from fishd.learning.trials import Trial, in_simulation
+from fishd.plant.optimum import best_square_wave
+from fishd.plant.parameters import PlantParameters
+from fishd.policies.card import Card
+from fishd.policies.network import to_onnx
+
+TOLERANCE = 1e-5
+"""The file must say what the trained policy says, to this share of Φ."""
+_PROBES = 1000
+
+
+class Exported(Struct, frozen=True):
+    """What was written."""
+
+    path: Path
+    checkpoint: Path
+    card: Card
+    trial: Trial
+    size: int
+    """[bytes]"""
+
+
+def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "") -> Exported:
+    """Write the policy of a checkpoint to `target`, once it is known to be right.
+
+    force: also where it stalls
+    note: for people, kept in the file
+
+    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would not say
+    what the policy says.
+    """
+    card = checkpoints.read_card(checkpoint)
+    policy = checkpoints.load_policy(checkpoint)
+    settings = msgspec.convert(card.provenance.settings, TrainingSettings)
+    trial = _swim(checkpoint, card, policy, settings)
+    if trial.stalled and not force:
+        raise PolicyError(
+            f"{checkpoint}: this policy stalls when it swims without exploration: "
+            f"{trial.frequency:.2f} Hz, |φ_c| {trial.fullness:.0%} of Φ; train longer, choose "
+            "another checkpoint, or export it all the same with --force"
+        )
+    card = _completed(card, trial, note)
+    content = to_onnx(layers_of(policy), settings.ppo.activation, card)
+    _verify(content, policy, len(card.observation))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part = target.with_name(f".{target.name}.part")
+        part.write_bytes(content)
+        part.replace(target)
+    except OSError as error:
+        raise PolicyError(f"{target}: cannot be written: {error.strerror}") from None
+    return Exported(target, checkpoint, card, trial, len(content))
+
+
+def _swim(
+    checkpoint: Path, card: Card, policy: ActorCriticPolicy, settings: TrainingSettings
+) -> Trial:
+    """How the policy swims: as last seen on the robot, else the simulated fish of its training."""
+    state = checkpoints.read_state(checkpoint)
+    seen = state.latest
+    if seen and state.on == "robot" and seen.steps == state.steps:
+        return Trial(seen.thrust, seen.frequency, seen.fullness)
+    decide = Deterministic(policy, card.observation, card.amplitude)
+    return in_simulation(_fish(checkpoint, card), decide, settings.evaluation)
+
+
+def _fish(checkpoint: Path, card: Card) -> Config:
+    """The fish of the run, imperfections of its rig included where its folder is still there."""
+    try:
+        config, _ = runs.read(checkpoint.parent)
+    except FishdError:
+        config = Config()
+    return replace(
+        config,
+        tick=card.tick,
+        amplitude_limit=card.amplitude,
+        plant=msgspec.convert(card.provenance.plant, PlantParameters),
+    )
+
+
+def _completed(card: Card, trial: Trial, note: str) -> Card:
+    """The card with what the last evaluation says, and the note."""
+    past = card.provenance
+    plant = msgspec.convert(past.plant, PlantParameters)
+    best = float(best_square_wave(plant, card.amplitude).thrust)
+    return replace(
+        card,
+        provenance=replace(
+            past,
+            efficiency=trial.thrust / best,
+            frequency=trial.frequency,
+            note="; ".join(part for part in (past.note, note) if part),
+        ),
+    )
+
+
+def _verify(content: bytes, policy: ActorCriticPolicy, inputs: int) -> None:
+    """Compare file and policy on random observations; raises `PolicyError`."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    name = session.get_inputs()[0].name
+    probes = np.random.default_rng(0).normal(0.0, 1.5, (_PROBES, inputs)).astype(np.float32)
+    wanted, _ = policy.predict(probes, deterministic=True)
+    worst = 0.0
+    for probe, action in zip(probes, wanted, strict=True):
+        (found,) = session.run(None, {name: probe[np.newaxis]})
+        worst = max(worst, abs(float(np.clip(found, -1.0, 1.0).item()) - float(action[0])))
+    if not worst <= TOLERANCE:
+        raise PolicyError(
+            f"the file would say something else than the policy, by up to {worst:.2g} of Φ: "
+            "this onnxruntime cannot be trusted with it"
+        )

@@ -1,0 +1,50 @@
+"""What a training is asked for, and what it comes to."""
+
+from pathlib import Path
+from typing import Literal
+
+from msgspec import Struct
+
+from fishd.config import Config
+from fishd.learning.checkpoints import Evaluation
+from fishd.learning.settings import TrainingSettings
+
+On = Literal["simulation", "robot"]
+Ended = Literal["finished", "interrupted", "lost", "diverged"]
+
+
+class Job(Struct, frozen=True, kw_only=True):
+    """What to train, on what, and where to keep it."""
+
+    config: Config
+    """The fish; on a robot, the one that the scales are made for."""
+    settings: TrainingSettings
+    folder: Path
+    """The run folder: a new one, or that of the run to resume."""
+    on: On = "simulation"
+    """A fish in this process on the virtual clock, or that of a running fishd."""
+    endpoint: str | None = None
+    """Control socket of that fishd; None looks for the one on this machine."""
+    resume: bool = False
+    """Go on from the newest checkpoint in `folder`."""
+    parent: Path | None = None
+    """Checkpoint whose networks a new run begins with."""
+
+
+class Outcome(Struct, frozen=True, kw_only=True):
+    """How a training ended."""
+
+    folder: Path
+    steps: int
+    """Control steps that were learned from."""
+    tank_time: float
+    """[s]"""
+    ended: Ended
+    message: str
+    """Why, where it was lost or diverged."""
+    checkpoint: Path | None
+    """The newest."""
+    best: Path | None
+    """The checkpoint of `best_evaluation`."""
+    latest_evaluation: Evaluation | None
+    best_evaluation: Evaluation | None

@@ -1,0 +1,54 @@
+"""Opens the link to what swims, and makes sure that the agent's scales fit it."""
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+from fishd.client import Fish
+from fishd.config import Config, load
+from fishd.errors import ConfigError
+from fishd.learning.in_process import InProcess
+from fishd.learning.link import Link
+from fishd.learning.settings import Randomisation, TrainingSettings
+
+
+def in_process(config: Config, settings: TrainingSettings) -> InProcess:
+    """A simulated fish in this process; a new one each episode where fish are to differ."""
+    varied = settings.randomisation != Randomisation()
+    return InProcess(config, settings.randomisation if varied else None)
+
+
+def on_daemon(endpoint: str | None) -> Link:
+    """The fish of a running fishd; raises `FishError`."""
+    from fishd.learning.on_daemon import OnDaemon
+
+    return OnDaemon(endpoint)
+
+
+def daemon_config(endpoint: str | None, file: Path | None, overrides: Iterable[str]) -> Config:
+    """The configuration for a training on a running fishd.
+
+    The daemon tells only its tick and Φ, so that the plant, which the scales are made from, must
+    come from here: from its own file, or from the defaults. Without a file, tick and Φ are those of
+    the daemon. Raises `ConfigError` and `FishError`.
+    """
+    if file is None:
+        with Fish(endpoint) as fish:
+            status = fish.status()
+        found = (f"tick={status.tick!r}", f"amplitude_limit={status.amplitude_limit!r}")
+        overrides = (*found, *overrides)
+    return load(file, overrides)
+
+
+def check_agreement(link: Link, config: Config) -> None:
+    """Raise `ConfigError` where what swims has another tick or Φ than the scales are made for."""
+    for key, here, there, unit in (
+        ("tick", config.tick, link.tick, "s"),
+        ("amplitude_limit", config.amplitude_limit, link.amplitude, "rad"),
+    ):
+        if not math.isclose(here, there, rel_tol=1e-9):
+            raise ConfigError(
+                f"{key}: {here:g} {unit} in this configuration, {there:g} {unit} in the fishd that "
+                "runs; what the network sees is scaled by it, so give the file that fishd was "
+                "started with"
+            )

@@ -1,0 +1,184 @@
+"""The link to a running fishd, on the robot or with a simulated fish: its controller `remote`."""
+
+import contextlib
+import time
+
+from fishd.client import Fish
+from fishd.client.agent import Agent
+from fishd.errors import FishError, NoDaemon, Refused
+from fishd.learning.link import LinkLost, Sensed
+from fishd.remote.messages import Observed
+from fishd.signals import Observation, Status
+
+SILENCE = 1.0
+"""After so long without an observation fishd is asked what is the matter [s]."""
+
+
+class OnDaemon:
+    """Puts `remote` in command of a fishd, and answers for it.
+
+    With `lockstep: true` and `start.controller: remote` fishd waits for its agent from its first
+    tick on: then everything comes out as it does in process, bit by bit.
+    """
+
+    restartable = False
+    varies = False
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        address: str | None = None,
+        patience: float = 10.0,
+        deadline: float | None = None,
+    ) -> None:
+        """
+        endpoint: control socket of the fishd; None looks for that of this machine
+        address: where that fishd can reach this program, as for `Agent`; None: where fishd waits
+            for an agent already, else any free port of this machine
+        patience: how long the fish may take to begin, or to go on [s]
+        deadline: how long a tick waits for an action [s]; None for fishd's default
+
+        Raises `NoDaemon` when no fishd answers, `FishError` when the address cannot be bound.
+        """
+        self._fish = Fish(endpoint)
+        try:
+            status = self._fish.status()
+            self._agent = _agent(address, status)
+        except FishError:
+            self._fish.close()
+            raise
+        self._patience = patience
+        self._deadline = deadline
+        self._begun = False
+        self.tick = status.tick
+        self.amplitude = status.amplitude_limit
+
+    def start(self) -> Observation:
+        """Take command, unless fishd waits for this agent already; raises `LinkLost`."""
+        self._begun = True
+        try:
+            if not self._is_ours(self._fish.status()):
+                self._fish.set_controller(
+                    "remote", agent=self._agent.address, deadline=self._deadline
+                )
+            elif self._agent.latest and not self._agent.poll(SILENCE):
+                return _observation(self._agent.latest)  # which fishd still waits for, in lockstep
+        except (NoDaemon, Refused) as error:
+            raise LinkLost(str(error)) from None
+        return _observation(self._next(begun=False))
+
+    def restart(self, seed: int) -> Observation:
+        """Not here: raises RuntimeError."""
+        raise RuntimeError("the fish of a running fishd cannot begin anew; it swims on")
+
+    def step(self, angle: float) -> Sensed:
+        """Answer the latest observation; what comes of it. Raises `LinkLost`."""
+        asked = self._asked()
+        self._agent.act(angle)
+        found = self._next()
+        # What was lost in a pause is not counted there, but no action was in force either.
+        in_force = found.answered == asked.seq
+        return Sensed(_observation(found), max(self._agent.lost, 0 if in_force else 1))
+
+    def pause(self, seconds: float) -> None:
+        """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""
+        self._asked()
+        self._agent.pause(min(seconds, 3600.0))
+
+    def resume(self) -> Observation:
+        """End the pause; an observation from after it. Raises `LinkLost`."""
+        self._asked()
+        self._agent.resume()
+        return _observation(self._next())
+
+    def close(self) -> None:
+        """Leave the fish at neutral, where this agent is still in command; may be called twice."""
+        if self._begun:
+            self._begun = False
+            with contextlib.suppress(FishError):
+                if self._is_ours(self._fish.status()):
+                    self._fish.stop()
+        self._agent.close()
+        self._fish.close()
+
+    def _asked(self) -> Observed:
+        """The observation to be answered, while this agent is in command of it."""
+        if self._agent.latest is None or not self._agent.in_command:
+            raise self._lost()
+        return self._agent.latest
+
+    def _next(self, *, begun: bool = True) -> Observed:
+        """The next observation, of the same session if one had begun."""
+        before = self._agent.latest
+        deadline = time.monotonic() + self._patience
+        while time.monotonic() < deadline:
+            found = self._agent.poll(SILENCE)
+            if found and begun and before and found.session != before.session:
+                raise LinkLost("fishd has put the agent in command anew: it was restarted, perhaps")
+            if found:
+                return found
+            if begun and not self._agent.in_command:
+                break
+            self._check()
+        raise self._lost()
+
+    def _check(self) -> None:
+        """Raises `LinkLost` where fishd itself says that this agent is not in command."""
+        try:
+            status = self._fish.status()
+        except NoDaemon as error:
+            raise LinkLost(str(error)) from None
+        if not self._is_ours(status):
+            raise self._lost(status)
+
+    def _is_ours(self, status: Status) -> bool:
+        """Is this agent in command, or waited for?"""
+        return _waits_for_an_agent(status) and (
+            self._agent.in_command or status.parameters["agent"] == self._agent.address
+        )
+
+    def _lost(self, status: Status | None = None) -> LinkLost:
+        """Why, in fishd's own words."""
+        self._agent.in_command = False
+        try:
+            status = status or self._fish.status()
+        except NoDaemon as error:
+            return LinkLost(str(error))
+        if status.reason:
+            return LinkLost(f"fishd is in mode {status.mode}: {status.reason.message}")
+        if self._is_ours(status):
+            return LinkLost(
+                f"fishd at {self._fish.endpoint} has sent no observation to {self._agent.address} "
+                f"within {self._patience:g} s"
+            )
+        if status.mode == "running":
+            return LinkLost(f"another controller has taken command: {status.controller}")
+        return LinkLost("fishd was told to stop")
+
+
+def _waits_for_an_agent(status: Status) -> bool:
+    return status.mode == "running" and status.controller == "remote"
+
+
+def _agent(address: str | None, status: Status) -> Agent:
+    if address is not None:
+        return Agent(address)
+    if _waits_for_an_agent(status):
+        with contextlib.suppress(FishError):  # another agent is there, or that is another machine
+            return Agent(status.parameters["agent"])
+    return Agent()
+
+
+def _observation(message: Observed) -> Observation:
+    return Observation(
+        time=message.time,
+        dt=message.dt,
+        fx=message.fx,
+        fy=message.fy,
+        fy_rate=message.fy_rate,
+        fin_velocity=message.fin_velocity,
+        instruction_angle=message.instruction_angle,
+        thrust=message.thrust,
+        frequency=message.frequency,
+    )

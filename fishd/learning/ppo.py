@@ -1,0 +1,148 @@
+"""The learner: PPO of stable-baselines3, and its policy as plain layers."""
+
+from collections.abc import Generator
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import Linear
+
+from fishd.learning.environment import spaces
+from fishd.learning.mirror import Layers, MirrorPolicy, plain_layers
+from fishd.learning.settings import PpoSettings, TrainingSettings
+from fishd.policies.card import Feature, Layout
+from fishd.signals import Observation
+
+_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+
+
+class Rollout(RolloutBuffer):
+    """The steps of one update, less those that teach nothing.
+
+    A step is void where something else than the agent's action was in force: what came of it is
+    nobody's merit. Neither it nor, through the advantages, the steps before it learn from that.
+    """
+
+    def reset(self) -> None:
+        """Forget all steps."""
+        super().reset()
+        self.void = np.zeros(self.buffer_size, dtype=bool)
+        """True for each step that teaches nothing."""
+
+    def compute_returns_and_advantage(
+        self, last_values: torch.Tensor, dones: NDArray[np.bool_]
+    ) -> None:
+        """As in PPO; a void step turns out just as expected, and ends its episode."""
+        self.rewards[self.void] = self.values[self.void]
+        super().compute_returns_and_advantage(last_values, dones)
+
+    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
+        """Minibatches in random order, of the steps that teach something."""
+        for batch in super().get(batch_size):
+            if len(batch.advantages) > 1:  # of fewer no spread can be taken
+                yield batch
+
+    def _get_samples(self, batch_inds: NDArray[np.int64], env: Any = None) -> RolloutBufferSamples:
+        return super()._get_samples(batch_inds[~self.void[batch_inds]], env)
+
+
+def make_learner(settings: TrainingSettings, env: VecEnv) -> PPO:
+    """A new PPO with a policy that knows nothing; seeds torch, numpy and the environment."""
+    ppo = settings.ppo
+    return PPO(
+        MirrorPolicy if ppo.symmetric else ActorCriticPolicy,
+        env,
+        learning_rate=ppo.learning_rate,
+        n_steps=ppo.n_steps,
+        batch_size=ppo.batch_size,
+        n_epochs=ppo.n_epochs,
+        gamma=ppo.gamma,
+        gae_lambda=ppo.gae_lambda,
+        clip_range=ppo.clip_range,
+        ent_coef=ppo.ent_coef,
+        vf_coef=ppo.vf_coef,
+        max_grad_norm=ppo.max_grad_norm,
+        target_kl=ppo.target_kl,
+        rollout_buffer_class=Rollout,
+        policy_kwargs=_shape(ppo),
+        seed=settings.seed,
+        device="cpu",
+    )
+
+
+def make_policy(ppo: PpoSettings, features: int) -> ActorCriticPolicy:
+    """The networks alone, as `make_learner` makes them, for an agent that sees so many features."""
+    observation, action = spaces(features)
+    kind = MirrorPolicy if ppo.symmetric else ActorCriticPolicy
+    return kind(observation, action, lambda _: ppo.learning_rate, **_shape(ppo))
+
+
+def _shape(ppo: PpoSettings) -> dict[str, Any]:
+    return {
+        "net_arch": {"pi": list(ppo.hidden), "vf": list(ppo.hidden)},
+        "activation_fn": _ACTIVATIONS[ppo.activation],
+        "log_std_init": ppo.log_std_init,
+    }
+
+
+def learning_rate(ppo: PpoSettings, steps: int) -> float:
+    """The rate for the update that comes after so many steps since the training began."""
+    share = min(1.0, steps / ppo.decay_steps)
+    return ppo.learning_rate + share * (ppo.final_learning_rate - ppo.learning_rate)
+
+
+def set_learning_rate(model: PPO, rate: float) -> None:
+    """The rate of the next updates, whatever share of the training is done."""
+    model.lr_schedule = FloatSchedule(rate)
+
+
+def layers_of(policy: ActorCriticPolicy) -> Layers:
+    """The deterministic policy, from its inputs to the mean of the action."""
+    hidden = [part for part in policy.mlp_extractor.policy_net if isinstance(part, Linear)]
+    last = cast(Linear, policy.action_net)
+    layers = [
+        (
+            linear.weight.detach().numpy().astype(np.float32),
+            linear.bias.detach().numpy().astype(np.float32),
+        )
+        for linear in (*hidden, last)
+    ]
+    return plain_layers(layers) if isinstance(policy, MirrorPolicy) else layers
+
+
+def is_finite(model: PPO) -> bool:
+    """False once learning has blown up."""
+    return all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())
+
+
+class Deterministic:
+    """The policy as it stands, without exploration: observation in, instruction angle out [rad].
+
+    A copy: training goes on without it. In numpy, several times as fast as torch for one input.
+    """
+
+    def __init__(
+        self, policy: ActorCriticPolicy, features: tuple[Feature, ...], amplitude: float
+    ) -> None:
+        """amplitude: Φ [rad]"""
+        self._layers = [(weight.copy(), bias.copy()) for weight, bias in layers_of(policy)]
+        self._tanh = policy.activation_fn is torch.nn.Tanh
+        self._layout = Layout(features)
+        self._amplitude = amplitude
+
+    def __call__(self, observation: Observation) -> float:
+        """The instruction angle that answers an observation [rad]."""
+        values = self._layout.vector(observation)
+        *hidden, (weight, bias) = self._layers
+        for inner, offset in hidden:
+            values = inner @ values + offset
+            values = np.tanh(values) if self._tanh else np.maximum(values, 0.0)
+        action = float((weight @ values + bias)[0])
+        return max(-1.0, min(1.0, action)) * self._amplitude

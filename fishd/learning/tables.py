@@ -1,0 +1,81 @@
+"""The CSV files of a run: one row an update, one row an evaluation; they go on after a resume."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.logger import KVWriter
+
+PROGRESS = {
+    "steps": "tank/steps",
+    "tank_time": "tank/time",
+    "reward": "rollout/reward",
+    "thrust": "rollout/thrust",
+    "efficiency": "rollout/efficiency",
+    "frequency": "rollout/frequency",
+    "fullness": "rollout/fullness",
+    "lost": "tank/lost",
+    "paused": "tank/paused",
+    "learning_rate": "train/learning_rate",
+    "loss": "train/loss",
+    "policy_loss": "train/policy_gradient_loss",
+    "value_loss": "train/value_loss",
+    "entropy_loss": "train/entropy_loss",
+    "kl": "train/approx_kl",
+    "clip_fraction": "train/clip_fraction",
+    "explained_variance": "train/explained_variance",
+    "deviation": "train/std",
+}
+"""Columns of progress.csv, and the keys that they have in TensorBoard."""
+
+
+class Table:
+    """A CSV file with a head; every row is on disk, for all that this process can do, at once."""
+
+    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
+        self._path = path
+        self._columns = columns
+        if not path.exists():
+            self._write([list(columns)], "w")
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """One row; numbers in full precision."""
+        self._write([[_plain(row[column]) for column in self._columns]], "a")
+
+    def keep_until(self, steps: int) -> None:
+        """Drop the rows of steps that a resumed run is going to do again."""
+        with self._path.open(newline="", encoding="utf-8") as file:
+            head, *rows = csv.reader(file)
+        at = head.index("steps")
+        whole = [row for row in rows if len(row) == len(head)]  # the last may be cut off
+        self._write([head, *(row for row in whole if int(row[at]) <= steps)], "w")
+
+    def _write(self, rows: list[list[Any]], mode: str) -> None:
+        with self._path.open(mode, newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+class Progress(KVWriter):
+    """Writes what stable-baselines3 logs in an update as a row of progress.csv."""
+
+    def __init__(self, path: Path) -> None:
+        self.table = Table(path, tuple(PROGRESS))
+
+    def write(
+        self,
+        key_values: dict[str, Any],
+        key_excluded: dict[str, tuple[str, ...]],
+        step: int = 0,
+    ) -> None:
+        """One row."""
+        self.table.add({column: key_values.get(key) for column, key in PROGRESS.items()})
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def _plain(value: Any) -> Any:
+    """numpy's numbers as Python's, truth as 0 and 1."""
+    value = value.item() if hasattr(value, "item") else value
+    return int(value) if isinstance(value, bool) else value

@@ -1,0 +1,94 @@
+"""Deterministic evaluations during a training: how does the policy swim without exploration?"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from fishd.config import Config
+from fishd.learning.environment import SwimEnv
+from fishd.learning.evaluation import judge
+from fishd.learning.settings import EvaluationSettings, TrainingSettings
+from fishd.learning.variation import at_edge
+from fishd.signals import Observation
+
+STALLED = 0.05
+"""A mean |φ_c| below this share of Φ is no swimming."""
+
+Decide = Callable[[Observation], float]
+"""A policy: observation in, instruction angle out [rad]."""
+
+
+class Trial(Struct, frozen=True):
+    """What an evaluation came to."""
+
+    thrust: float
+    """Mean thrust [N]: the true one of a simulated fish, the measured one of another."""
+    frequency: float
+    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    fullness: float
+    """Mean |φ_c|/Φ."""
+
+    @property
+    def stalled(self) -> bool:
+        """Does the policy hold still, or nearly so?"""
+        return self.frequency == 0.0 or self.fullness < STALLED
+
+
+def in_simulation(config: Config, decide: Decide, settings: EvaluationSettings) -> Trial:
+    """A fresh fish as configured, not one of a randomised training, and with other noise."""
+    other = replace(config.simulation, seed=config.simulation.seed + 1)
+    found = judge(replace(config, simulation=other), decide, settings.seconds, settings.settle)
+    return Trial(float(found.mean_thrust), float(found.frequency), float(found.fullness))
+
+
+def worst_of_others(config: Config, decide: Decide, settings: TrainingSettings) -> float:
+    """Lowest efficiency on fish at the edges of the randomisation, each over its own optimum."""
+    trial = settings.evaluation
+    return min(
+        judge(
+            at_edge(config, settings.randomisation, seed), decide, trial.seconds, trial.settle
+        ).efficiency
+        for seed in range(trial.others)
+    )
+
+
+def on_link(
+    env: SwimEnv, decide: Decide, settings: EvaluationSettings, stop: Callable[[], bool]
+) -> Trial | None:
+    """The very fish that learns, by its measured thrust; None where `stop` says so on the way.
+
+    The fish must not be at pause. Raises `LinkLost`.
+    """
+    tick, amplitude = env.link.tick, env.link.amplitude
+    ticks = math.ceil(settings.seconds / tick)
+    settled = round(settings.settle / tick)
+    thrusts, angles = [], []
+    for index in range(ticks):
+        if stop():
+            return None
+        angle = max(-amplitude, min(amplitude, decide(env.latest)))
+        env.advance(angle)
+        if index >= settled:
+            thrusts.append(env.latest.fx)
+            angles.append(angle)
+    shares = np.array(angles) / amplitude
+    return Trial(
+        thrust=float(np.mean(thrusts)),
+        frequency=beat_frequency(shares, tick),
+        fullness=float(np.mean(np.abs(shares))),
+    )
+
+
+def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:
+    """Tail beats per second, from the changes of side of a command; 0 for less than a beat [Hz].
+
+    shares: φ_c/Φ of successive ticks; what is too small to swim with is on neither side
+    tick: [s]
+    """
+    sides = np.sign(shares[np.abs(shares) >= STALLED])
+    reversals = int(np.count_nonzero(np.diff(sides)))
+    return reversals / (2.0 * len(shares) * tick) if reversals > 1 else 0.0

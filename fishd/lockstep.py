@@ -1,0 +1,76 @@
+"""Lockstep: ticks of virtual time for a daemon, which wait for the agent that is in command."""
+
+import asyncio
+import os
+from collections.abc import Callable
+from typing import Self
+
+from fishd.clock import Slot, Ticker, VirtualClock, VirtualTicker
+from fishd.loop import ControlLoop
+from fishd.remote.controller import Remote
+from fishd.supervisor import Mode
+
+GLANCE = 0.02
+"""How soon a wait notices that somebody else has taken command, or that fishd ends [s]."""
+
+
+class Lockstep:
+    """Yields slots as a `Ticker` does, and turns the loop in them.
+
+    While `remote` is in command, a tick follows as soon as the agent has answered. While anything
+    else is, ticks come at the pace of real time.
+    """
+
+    def __init__(self, loop: ControlLoop, clock: VirtualClock, period: float) -> None:
+        """Must be made inside a running asyncio loop."""
+        self._loop = loop
+        self._slots = iter(VirtualTicker(clock, period))
+        self._pace = Ticker(period)
+        self._events = asyncio.get_running_loop()
+        self._news = asyncio.Event()
+
+    def close(self) -> None:
+        """Stop ticking; may be called twice."""
+        self._pace.close()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Slot:
+        """The next slot, once it is due."""
+        if self._agent():
+            await asyncio.sleep(0)  # requests have their turn, however quick the agent is
+        else:
+            await anext(self._pace)
+        return next(self._slots)
+
+    async def tick(self, slot: Slot, glance: Callable[[], None]) -> None:
+        """One turn of the loop, which waits for the agent as long as that is in command.
+
+        glance: called again and again meanwhile; may put something else in command
+        """
+        turn = self._loop.observe(slot)
+        while (agent := self._agent()) and not agent.ready(turn.observation):
+            await self._wait_for(agent)
+            glance()
+        self._loop.act(turn)
+
+    def _agent(self) -> Remote | None:
+        """The controller that waits for an agent, if that is in command."""
+        controller = self._loop.controller
+        running = self._loop.supervisor.mode is Mode.RUNNING
+        return controller if running and isinstance(controller, Remote) else None
+
+    async def _wait_for(self, agent: Remote) -> None:
+        # A copy: whoever takes command closes the socket, while this still waits for it.
+        descriptor = os.dup(agent.fileno())
+        self._news.clear()
+        self._events.add_reader(descriptor, self._news.set)
+        try:
+            async with asyncio.timeout(GLANCE):
+                await self._news.wait()
+        except TimeoutError:
+            pass
+        finally:
+            self._events.remove_reader(descriptor)
+            os.close(descriptor)

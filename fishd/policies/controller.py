@@ -1,0 +1,96 @@
+"""`ppo`: a learned policy, from a policy file, in the tick."""
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+from msgspec import Meta, Struct
+
+from fishd.controllers.base import Controller, Limits
+from fishd.errors import ParameterError, PolicyError
+from fishd.policies import library
+from fishd.signals import Observation
+
+if TYPE_CHECKING:  # numbers and onnxruntime are loaded with the first policy
+    from fishd.policies.card import Card
+    from fishd.policies.runtime import Network
+
+
+class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Parameters of `ppo`."""
+
+    policy: Annotated[
+        str,
+        Meta(
+            min_length=1,
+            max_length=4096,
+            pattern="^[^\x00-\x1f\x7f-\x9f]*$",
+            description="What to follow; 'fishctl policies' lists those that have a name.",
+            extra_json_schema={"unit": "1", "file": library.SUFFIX},
+        ),
+    ]
+
+
+class Ppo(Controller[PpoParameters]):
+    """Follow a learned policy: a small network chooses each instruction angle.
+
+    It is what `fishctl learn export` writes: an ONNX model with the card that says what it must be
+    shown, at which tick, and what its output means.
+    """
+
+    Parameters = PpoParameters
+
+    def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
+        """Reads, checks and warms up the policy."""
+        from fishd.policies.card import Layout
+
+        self.parameters = parameters  # without super(), which would do all of it twice
+        self.limits = limits
+        card, self._network = _open(parameters, limits)
+        self._write = Layout(card.observation).write
+        self._amplitude = card.amplitude
+        self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def check(cls, parameters: PpoParameters, limits: Limits) -> None:
+        """Refuse what is no policy, or none for this tick and amplitude."""
+        _open(parameters, limits)
+
+    def retune(self, parameters: PpoParameters) -> None:
+        """Refuse: another policy is loaded and warmed up outside the loop."""
+        if parameters != self.parameters:
+            raise ParameterError(
+                "policy: it cannot change in flight; start the controller again, with another one"
+            )
+
+    def rehearse(self) -> None:
+        """Choose once more as in the latest tick: three times as fast is the next one then."""
+        self.update(self._latest)
+
+    def update(self, observation: Observation) -> float:
+        """Φ times the network's output, which is cut to ±1 [rad].
+
+        An output that is not finite stays what it is, and ends in the fault `controller-error`.
+        """
+        self._latest = observation
+        network = self._network
+        self._write(observation, network.row)
+        action = network.run()
+        if math.isfinite(action):
+            action = max(-1.0, min(1.0, action))
+        return self._amplitude * action
+
+
+def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
+    from fishd.policies import file
+    from fishd.policies.runtime import Network
+
+    try:
+        path = library.find(parameters.policy)
+        policy = file.read(path)
+        try:
+            policy.card.check_fit(limits.tick, limits.amplitude)
+        except PolicyError as error:
+            raise PolicyError(f"{path}: {error}") from None
+        return policy.card, Network(policy)
+    except PolicyError as error:
+        raise ParameterError(f"policy: {error}", ("policy",)) from None

@@ -1,0 +1,212 @@
+"""Reads a policy file, and refuses what is none or would run code.
+
+A policy file is an ONNX model with a card (`fishd.policies.card`) in its metadata. Messages are for
+the person who named the file: why it is refused, and what to do.
+"""
+
+import os
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fishd.errors import PolicyError
+from fishd.policies.card import KEY, Card, decode
+
+if TYPE_CHECKING:
+    from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
+
+INPUT, OUTPUT = "observation", "action"
+LARGEST = 16 * 2**20
+"""Longer files are not read: a policy has some ten thousand weights [bytes]."""
+MISSING = (
+    "is not installed: install fishd[policy], or onnx and onnxruntime, which have no build for "
+    "32-bit ARM"
+)
+
+_EXPORT = "export it with 'fishctl learn export'"
+_HIDDEN = ("/home/", "/root/", "/run/user/")
+"""What systemd's ProtectHome= hides from a service."""
+
+
+class PolicyFile(NamedTuple):
+    """A file that was read and found good; whether it fits a robot is another question."""
+
+    path: Path
+    content: bytes
+    card: Card
+
+
+def read(path: Path) -> PolicyFile:
+    """The policy in a file; raises `PolicyError` that names it."""
+    try:
+        content = _content(path)
+        return PolicyFile(path, content, parse(content))
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
+
+
+def parse(content: bytes) -> Card:
+    """The card of a policy whose whole content is good; raises `PolicyError`."""
+    _refuse_pickles(content)
+    model = _model(content)
+    card = _card(model)
+    _check_ends(model.graph, len(card.observation))
+    _check_graph(model.graph)
+    for function in model.functions:
+        _check_nodes(function.node)
+    return card
+
+
+def _content(path: Path) -> bytes:
+    def opener(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NONBLOCK)  # a pipe would hold the reader for ever
+
+    try:
+        with open(path, "rb", opener=opener) as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise PolicyError("is not a regular file")
+            content = file.read(LARGEST + 1) if found.st_size <= LARGEST else None
+    except FileNotFoundError:
+        raise PolicyError(f"no such file{_why_hidden(path)}") from None
+    except OSError as error:
+        raise PolicyError(f"cannot be read: {error.strerror}") from None
+    if content is None or len(content) > LARGEST:
+        raise PolicyError(f"is longer than {LARGEST // 2**20} MB, far more than a policy needs")
+    return content
+
+
+def _why_hidden(path: Path) -> str:
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if not (state and str(path).startswith(_HIDDEN)):
+        return ""
+    return (
+        f" that this fishd could see: it is a service, put the file into {state}/policies and give "
+        "its name"
+    )
+
+
+def _refuse_pickles(content: bytes) -> None:
+    if content.startswith(b"\x80"):
+        raise PolicyError(f"this is a pickle, which could run any code; {_EXPORT}")
+    if content.startswith(b"PK"):
+        raise PolicyError(
+            "this is a zip archive as torch writes, with a pickle, which could run any code; "
+            f"{_EXPORT}"
+        )
+
+
+def _model(content: bytes) -> "ModelProto":
+    try:
+        import onnx
+    except ImportError:
+        raise PolicyError(f"it cannot be checked: onnx {MISSING}") from None
+    try:
+        model = onnx.load_model_from_string(content)
+    except Exception:  # protobuf has classes of its own
+        model = None
+    # Almost any bytes are some message of protobuf, with fields that nobody knows.
+    if model is None or not (model.ir_version and model.opset_import and model.graph.node):
+        raise PolicyError(f"this is no ONNX model; {_EXPORT}")
+    return model
+
+
+def _card(model: "ModelProto") -> Card:
+    cards = [entry.value for entry in model.metadata_props if entry.key == KEY]
+    if not cards:
+        raise PolicyError(
+            "this ONNX file says nothing about observation, tick and Φ, without which it cannot be "
+            f"run: its metadata lacks {KEY}; {_EXPORT}"
+        )
+    if len(cards) > 1:
+        raise PolicyError(f"it has {len(cards)} cards that may contradict one another")
+    return decode(cards[0])
+
+
+def _check_ends(graph: "GraphProto", features: int) -> None:
+    given = {tensor.name for tensor in graph.initializer}
+    inputs = [value for value in graph.input if value.name not in given]
+    wanted = f"one float32 {{}} of shape [1, {{}}] named '{{}}' is needed; {_EXPORT}"
+    for what, found, name, width in (
+        ("inputs", inputs, INPUT, features),
+        ("outputs", list(graph.output), OUTPUT, 1),
+    ):
+        if [_form(value) for value in found] != [(name, "float32", (1, width))]:
+            shown = ", ".join(_spelled(value) for value in found) or "none"
+            raise PolicyError(f"its {what}: {shown}; {wanted.format(what[:-1], width, name)}")
+
+
+def _form(value: "ValueInfoProto") -> tuple[str, str, tuple[int | str, ...]]:
+    """Name, type and dimensions; a dimension that is left open is its name, or `?`."""
+    from onnx import TensorProto
+
+    tensor = value.type.tensor_type
+    try:
+        kind = TensorProto.DataType.Name(tensor.elem_type).lower()
+    except ValueError:
+        kind = "unknown"
+    dims = tuple(
+        int(dim.dim_value) if dim.HasField("dim_value") else dim.dim_param or "?"
+        for dim in tensor.shape.dim
+    )
+    return value.name, "float32" if kind == "float" else kind, dims
+
+
+def _spelled(value: "ValueInfoProto") -> str:
+    name, kind, dims = _form(value)
+    return f"{kind} of shape [{', '.join(map(str, dims))}] named '{name}'"
+
+
+def _check_graph(graph: "GraphProto") -> None:
+    """Every number of the model, wherever it hides, is in this file and finite."""
+    for tensor in graph.initializer:
+        _check_tensor(tensor)
+    for sparse in graph.sparse_initializer:
+        _check_tensor(sparse.values)
+    _check_nodes(graph.node)
+
+
+def _check_nodes(nodes: "Iterable[NodeProto]") -> None:
+    for node in nodes:
+        for attribute in node.attribute:
+            if not np.isfinite([attribute.f, *attribute.floats]).all():
+                raise PolicyError(
+                    _not_finite(f"'{attribute.name}' of '{node.name or node.op_type}'")
+                )
+            for tensor in (attribute.t, *attribute.tensors):
+                _check_tensor(tensor)
+            for sparse in (attribute.sparse_tensor, *attribute.sparse_tensors):
+                _check_tensor(sparse.values)
+            for graph in (attribute.g, *attribute.graphs):
+                _check_graph(graph)
+
+
+def _check_tensor(tensor: "TensorProto") -> None:
+    from onnx import TensorProto, numpy_helper
+
+    what = f"weights '{tensor.name}'" if tensor.name else "constants"
+    if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
+        raise PolicyError(f"its {what} are in another file; save the model as a single file")
+    if tensor.data_type in (TensorProto.UNDEFINED, TensorProto.STRING):
+        return
+    try:
+        array = numpy_helper.to_array(tensor)
+    except Exception as error:  # a tensor may contradict itself in many ways
+        raise PolicyError(f"its {what} cannot be read: {one_line(error)}") from None
+    numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise PolicyError(_not_finite(what))
+
+
+def _not_finite(what: str) -> str:
+    return (
+        f"its {what} are not all finite numbers: the training blew up; export an earlier checkpoint"
+    )
+
+
+def one_line(error: Exception) -> str:
+    """What a library says, as part of a sentence."""
+    return " ".join(str(error).split())[:300] or type(error).__name__

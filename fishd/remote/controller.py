@@ -1,0 +1,237 @@
+"""`remote`: an agent in another process chooses the instruction angle; see docs/remote.md."""
+
+import secrets
+import time
+from typing import Any
+
+from fishd.controllers.base import Controller, Limits
+from fishd.errors import ControllerFault, ParameterError
+from fishd.remote.messages import Ended, FromAgent, Observed, Pause, encode
+from fishd.remote.parameters import RemoteParameters
+from fishd.remote.wire import Wire, is_address
+from fishd.signals import Observation
+
+DEADLINE = 0.4
+"""Time that the agent has by default, as a share of the tick."""
+LONGEST_DEADLINE = 0.45
+"""Of the half tick that a controller may take, the rest is for its own work."""
+LONGEST_WAIT = 60.0
+"""How long a run in virtual time waits for its agent, pauses not counted [s, real]."""
+MOST_AT_ONCE = 200
+"""Messages that are read before time is looked at."""
+
+
+class Remote(Controller[RemoteParameters]):
+    """Let an agent choose: a program in another process, on another machine perhaps.
+
+    Each tick sends it the observation and waits for its action until the deadline. A tick without
+    one is spent at neutral. An action is for the tick whose observation it answers, or for none.
+    Virtual time stands still meanwhile, so there the agent has as long as it needs.
+    """
+
+    Parameters = RemoteParameters
+
+    def __init__(self, parameters: RemoteParameters, limits: Limits) -> None:
+        super().__init__(parameters, limits)
+        self._wire = Wire(parameters.agent)
+        self._session = secrets.token_hex(8)
+        self._observation: Observation | None = None
+        """Of the tick that is going on."""
+        self._question = b""
+        self._unsent = False
+        self._seq = 0
+        self._open = 0
+        """The observation whose action is waited for; 0 for none."""
+        self._command: float | None = None
+        self._resting = False
+        """Is the agent in a pause in this tick?"""
+        self._pause = 0.0
+        """What is left of it; in virtual time, how long it may take [s]."""
+        self._answered = 0
+        self._lost = 0
+        self._late = 0
+        self._silent = 0
+        """Ticks in a row without an action."""
+        self._waited = 0.0
+        """For the first action [s]."""
+        self._problem: ControllerFault | None = None
+
+    @classmethod
+    def check(cls, parameters: Any, limits: Limits) -> None:
+        """Refuse what is no address, and a deadline that the tick has no room for."""
+        super().check(parameters, limits)
+        if not is_address(parameters.agent):
+            raise ParameterError(
+                f"agent: '{parameters.agent}' is not valid: tcp://HOST:PORT or ipc://PATH is "
+                "needed, the address that the agent has bound",
+                ("agent",),
+            )
+        longest = LONGEST_DEADLINE * limits.tick
+        if parameters.deadline is not None and parameters.deadline > longest:
+            raise ParameterError(
+                f"deadline: {parameters.deadline:g} s is not valid: at most {longest:g} s, "
+                f"{LONGEST_DEADLINE:g} of a tick, as half a tick is all that a controller may take",
+                ("deadline",),
+            )
+
+    def retune(self, parameters: RemoteParameters) -> None:
+        """Take another deadline or limit; another agent has to take over properly."""
+        if parameters.agent != self.parameters.agent:
+            raise ParameterError(
+                "agent: cannot be changed in command; to change agents, use "
+                f"'fishctl set-controller remote --agent {parameters.agent}'"
+            )
+        super().retune(parameters)
+
+    def fileno(self) -> int:
+        """A descriptor that is readable once `ready` may have more to say."""
+        return self._wire.fileno()
+
+    def ready(self, observation: Observation) -> bool:
+        """Ask the agent, without waiting; True once `update` would return at once.
+
+        Call it with the observation of the tick as often as there is news.
+        """
+        try:
+            if observation is not self._observation:
+                self._begin(observation)
+            self._exchange()
+        except ControllerFault as problem:
+            self._problem = problem
+        return self._settled or self._problem is not None
+
+    def update(self, observation: Observation) -> float:
+        """The agent's action [rad], or 0 where none came in time.
+
+        Raises `ControllerFault`: `remote-silent` where that has lasted too long, `remote-error`
+        where something else came.
+        """
+        begun = time.monotonic()
+        while not self.ready(observation):
+            left = begun + self._patience - time.monotonic()
+            if left <= 0.0:
+                break
+            self._wire.wait(left)
+        if self._problem:
+            raise self._problem
+        return self._decide(observation)
+
+    def close(self) -> None:
+        """Tell the agent that it is no longer in command."""
+        self._wire.close(encode(Ended(session=self._session)))
+
+    @property
+    def _patience(self) -> float:
+        """How long a tick may wait [s]."""
+        if self.limits.virtual:
+            return LONGEST_WAIT + self._pause
+        deadline = self.parameters.deadline
+        return DEADLINE * self.limits.tick if deadline is None else deadline
+
+    @property
+    def _settled(self) -> bool:
+        """Is it clear what this tick will command?"""
+        return self._resting or self._command is not None
+
+    def _begin(self, o: Observation) -> None:
+        """Begin a tick: what has come since the last one answers none, but may be a pause."""
+        self._observation, self._command, self._unsent, self._open = o, None, False, 0
+        self._exchange()
+        if not self.limits.virtual:
+            self._pause = max(0.0, self._pause - o.dt)
+            self._resting = self._pause > 0.0
+            if self._resting:
+                return
+        self._question = encode(
+            Observed(
+                session=self._session,
+                seq=self._seq + 1,
+                answered=self._answered,
+                lost=self._lost,
+                time=o.time,
+                dt=o.dt,
+                fx=o.fx,
+                fy=o.fy,
+                fy_rate=o.fy_rate,
+                fin_velocity=o.fin_velocity,
+                instruction_angle=o.instruction_angle,
+                thrust=o.thrust,
+                frequency=o.frequency,
+                tick=self.limits.tick,
+                amplitude=self.limits.amplitude,
+            )
+        )
+        self._unsent = True
+
+    def _exchange(self) -> None:
+        """Send and receive whatever is possible without waiting."""
+        for _ in range(MOST_AT_ONCE):
+            writable, readable = self._wire.state()
+            if self.limits.virtual and self._open and not writable:
+                self._unsent = True  # the agent is gone: its successor has to be asked again
+            if self._unsent and writable:
+                self._send()
+            elif readable and self._command is None:
+                self._take(self._wire.receive())
+            else:
+                return
+
+    def _send(self) -> None:
+        self._wire.send(self._question)
+        self._unsent = False
+        if not self._open:  # else it is the same one, once more
+            self._seq += 1
+            self._open = self._seq
+            self._lost = 0
+
+    def _take(self, message: FromAgent) -> None:
+        if message.session != self._session:
+            self._late += 1  # for another fishd, or from before this agent took over
+        elif isinstance(message, Pause):
+            over = self._pause > 0.0 and message.seconds == 0.0
+            self._pause = message.seconds
+            if self._open:  # this tick has been asked about, and once more when the pause is over
+                self._resting = self._pause > 0.0 and not self.limits.virtual
+                self._unsent = over
+        elif message.seq == self._open:
+            self._command = message.phi_c
+        elif message.seq <= self._seq:
+            self._late += 1
+        else:
+            raise ControllerFault(
+                "remote-error",
+                f"the agent at {self.parameters.agent} sent an action for observation "
+                f"{message.seq}, but {self._seq} is the latest that it was sent",
+            )
+
+    def _decide(self, observation: Observation) -> float:
+        """What the tick has come to, and how long that may go on."""
+        if self._command is not None:
+            self._answered, self._silent = self._open, 0
+            return self._command
+        if self._settled:
+            self._silent = 0
+            return 0.0
+        self._lost += 1
+        agent, patience = self.parameters.agent, self._patience
+        if self.limits.virtual:
+            raise _silence(f"the agent at {agent} has not answered within {patience:g} s")
+        if not self._answered:
+            self._waited += observation.dt
+            if self._waited + 0.5 * self.limits.tick < self.parameters.first_action:
+                return 0.0
+            raise _silence(
+                f"no action has come from the agent at {agent} within "
+                f"{self.parameters.first_action:g} s: does it run, and is that its address?"
+            )
+        self._silent += 1
+        if self._silent >= self.parameters.misses:
+            raise _silence(
+                f"the agent at {agent} has not answered within {patience * 1e3:g} ms, "
+                f"{self._silent} ticks in a row ({self._late} answers came too late)"
+            )
+        return 0.0
+
+
+def _silence(what: str) -> ControllerFault:
+    return ControllerFault("remote-silent", what)

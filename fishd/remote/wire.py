@@ -1,0 +1,104 @@
+"""The socket between the controller `remote` and its agent; nothing here waits but `wait`."""
+
+import re
+import select
+
+import msgspec
+import zmq
+
+from fishd.errors import ControllerFault
+from fishd.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
+
+_ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
+_QUEUE = 100
+"""Messages kept in either direction; an agent that does not read gets no more than these."""
+_FAREWELL = 200
+"""How long the last message may take to leave, in the background [ms]."""
+
+
+class _Versioned(msgspec.Struct):
+    """Any message, as far as every version will have it."""
+
+    v: int = VERSION
+
+
+def is_address(text: str) -> bool:
+    """Can a socket connect to it?"""
+    found = _ADDRESS.fullmatch(text)
+    return found is not None and 0 <= int(found["port"] or 1) < 65536
+
+
+class Wire:
+    """A DEALER socket that connects to the agent, and connects again when it was lost."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        # The context of the whole process: its thread has fishd's priority, and to end one of its
+        # own would take time, in a tick.
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+        self._socket = context.socket(zmq.DEALER)
+        self._socket.set(zmq.IMMEDIATE, 1)  # nothing old waits for an agent that comes late
+        self._socket.set(zmq.SNDHWM, _QUEUE)
+        self._socket.set(zmq.RCVHWM, _QUEUE)
+        self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
+        self._socket.connect(address)
+
+    def fileno(self) -> int:
+        """A descriptor that is readable once `state` may have changed."""
+        return self._socket.FD
+
+    def state(self) -> tuple[bool, bool]:
+        """Can a message be sent, and is there one to receive?"""
+        events = int(self._socket.get(zmq.EVENTS))
+        return bool(events & zmq.POLLOUT), bool(events & zmq.POLLIN)
+
+    def send(self, payload: bytes) -> None:
+        """Send a message, where `state` says that this is possible."""
+        self._socket.send(payload, zmq.DONTWAIT)
+
+    def receive(self) -> FromAgent:
+        """A message, where `state` says that there is one.
+
+        Raises `ControllerFault` when it is none that an agent may send.
+        """
+        frames = self._socket.recv_multipart(zmq.DONTWAIT)
+        if len(frames) != 1:
+            raise self._bad(f"a message of {len(frames)} frames; one frame of JSON is needed")
+        try:
+            message: FromAgent = decode_from_agent(frames[0])
+        except msgspec.DecodeError as error:  # of the syntax, or of what is in it
+            raise self._bad(_why(frames[0], error)) from None
+        if message.v != VERSION:
+            raise self._bad(_other_version(message.v))
+        return message
+
+    def wait(self, seconds: float) -> None:
+        """Return when `state` has changed, or after a while."""
+        # zmq_poll and epoll count whole milliseconds, too coarse for a tick of a few.
+        select.select([self._socket.FD], [], [], seconds)
+
+    def close(self, farewell: bytes) -> None:
+        """Send a last message if somebody takes it, and disconnect; may be called twice."""
+        if self._socket.closed:
+            return
+        if self.state()[0]:
+            self._socket.send(farewell, zmq.DONTWAIT)
+        self._socket.close(linger=_FAREWELL)
+
+    def _bad(self, what: str) -> ControllerFault:
+        return ControllerFault("remote-error", f"the agent at {self._address} sent {what}")
+
+
+def _why(payload: bytes, error: msgspec.DecodeError) -> str:
+    try:
+        version = msgspec.json.decode(payload, type=_Versioned).v
+    except msgspec.DecodeError:
+        version = VERSION
+    if version != VERSION:
+        return _other_version(version)
+    shown = payload[:60].decode(errors="replace") + ("…" if len(payload) > 60 else "")
+    return f"{shown!r}, which is no action or pause: {error}"
+
+
+def _other_version(version: int) -> str:
+    return f"a message of version {version}; this fishd needs version {VERSION}"

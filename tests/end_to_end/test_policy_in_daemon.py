@@ -1,0 +1,172 @@
+"""Policies in a running fishd: put in command by name and by path, refused, listed, never late."""
+
+import json
+import pickle
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from policy_files import FLIP, card, linear, random_layers, write
+from processes import FISHCTL, PATIENCE, Daemon, Subscriber, running
+
+from fishd.client import Fish, Refused
+from fishd.policies.network import to_onnx
+
+
+@pytest.fixture
+def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder of policies that the daemon and fishctl both look into."""
+    folder = tmp_path / "policies"
+    monkeypatch.setenv("FISHD_POLICIES", str(folder))
+    write(folder, FLIP, "flip")
+    write(folder, to_onnx(linear(1.0), "tanh", card(tick=0.02)), "quick")
+    write(folder, pickle.dumps({}), "torch")
+    return folder
+
+
+@pytest.fixture
+def daemon(folder: Path, tmp_path: Path) -> Iterator[Daemon]:
+    with running(tmp_path) as found:
+        yield found
+
+
+def test_a_named_policy_swims(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        done = daemon.fishctl("set-controller", "ppo", "--policy", "flip")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "running: ppo policy=flip" in done.stdout
+        first = ticks.until(controller="ppo")
+        angles = [first["phi_c"], *(ticks.message()["phi_c"] for _ in range(5))]
+    assert angles == [0.42, -0.42, 0.42, -0.42, 0.42, -0.42]
+
+
+def test_a_relative_path_is_that_of_the_one_who_asks(daemon: Daemon, tmp_path: Path) -> None:
+    write(tmp_path / "elsewhere", FLIP, "mine")
+    done = subprocess.run(
+        [
+            FISHCTL,
+            "--endpoint",
+            daemon.endpoint,
+            "set-controller",
+            "ppo",
+            "--policy",
+            "./mine.onnx",
+        ],
+        cwd=tmp_path / "elsewhere",
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"ppo policy={tmp_path}/elsewhere/mine.onnx" in done.stdout
+
+
+def test_a_policy_that_loads_costs_no_tick(daemon: Daemon, folder: Path) -> None:
+    write(folder, to_onnx(random_layers(1, 64, 64, 1), "tanh", card()), "real")
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        before = ticks.message()
+        daemon.fishctl("set-controller", "ppo", "--policy", "real")
+        after = ticks.until(controller="ppo")
+    assert after["missed"] == before["missed"]
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("flop", "ppo: policy: no policy is named 'flop'; did you mean 'flip'? There are: flip, "),
+        ("torch", "this is a pickle, which could run any code"),
+        ("quick", "it was trained at a tick of 20 ms, this robot's is 50 ms"),
+        ("/nowhere/x.onnx", "ppo: policy: /nowhere/x.onnx: no such file [bad-parameter]"),
+    ],
+)
+def test_a_policy_that_cannot_be_used_is_refused_in_one_line(
+    daemon: Daemon, policy: str, message: str
+) -> None:
+    done = daemon.fishctl("set-controller", "ppo", "--policy", policy)
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert json.loads(daemon.fishctl("status", "--json").stdout)["mode"] == "idle"
+
+
+def test_a_policy_does_not_change_in_flight(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "ppo", "--policy", "flip")
+    with Fish(daemon.endpoint) as fish:
+        with pytest.raises(Refused, match="ppo: policy: it cannot change in flight") as caught:
+            fish.set_parameters(policy="flip")
+        assert fish.status().controller == "ppo"
+    assert caught.value.code == "bad-parameter"
+
+
+def test_the_daemon_lists_its_policies_and_why_some_are_not_for_it(daemon: Daemon) -> None:
+    listed = {
+        info["name"]: info for info in json.loads(daemon.fishctl("policies", "--json").stdout)
+    }
+    assert listed["flip"]["problem"] == ""
+    assert listed["flip"]["card"]["amplitude"] == 0.42
+    assert listed["torch"]["card"] is None
+    text = daemon.fishctl("policies").stdout
+    assert "flip" in text
+    assert "    not here: this is a pickle, which could run any code" in text
+    assert "    not here: it was trained at a tick of 20 ms, this robot's is 50 ms" in text
+    shown = daemon.fishctl("policies", "show", "flip").stdout
+    assert "steps: 8000" in shown
+    assert "- name: instruction_angle\n  scale: 0.42" in shown
+
+
+def test_a_service_finds_policies_in_its_state_folder(tmp_path: Path) -> None:
+    write(tmp_path / "state" / "policies", FLIP, "kept")
+    under = ("env", f"STATE_DIRECTORY={tmp_path / 'state'}")
+    with running(tmp_path, under=under) as daemon, Fish(daemon.endpoint) as fish:
+        assert "kept" in {info.name for info in fish.policies()}
+        assert fish.set_controller("ppo", policy="kept").controller == "ppo"
+
+
+def test_a_fishd_without_a_policy_loads_nothing_of_training(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "ppo", "--policy", "flip")
+    loaded = Path(f"/proc/{daemon.process.pid}/maps").read_text()
+    assert "onnxruntime" in loaded
+    for package in ("torch", "matplotlib", "gymnasium"):
+        assert f"/{package}/" not in loaded
+
+
+def test_fishd_starts_with_a_policy_of_its_configuration(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "fishd.yaml"
+    file.write_text("start:\n  controller: ppo\n  parameters:\n    policy: flip\n")
+    with running(tmp_path, "--config", str(file)) as daemon, Fish(daemon.endpoint) as fish:
+        assert (fish.status().mode, fish.status().parameters) == ("running", {"policy": "flip"})
+    (folder / "flip.onnx").unlink()
+    status, _, errors = Daemon(tmp_path, "--config", str(file)).finish()
+    assert status == 78
+    assert f"fishd: {file}:4: start.parameters.policy: ppo: policy: no policy is named 'flip'" in (
+        errors
+    )
+
+
+def test_a_running_fishd_rehearses_its_controller(tmp_path: Path) -> None:
+    """A controller of another package, whose angle counts how often it was rehearsed."""
+    package = tmp_path / "site" / "rehearsing-1.dist-info"
+    package.mkdir(parents=True)
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: rehearsing\nVersion: 1\n")
+    (package / "entry_points.txt").write_text(
+        "[fishd.controllers]\nrehearsing = rehearsing:Rehearsing\n"
+    )
+    (tmp_path / "site" / "rehearsing.py").write_text(
+        "from fishd.controllers.hold import Hold\n\n\n"
+        "class Rehearsing(Hold):\n"
+        '    """Count."""\n\n'
+        "    count = 0\n\n"
+        "    def rehearse(self):\n"
+        "        self.count += 1\n\n"
+        "    def update(self, observation):\n"
+        "        return 1e-3 * self.count\n"
+    )
+    under = ("env", f"PYTHONPATH={tmp_path / 'site'}")
+    with running(tmp_path, under=under) as daemon, Subscriber(daemon.telemetry, b"tick") as ticks:
+        with Fish(daemon.endpoint) as fish:
+            fish.set_controller("rehearsing")
+        ticks.until(controller="rehearsing")
+        angles = (ticks.message()["phi_c"] for _ in range(200))
+        assert any(angle > 5e-3 for angle in angles)  # one for which there is no time is left out

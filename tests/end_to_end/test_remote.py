@@ -1,0 +1,219 @@
+"""A true fishd and a true agent, in two processes: who is in command, and what goes wrong."""
+
+import itertools
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from documents import FENCE, ROOT, text_of
+from processes import FISHCTL, PATIENCE, Daemon, Subscriber, running
+
+from fishd.client import Agent, Fish, Refused
+
+AGENT = """
+import sys
+from fishd.client import Agent
+
+with Agent(sys.argv[1]) as agent:
+    for seen in agent:
+        agent.act(0.25)
+"""
+
+
+@contextmanager
+def agent_process(address: str) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen([sys.executable, "-c", AGENT, address])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/agent"
+
+
+def status(daemon: Daemon) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(daemon.fishctl("status", "--json").stdout)
+    return found
+
+
+def test_an_agent_that_dies_leaves_a_fault_and_its_successor_swims_on(
+    daemon: Daemon, address: str
+) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        with agent_process(address) as process:
+            assert daemon.fishctl("set-controller", "remote", "--agent", address).returncode == 0
+            ticks.until(controller="remote", phi_c=0.25)
+            process.kill()
+            process.wait()
+            seen = [ticks.message()]
+            while seen[-1]["mode"] == "running":
+                seen.append(ticks.message())
+        angles = [tick["phi_c"] for tick in seen]
+        assert angles[-5:] == [0.0] * 5  # the fifth is the fault
+        assert angles[:-5][-1:] in ([], [0.25])
+        reason = status(daemon)["reason"]
+        assert reason["code"] == "remote-silent"
+        assert "has not answered within 20 ms, 5 ticks in a row" in reason["message"]
+        with agent_process(address):
+            refused = daemon.fishctl("set-controller", "remote", "--agent", address)
+            assert refused.returncode == 1
+            assert "has not answered within 20 ms" in refused.stderr
+            assert daemon.fishctl("clear-fault").returncode == 0
+            assert daemon.fishctl("set-controller", "remote", "--agent", address).returncode == 0
+            ticks.until(mode="running", phi_c=0.25)
+
+
+def test_no_late_action_reaches_the_servo(daemon: Daemon, address: str) -> None:
+    with (
+        Agent(address) as agent,
+        Fish(daemon.endpoint) as fish,
+        Subscriber(daemon.telemetry, b"tick") as telemetry,
+    ):
+        fish.set_controller("remote", agent=address, misses=1000)
+        late = 0
+        for seen in itertools.islice(agent, 40):
+            late += agent.lost
+            slow = seen.seq % 2 == 1
+            time.sleep(0.03 if slow else 0.0)  # of the 20 ms
+            agent.act(0.4 if slow else -0.1)
+        fish.stop()
+        ticks = [telemetry.until(controller="remote")]
+        while ticks[-1]["controller"] == "remote":
+            ticks.append(telemetry.message())
+    assert late >= 10
+    assert {tick["phi_c"] for tick in ticks[:-1]} == {0.0, -0.1}
+
+
+def test_an_agent_learns_for_seconds_and_then_swims_on(daemon: Daemon, address: str) -> None:
+    with Agent(address) as agent, Fish(daemon.endpoint) as fish:
+        fish.set_controller("remote", agent=address)
+        agent.observe()
+        agent.act(0.2)
+        agent.observe()
+        agent.pause(30.0)
+        time.sleep(1.0)  # twenty ticks
+        assert agent.poll(0.3) is None
+        assert fish.status().mode == "running"
+        agent.resume()
+        before = fish.status().seq
+        assert agent.observe().instruction_angle == 0.0
+        agent.act(0.2)
+        agent.observe()
+        assert fish.status().seq >= before
+        assert fish.status().mode == "running"
+
+
+def test_rubbish_is_a_fault_that_says_what_came(daemon: Daemon, address: str) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    socket = context.socket(zmq.DEALER)  # may bind just as well
+    socket.bind(address)
+    with Fish(daemon.endpoint) as fish:
+        fish.set_controller("remote", agent=address)
+        assert socket.poll(int(PATIENCE * 1e3))
+        seen = msgspec.json.decode(socket.recv())
+        assert seen["kind"] == "observation"
+        socket.send(b"0.3")
+        deadline = time.monotonic() + PATIENCE
+        while fish.status().mode == "running" and time.monotonic() < deadline:
+            time.sleep(0.02)
+        reason = fish.status().reason
+        assert reason
+        assert reason.code == "remote-error"
+        assert "sent '0.3', which is no action or pause" in reason.message
+    context.destroy(linger=0)
+
+
+def test_a_deadline_beyond_the_tick_is_refused(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish, pytest.raises(Refused, match=r"at most 0\.0225 s"):
+        fish.set_controller("remote", deadline=0.03)
+    assert status(daemon)["mode"] == "idle"
+
+
+def test_a_simulation_waits_for_its_agent(address: str) -> None:
+    with agent_process(address):
+        command = [FISHCTL, "simulate", "remote", "--agent", address, "--seconds", "20"]
+        done = subprocess.run(
+            [*command, "--settle", "1", "--json"],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
+        )
+    report = json.loads(done.stdout)
+    assert report["mode"] == "running"
+    assert report["ticks"] == 400
+    assert report["frequency"] == 0.0  # it holds 0.25 rad
+
+
+@contextmanager
+def waiting_daemon(folder: Path, address: str) -> Iterator[Daemon]:
+    """A fishd in lockstep that waits for an agent in its first tick."""
+    settings = ["lockstep=true", "start.controller=remote", f"start.parameters.agent={address}"]
+    with running(folder, *(word for s in settings for word in ("--set", s))) as daemon:
+        yield daemon
+
+
+def test_in_lockstep_fishd_waits_for_its_agent_and_answers_meanwhile(
+    tmp_path: Path, address: str
+) -> None:
+    with waiting_daemon(tmp_path, address) as daemon, Fish(daemon.endpoint) as fish:
+        time.sleep(0.5)
+        assert (fish.status().seq, fish.status().mode) == (1, "running")
+        with Subscriber(daemon.telemetry, b"status") as telemetry:
+            assert telemetry.message()["seq"] == 1
+        with Agent(address) as agent:
+            for seen in agent:
+                assert seen.time == pytest.approx((seen.seq - 1) * 0.05)
+                agent.act(0.1)
+                if seen.seq == 400:  # 20 s of virtual time
+                    break
+            agent.observe()
+            assert fish.status().seq == 401
+            assert fish.status().missed == 0
+
+
+@pytest.mark.parametrize("request_", ["stop", "estop", "set-controller swing"])
+def test_in_lockstep_a_request_ends_the_wait(tmp_path: Path, address: str, request_: str) -> None:
+    with waiting_daemon(tmp_path, address) as daemon:
+        assert daemon.fishctl(*request_.split()).returncode == 0
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            first = ticks.message()
+            assert first["controller"] == ("swing" if "swing" in request_ else "hold")
+            begun = time.monotonic()
+            while ticks.message()["seq"] < first["seq"] + 20:
+                pass
+            assert time.monotonic() - begun > 0.5  # at the pace of real time
+
+
+def test_in_lockstep_a_signal_ends_the_wait(tmp_path: Path, address: str) -> None:
+    with waiting_daemon(tmp_path, address) as daemon:
+        code, _, errors = daemon.end()
+    assert code == 0
+    assert "Traceback" not in errors
+
+
+def test_the_example_of_the_documentation_swims(daemon: Daemon) -> None:
+    document = text_of(ROOT / "docs" / "remote.md")
+    example = next(block for kind, block in FENCE.findall(document) if kind == "python")
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        process = subprocess.Popen(
+            [sys.executable, "-c", example], env={"FISHD_ENDPOINT": daemon.endpoint}
+        )
+        try:
+            ticks.until(controller="remote", phi_c=0.42)
+            ticks.until(controller="remote", phi_c=-0.42)
+        finally:
+            process.kill()
+            process.wait()

@@ -1,0 +1,31 @@
+"""A remote agent on the robot's own drivers, in real time."""
+
+import time
+from pathlib import Path
+
+from processes import running
+from test_virtual_pi_swims import virtual_pi
+
+from fishd.learning.on_daemon import OnDaemon
+
+
+def test_an_agent_swims_the_virtual_pi(tmp_path: Path) -> None:
+    with virtual_pi(tmp_path) as pi, running(tmp_path, *pi.settings) as daemon:
+        link = OnDaemon(daemon.endpoint, deadline=0.0225)
+        try:
+            link.start()
+            in_time = 0
+            for step in range(40):
+                angle = 0.3 if step % 12 < 6 else -0.3
+                found, lost = link.step(angle)
+                if not lost:
+                    in_time += 1
+                    assert abs(found.instruction_angle - angle) < 1e-6
+            assert in_time > 20
+            link.pause(10.0)
+            time.sleep(0.5)
+            rested = link.resume()
+            assert rested.time > found.time + 0.4
+            assert rested.instruction_angle == 0.0
+        finally:
+            link.close()

@@ -1,0 +1,142 @@
+"""Policies and controllers on the same fish: a table, JSON and a picture."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from processes import FISHCTL
+
+from fishd.config import load
+from fishd.errors import FishdError, ParameterError, UnknownController
+from fishd.learning import comparison
+from fishd.learning.comparison import Trace, compare, parse
+
+CONFIG = load(None, ["simulation.offset_y=0.005"])
+
+
+def swum(*texts: str, runs: int = 1) -> list[comparison.Standing]:
+    return compare(CONFIG, [parse(text) for text in texts], 20.0, 5.0, runs)[0]
+
+
+def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> None:
+    standings = swum(*(f"{name}:frequency=1.7" for name in ("square", "sine", "triangle")))
+    efficiencies = [standing.efficiency for standing in standings]
+    assert efficiencies == sorted(efficiencies, reverse=True)
+    assert [standing.squareness for standing in standings] == pytest.approx(
+        [1.0, 0.900, 0.866], abs=0.003
+    )
+    assert standings[0].frequency == pytest.approx(1.7, abs=0.02)
+
+
+def test_the_runs_of_a_contestant_differ_in_noise_and_are_summarised_by_the_median() -> None:
+    config = load(None, ["simulation.noise=0.02"])
+    (standing,), _ = compare(config, [parse("swing")], 20.0, 5.0, runs=5)
+    found = sorted(run.efficiency for run in standing.runs)
+    assert len(set(found)) > 1
+    assert [standing.lowest_efficiency, standing.efficiency, standing.highest_efficiency] == [
+        found[0],
+        found[2],
+        found[4],
+    ]
+
+
+def test_what_the_fish_starts_with_takes_no_part() -> None:
+    config = load(None, ["start.controller=hold"])
+    (standing,), _ = compare(config, [parse("swing")], 20.0, 5.0)
+    assert standing.efficiency > 0.9
+
+
+def test_without_names_the_best_square_wave_of_whole_ticks_meets_swing() -> None:
+    square, swing, *_ = comparison.default_contestants(CONFIG)
+    assert square.parameters["frequency"] == pytest.approx(1 / 0.6)
+    assert (square.controller, swing.controller) == ("square", "swing")
+
+
+def test_what_is_no_controller_is_taken_for_a_policy() -> None:
+    assert parse("champion") == ("champion", "ppo", {"policy": "champion"})
+    assert parse("C:/a.onnx").parameters == {"policy": "C:/a.onnx"}
+    with pytest.raises(ParameterError, match="champion"):
+        swum("champion")
+
+
+def test_nobody_swims_before_everybody_is_known_to_be_able_to() -> None:
+    done: list[None] = []
+    contestants = [parse("swing"), parse("square:frequency=99")]
+    with pytest.raises(ParameterError, match="frequency"):
+        compare(CONFIG, contestants, 20.0, 5.0, done=lambda: done.append(None))
+    assert not done
+
+
+@pytest.mark.parametrize(
+    "text", ["swing:C", "swing:=1", "swing:C=", "swing:C=[", "swing:D=1", "swing:C=much"]
+)
+def test_a_contestant_that_is_spelled_wrong_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises((ParameterError, UnknownController)) as caught:
+        swum(text)
+    assert "\n" not in str(caught.value)
+    assert "swing" in str(caught.value)
+
+
+def test_a_trace_is_the_end_of_the_run() -> None:
+    _, (trace,) = compare(CONFIG, [parse("square:frequency=1")], 20.0, 5.0)
+    assert trace.time[-1] == 0.0
+    assert trace.time[0] <= -comparison.TRACE
+    assert set(trace.command) == {0.42, -0.42}
+    assert max(trace.thrust) > 0.02
+    assert 0.1 < max(trace.fin) < 0.4
+
+
+def test_the_picture_begins_with_an_upward_reversal() -> None:
+    figures = pytest.importorskip("fishd.learning.figures")
+    times = [0.05 * k - 5.0 for k in range(101)]
+    command = [0.4 if k % 20 >= 10 else -0.4 for k in range(101)]
+    shown = figures._from_upward_reversal(Trace(times, command, times, times))
+    assert (shown.time[0], shown.command[0]) == (0.0, 0.4)
+    assert shown.time[-1] == pytest.approx(comparison.TRACE)
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [FISHCTL, "learn", "evaluate", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "contest.png"
+    done = run("swing:C=0.5", "hold", "--seconds", "15", "--settle", "5", "--png", str(picture))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "swing:C=0.5" in done.stdout
+    assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
+
+
+def test_the_command_prints_json_with_every_run() -> None:
+    done = run("swing", "square", "--seconds", "15", "--settle", "5", "--seeds", "2", "--json")
+    first, second = json.loads(done.stdout)
+    assert (first["contestant"], second["contestant"]) == ("swing", "square")
+    assert len(first["runs"]) == 2
+    assert {"efficiency", "thrust", "frequency", "fullness", "squareness"} <= set(first)
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from fishd.learning.figures import picture
+
+    standings, traces = compare(CONFIG, [parse("hold")], 6.0, 1.0)
+    with pytest.raises(FishdError, match=r"no/such\.png: the picture cannot be written"):
+        picture(tmp_path / "no" / "such.png", standings, traces, 0.42)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "status"),
+    [
+        (["swing:C=2"], "fishctl: swing: C: 2 is not valid: a number in [0, 1]", 1),
+        (["swing", "--seconds", "1"], "fishctl: nothing is left to judge", 1),
+        (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
+    ],
+)
+def test_a_wrong_command_is_one_line(arguments: list[str], message: str, status: int) -> None:
+    done = run(*arguments)
+    assert message in done.stderr
+    assert (done.stdout, done.returncode, done.stderr.count("\n")) == ("", status, 1)

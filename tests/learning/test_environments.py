@@ -1,0 +1,115 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
+pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from processes import Daemon, running  # noqa: E402
+from stable_baselines3.common.env_checker import check_env as check_for_baselines  # noqa: E402
+from swimming import BRIEF, Resting, brief_job  # noqa: E402
+
+import fishd.learning  # noqa: E402, F401 (registers the environments)
+from fishd.config import load  # noqa: E402
+from fishd.errors import ConfigError, NoDaemon  # noqa: E402
+from fishd.learning.environment import SwimEnv  # noqa: E402
+
+STILL = ("simulation.noise=0.0",)
+
+
+def test_the_environment_in_process_passes_both_checkers() -> None:
+    env = gymnasium.make("fishd/Swim-v0", overrides=("simulation.noise=0.001",))
+    check_env(env.unwrapped, skip_render_check=True)
+    check_for_baselines(env.unwrapped, warn=True)
+
+
+def test_it_takes_the_files_of_fish_and_training(tmp_path: Path) -> None:
+    (tmp_path / "fish.yaml").write_text("amplitude_limit: 0.2\n", encoding="utf-8")
+    (tmp_path / "training.yaml").write_text(
+        "environment:\n  observation: [fy]\n  episode: 3\n", encoding="utf-8"
+    )
+    env = gymnasium.make(
+        "fishd/Swim-v0", config=tmp_path / "fish.yaml", settings=str(tmp_path / "training.yaml")
+    )
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (1,)
+    swim = env.unwrapped
+    assert isinstance(swim, SwimEnv)
+    assert swim.link.amplitude == 0.2
+    ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+
+
+def test_a_wrong_override_is_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"plant\.omega: unknown key; did you mean 'omega0'"):
+        gymnasium.make("fishd/Swim-v0", overrides=("plant.omega=3",))
+
+
+def test_the_same_seed_swims_the_same_way() -> None:
+    def course(seed: int) -> list[float]:
+        env = gymnasium.make("fishd/Swim-v0", overrides=("simulation.noise=0.001",))
+        env.reset(seed=seed)
+        return [float(env.step(np.array([(-1.0) ** (k // 6)]))[1]) for k in range(40)]
+
+    assert course(3) == course(3)
+    assert course(3) != course(4)
+
+
+def test_randomised_fish_differ_from_episode_to_episode(tmp_path: Path) -> None:
+    (tmp_path / "training.yaml").write_text("randomisation:\n  omega0: 0.2\n", encoding="utf-8")
+    env = gymnasium.make("fishd/Swim-v0", settings=tmp_path / "training.yaml")
+    swim = env.unwrapped
+    found = []
+    for _ in range(5):
+        env.reset()
+        found.append(swim.link.config.plant.omega0)  # type: ignore[attr-defined]
+    assert len(set(found)) == 5
+    assert all(12.5 / 1.2 <= omega0 <= 12.5 * 1.2 for omega0 in found)
+
+
+def test_after_a_pause_the_agent_sees_the_fish_as_it_is_now(tmp_path: Path) -> None:
+    job = brief_job(tmp_path)
+    env = SwimEnv(Resting(job), load(None, STILL), BRIEF.environment)
+    env.reset(seed=1)
+    for k in range(40):
+        before, *_ = env.step(np.array([(-1.0) ** (k // 6)], np.float32))
+    tank_time = env.tank_time
+    env.pause(60.0)
+    after = env.resume()
+    angle = BRIEF.environment.observation.index("instruction_angle")
+    assert abs(before[angle]) == 1.0
+    assert after[angle] == 0.0
+    *_, info = env.step(np.zeros(1, np.float32))
+    assert info["paused"] == pytest.approx(3.0)
+    assert env.tank_time == pytest.approx(tank_time + 3.0 + 0.05)
+    *_, info = env.step(np.zeros(1, np.float32))
+    assert info["paused"] == 0.0
+
+
+@pytest.fixture
+def daemon(tmp_path: Path):  # type: ignore[no-untyped-def]
+    with running(tmp_path, "--set", "simulation.noise=0.001") as found:
+        yield found
+
+
+def test_the_environment_on_a_running_fishd_passes_both_checkers(daemon: Daemon) -> None:
+    env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint).unwrapped
+    try:
+        check_env(env, skip_render_check=True, skip_close_check=True)
+        check_for_baselines(env, warn=True)
+    finally:
+        env.close()
+
+
+def test_scales_for_another_amplitude_than_that_of_the_fishd_are_refused(daemon: Daemon) -> None:
+    with pytest.raises(ConfigError, match=r"amplitude_limit: 0\.3 rad .* 0\.42 rad in the fishd"):
+        gymnasium.make(
+            "fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, overrides=("amplitude_limit=0.3",)
+        )
+
+
+def test_without_a_fishd_it_says_where_it_looked(tmp_path: Path) -> None:
+    with pytest.raises(NoDaemon, match="control"):
+        gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=f"ipc://{tmp_path}/control")

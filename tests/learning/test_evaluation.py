@@ -1,0 +1,124 @@
+"""A policy is judged as any controller is, on the same loop and the same fish."""
+
+import csv
+import math
+from pathlib import Path
+
+import pytest
+
+from fishd.config import load
+from fishd.errors import ParameterError
+from fishd.learning.evaluation import best_on_grid, judge
+from fishd.learning.settings import EvaluationSettings, Randomisation, TrainingSettings
+from fishd.learning.variation import at_edge, drawn
+from fishd.plant.optimum import best_square_wave, square_wave
+from fishd.signals import Observation
+from fishd.simulation import simulate
+
+CONFIG = load(None, ["simulation.offset_y=0.005"])
+
+
+def square_of_six_ticks(observation: Observation) -> float:
+    return 0.42 if round(observation.time / 0.05) // 6 % 2 else -0.42
+
+
+def test_a_function_gets_the_report_that_a_controller_gets() -> None:
+    found = judge(CONFIG, square_of_six_ticks, 30.0, 10.0)
+    controller = simulate(CONFIG, "square", {"frequency": 1 / 0.6}, 30.0)
+    assert found.efficiency == pytest.approx(controller.efficiency, rel=1e-6)
+    assert found.frequency == pytest.approx(1 / 0.6)
+    assert (found.fullness, found.squareness) == pytest.approx((1.0, 1.0))
+    assert found.controller == "policy"
+
+
+def test_it_sees_what_the_sensor_sees() -> None:
+    seen: list[Observation] = []
+
+    def rest(observation: Observation) -> float:
+        seen.append(observation)
+        return 0.0
+
+    report = judge(load(None, ["simulation.noise=0", "simulation.offset_y=0.02"]), rest, 3.0, 1.0)
+    assert len(seen) == report.ticks
+    assert seen[-1].fy == pytest.approx(0.02)
+    assert (report.efficiency, report.frequency, report.fullness) == (0.0, 0.0, 0.0)
+
+
+def test_half_the_amplitude_is_half_full() -> None:
+    report = judge(CONFIG, lambda seen: 0.5 * square_of_six_ticks(seen), 30.0, 10.0)
+    assert report.fullness == pytest.approx(0.5)
+    assert report.squareness == pytest.approx(1.0)
+
+
+def test_what_the_configuration_starts_with_is_not_asked() -> None:
+    config = load(None, ["robot=virtual-pi", "start.controller=swing"])
+    assert judge(config, lambda _: 0.0, 5.0, 1.0).fullness == 0.0
+
+
+def test_an_answer_that_is_no_number_ends_in_a_fault_with_its_reason() -> None:
+    report = judge(CONFIG, lambda _: math.nan, 5.0, 1.0)
+    assert report.mode == "fault"
+    assert report.reason
+    assert report.reason.code == "controller-error"
+
+
+def test_lengths_that_leave_nothing_to_judge_are_refused() -> None:
+    with pytest.raises(ParameterError, match="nothing is left to judge"):
+        judge(CONFIG, lambda _: 0.0, 5.0, 5.0)
+
+
+@pytest.mark.parametrize("amplitude", [0.2, 0.42, 0.8])
+def test_no_square_wave_of_whole_ticks_beats_the_best_on_the_grid(amplitude: float) -> None:
+    config = load(None, [f"amplitude_limit={amplitude}"])
+    best = best_on_grid(config)
+    half_period = 0.5 / best.frequency / config.tick
+    assert half_period == pytest.approx(round(half_period))
+    for ticks in range(1, 30):
+        wave = square_wave(config.plant, amplitude, 0.5 / (ticks * config.tick))
+        assert wave.thrust <= best.thrust
+    optimum = best_square_wave(config.plant, amplitude)
+    assert 0.98 * optimum.thrust < best.thrust < optimum.thrust
+
+
+def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
+    pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
+    from fishd.learning.trials import worst_of_others
+
+    weak = Randomisation(coupling=0.5)
+    settings = TrainingSettings(randomisation=weak, evaluation=EvaluationSettings(others=6))
+    others = [at_edge(CONFIG, weak, seed) for seed in range(6)]
+    own = [judge(fish, square_of_six_ticks, 20.0, 5.0).efficiency for fish in others]
+    assert worst_of_others(CONFIG, square_of_six_ticks, settings) == min(own)
+
+
+def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
+    spread = Randomisation(omega0=0.2, xi=0.2, servo_speed=0.2, coupling=0.2, offset=0.01)
+    fish = [at_edge(CONFIG, spread, seed) for seed in range(40)]
+    for name in ("omega0", "xi", "servo_speed", "coupling"):
+        shares = {getattr(one.plant, name) / getattr(CONFIG.plant, name) for one in fish}
+        assert sorted(shares) == pytest.approx([1 / 1.2, 1.2])
+    assert sorted({one.simulation.offset_y for one in fish}) == pytest.approx([-0.005, 0.015])
+    within = [drawn(CONFIG, spread, seed).plant.omega0 / CONFIG.plant.omega0 for seed in range(40)]
+    assert len(set(within)) == 40
+    assert 1 / 1.2 < min(within) < 0.95 < 1.05 < max(within) < 1.2
+
+
+def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
+    pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
+    from fishd.learning.jobs import Job
+    from fishd.learning.training import train
+
+    settings = TrainingSettings(
+        steps=640,
+        randomisation=Randomisation(omega0=0.2, coupling=0.2),
+        evaluation=EvaluationSettings(seconds=8.0, settle=3.0, others=3),
+    )
+    outcome = train(Job(config=CONFIG, settings=settings, folder=tmp_path / "run"))
+    with (tmp_path / "run" / "evaluations.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all(float(row["worst"]) <= float(row["efficiency"]) for row in rows)
+    assert outcome.best_evaluation
+    assert outcome.best_evaluation.worst == max(
+        float(row["worst"]) for row in rows if row["stalled"] == "0"
+    )

@@ -1,0 +1,150 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
+pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
+pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
+pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
+pytest.importorskip("onnx", reason="the extra 'policy' is not installed")
+
+from click.testing import CliRunner  # noqa: E402
+from harness import Rig, observe  # noqa: E402
+from msgspec.structs import replace  # noqa: E402
+from swimming import NOISY, brief_job  # noqa: E402
+
+from fishd.cli.main import fishctl  # noqa: E402
+from fishd.controllers import registry  # noqa: E402
+from fishd.controllers.base import Limits  # noqa: E402
+from fishd.errors import ParameterError, PolicyError  # noqa: E402
+from fishd.learning import checkpoints  # noqa: E402
+from fishd.learning.checkpoints import CheckpointError  # noqa: E402
+from fishd.learning.export import export  # noqa: E402
+from fishd.learning.jobs import Outcome  # noqa: E402
+from fishd.learning.ppo import Deterministic  # noqa: E402
+from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings  # noqa: E402
+from fishd.learning.training import train  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """A run that has learned to swim."""
+    settings = TrainingSettings(steps=768, evaluation=EvaluationSettings(seconds=8.0, settle=4.0))
+    job = brief_job(tmp_path_factory.mktemp("trained") / "run")
+    return train(replace(job, settings=settings))
+
+
+@pytest.fixture(scope="module")
+def stalled(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """A run that has learned nothing."""
+    timid = PpoSettings(n_steps=64, n_epochs=1, learning_rate=1e-9, final_learning_rate=1e-9)
+    return train(brief_job(tmp_path_factory.mktemp("stalled") / "run", ppo=timid, steps=64))
+
+
+def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
+    tmp_path: Path, trained: Outcome
+) -> None:
+    assert trained.best
+    found = export(trained.best, tmp_path / "policy.onnx")
+    controller = registry.create(
+        "ppo", {"policy": str(found.path)}, Limits(amplitude=0.42, tick=0.05)
+    )
+    policy = checkpoints.load_policy(trained.best)
+    decide = Deterministic(policy, found.card.observation, 0.42)
+    draw = np.random.default_rng(1)
+    for _ in range(200):
+        fy, rate, velocity, angle = draw.normal(0.0, (0.4, 5.0, 0.03, 0.42)).tolist()
+        seen = replace(observe(angle, velocity), fy=fy, fy_rate=rate)
+        assert controller.update(seen) == pytest.approx(decide(seen), abs=1e-5)
+
+
+def test_it_swims_on_the_loop_of_the_robot(tmp_path: Path, trained: Outcome) -> None:
+    assert trained.best
+    found = export(trained.best, tmp_path / "policy.onnx")
+    rig = Rig(*NOISY)
+    rig.start("ppo", policy=str(found.path))
+    rig.run_for(5.0)
+    thrust = float(np.mean([tick.fx for tick in rig.run_for(10.0)]))
+    assert rig.mode == "running"
+    assert thrust == pytest.approx(found.trial.thrust, rel=0.05)
+
+
+def test_the_card_says_how_it_swims_and_carries_the_note(tmp_path: Path, trained: Outcome) -> None:
+    assert trained.best
+    assert trained.best_evaluation
+    past = export(trained.best, tmp_path / "p.onnx", note="for the small tail").card.provenance
+    assert past.note == "for the small tail"
+    assert past.efficiency == pytest.approx(trained.best_evaluation.efficiency)
+    assert past.frequency == pytest.approx(trained.best_evaluation.frequency)
+
+
+def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
+    tmp_path: Path, stalled: Outcome
+) -> None:
+    assert stalled.checkpoint
+    target = tmp_path / "policy.onnx"
+    with pytest.raises(PolicyError, match=r"this policy stalls .* all the same with --force"):
+        export(stalled.checkpoint, target)
+    assert list(tmp_path.iterdir()) == []
+    assert export(stalled.checkpoint, target, force=True).trial.stalled
+    assert target.exists()
+
+
+def test_a_file_that_would_say_something_else_is_never_put_in_place(
+    tmp_path: Path, trained: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from fishd.learning import export as exporting
+
+    whole = exporting.to_onnx
+    monkeypatch.setattr(  # relu where the policy was trained with tanh
+        exporting, "to_onnx", lambda layers, activation, card: whole(layers, "relu", card)
+    )
+    assert trained.best
+    with pytest.raises(PolicyError, match="would say something else than the policy"):
+        export(trained.best, tmp_path / "policy.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_tick_than_that_of_the_training_is_refused(
+    tmp_path: Path, trained: Outcome
+) -> None:
+    assert trained.best
+    found = export(trained.best, tmp_path / "policy.onnx")
+    with pytest.raises(ParameterError, match="tick"):
+        registry.create("ppo", {"policy": str(found.path)}, Limits(amplitude=0.42, tick=0.02))
+
+
+def test_a_broken_checkpoint_is_one_line(tmp_path: Path, trained: Outcome) -> None:
+    broken = tmp_path / "step-000064"
+    broken.mkdir()
+    (broken / "model.zip").write_bytes(b"PK")
+    with pytest.raises(CheckpointError, match=r"card\.json: no such file"):
+        export(broken, tmp_path / "p.onnx")
+    assert trained.best
+    for name in ("card.json", "state.json"):
+        (broken / name).write_bytes((trained.best / name).read_bytes())
+    with pytest.raises(CheckpointError, match=r"model\.zip: does not fit"):
+        export(broken, tmp_path / "p.onnx")
+
+
+def test_the_verb_takes_the_best_of_a_run_or_a_checkpoint(
+    tmp_path: Path, trained: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert trained.best
+    assert trained.checkpoint
+
+    def written(*arguments: str) -> str:
+        found = CliRunner().invoke(fishctl, ["learn", "export", *arguments])
+        assert found.exit_code == 0, found.output
+        return found.output
+
+    output = written(str(trained.folder))
+    assert output.startswith("run.onnx: ")
+    assert f"from {trained.best}" in output
+    assert "it swims with" in output
+    assert "fishctl set-controller ppo --policy run.onnx" in output
+    assert f"from {trained.checkpoint}" in written(str(trained.folder), "--newest")
+    assert f"from {trained.checkpoint}" in written(str(trained.checkpoint), "--to", "a/b.onnx")
+    assert (tmp_path / "a" / "b.onnx").exists()

@@ -1,0 +1,91 @@
+from typing import Literal
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
+pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
+
+from harness import observe  # noqa: E402
+
+from fishd.learning.environment import spaces  # noqa: E402
+from fishd.learning.ppo import (  # noqa: E402
+    Deterministic,
+    Rollout,
+    layers_of,
+    learning_rate,
+    make_policy,
+)
+from fishd.learning.settings import PpoSettings  # noqa: E402
+from fishd.policies.card import Feature, Layout  # noqa: E402
+
+FEATURES = (Feature("fy", 0.4), Feature("instruction_angle", 0.42))
+
+
+def rollout(rewards: list[float], void: int | None = None) -> Rollout:
+    """A full rollout of one long episode, in which the step after a void one begins another."""
+    observation, action = spaces(2)
+    buffer = Rollout(len(rewards), observation, action, "cpu", gae_lambda=0.95, gamma=0.9)
+    starts = False
+    for k, reward in enumerate(rewards):
+        buffer.void[buffer.pos] = k == void
+        buffer.add(
+            np.full((1, 2), k, np.float32),
+            np.zeros((1, 1), np.float32),
+            np.array([reward]),
+            np.array([starts]),
+            torch.tensor([[0.1 * k]]),
+            torch.tensor([-0.5]),
+        )
+        starts = k == void
+    buffer.compute_returns_and_advantage(torch.zeros(1, 1), np.array([False]))
+    return buffer
+
+
+def test_what_came_of_a_void_step_changes_no_advantage() -> None:
+    calm = rollout([0.3] * 12, void=5)
+    wild = rollout([0.3] * 5 + [1e6] + [0.3] * 6, void=5)
+    np.testing.assert_array_equal(calm.advantages, wild.advantages)
+    assert calm.advantages[5] == 0.0
+
+
+def test_a_void_step_is_in_no_minibatch() -> None:
+    def taught(buffer: Rollout) -> list[int]:
+        return sorted(int(o) for batch in buffer.get(4) for o in batch.observations[:, 0])
+
+    assert taught(rollout([0.3] * 12)) == list(range(12))
+    assert taught(rollout([0.3] * 12, void=5)) == [*range(5), *range(6, 12)]
+
+
+def test_the_learning_rate_falls_with_the_steps_since_the_beginning_and_then_stays() -> None:
+    ppo = PpoSettings(learning_rate=1e-2, final_learning_rate=1e-3, decay_steps=1000)
+    rates = [learning_rate(ppo, steps) for steps in (0, 500, 1000, 5000)]
+    assert rates == pytest.approx([1e-2, 5.5e-3, 1e-3, 1e-3])
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_the_policy_in_numpy_is_that_of_stable_baselines(
+    activation: Literal["tanh", "relu"], symmetric: bool
+) -> None:
+    torch.manual_seed(0)
+    ppo = PpoSettings(hidden=(16, 8), activation=activation, symmetric=symmetric)
+    policy = make_policy(ppo, 2)
+    with torch.no_grad():
+        policy.action_net.weight *= 100.0  # so that some actions are clipped
+    decide = Deterministic(policy, FEATURES, 0.42)
+    layout = Layout(FEATURES)
+    found = []
+    for angle in np.linspace(-0.42, 0.42, 21):
+        observation = observe(float(angle))
+        action, _ = policy.predict(layout.vector(observation), deterministic=True)
+        found.append(decide(observation))
+        assert found[-1] == pytest.approx(0.42 * float(action[0]), abs=1e-5)
+    assert len(set(found)) > 2
+
+
+def test_the_layers_are_those_from_the_inputs_to_the_mean_of_the_action() -> None:
+    layers = layers_of(make_policy(PpoSettings(hidden=(16, 8), symmetric=False), 2))
+    assert [weight.shape for weight, _ in layers] == [(16, 2), (8, 16), (1, 8)]
+    assert [bias.shape for _, bias in layers] == [(16,), (8,), (1,)]
+    assert all(weight.dtype == np.float32 for weight, _ in layers)

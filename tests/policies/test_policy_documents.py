@@ -1,0 +1,25 @@
+"""docs/policies.md against the program."""
+
+from documents import ROOT, first_cells, text_of
+
+from fishd.policies import file, library
+from fishd.policies.card import FORMAT, KEY, Card, Provenance
+from fishd.schema import fields_of
+
+DOCUMENT = ROOT / "docs" / "policies.md"
+
+
+def test_each_key_of_the_card_is_described() -> None:
+    table = first_cells(DOCUMENT, "What is in a policy file")
+    assert table == [field.name for field in fields_of(Card)]
+    text = text_of(DOCUMENT)
+    assert f"| `format` | | {FORMAT} |" in text
+    assert all(f"`{field.name}`" in text for field in fields_of(Provenance))
+
+
+def test_names_of_files_ends_and_folders_are_right() -> None:
+    text = text_of(DOCUMENT)
+    for word in (KEY, file.INPUT, file.OUTPUT, library.SUFFIX, f"${library.FOLDERS_VARIABLE}"):
+        assert f"`{word}`" in text or f"`{word} " in text or f"metadata `{word}`" in text
+    assert f"more than {file.LARGEST // 2**20} MB" in text
+    assert "/etc/fishd/policies" in text

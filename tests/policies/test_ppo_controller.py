@@ -1,0 +1,211 @@
+"""The controller `ppo`: a policy in the loop, and which policies it refuses."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from harness import LIMITS, Rig, observe
+from onnx import TensorProto, helper, numpy_helper
+from policy_files import FLIP, answer, card, linear, random_layers, write
+
+from fishd.config import load
+from fishd.controllers import registry
+from fishd.controllers.base import Controller, Limits
+from fishd.errors import ConfigError, ParameterError
+from fishd.policies.card import KEY, Card, encode
+from fishd.policies.network import to_onnx
+from fishd.simulation import simulate
+
+
+def made(path: Path, limits: Limits = LIMITS) -> Controller[Any]:
+    return registry.create("ppo", {"policy": str(path)}, limits)
+
+
+def refusal(path: Path | str, limits: Limits = LIMITS) -> str:
+    with pytest.raises(ParameterError) as caught:
+        registry.check("ppo", {"policy": str(path)}, limits)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_policy_in_the_loop_gives_exactly_the_angles_of_its_network(tmp_path: Path) -> None:
+    # -0.5·φ_c/Φ + 0.25: from neutral φ_c/Φ goes 1/4, 1/8, 3/16, ..., all of them exact.
+    path = write(tmp_path, to_onnx(linear(-0.5, bias=0.25), "tanh", card()))
+    rig = Rig("slew_limit=null")
+    rig.start("ppo", policy=str(path))
+    angles = [tick.phi_c for tick in rig.run(5)]
+    # The input is float32, so that φ_c/Φ comes back rounded to that.
+    assert angles == pytest.approx([0.42 * x for x in (1 / 4, 1 / 8, 3 / 16, 5 / 32, 11 / 64)])
+    assert angles[0] == 0.42 * 0.25
+    assert rig.mode == "running"
+
+
+def test_a_policy_that_flips_the_tail_swims_a_square_wave(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.start("ppo", policy=str(write(tmp_path)))
+    assert [tick.phi_c for tick in rig.run(5)] == [0.42, -0.42, 0.42, -0.42, 0.42]
+
+
+def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) -> None:
+    features = (("fy", 0.02), ("fy_rate", 0.3), ("fin_velocity", 0.002), ("fx", 0.026))
+    layers = random_layers(4, 16, 1)
+    rig = Rig("simulation.noise=1e-3", "simulation.seed=1")
+    path = write(tmp_path, to_onnx(layers, "tanh", card(*features)))
+    rig.start("ppo", policy=str(path))
+    for tick in rig.run(200):
+        seen = np.array([tick.fy / 0.02, tick.fy_rate / 0.3, tick.fin_velocity / 0.002])
+        wanted = answer(layers, "tanh", np.append(seen, tick.fx / 0.026))
+        assert tick.phi_c == pytest.approx(0.42 * wanted, abs=1e-6)
+
+
+def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> None:
+    path = write(tmp_path, to_onnx(linear(-9.0, bias=9.0), "tanh", card(amplitude=0.2)))
+    rig = Rig()
+    rig.start("ppo", policy=str(path))
+    assert max(tick.phi_c for tick in rig.run(10)) == 0.2
+
+
+def test_a_virtual_fish_can_be_simulated_with_a_policy(tmp_path: Path) -> None:
+    report = simulate(load(), "ppo", {"policy": str(write(tmp_path))}, seconds=5.0, settle=1.0)
+    assert (report.mode, report.reason) == ("running", None)
+    assert report.frequency == pytest.approx(10.0)
+
+
+def test_a_rehearsal_changes_nothing(tmp_path: Path) -> None:
+    layers = random_layers(1, 8, 1)
+    path = write(tmp_path, to_onnx(layers, "tanh", card()))
+    rehearsed, plain = made(path), made(path)
+    rehearsed.rehearse()
+    for angle in (0.1, -0.3, 0.42):
+        assert rehearsed.update(observe(angle)) == plain.update(observe(angle))
+        rehearsed.rehearse()
+
+
+def hand_made(nodes: list[Any], numbers: dict[str, float], about: Card) -> bytes:
+    """A policy from nodes that turn `observation` into `action`, by one who knows ONNX."""
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
+        for name in ("observation", "action")
+    ]
+    weights = [
+        numpy_helper.from_array(np.array([[value]], np.float32), name)
+        for name, value in numbers.items()
+    ]
+    graph = helper.make_graph(nodes, "by hand", *ends, weights)
+    opset = [helper.make_opsetid("", 13)]
+    model = helper.make_model(graph, ir_version=7, opset_imports=opset)
+    helper.set_model_props(model, {KEY: encode(about)})
+    content: bytes = model.SerializeToString()
+    return content
+
+
+def root_of_what_is_left(largest: float, about: Card) -> bytes:
+    """√(largest − x): not a number beyond."""
+    left = helper.make_node("Sub", ["largest", "observation"], ["left"])
+    root = helper.make_node("Sqrt", ["left"], ["action"])
+    return hand_made([left, root], {"largest": largest}, about)
+
+
+def test_an_output_that_is_not_finite_in_the_tick_is_a_fault_at_neutral(tmp_path: Path) -> None:
+    # No probe is that large, but with this scale an angle of 0.42 rad is.
+    content = root_of_what_is_left(1e6, card(("instruction_angle", 1e-8)))
+    rig = Rig()
+    rig.start("ppo", policy=str(write(tmp_path, content)))
+    first, *_, last = rig.run(20)
+    assert first.phi_c == 0.42  # √1e6, cut to 1
+    assert (rig.mode, rig.reason) == ("fault", "controller-error")
+    assert rig.loop.supervisor.reason
+    assert "the command is nan, not an angle" in rig.loop.supervisor.reason.message
+    assert (last.controller, last.phi_c) == ("hold", 0.0)
+
+
+def test_an_infinite_output_is_a_fault_and_not_the_full_amplitude(tmp_path: Path) -> None:
+    grow = helper.make_node("Exp", ["observation"], ["action"])
+    content = hand_made([grow], {}, card(("instruction_angle", 1e-6)))
+    with pytest.raises(ParameterError, match="its output is not finite for the input"):
+        made(write(tmp_path, content))  # a probe of 1000 is enough for this one
+
+
+def test_a_policy_whose_output_is_not_finite_for_some_input_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, root_of_what_is_left(0.5, card()))
+    message = refusal(path)
+    assert message.startswith(f"ppo: policy: {path}: its output is not finite for the input [")
+    assert message.endswith("; train it again, or export an earlier checkpoint")
+
+
+def test_a_model_that_onnxruntime_cannot_run_is_refused(tmp_path: Path) -> None:
+    node = helper.make_node("NoSuchOperator", ["observation"], ["action"])
+    path = write(tmp_path, hand_made([node], {}, card()))
+    assert refusal(path).startswith(f"ppo: policy: {path}: onnxruntime cannot run it: ")
+
+
+def test_another_tick_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    assert refusal(path, Limits(amplitude=0.42, tick=0.02)) == (
+        f"ppo: policy: {path}: it was trained at a tick of 50 ms, this robot's is 20 ms; "
+        "set tick: 0.05, or train one at this tick"
+    )
+    made(path, Limits(amplitude=0.42, tick=0.05 + 1e-12))
+
+
+def test_an_amplitude_beyond_the_robots_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    assert refusal(path, Limits(amplitude=0.4, tick=0.05)) == (
+        f"ppo: policy: {path}: it commands up to ±0.42 rad, beyond the robot's amplitude_limit, "
+        "0.4 rad; set amplitude_limit: 0.42, or train one for less"
+    )
+
+
+def test_a_bad_file_is_refused_with_its_path(tmp_path: Path) -> None:
+    path = write(tmp_path, b"\x80\x04]")
+    assert refusal(path) == (
+        f"ppo: policy: {path}: this is a pickle, which could run any code; "
+        "export it with 'fishctl learn export'"
+    )
+
+
+def test_a_policy_must_be_given() -> None:
+    with pytest.raises(ParameterError, match=r"ppo: policy: is missing: a name or the path of a"):
+        registry.check("ppo", {}, LIMITS)
+
+
+def test_the_policy_does_not_change_in_flight(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.start("ppo", policy=str(write(tmp_path)))
+    rig.run()
+    with pytest.raises(ParameterError, match="it cannot change in flight"):
+        rig.retune(policy=str(write(tmp_path, name="other")))
+    assert rig.mode == "running"
+
+
+def test_what_is_run_is_what_was_checked(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    policy = made(path)
+    path.write_bytes(b"something else by now")
+    assert policy.update(observe(0.42)) == -0.42
+
+
+def test_a_configuration_can_start_with_a_policy_or_says_why_not(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    rig = Rig("start.controller=ppo", f"start.parameters.policy={path}")
+    assert (rig.mode, rig.run(2)[-1].phi_c) == ("running", -0.42)
+    with pytest.raises(ConfigError, match=r"tick of 50 ms, this robot's is 20 ms"):
+        load(None, ("start.controller=ppo", f"start.parameters.policy={path}", "tick=0.02"))
+
+
+def test_the_flipping_policy_of_these_tests_is_an_ordinary_one() -> None:
+    onnx.checker.check_model(onnx.load_model_from_string(FLIP), full_check=True)
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_fishd_without_the_extra_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str
+) -> None:
+    path = write(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
+    message = refusal(path)
+    assert message.startswith(f"ppo: policy: {path}: it cannot be ")
+    assert f": {package} is not installed: install fishd[policy], or onnx and onnx" in message

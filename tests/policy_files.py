@@ -1,0 +1,71 @@
+"""Policies whose answers are known, and files that only look like policies."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fishd.policies.card import Card, Feature, FeatureName, Provenance
+from fishd.policies.network import Layer, to_onnx
+
+PROVENANCE = Provenance(
+    created="2026-11-21T07:00:00+00:00",
+    fishd="0.1.0",
+    algorithm="by hand",
+    on="simulation",
+    steps=8000,
+    seed=3,
+    settings={"ppo": {"n_steps": 128}},
+    plant={"omega0": 12.5},
+    libraries={"numpy": np.__version__},
+    efficiency=0.987,
+    frequency=1.67,
+)
+
+
+def card(*features: tuple[FeatureName, float], tick: float = 0.05, amplitude: float = 0.42) -> Card:
+    """By default it sees the angle in force, over Φ."""
+    return Card(
+        observation=tuple(Feature(*f) for f in features or (("instruction_angle", 0.42),)),
+        tick=tick,
+        amplitude=amplitude,
+        provenance=PROVENANCE,
+    )
+
+
+def linear(*weights: float, bias: float = 0.0) -> list[Layer]:
+    """One layer: the weighted sum of the inputs."""
+    return [(np.array([weights]), np.array([bias]))]
+
+
+def random_layers(*sizes: int, seed: int = 0) -> list[Layer]:
+    """Layers of these sizes, from the inputs on."""
+    draw = np.random.default_rng(seed)
+    return [
+        (draw.normal(0.0, before**-0.5, (after, before)), draw.normal(0.0, 0.1, after))
+        for before, after in pairwise(sizes)
+    ]
+
+
+def answer(layers: Sequence[Layer], activation: str, inputs: NDArray[Any]) -> float:
+    """What a network says, in numpy and double precision."""
+    value = np.asarray(inputs, np.float64)
+    for number, (weight, bias) in enumerate(layers):
+        value = weight @ value + bias
+        if number < len(layers) - 1:
+            value = np.tanh(value) if activation == "tanh" else np.maximum(value, 0.0)
+    return float(np.clip(value.item(), -1.0, 1.0))
+
+
+FLIP = to_onnx(linear(-100.0, bias=1.0), "tanh", card())
+"""To the other side of where the tail is, from neutral to plus: a square wave of two ticks."""
+
+
+def write(folder: Path, content: bytes = FLIP, name: str = "flip") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.onnx"
+    path.write_bytes(content)
+    return path

@@ -1,0 +1,185 @@
+"""`Agent`, the agent's side for Python, against the true controller `remote`."""
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zmq
+from harness import Rig
+
+from fishd.client import Agent, FishError, NoDaemon
+from fishd.errors import ParameterError
+from fishd.signals import Tick
+
+PATIENCE = 20.0
+
+
+@pytest.fixture
+def agent(tmp_path: Path) -> Iterator[Agent]:
+    with Agent(f"ipc://{tmp_path}/agent", timeout=PATIENCE) as agent:
+        yield agent
+
+
+@contextmanager
+def swimming(rig: Rig, agent: Agent, ticks: int) -> Iterator[list[Tick]]:
+    """`remote` is in command for some ticks, in another thread; the list is filled at the end."""
+    rig.start("remote", agent=agent.address)
+    swum: list[Tick] = []
+
+    def swim() -> None:
+        swum.extend(rig.run(ticks))
+        rig.loop.close()
+
+    thread = threading.Thread(target=swim)
+    thread.start()
+    try:
+        yield swum
+    finally:
+        agent.close()  # whatever happened, the loop must not wait for ever
+        thread.join(PATIENCE)
+
+
+def test_it_takes_observations_and_answers_each(agent: Agent) -> None:
+    rig = Rig("lockstep=true")
+    with swimming(rig, agent, 20) as ticks:
+        for seen in agent:
+            agent.act(0.01 * seen.seq)
+            if seen.seq == 20:
+                break
+        assert agent.poll(PATIENCE) is None  # as soon as fishd says that this was all
+        assert not agent.in_command
+    assert [tick.phi_c for tick in ticks] == pytest.approx([0.01 * n for n in range(1, 21)])
+
+
+def test_a_pause_gives_the_observation_anew(agent: Agent) -> None:
+    rig = Rig("lockstep=true")
+    with swimming(rig, agent, 3) as ticks:
+        for _ in range(3):
+            before = agent.observe()
+            agent.pause(60.0)
+            time.sleep(0.1)
+            agent.resume()
+            assert agent.observe() == before
+            assert agent.lost == 0
+            agent.act(0.2)
+        assert agent.poll(PATIENCE) is None
+    assert [tick.phi_c for tick in ticks] == [0.2] * 3
+
+
+def test_the_newest_of_several_observations_counts(agent: Agent) -> None:
+    rig = Rig("tick=0.02")
+    rig.start("remote", agent=agent.address)
+    rig.run(20)  # nobody answers
+    latest = agent.observe()
+    assert latest.time == pytest.approx(19 * 0.02)
+    assert agent.lost == 19  # of all that it took at once
+    rig.loop.close()
+
+
+def test_a_fishd_that_comes_back_is_served_as_before(agent: Agent) -> None:
+    sessions = set()
+    for _ in range(3):
+        rig = Rig("lockstep=true")
+        rig.start("remote", agent=agent.address)
+        thread = threading.Thread(target=lambda rig=rig: rig.run(5))
+        thread.start()
+        for _ in range(5):
+            sessions.add(agent.observe().session)
+            agent.act(0.3)
+        thread.join(PATIENCE)
+        assert [tick.phi_c for tick in rig.recorder.ticks] == [0.3] * 5
+        rig.loop.close()
+    assert len(sessions) == 3
+
+
+def test_in_virtual_time_the_successor_of_an_agent_that_died_is_asked_again(tmp_path: Path) -> None:
+    rig = Rig("lockstep=true")
+    address = f"ipc://{tmp_path}/agent"
+    first = Agent(address, timeout=PATIENCE)
+    with swimming(rig, first, 3) as ticks:
+        first.observe()
+        first.act(0.1)
+        unanswered = first.observe()
+        first.close()
+        with Agent(address, timeout=PATIENCE) as second:
+            assert second.observe() == unanswered
+            second.act(0.2)
+            assert second.observe().answered == unanswered.seq
+            second.act(0.3)
+            assert second.poll(PATIENCE) is None
+    assert [tick.phi_c for tick in ticks] == [0.1, 0.2, 0.3]
+
+
+def test_whoever_asks_last_is_served(agent: Agent) -> None:
+    first, second = Rig("tick=0.02"), Rig("tick=0.02")
+    first.start("remote", agent=agent.address)
+    while not agent.poll(0.01):
+        first.run()
+    second.start("remote", agent=agent.address)
+    old = agent.latest
+    while agent.latest is old:
+        second.run()
+        agent.poll(0.01)
+    new = agent.latest
+    assert new
+    first.run(3)
+    assert agent.poll(0.1) is None
+    assert agent.latest is new
+    for rig in (first, second):
+        rig.loop.close()
+
+
+def test_a_number_that_is_none_is_refused(agent: Agent) -> None:
+    rig = Rig("tick=0.02")
+    rig.start("remote", agent=agent.address)
+    while not agent.poll(0.01):
+        rig.run()
+    for angle in (math.nan, math.inf):
+        with pytest.raises(ParameterError, match="is not a number"):
+            agent.act(angle)
+    for seconds in (-1.0, 0.0, 3601.0, math.nan):
+        with pytest.raises(ParameterError, match="more than 0, up to 3600"):
+            agent.pause(seconds)
+    rig.loop.close()
+
+
+def test_when_nobody_asks_it_says_what_would_help() -> None:
+    with Agent(timeout=0.05) as agent:
+        assert agent.address.startswith("tcp://127.0.0.1:")
+        with pytest.raises(NoDaemon) as caught:
+            agent.observe()
+        with pytest.raises(NoDaemon):
+            agent.act(0.0)
+    assert f"no observation has come to {agent.address} within 0.05 s" in str(caught.value)
+    assert f"'fishctl set-controller remote --agent {agent.address}'" in str(caught.value)
+
+
+def test_when_another_controller_takes_over_it_says_so(tmp_path: Path) -> None:
+    rig = Rig("tick=0.02")
+    with Agent(f"ipc://{tmp_path}/agent", timeout=0.3) as agent:
+        rig.start("remote", agent=agent.address)
+        while not agent.poll(0.01):
+            rig.run()
+        rig.start("hold")
+        with pytest.raises(NoDaemon, match="another controller is in command, or none"):
+            agent.observe()
+
+
+def test_what_is_no_message_of_a_fishd_is_left_aside(tmp_path: Path) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with Agent(f"ipc://{tmp_path}/agent", timeout=0.3) as agent:
+        stranger = context.socket(zmq.DEALER)
+        stranger.connect(agent.address)
+        stranger.send(b"hello")
+        with pytest.raises(NoDaemon, match="but what is none: JSON is malformed"):
+            agent.observe()
+    context.destroy(linger=0)
+
+
+def test_an_address_in_use_is_named(agent: Agent) -> None:
+    with Agent() as other, pytest.raises(FishError, match="cannot listen on 'tcp://"):
+        Agent(other.address)

@@ -1,0 +1,323 @@
+"""The controller `remote` against agents on true sockets: deadlines, numbers, pauses, rubbish."""
+
+import math
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from harness import Rig
+from scripted_agent import ScriptedAgent, connect
+
+from fishd.config import load
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.errors import ConfigError, ParameterError
+
+SLOW = ("tick=0.2",)
+"""A tick with a deadline of 80 ms, so that a busy machine does not spoil a test."""
+
+
+@pytest.fixture
+def agent(tmp_path: Path) -> Iterator[ScriptedAgent]:
+    agent = ScriptedAgent(tmp_path)
+    yield agent
+    agent.close()
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig(*SLOW)
+    yield rig
+    rig.loop.close()
+
+
+@pytest.fixture
+def still() -> Iterator[Rig]:
+    """A loop whose virtual time stands still while an agent thinks."""
+    rig = Rig("lockstep=true")
+    yield rig
+    rig.loop.close()
+
+
+def reason(rig: Rig) -> str:
+    assert rig.loop.supervisor.reason
+    return rig.loop.supervisor.reason.message
+
+
+def test_an_action_is_in_force_in_the_tick_whose_observation_it_answers(
+    still: Rig, agent: ScriptedAgent
+) -> None:
+    angles = {n: 0.4 * math.sin(n) for n in range(1, 51)}
+    still.start("remote", agent=agent.address)
+    with agent.answering(lambda seen: agent.action(angles[seen["seq"]])):
+        ticks = still.run(50)
+    assert [tick.phi_c for tick in ticks] == list(angles.values())
+    assert [seen["seq"] for seen in agent.seen] == list(angles)
+    for seen, tick in zip(agent.seen, ticks, strict=True):
+        assert (seen["fx"], seen["fy"], seen["fy_rate"]) == (tick.fx, tick.fy, tick.fy_rate)
+        assert seen["fin_velocity"] == tick.fin_velocity
+        assert (seen["tick"], seen["amplitude"]) == (0.05, 0.42)
+        assert seen["answered"] == seen["seq"] - 1
+        assert seen["lost"] == 0
+    assert [seen["instruction_angle"] for seen in agent.seen[1:]] == list(angles.values())[:-1]
+
+
+def test_an_angle_beyond_the_limit_is_clamped(still: Rig, agent: ScriptedAgent) -> None:
+    still.start("remote", agent=agent.address)
+    with agent.answering(lambda seen: agent.action(3.0)):
+        assert still.run(3)[-1].phi_c == 0.42
+
+
+def test_virtual_time_waits_for_a_slow_agent(still: Rig, agent: ScriptedAgent) -> None:
+    def slowly(seen: dict[str, Any]) -> dict[str, Any]:
+        time.sleep(0.2)  # four ticks
+        return agent.action(0.1)
+
+    still.start("remote", agent=agent.address, misses=1)
+    with agent.answering(slowly):
+        assert [tick.phi_c for tick in still.run(3)] == [0.1] * 3
+    assert still.mode == "running"
+
+
+def test_silence_is_neutral_and_after_some_ticks_a_fault(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent, deadline=0.03)
+    with agent.answering(lambda seen: agent.action(0.2)):
+        while rig.run()[-1].phi_c == 0.0:
+            pass
+    ticks = rig.run(4)
+    assert [(tick.phi_c, tick.mode) for tick in ticks] == [(0.0, "running")] * 4
+    assert rig.run()[-1].mode == "fault"
+    assert rig.reason == "remote-silent"
+    assert reason(rig) == (
+        f"controller remote gave up: the agent at {agent.address} has not answered within 30 ms, "
+        "5 ticks in a row (0 answers came too late)"
+    )
+    assert rig.loop.controller_name == "hold"
+
+
+def test_one_answer_in_time_forgives_the_silence_before(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent, misses=3)
+    with agent.answering(lambda seen: agent.action(0.2) if seen["seq"] % 3 == 0 else None):
+        rig.run(20)
+    assert rig.mode == "running"
+
+
+def test_the_first_action_may_take_its_time_at_neutral(rig: Rig, agent: ScriptedAgent) -> None:
+    rig.start("remote", agent=agent.address, first_action=2.0, deadline=0.001)
+    assert {tick.phi_c for tick in rig.run_for(1.8)} == {0.0}
+    assert rig.mode == "running"
+    rig.run()
+    assert rig.reason == "remote-silent"
+    assert "no action has come from" in reason(rig)
+    assert "within 2 s: does it run, and is that its address?" in reason(rig)
+
+
+def test_a_late_action_is_for_no_other_tick(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent, deadline=0.02)
+    for _ in range(10):
+        agent.send(agent.action(0.3))  # the tick that asked is over
+        time.sleep(0.01)
+        assert rig.run()[-1].phi_c == 0.0
+        agent.drain()
+    assert agent.seen[-1]["answered"] == 0
+    rig.run(10)  # the ten ticks have not counted as a first action
+    assert rig.mode == "running"
+
+
+def test_what_was_lost_is_told_with_the_next_observation(rig: Rig, agent: ScriptedAgent) -> None:
+    first = connect(rig, agent, misses=100)
+    silent = {first["seq"] + n for n in (3, 4, 8)}
+    with agent.answering(
+        lambda seen: None if seen["seq"] in silent or seen["seq"] < 2 else agent.action(0.1)
+    ):
+        ticks = rig.run(14)
+    angles = {round(n * 0.2, 6): tick.phi_c for n, tick in enumerate(ticks, rig.index - 14)}
+    seen = [message for message in agent.seen if message["seq"] > first["seq"]]
+    assert [message["seq"] for message in seen] == [first["seq"] + n for n in range(1, 15)]
+    for before, after in pairwise(seen):
+        applied = angles[round(before["time"], 6)] != 0.0
+        assert not (applied and before["seq"] in silent)
+        assert after["lost"] == (0 if applied else 1)
+        assert (after["answered"] == before["seq"]) == applied
+
+
+def test_ticks_without_an_observation_are_lost_too(rig: Rig, agent: ScriptedAgent) -> None:
+    rig.start("remote", agent=f"{agent.address}-later", deadline=0.001)
+    rig.run(7)
+    agent._socket.bind(f"{agent.address}-later")
+    for _ in range(100):
+        rig.run()
+        if agent.drain():
+            break
+    assert agent.seen[0]["seq"] == 1
+    assert agent.seen[0]["lost"] == rig.index - 1 >= 7
+
+
+def test_a_pause_is_neutral_and_silent_and_ends_when_it_is_told(
+    rig: Rig, agent: ScriptedAgent
+) -> None:
+    connect(rig, agent, misses=2)
+    with agent.answering(lambda seen: agent.action(0.2)):
+        while rig.run()[-1].phi_c == 0.0:
+            pass
+    agent.drain()
+    agent.send(agent.pause(100.0))
+    time.sleep(0.02)
+    assert {tick.phi_c for tick in rig.run(50)} == {0.0}
+    assert agent.drain() == []
+    answered = agent.seen[-1]
+    agent.send(agent.pause(0.0))
+    time.sleep(0.02)
+    rig.run()
+    (fresh,) = agent.drain()
+    assert fresh["seq"] == answered["seq"] + 1
+    assert fresh["answered"] == answered["seq"]
+    assert fresh["lost"] == 0
+    assert fresh["time"] == pytest.approx((rig.index - 1) * 0.2)
+    assert rig.mode == "running"
+
+
+def test_a_pause_in_place_of_an_action_ends_the_wait(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent, misses=1)
+    with agent.answering(lambda seen: agent.pause(1.0)):
+        begun = time.monotonic()
+        rig.run(5)
+    assert rig.mode == "running"
+    assert time.monotonic() - begun < 0.3  # not five deadlines of 80 ms
+
+
+def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent, misses=2, deadline=0.001)
+    with agent.answering(lambda seen: agent.action(0.2)):
+        while rig.run()[-1].phi_c == 0.0:
+            pass
+    agent.drain()
+    agent.send(agent.pause(1.0))
+    time.sleep(0.02)
+    rig.run(5)
+    assert rig.mode == "running"
+    rig.run(2)
+    assert rig.reason == "remote-silent"
+
+
+def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) -> None:
+    def pausing(seen: dict[str, Any]) -> dict[str, Any] | None:
+        if agent.seen.count(seen) == 1:  # and once more after the pause
+            agent.send(agent.pause(30.0))
+            agent.send(agent.pause(0.0))
+            return None
+        return agent.action(0.1)
+
+    still.start("remote", agent=agent.address)
+    with agent.answering(pausing):
+        ticks = still.run(5)
+    assert [tick.phi_c for tick in ticks] == [0.1] * 5
+    assert [seen["seq"] for seen in agent.seen] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+
+
+def spoiled(**changes: Any) -> dict[str, Any]:
+    return {"kind": "action", "v": 1, "session": "s", "seq": 1, "phi_c": 0.1, **changes}
+
+
+@pytest.mark.parametrize(
+    ("rubbish", "complaint"),
+    [
+        (b"\xff\x00", "which is no action or pause"),
+        (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
+        (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
+        (spoiled(phi_c="0.1"), "Expected `float`, got `str` - at `$.phi_c`"),
+        (spoiled(speed=1), "Object contains unknown field `speed`"),
+        (spoiled(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
+        (spoiled(v=2), "a message of version 2; this fishd needs version 1"),
+        (spoiled(v=2, angle=1), "a message of version 2; this fishd needs version 1"),
+        ({"kind": "pause", "v": 1, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
+    ],
+)
+def test_rubbish_is_a_fault_that_says_what_came(
+    rig: Rig, agent: ScriptedAgent, rubbish: dict[str, Any] | bytes, complaint: str
+) -> None:
+    connect(rig, agent)
+    agent.send(rubbish)
+    time.sleep(0.02)
+    rig.run()
+    assert rig.reason == "remote-error"
+    assert f"the agent at {agent.address} sent " in reason(rig)
+    assert complaint in reason(rig)
+    assert "\n" not in reason(rig)
+
+
+def test_more_frames_than_one_are_rubbish(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent)
+    agent.send(b"", agent.action(0.1))
+    time.sleep(0.02)
+    rig.run()
+    assert "a message of 2 frames; one frame of JSON is needed" in reason(rig)
+
+
+def test_an_action_for_what_was_never_asked_is_a_fault(rig: Rig, agent: ScriptedAgent) -> None:
+    latest = connect(rig, agent)["seq"]
+    agent.send(agent.action(0.1, seq=latest + 7))
+    time.sleep(0.02)
+    rig.run()
+    assert rig.reason == "remote-error"
+    assert f"an action for observation {latest + 7}" in reason(rig)
+
+
+def test_an_action_of_another_session_is_not_for_this_one(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent)
+    with agent.answering(lambda seen: agent.action(0.3, session="0123")):
+        assert {tick.phi_c for tick in rig.run(5)} == {0.0}
+    assert rig.mode == "running"
+
+
+def test_each_take_over_has_a_session_of_its_own_whose_end_is_told(
+    rig: Rig, agent: ScriptedAgent
+) -> None:
+    first = connect(rig, agent)["session"]
+    second = connect(rig, agent)["session"]
+    rig.start("hold")
+    agent.drain()
+    assert first != second
+    ended = [m["session"] for m in agent.seen if m["kind"] == "ended"]
+    assert ended == [first, second]
+
+
+def test_an_agent_that_does_not_read_costs_no_time(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent, deadline=1e-4, first_action=3600.0)
+    begun = time.monotonic()
+    rig.run(3000)  # more than any buffer holds
+    assert time.monotonic() - begun < 3000 * 0.005
+    assert rig.mode == "running"
+    rig.start("hold")
+    assert rig.mode == "running"
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"agent": "localhost"}, "agent: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH"),
+        ({"agent": "tcp://127.0.0.1:99999"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
+        ({"agent": "tcp://127.0.0.1:*"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
+        ({"deadline": 0.024}, "deadline: 0.024 s is not valid: at most 0.0225 s, 0.45 of a tick"),
+    ],
+)
+def test_parameters_that_cannot_work_are_refused(values: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ParameterError, match="remote: ") as caught:
+        registry.check("remote", values, Limits(amplitude=0.42, tick=0.05))
+    assert complaint in str(caught.value)
+
+
+def test_deadlines_change_in_command_but_not_the_agent(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent)
+    rig.retune(misses=7)
+    assert rig.loop.controller.parameters.misses == 7
+    with pytest.raises(ParameterError, match=r"set-controller remote --agent tcp://"):
+        rig.retune(agent="tcp://127.0.0.1:9873")
+
+
+def test_lockstep_is_for_a_simulated_fish_only() -> None:
+    with pytest.raises(ConfigError, match="lockstep: true is not valid with robot: pi"):
+        load(None, ["robot=pi", "lockstep=true"])

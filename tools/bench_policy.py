@@ -1,0 +1,193 @@
+"""Measures what a policy costs in the tick: one update of the controller `ppo`.
+
+    python tools/bench_policy.py                            the table of docs/policies.md
+    python tools/bench_policy.py --write docs/policies.md   put it there
+    python tools/bench_policy.py --policy NAME|FILE         with this one, not a random 64 × 64 tanh
+
+First the loop on the virtual clock, where one update follows the other, in turn with the controller
+`hold`, whose update does nothing. Then real fishd, whose update comes after 50 ms of sleep: with
+rehearsed ticks as usual, and without.
+"""
+
+import argparse
+import itertools
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_contestants import Fishd, quantile
+from bench_machine import machine
+from reports import put, table
+
+from fishd import __version__
+from fishd.build import build_loop
+from fishd.clock import VirtualClock, VirtualTicker
+from fishd.config import Config, load
+from fishd.controllers import registry
+from fishd.hardware.simulated import SimulatedFish
+from fishd.loop import ControlLoop
+from fishd.policies.card import Card, Feature, Provenance
+from fishd.policies.network import to_onnx
+from fishd.signals import Event, Observation, Percentiles, Tick
+
+GOAL = 50.0
+"""Longest update that is asked for, at p99 [µs]."""
+BLOCK = 500
+"""Updates before the other controller has its turn."""
+RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
+UNITS = {"CPU": "", "Cores": "cores", "SCHED_FIFO": "of SCHED_FIFO"}
+HEAD = ["controller", "where", "updates", "p50 [µs]", "p99 [µs]", "worst [µs]"]
+
+
+class Deaf:
+    """A publisher that keeps nothing."""
+
+    def tick(self, tick: Tick) -> None:
+        """Drop."""
+
+    def event(self, event: Event) -> None:
+        """Drop."""
+
+
+def random_policy() -> bytes:
+    """A 64 × 64 tanh network of random weights, which sees what training shows by default."""
+    draw = np.random.default_rng(0)
+    sizes = (4, 64, 64, 1)
+    layers = [
+        (draw.normal(0.0, before**-0.5, (after, before)), draw.normal(0.0, 0.1, after))
+        for before, after in itertools.pairwise(sizes)
+    ]
+    features = (
+        Feature("fy", 0.39),
+        Feature("fy_rate", 4.9),
+        Feature("instruction_angle", 0.42),
+        Feature("fin_velocity", 0.031),
+    )
+    provenance = Provenance(
+        created="",
+        fishd=__version__,
+        algorithm="random numbers",
+        on="nothing",
+        steps=0,
+        seed=0,
+        settings={},
+        plant={},
+        libraries={"numpy": np.__version__},
+    )
+    card = Card(observation=features, tick=0.05, amplitude=0.42, provenance=provenance)
+    return to_onnx(layers, "tanh", card)
+
+
+class Swimmer:
+    """A controller in a loop on the virtual clock, with a stopwatch around its update."""
+
+    def __init__(self, config: Config, name: str, parameters: dict[str, Any]) -> None:
+        clock = VirtualClock()
+        fish = SimulatedFish(config.plant, config.simulation, config.tick)
+        self._loop: ControlLoop = build_loop(config, fish.robot(), clock, Deaf())
+        controller = registry.create(name, parameters, config.limits)
+        self.times: list[int] = []
+        controller.update = self._timed(controller.update)  # type: ignore[method-assign]
+        self._loop.set_controller(name, controller)
+        self._slots = iter(VirtualTicker(clock, config.tick))
+
+    def swim(self, ticks: int) -> None:
+        """Turn the loop."""
+        for slot in itertools.islice(self._slots, ticks):
+            self._loop.tick(slot)
+        if self._loop.supervisor.reason:
+            raise SystemExit(self._loop.supervisor.reason.message)
+
+    def percentiles(self) -> Percentiles:
+        """Of all updates so far, but for the first block [µs]."""
+        times = [nanoseconds / 1e3 for nanoseconds in self.times[BLOCK:]]
+        return Percentiles(quantile(times, 0.5), quantile(times, 0.99), max(times), 0)
+
+    def _timed(self, update: Callable[[Observation], float]) -> Callable[[Observation], float]:
+        clock, times = time.perf_counter_ns, self.times
+
+        def timed(observation: Observation) -> float:
+            begun = clock()
+            angle = update(observation)
+            times.append(clock() - begun)
+            return angle
+
+        return timed
+
+
+def in_virtual_time(policy: str, updates: int) -> Iterator[list[str]]:
+    """The rows of both controllers, which swim in turn."""
+    config = load(None, RIG)
+    swimmers = {
+        "hold": Swimmer(config, "hold", {}),
+        "ppo": Swimmer(config, "ppo", {"policy": policy}),
+    }
+    for _ in range(1 + -(-updates // BLOCK)):
+        for swimmer in swimmers.values():
+            swimmer.swim(BLOCK)
+    for name, swimmer in swimmers.items():
+        count = len(swimmer.times) - BLOCK
+        yield _row(name, "virtual clock", count, swimmer.percentiles())
+
+
+def in_real_time(policy: str, seconds: float) -> Iterator[list[str]]:
+    """The rows of daemons that swim at the same time, with the policy and with `hold`."""
+    with ExitStack() as stack:
+        started = []
+        for name, parameters in (("hold", ()), ("ppo", (f"start.parameters.policy={policy}",))):
+            for rehearse, where in (("true", "fishd"), ("false", "fishd, not rehearsed")):
+                own = (f"start.controller={name}", *parameters, f"realtime.rehearse={rehearse}")
+                fishd = stack.enter_context(Fishd(*RIG, *own))
+                started.append((name, where, fishd))
+        time.sleep(seconds)
+        for name, where, fishd in started:
+            status = fishd.status()
+            if status.reason:
+                raise SystemExit(f"{name}: {status.reason.message}")
+            yield _row(name, where, status.seq, status.timing.phases["update"])
+
+
+def _row(name: str, where: str, updates: int, found: Percentiles) -> list[str]:
+    times = (f"{value:.1f}" for value in (found.p50, found.p99, found.worst))
+    return [f"`{name}`", where, str(updates), *times]
+
+
+@contextmanager
+def policy_file(given: str | None) -> Iterator[str]:
+    """The policy to measure: the given one, or a random one in a file of its own."""
+    if given:
+        yield str(Path(given).absolute()) if "/" in given or given.endswith(".onnx") else given
+        return
+    with tempfile.TemporaryDirectory(prefix="bench-policy-") as folder:
+        path = Path(folder) / "random.onnx"
+        path.write_bytes(random_policy())
+        yield str(path)
+
+
+def main() -> None:
+    """Parse the command line, measure, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--updates", type=int, default=20_000, help="in virtual time (20000)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of real time (60)")
+    parser.add_argument("--policy", metavar="NAME|FILE", help="instead of a random one")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="replace the table in FILE")
+    options = parser.parse_args()
+    with policy_file(options.policy) as policy:
+        rows = [*in_virtual_time(policy, options.updates), *in_real_time(policy, options.seconds)]
+    p99 = float(rows[1][4])
+    met = "met" if p99 <= GOAL else "**not met**"
+    verdict = f"Goal, p99 ≤ {GOAL:g} µs where one update follows the other: {met}."
+    about = machine()
+    on = ", ".join(f"{about[key]} {unit}" for key, unit in UNITS.items())
+    text = f"{table(HEAD, rows)}\n\n{verdict} Machine: {on}."
+    if options.write:
+        put(options.write, "bench_policy", text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Trainings for `bench_learning.py`: many at a time, and what their policies do on other fish."""
+
+import itertools
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import joblib
+from msgspec.structs import replace
+
+from fishd.config import Config, load
+from fishd.learning import settings as training
+from fishd.learning.checkpoints import load_policy
+from fishd.learning.evaluation import judge
+from fishd.learning.jobs import Job
+from fishd.learning.ppo import Deterministic
+from fishd.learning.scales import features
+from fishd.learning.seed_table import Point, curve
+from fishd.learning.settings import TrainingSettings
+from fishd.learning.training import train
+
+CONFIG = Path(__file__).resolve().parent.parent / "config"
+OFF = 0.15
+"""By this share each of four parameters of a fish is off, up or down."""
+
+
+class Trained(NamedTuple):
+    """One training."""
+
+    points: list[Point]
+    others: list[float]
+    """Efficiencies of its best policy on fish that are off, if those were asked for."""
+    others_last: list[float]
+    """The same of its last policy."""
+
+
+def rig(amplitude: float = 0.42) -> Config:
+    """A fish of which F_y has 1 mN of noise and an offset of 5 mN."""
+    keys = ("simulation.noise=0.001", "simulation.offset_y=0.005")
+    return load(None, [f"amplitude_limit={amplitude}", *keys])
+
+
+def settings_of(name: str | None, steps: int | None = None) -> TrainingSettings:
+    """Those of a file in config/, or the defaults; with another number of steps."""
+    chosen = training.load(CONFIG / name if name else None)
+    return replace(chosen, steps=steps or chosen.steps)
+
+
+def trained(config: Config, settings: TrainingSettings, seed: int, others: bool) -> Trained:
+    """Train once; in a process of its own."""
+    fish = replace(config, simulation=replace(config.simulation, seed=seed))
+    with tempfile.TemporaryDirectory() as temporary:
+        job = Job(
+            config=fish, settings=replace(settings, seed=seed), folder=Path(temporary) / "run"
+        )
+        outcome = train(job)
+        points = curve(job.folder)
+        if not others:
+            return Trained(points, [], [])
+        assert outcome.best
+        assert outcome.checkpoint
+        best, last = (swum(path, config, settings) for path in (outcome.best, outcome.checkpoint))
+        return Trained(points, best, last)
+
+
+def swum(checkpoint: Path, config: Config, settings: TrainingSettings) -> list[float]:
+    """Efficiency of a policy on each fish that is off, over that fish's own best square wave."""
+    seen = features(config, settings.environment)
+    found = []
+    for signs in itertools.product((-1.0, 1.0), repeat=4):
+        plant = config.plant
+        values = (plant.omega0, plant.xi, plant.servo_speed, plant.coupling)
+        omega0, xi, speed, coupling = (
+            value * (1.0 + OFF * sign) for value, sign in zip(values, signs, strict=True)
+        )
+        off = replace(plant, omega0=omega0, xi=xi, servo_speed=speed, coupling=coupling)
+        decide = Deterministic(load_policy(checkpoint), seen, config.amplitude_limit)
+        fish = replace(config, plant=off, simulation=replace(config.simulation, seed=1000))
+        found.append(judge(fish, decide, 60.0, 10.0).efficiency)
+    return found
+
+
+def several(
+    rows: dict[str, tuple[Config, TrainingSettings]], seeds: int, jobs: int, others: bool = False
+) -> dict[str, list[Trained]]:
+    """All seeds of all rows, in parallel."""
+    tasks = [(row, seed) for row in rows for seed in range(seeds)]
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator")
+        work = parallel(joblib.delayed(trained)(*rows[row], seed, others) for row, seed in tasks)
+        found: dict[str, list[Trained]] = {row: [] for row in rows}
+        for (row, seed), result in zip(tasks, work, strict=True):
+            found[row].append(result)
+            last = result.points[-1]
+            print(f"{row}, seed {seed}: {last.efficiency:.1%}, best {last.best:.1%}", flush=True)
+    return found
