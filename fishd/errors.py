@@ -5,6 +5,7 @@
     ├── ParameterError   (ValueError)   a controller's parameter is wrong
     ├── UnknownController (LookupError) no controller has that name
     ├── StartupError     (RuntimeError) the daemon cannot start, such as address in use
+    │   └── MissingPackage              a driver's library is not installed
     ├── SensorError      (OSError)      the force sensor cannot be read
     ├── ServoError       (OSError)      the servo cannot be driven
     └── FishError                       raised by the client, `fishd.client`
@@ -40,6 +41,10 @@ class UnknownController(FishdError, LookupError):
 
 class StartupError(FishdError, RuntimeError):
     """The daemon cannot start on this machine as it is."""
+
+
+class MissingPackage(StartupError):
+    """A driver's library is not installed, or cannot be imported."""
 
 
 class SensorError(FishdError, OSError):

@@ -44,6 +44,7 @@ class Operations:
         self._clock = clock
         self._telemetry = telemetry
         self._realtime = realtime
+        self._check_calibration = workbench.check_startable
         self._started = clock.monotonic()
         self._decisions = 0
         self._loading = 0
@@ -90,6 +91,8 @@ class Operations:
             frequency=observation.frequency if observation else 0.0,
             tick=loop.limits.tick,
             amplitude_limit=loop.limits.amplitude,
+            lowest=loop.guard.lowest,
+            highest=loop.guard.highest,
             seq=loop.seq,
             missed=loop.statistics.missed,
             overruns=loop.statistics.overruns,
@@ -99,6 +102,8 @@ class Operations:
             counters=loop.robot.counters(),
             realtime=self._realtime,
             telemetry=self._telemetry,
+            servo_lost=loop.servo_lost,
+            sensor_lost=loop.supervisor.sensor_lost,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
@@ -109,6 +114,7 @@ class Operations:
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
+        self._check_calibration(wanted.name)
         if self._loading >= MOST_LOADING:
             raise Refused("busy", f"{self._loading} controllers are being loaded; try again")
         decision = self._decide()
@@ -131,6 +137,7 @@ class Operations:
             raise Refused(
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
+        self._check_calibration(wanted.name)
         self._loop.set_controller(wanted.name, controller)
         return self._state()
 
