@@ -30,7 +30,8 @@ class Pi:
         self.settings = [
             *("--config", SHIPPED, *self._place),
             *("--set", f"servo.pigpio.port={port}"),
-            *("--set", "servo.pigpio.timeout=0.1"),  # machines that run tests may stall
+            # Machines that run tests may stall.
+            *("--set", "servo.pigpio.timeout=0.1", "--set", "servo.pigpio.countdown=2"),
             *("--set", f"state_folder={folder}"),
             *PANEL,
         ]

@@ -51,7 +51,7 @@ class PigpioServo:
         """
         self._settings = settings
         self._clock = clock
-        self._counts = counts(tick)
+        self._counts = counts(settings.pigpio.countdown, tick)
         self.countdown = COUNT * self._counts
         self._pulses = (
             HardwarePwm(settings) if settings.pigpio.hardware_pwm else ServoPulses(settings)
