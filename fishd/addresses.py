@@ -1,18 +1,18 @@
 """Where the sockets are, for the daemon that binds them and for clients that look for it."""
 
 import errno
-import fcntl
 import os
 import socket
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import zmq
 
 from fishd.errors import StartupError
+from fishd.lockfile import Taken, lock_path, locked
 
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 _SERVICE = Path("/run/fishd/control")
@@ -87,30 +87,22 @@ def claimed(address: str) -> Iterator[None]:
     path = socket_path(address)
     if path.exists() and not path.is_socket():
         raise StartupError(f"{path} is there already and is no socket; choose another address")
-    lock_path = path.with_name(path.name + ".lock")
-    try:
-        lock = lock_path.open("a+", encoding="ascii")
-    except OSError as error:
-        raise StartupError(
-            f"{lock_path}: cannot be made: {error.strerror}; "
-            "choose an address in a folder that exists"
-        ) from None
-    with lock:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.seek(0)
-            pid = lock.read().strip() or "unknown"
+            stack.enter_context(locked(path))
+        except Taken as taken:
             raise StartupError(
-                f"another fishd (pid {pid}) already serves {address}; stop it, or give this one "
-                "another control.address and telemetry.address"
+                f"another fishd (pid {taken.pid}) already serves {address}; stop it, or give this "
+                "one another control.address and telemetry.address"
             ) from None
-        lock.truncate(0)
-        lock.write(f"{os.getpid()}\n")
-        lock.flush()
+        except OSError as error:
+            raise StartupError(
+                f"{lock_path(path)}: cannot be made: {error.strerror}; "
+                "choose an address in a folder that exists"
+            ) from None
         try:
             yield
-        finally:  # the lock file stays: to remove it would let two daemons hold two of them
+        finally:
             if path.is_socket():
                 path.unlink()
 

@@ -16,6 +16,12 @@ from fishd.hardware.calibration import ForceCalibration
 FEWEST_LOADS = 5
 WORST_CONDITION = 100.0
 """Beyond this one direction is known so much worse than the other that the fit is refused."""
+WORST_RESIDUAL = 0.2
+"""A residual beyond this share of the loads, both as root mean squares, is no fit.
+
+Voltages that have nothing to do with the loads leave about 0.7 with five of them; less than 0.2 is
+then rarer than one in five hundred. The worst sensors that are of use leave 0.02.
+"""
 _NOTICEABLE = 0.01
 """A load counts as one along an axis from this share of the largest load on."""
 
@@ -83,6 +89,24 @@ def fit(loads: Sequence[Load]) -> Fit:
         condition=condition,
     )
     return Fit(calibration, [(float(x), float(y)) for x, y in errors])
+
+
+def check(fitted: Fit, loads: Sequence[Load], names: Sequence[str]) -> None:
+    """Raises `PoorLoads`, which names the worst load, unless the fit has to do with the loads."""
+    size = math.sqrt(sum(load.fx**2 + load.fy**2 for load in loads) / (2 * len(loads)))
+    residual = fitted.calibration.residual
+    if residual > WORST_RESIDUAL * size:
+        raise PoorLoads(
+            f"the voltages do not follow the loads: the residual is {residual / size:.0%} of them "
+            f"(rms), and at most {WORST_RESIDUAL:.0%} is a fit; measure {worst(fitted, names)} "
+            "again first"
+        )
+
+
+def worst(fitted: Fit, names: Sequence[str]) -> str:
+    """The name of the load with the largest error."""
+    sizes = [math.hypot(*error) for error in fitted.errors]
+    return names[sizes.index(max(sizes))]
 
 
 def missing_loads(forces: Sequence[tuple[float, float]]) -> list[str]:

@@ -3,6 +3,7 @@
 Each section is a struct of the part that it configures; this module only puts them together.
 """
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +30,10 @@ from fishd.hardware.imperfections import SimulationSettings
 from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
 from fishd.plant.parameters import PlantParameters
 from fishd.schema import Problem, convert, without_empty_sections
+
+SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
+"""What the service runs with, as installed by 'make install-pi'."""
+FILE_VARIABLE = "FISHD_CONFIG"
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -177,6 +182,17 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return Limits(amplitude=self.amplitude_limit, tick=self.tick, virtual=self.lockstep)
 
 
+def service_file() -> Path | None:
+    """The file that the fishd of this machine most likely runs with; None for the defaults.
+
+    $FISHD_CONFIG where it is set, empty for none; else that of the service where there is one.
+    """
+    given = os.environ.get(FILE_VARIABLE)
+    if given is not None:
+        return Path(given) if given else None
+    return SERVICE_FILE if os.path.lexists(SERVICE_FILE) else None
+
+
 def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     """Read a configuration file and apply `KEY=VALUE` overrides, such as `plant.xi=0.9`.
 
@@ -197,7 +213,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
         check_force_sensor(config.force_sensor)
         if config.robot != "simulated":
             check_data_rate(config.force_sensor, config.tick)
-        check_servo(config.servo)
+        check_servo(config.servo, config.amplitude_limit)
         check_pins(config.force_sensor, config.servo, config.panel)
         check_lockstep(config.robot, config.lockstep)
         check_virtual_pi(config.robot, config.servo, config.virtual_pi)

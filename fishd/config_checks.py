@@ -3,6 +3,8 @@
 Each check raises `Problem` with the key to blame and what would be right.
 """
 
+import math
+import os
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -25,6 +27,8 @@ SLOWEST_CONVERSION = 1.25
 """Of the ADC with its tolerance and its transfers, in units of 1 / data rate."""
 I2C_PINS = (2, 3)
 """SDA and SCL of bus 1."""
+LONGEST_SOCKET = 107
+"""Of the path of a Unix socket, by Linux [bytes]."""
 _ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
 _LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
@@ -33,7 +37,10 @@ def check_start(controller: str | None, parameters: Mapping[str, Any], limits: L
     """The controller to start with is there and takes its parameters."""
     if controller is None:
         if parameters:
-            raise Problem(("start", "parameters"), "there is no start.controller to take these")
+            raise Problem(
+                ("start", "parameters"),
+                "there is no start.controller to take these; name one, or remove them",
+            )
         return
     try:
         registry.check(controller, parameters, limits)
@@ -50,6 +57,7 @@ def check_addresses(telemetry: str, control: str | None) -> None:
             ("telemetry", "address"),
             f"'{telemetry}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
         )
+    _check_length(("telemetry", "address"), telemetry)
     if control is None:
         return
     if not (_is_address(control) and _LOCAL.match(control)):
@@ -58,6 +66,7 @@ def check_addresses(telemetry: str, control: str | None) -> None:
             f"'{control}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
             "who can send requests can move the fish, so they are taken from this machine only",
         )
+    _check_length(("control", "address"), control)
     if control == telemetry:
         raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
 
@@ -87,13 +96,19 @@ def check_force_sensor(sensor: ForceSensorSettings) -> None:
         )
 
 
-def check_servo(servo: ServoSettings) -> None:
-    """Neutral is a pulse, and the driver can send it on that pin at that frequency."""
+def check_servo(servo: ServoSettings, amplitude: float) -> None:
+    """Each angle within ±Φ [rad] has a pulse, and the driver can send it on that pin."""
     low, high = pulses.reach(servo)
     if not low <= 0.0 <= high:
         raise Problem(
             ("servo", "trim"),
             f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to 2500 µs",
+        )
+    _check_pulses(servo, amplitude)
+    if not re.fullmatch(r"\S+", servo.pigpio.host):
+        raise Problem(
+            ("servo", "pigpio", "host"),
+            f"'{servo.pigpio.host}' is not valid: a host is needed, such as 127.0.0.1",
         )
     if servo.driver != "pigpio":
         return
@@ -108,6 +123,34 @@ def check_servo(servo: ServoSettings) -> None:
             ("servo", "gpio"),
             f"{servo.gpio} is not valid: hardware PWM comes out of GPIO 12, 13, 18 or 19 only",
         )
+
+
+def _check_pulses(servo: ServoSettings, amplitude: float) -> None:
+    """Pulse widths permit what Φ [rad] and the soft limits do; who wants less says so by those."""
+    wanted = max(servo.lowest, -amplitude), min(servo.highest, amplitude)
+    possible = pulses.widest(servo)
+    if possible[0] <= wanted[0] + pulses.ROUNDING and wanted[1] - pulses.ROUNDING <= possible[1]:
+        return
+    neutral = servo.centre + servo.trim
+    below, above = sorted(servo.direction * servo.scale * angle for angle in wanted)
+    lowest, highest = pulses.SHORTEST - below, pulses.LONGEST - above
+    if lowest > highest:
+        key = "scale"
+        most = (pulses.LONGEST - pulses.SHORTEST) / (wanted[1] - wanted[0])
+        right = f"at most {math.floor(most)} µs/rad"
+    else:
+        key = "trim" if servo.trim else "centre"
+        right = f"centre + trim from {math.ceil(lowest)} to {math.floor(highest)} µs"
+    less = min(
+        end for end, angle in zip(map(abs, possible), map(abs, wanted), strict=True) if end < angle
+    )
+    smaller = f", or an amplitude_limit of at most {math.floor(less * 1e3) / 1e3:g} rad"
+    raise Problem(
+        ("servo", key),
+        f"{getattr(servo, key):g} is not valid: angles from {wanted[0]:+.4g} to {wanted[1]:+.4g} "
+        f"rad would need pulses of {neutral + below:.0f} to {neutral + above:.0f} µs, beyond 500 "
+        f"to 2500 µs; {right} is needed" + (smaller if less >= 1e-3 else ""),
+    )
 
 
 def check_pins(sensor: ForceSensorSettings, servo: ServoSettings, panel: PanelSettings) -> None:
@@ -142,11 +185,28 @@ def check_virtual_pi(robot: str, servo: ServoSettings, pi: VirtualPiSettings) ->
             ("servo", "driver"),
             f"'{servo.driver}' is not valid: the virtual Pi has pigpiod, and no other pulses",
         )
+    if pi.socket is not None:
+        if not pi.socket:
+            raise Problem(("virtual_pi", "socket"), "'' is not valid: a path or null is needed")
+        _check_length(("virtual_pi", "socket"), pi.socket)
     if pi.servo_scale == 0.0:
         raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")
     if pi.channel_x == pi.channel_y:
         raise Problem(
             ("virtual_pi", "channel_y"), f"'{pi.channel_y}' is what channel_x is wired to"
+        )
+
+
+def _check_length(key: tuple[str, ...], address: str) -> None:
+    """A Unix socket can have this path, or ipc address."""
+    if address.startswith("tcp://"):
+        return
+    length = len(os.fsencode(address.removeprefix("ipc://")))
+    if length > LONGEST_SOCKET:
+        raise Problem(
+            key,
+            f"'{address}' is not valid: the path of a Unix socket has at most {LONGEST_SOCKET} "
+            f"bytes, this one has {length}; choose a shorter one, such as in /run or /tmp",
         )
 
 

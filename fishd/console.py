@@ -9,14 +9,16 @@ from fishd.signals import Status
 
 
 def status_line(status: Status) -> str:
-    """Mode, controller, frequency, mean thrust, lateness and missed ticks."""
+    """Mode, controller, frequency, mean thrust, lateness, missed ticks, and a servo not reached."""
     what = status.mode if status.mode == "idle" else f"{status.mode} {status.controller}"
     if status.reason:
         what = f"{status.mode} {status.reason.code}"
+    thrust = "     –" if status.sensor_lost else f"{status.thrust * 1e3:6.2f}"
+    servo = "  servo not reached" if status.servo_lost else ""
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  thrust {status.thrust * 1e3:6.2f} mN  "
+        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust} mN  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
-        f"missed {status.missed} of {status.seq + status.missed} ticks"
+        f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
     )
 
 

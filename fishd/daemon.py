@@ -6,7 +6,7 @@ import logging
 import signal
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import click
@@ -17,7 +17,7 @@ from fishd.clock import SystemClock, Ticker, VirtualClock
 from fishd.config import Config, load
 from fishd.console import complain, run, status_line
 from fishd.controllers import registry
-from fishd.errors import ConfigError, FishdError
+from fishd.errors import ConfigError, FishdError, ServoError
 from fishd.hardware.pulses import REST
 from fishd.lockstep import Lockstep
 from fishd.logs import LogWriter
@@ -91,8 +91,17 @@ class Daemon:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        """Raises `ServoError` when the servo could not be released."""
+        try:
+            self._stack.close()
+        except ServoError as failure:
+            if isinstance(error, Exception):  # which the one below takes the place of
+                log.critical("fishd failed", exc_info=error)
+            raise ServoError(
+                f"the servo could not be released and may keep its pulses: {failure}; "
+                "once it can be reached, 'fishctl release' releases it"
+            ) from None
 
     async def run(self, stopping: asyncio.Event) -> None:
         """Tick until `stopping` is set, then fade to neutral."""
@@ -164,8 +173,9 @@ class Daemon:
     def _come_to_rest(self) -> None:
         """Where fishd failed and could not fade: neutral, and time to get there."""
         if self._loop.servo_on and self._loop.applied != 0.0:
-            self._loop.robot.servo.write(0.0)
-            self._clock.sleep(REST)
+            with suppress(ServoError):  # closing it comes next, and says what could not be done
+                self._loop.robot.servo.write(0.0)
+                self._clock.sleep(REST)
 
     def _on_press(self) -> None:
         """The E-stop button was pressed, says a thread of the driver: do not wait for a tick."""

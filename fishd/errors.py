@@ -7,6 +7,7 @@
     ├── PolicyError      (ValueError)   a policy file cannot be used
     ├── ControllerFault  (RuntimeError) a controller cannot go on, and knows why; see its `code`
     ├── StartupError     (RuntimeError) the daemon cannot start, such as address in use
+    │   └── MissingPackage              a driver's library is not installed
     ├── SensorError      (OSError)      the force sensor cannot be read
     ├── ServoError       (OSError)      the servo cannot be driven
     └── FishError                       raised by the client, `fishd.client`
@@ -54,6 +55,10 @@ class ControllerFault(FishdError, RuntimeError):
 
 class StartupError(FishdError, RuntimeError):
     """The daemon cannot start on this machine as it is."""
+
+
+class MissingPackage(StartupError):
+    """A driver's library is not installed, or cannot be imported."""
 
 
 class SensorError(FishdError, OSError):

@@ -26,8 +26,10 @@ class Guard:
 
     def restrict(self, lowest: float, highest: float) -> None:
         """Permit angles from `lowest` to `highest` [rad] only, as far as they are within ±Φ."""
-        self._lowest = max(-self._amplitude, lowest)
-        self._highest = min(self._amplitude, highest)
+        self.lowest = max(-self._amplitude, lowest)
+        """The lowest angle that is permitted [rad]."""
+        self.highest = min(self._amplitude, highest)
+        """The highest angle that is permitted [rad]."""
 
     def apply(self, command: float, previous: float) -> float:
         """The instruction angle to send [rad].
@@ -38,7 +40,7 @@ class Guard:
         """
         if not math.isfinite(command):
             raise ValueError(f"the command is {command}, not an angle")
-        wanted = max(self._lowest, min(self._highest, command))
+        wanted = max(self.lowest, min(self.highest, command))
         return _towards(wanted, previous, self.step)
 
     def fade(self, previous: float) -> float:

@@ -5,7 +5,6 @@ clock. It never raises: whatever goes wrong, the supervisor decides and the serv
 Everything else here is called between two ticks, by the thread that ticks.
 """
 
-import logging
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,16 +15,15 @@ from msgspec.structs import replace
 from fishd.clock import Clock, Slot
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.hold import Hold, HoldParameters
-from fishd.errors import ControllerFault, FishdError, SensorError
+from fishd.drive import Drive
+from fishd.errors import ControllerFault, SensorError
 from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
-from fishd.reporting import Publisher, Reporter, why_overrun, why_skipped
+from fishd.reporting import Publisher, Reporter, named, why_overrun, why_silent, why_skipped
 from fishd.signals import Measurement, Observation
 from fishd.statistics import Statistics
 from fishd.supervisor import Mode, Supervisor
-
-log = logging.getLogger(__name__)
 
 UPDATE_BUDGET = 0.5
 """Share of the period that a controller's update may take."""
@@ -69,8 +67,6 @@ class ControlLoop:
         """The instruction angle in force [rad]."""
         self.neutral_for = 0.0
         """How long the instruction angle has been zero [s]."""
-        self.servo_on = False
-        """False while the servo gets no pulses."""
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
@@ -79,12 +75,21 @@ class ControlLoop:
         self._estimator = estimator
         self.guard = guard
         self._now = clock.monotonic
+        self._drive = Drive(robot, clock.monotonic)
         self._notify = notify
-        self._lost = False
         self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
         self._index = -1
         self._overran = False
-        self._latest_problem = ""
+
+    @property
+    def servo_on(self) -> bool:
+        """False once the servo is known to get no pulses."""
+        return self._drive.on
+
+    @property
+    def servo_lost(self) -> bool:
+        """True while the servo cannot be reached; with `servo_on`, it may still have pulses."""
+        return self._drive.lost
 
     def tick(self, slot: Slot) -> None:
         """One turn of the loop."""
@@ -158,7 +163,6 @@ class ControlLoop:
     def clear_fault(self) -> None:
         """Leave mode fault or estop for idle: the servo gets pulses again."""
         before = self.supervisor.mode
-        self._latest_problem = ""
         self.supervisor.clear()
         self.reporter.mode(before, self.supervisor)
 
@@ -183,8 +187,8 @@ class ControlLoop:
         self.controller_name, self.controller, self._fresh = name, controller, fresh
         try:
             former.close()
-        except Exception:
-            log.exception("the controller before %s could not be closed", name)
+        except Exception as error:
+            self.reporter.problem(f"the controller before {name} could not be closed", error)
 
     def _attend_panel(self, slot: Slot) -> None:
         """Show the mode on the operator's panel, and stop at once while its button is pressed."""
@@ -206,7 +210,7 @@ class ControlLoop:
             if self.supervisor.suspect(measurement.suspect):
                 self._fall()
         except Exception as error:
-            problem = f"the force sensor cannot be read: {_named(error)}"
+            problem = f"the force sensor cannot be read: {named(error)}"
             measurement = self._measurement  # once more, and nothing of it is new
         self._measurement = replace(measurement, samples=0, suspect="", extremes=None)
         age = slot.now - measurement.time
@@ -249,28 +253,21 @@ class ControlLoop:
         return applied
 
     def _write(self, neutral: bool) -> None:
-        """Drive the servo, or release it: at once in estop, once neutral in fault.
-
-        In fault pulses never begin: a servo that was lost is released when it is back.
-        """
-        mode = self.supervisor.mode
-        fading = self.servo_on and not self._lost and not neutral
+        """Send the angle in force, or release the servo, as the mode demands."""
+        if silence := self._drive.silence():
+            self.applied = 0.0  # where the servo is: to begin elsewhere would make it jump
+            neutral = True
+            if self.supervisor.fail("overrun", why_silent(silence)):
+                self._fall()
+        latched, lost = self.supervisor.reason, self._drive.lost
         try:
-            if mode is Mode.ESTOP or (mode is Mode.FAULT and not fading):
-                self.robot.servo.release()  # in every tick: so a servo that is lost is noticed
-                self.servo_on = False
-            else:
-                self.robot.servo.write(self.applied)
-                self.servo_on = True
-            if self._lost:
+            self._drive.command(self.supervisor.mode, self.applied, neutral)
+            if lost:
                 self.reporter.event("servo", "the servo can be reached again")
-            self._lost = False
         except Exception as error:
-            latched, lost = self.supervisor.reason, self._lost
-            self._lost = True
             self._fail("servo-link", "the servo cannot be driven", error)
             if latched and not lost:  # which the fault or the stop that is latched does not say
-                message = f"it may still have pulses, and cannot be released: {_named(error)}"
+                message = f"it may still have pulses, and cannot be released: {named(error)}"
                 self.reporter.event("servo", message, "error")
 
     def _publish(
@@ -307,20 +304,10 @@ class ControlLoop:
 
     def _fail(self, code: str, what: str, error: Exception) -> None:
         """Latch a fault; an error while one is latched is logged all the same, once."""
-        problem = f"{what}: {_named(error)}"
-        if problem != self._latest_problem:
-            log.error("%s", problem, exc_info=None if isinstance(error, FishdError) else error)
-        self._latest_problem = problem
-        if self.supervisor.fail(code, problem):
+        if self.supervisor.fail(code, self.reporter.problem(what, error)):
             self._fall()
 
     def _fall(self) -> None:
         """The supervisor has just latched a fault: put `hold` in command and tell everyone."""
         self._rest()
         self.reporter.fault(self.supervisor)
-
-
-def _named(error: Exception) -> str:
-    if isinstance(error, FishdError):  # one of ours is a sentence by itself
-        return str(error)
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -49,6 +49,7 @@ class Operations:
         self._clock = clock
         self._telemetry = telemetry
         self._realtime = realtime
+        self._check_calibration = workbench.check_startable
         self._started = clock.monotonic()
         self._decisions = 0
         self._loading = 0
@@ -96,6 +97,8 @@ class Operations:
             frequency=observation.frequency if observation else 0.0,
             tick=loop.limits.tick,
             amplitude_limit=loop.limits.amplitude,
+            lowest=loop.guard.lowest,
+            highest=loop.guard.highest,
             seq=loop.seq,
             missed=loop.statistics.missed,
             overruns=loop.statistics.overruns,
@@ -105,6 +108,8 @@ class Operations:
             counters=loop.robot.counters(),
             realtime=self._realtime,
             telemetry=self._telemetry,
+            servo_lost=loop.servo_lost,
+            sensor_lost=loop.supervisor.sensor_lost,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
@@ -120,6 +125,7 @@ class Operations:
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
+        self._check_calibration(wanted.name)
         self._check_busy()
         decision = self._decide()
         try:
@@ -139,8 +145,9 @@ class Operations:
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
         try:
+            self._check_calibration(wanted.name)
             self._loop.set_controller(wanted.name, controller)
-        except Refused:  # a fault since
+        except Refused:  # a fault since, or a calibration
             controller.close()
             raise
         return self._state()

@@ -16,6 +16,11 @@ VERSION = 1
 MAX_MESSAGE = 65536
 """Longer messages are not even received [bytes]."""
 
+LOAN = 5.0
+"""How long a servo calibration that is not saved stays in force without being renewed [s]."""
+FRESH = 10.0
+"""How long after it was taken a force sample is good for a tare [s]."""
+
 RequestId = int | str | None
 
 Line = Annotated[str, Meta(max_length=1000, pattern="^[^\x00-\x1f\x7f-\x9f]*$")]
@@ -83,9 +88,15 @@ class Estop(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SampleForce(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of sample-force and tare."""
+    """Arguments of sample-force."""
 
     seconds: Annotated[float, Meta(ge=0.1, le=60)] = 2.0
+
+
+class Tare(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of tare: the `number` of a sample that is at most `FRESH` seconds old."""
+
+    sample: int
 
 
 class CalibrateForce(Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,19 +106,33 @@ class CalibrateForce(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of calibrate-servo: in force from the next tick on, saved only where `save`."""
+    """Arguments of calibrate-servo: in force from the next tick on, saved or for a loan only.
+
+    A loan ends unless it is renewed; whoever has it names it in each change, and to save.
+    """
 
     calibration: ServoCalibration
     save: bool = False
+    loan: str | None = None
+
+
+class ServoLoan(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of renew-loan and end-loan."""
+
+    loan: str
 
 
 class Calibrations(Struct, frozen=True):
-    """The calibrations in force, and their files; null where they come from the configuration."""
+    """The calibrations in force, and their files; null where they come from the configuration.
+
+    `loan` is null unless that of the servo is in force for a loan only.
+    """
 
     force: ForceCalibration
     force_file: str | None
     servo: ServoCalibration
     servo_file: str | None
+    loan: str | None = None
 
 
 class Mark(Struct, frozen=True, forbid_unknown_fields=True):

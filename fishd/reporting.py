@@ -6,6 +6,7 @@ from typing import Any, Protocol
 from msgspec import UNSET, Struct, structs
 
 from fishd.clock import Clock, Slot
+from fishd.errors import FishdError
 from fishd.signals import Event, Measurement, Observation, Tick, Truth
 from fishd.statistics import PHASES
 from fishd.supervisor import Mode, Supervisor
@@ -29,6 +30,7 @@ class Reporter:
     def __init__(self, clock: Clock, publisher: Publisher) -> None:
         self._clock = clock
         self._publisher = publisher
+        self._latest_problem = ""
 
     def event(self, kind: str, message: str, level: str = "info", **data: Any) -> None:
         """Publish and log an event; never raises, since bad news must not make things worse."""
@@ -50,8 +52,17 @@ class Reporter:
         mode, reason = supervisor.mode, supervisor.reason
         if mode is before:
             return
+        self._latest_problem = ""  # what fails again after a clear is news
         message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
         self.event("mode", message, level, before=before.value, mode=mode.value)
+
+    def problem(self, what: str, error: Exception) -> str:
+        """Log that something failed, with its error, once; gives the two in one line."""
+        line = f"{what}: {named(error)}"
+        if line != self._latest_problem:
+            log.error("%s", line, exc_info=None if isinstance(error, FishdError) else error)
+        self._latest_problem = line
+        return line
 
     def fault(self, supervisor: Supervisor) -> None:
         """Tell of the fault that was just latched."""
@@ -112,6 +123,13 @@ class Reporter:
         )
 
 
+def named(error: Exception) -> str:
+    """An error in one line: one of ours is a sentence by itself, others say their type."""
+    if isinstance(error, FishdError):
+        return str(error)
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
 def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None:
     """One line that blames the right phase of a tick that took longer than a period [s], or None.
 
@@ -127,6 +145,14 @@ def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None
     return (
         f"tick {seq} took {busy * 1e3:.1f} ms of its {period * 1e3:g} ms, "
         f"{longest * 1e3:.1f} ms of it in {phase}"
+    )
+
+
+def why_silent(silence: float) -> str:
+    """One line on a servo that was left alone for so long [s] that it has come to rest."""
+    return (
+        f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral and "
+        "ends its pulses by itself: the machine is overloaded or was suspended"
     )
 
 

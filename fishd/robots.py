@@ -1,5 +1,6 @@
 """Opens the robot that the configuration describes: its sensor, servo and panel, ready to use."""
 
+import logging
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -13,18 +14,23 @@ from fishd.addresses import virtual_pi_socket
 from fishd.clock import Clock, VirtualClock
 from fishd.config import Config
 from fishd.errors import SensorError
+from fishd.hardware import ownership, pulses
 from fishd.hardware.base import Bench, CalibratedServo, Panel, Robot
 from fishd.hardware.calibration import (
     CalibrationFolder,
     ForceCalibration,
     ServoCalibration,
     as_configured,
+    calibrated,
 )
+from fishd.hardware.packages import driver_packages
 from fishd.hardware.simulated import SimulatedFish
 from fishd.signals import Truth
 
 if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
     from fishd.emulation.virtual_pi import VirtualPi
+
+log = logging.getLogger(__name__)
 
 START_LIMIT = 1.0
 """How long the force sensor may take for its first sample [s]."""
@@ -34,14 +40,24 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack) -> Robot:
     """The robot, in real time; leaving `stack` releases its servo first, then lets go of the rest.
 
     A sensor or servo that does not answer is no error here: the loop will say so, and recovers
-    when it comes back. Raises `StartupError` when a package is missing or no virtual Pi is
-    running, `ConfigError` when a calibration file is broken.
+    when it comes back. Raises `StartupError` when a package is missing, no virtual Pi is running or
+    another fishd drives this robot, `ConfigError` when a calibration file is broken.
     """
     if config.robot == "simulated":
         return SimulatedFish(config.plant, config.simulation, config.tick).robot()
+    stack.enter_context(ownership.owned(parts_of(config)))
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
     return _assemble(config, clock, stack, threaded=True)
+
+
+def parts_of(config: Config) -> tuple[ownership.Part, ...]:
+    """What no other fishd may drive meanwhile; `fishctl release`, the last resort, does not ask."""
+    if config.robot == "pi":
+        return ownership.parts_of_pi(config.force_sensor, config.servo)
+    if config.robot == "virtual-pi":
+        return ownership.parts_of_virtual_pi(virtual_pi_socket(config.virtual_pi.socket))
+    return ()
 
 
 class Lockstep(NamedTuple):
@@ -67,7 +83,8 @@ def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
     stack.callback(pi.close)
     pi.start()
     set_timeout = partial(setattr, pi.bus, "timeout")
-    stack.enter_context(LinuxI2c(pi.bus.transfer, {settings.bus}, set_timeout))
+    with driver_packages():
+        stack.enter_context(LinuxI2c(pi.bus.transfer, {settings.bus}, set_timeout))
     if _has_panel(config):
         stack.enter_context(EmulatedLgpio(pi.pins))
     robot = _assemble(
@@ -79,7 +96,7 @@ def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
     """Let the I2C bus and the pins of this process be those of the virtual Pi that is running.
 
-    Raises `StartupError` where there is none.
+    Raises `StartupError` where there is none, or a package is missing.
     """
     from fishd.emulation.lgpio import EmulatedLgpio
     from fishd.emulation.link import RemotePi
@@ -91,7 +108,8 @@ def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
     remote = RemotePi(path)
     stack.callback(remote.close)
     buses = {config.virtual_pi.bus}
-    stack.enter_context(LinuxI2c(remote.transfer, buses, remote.set_timeout))
+    with driver_packages():
+        stack.enter_context(LinuxI2c(remote.transfer, buses, remote.set_timeout))
     if _has_panel(config):
         pins = Pins()
         stack.enter_context(EmulatedLgpio(pins))
@@ -113,7 +131,8 @@ def open_servo(config: Config, clock: Clock, *, threaded: bool) -> CalibratedSer
     calibration = found[0] if found else as_configured(config.servo)
     settings = config.servo
     if settings.driver == "pigpio":
-        from fishd.hardware.pigpio import PigpioServo
+        with driver_packages():
+            from fishd.hardware.pigpio import PigpioServo
 
         return PigpioServo(settings, calibration, clock, threaded=threaded, tick=config.tick)
     if settings.driver == "sysfs-pwm":
@@ -150,9 +169,21 @@ def _assemble(
     if threaded:
         _await_first_sample(sensor.read, clock)
 
+    if left := pulses.cut(config.servo, config.amplitude_limit):
+        log.info("servo.lowest and servo.highest permit %s, amplitude_limit", left)
+
     def degraded() -> tuple[str, ...]:
-        uncalibrated = "the force is not calibrated: fishctl calibrate force"
-        return servo.degraded + (() if sensor.calibration.date else (uncalibrated,))
+        lines = servo.degraded
+        if not sensor.calibration.date:
+            lines += ("the force is not calibrated: fishctl calibrate force",)
+        left = pulses.cut(calibrated(config.servo, servo.calibration), config.amplitude_limit)
+        if left and servo.calibration != as_configured(config.servo):
+            date = servo.calibration.date or "no date"
+            lines += (
+                f"the servo's calibration of {date} permits {left}, amplitude_limit: "
+                "fishctl calibrate servo",
+            )
+        return lines
 
     return Robot(
         name=config.robot,
@@ -163,6 +194,7 @@ def _assemble(
         bench=Bench(sensor, servo),
         degraded=degraded,
         counters=lambda: {**sensor.counters(), **servo.counters()},
+        countdown=servo.countdown,
     )
 
 

@@ -93,7 +93,7 @@ class Tick(Struct, frozen=True, gc=False):
     phi_c: float
     """The instruction angle that was sent to the servo in this tick, after the guard [rad]."""
     servo_on: bool
-    """False while the servo gets no pulses."""
+    """False once the servo is known to get no pulses."""
     thrust: float
     """Mean longitudinal force over the latest whole tail beats [N]."""
     frequency: float
@@ -191,6 +191,7 @@ class Status(Struct, frozen=True):
     parameters: dict[str, Any]
     """Parameters of the running controller."""
     servo_on: bool
+    """False once the servo is known to get no pulses."""
     thrust: float
     """[N]"""
     frequency: float
@@ -199,6 +200,10 @@ class Status(Struct, frozen=True):
     """Period of the loop [s]."""
     amplitude_limit: float
     """[rad]"""
+    lowest: float
+    """Lowest instruction angle that Φ, soft limits and pulse widths permit [rad]."""
+    highest: float
+    """Highest instruction angle that they permit [rad]."""
     seq: int
     """Number of the latest tick."""
     missed: int
@@ -216,3 +221,7 @@ class Status(Struct, frozen=True):
     """True when the loop runs under SCHED_FIFO."""
     telemetry: str
     """Address of the telemetry socket."""
+    servo_lost: bool = False
+    """True while the servo cannot be reached; with `servo_on`, it may still have pulses."""
+    sensor_lost: bool = False
+    """True while there is no force to believe; `thrust` is then that of the time before."""

@@ -99,6 +99,11 @@ class Supervisor:
             "sensor-range", f"{suspicion}, in {self._suspect} windows in a row"
         )
 
+    @property
+    def sensor_lost(self) -> bool:
+        """Whether the latest SENSOR_STREAK reads gave no force, or none to believe."""
+        return max(self._bad_reads, self._suspect) >= SENSOR_STREAK
+
     def update_time(self, seconds: float, budget: float, controller: str) -> bool:
         """Count an update of the controller; True when that latches the fault controller-slow."""
         self._slow_updates = self._slow_updates + 1 if seconds > budget else 0

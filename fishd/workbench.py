@@ -13,7 +13,6 @@ from msgspec import Struct
 from fishd.clock import Clock
 from fishd.config import Config
 from fishd.errors import ConfigError, Refused
-from fishd.hardware import pulses
 from fishd.hardware.base import Bench
 from fishd.hardware.calibration import (
     C,
@@ -21,11 +20,19 @@ from fishd.hardware.calibration import (
     ForceCalibration,
     ForceSample,
     ServoCalibration,
-    calibrated,
 )
 from fishd.loop import ControlLoop
-from fishd.protocol import CalibrateForce, CalibrateServo, Calibrations, NoArguments, SampleForce
-from fishd.supervisor import Mode
+from fishd.protocol import (
+    FRESH,
+    CalibrateForce,
+    CalibrateServo,
+    Calibrations,
+    NoArguments,
+    SampleForce,
+    ServoLoan,
+    Tare,
+)
+from fishd.servo_bench import ServoBench, resting_bench
 
 Operations = dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]]
 """What can be asked for: the arguments, and what answers."""
@@ -40,43 +47,70 @@ class Workbench:
         self._clock = clock
         self._folder = CalibrationFolder(folder)
         self._sensor = config.force_sensor
-        self._servo = config.servo
         self._changing = asyncio.Lock()
         """Held while a calibration is replaced: the newest file must be the one in force."""
+        self._servo = ServoBench(loop, clock, config.servo, self._changing)
+        self._samples: dict[int, tuple[float, ForceSample]] = {}
+        """When each fresh sample was taken, and what it says, by its number."""
+        self._sampled = 0
         self._force_file = self._file(ForceCalibration)
         self._servo_file = self._file(ServoCalibration)
         self.operations: Operations = {
             "calibrations": (NoArguments, self._calibrations),
             "sample-force": (SampleForce, self._sample_force),
-            "tare": (SampleForce, self._tare),
+            "tare": (Tare, self._tare),
             "calibrate-force": (CalibrateForce, self._calibrate_force),
             "calibrate-servo": (CalibrateServo, self._calibrate_servo),
+            "renew-loan": (ServoLoan, self._renew_loan),
+            "end-loan": (ServoLoan, self._end_loan),
         }
+        self.check_startable = self._servo.check_startable
+        """Raises `Refused` while a controller of that name must not take over."""
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
         bench = self._bench()
         return Calibrations(
-            bench.sensor.calibration, self._force_file, bench.servo.calibration, self._servo_file
+            force=bench.sensor.calibration,
+            force_file=self._force_file,
+            servo=bench.servo.calibration,
+            servo_file=self._servo_file,
+            loan=self._servo.loan,
         )
 
     async def _sample_force(self, wanted: SampleForce) -> ForceSample:
-        sensor = self._resting_bench().sensor
+        sensor = resting_bench(self._loop).sensor
         watch = sensor.watch()
         try:
             await asyncio.sleep(wanted.seconds)
         finally:
             sample = watch.close()
-        self._resting_bench()  # a controller may have been started meanwhile
+        resting_bench(self._loop)  # a controller may have been started meanwhile
         if sample.pairs == 0:
             raise Refused("no-samples", f"the force sensor gave nothing for {wanted.seconds:g} s")
+        self._forget_old_samples()
+        self._sampled += 1
+        sample = msgspec.structs.replace(sample, number=self._sampled)
+        self._samples[sample.number] = (self._clock.monotonic(), sample)
         return sample
 
-    async def _tare(self, wanted: SampleForce) -> Calibrations:
-        sample = await self._sample_force(wanted)
+    def _forget_old_samples(self) -> None:
+        oldest = self._clock.monotonic() - FRESH
+        self._samples = {n: taken for n, taken in self._samples.items() if taken[0] >= oldest}
+
+    async def _tare(self, wanted: Tare) -> Calibrations:
+        # Of a sample that is there already: who gives up while measuring changes nothing.
+        self._forget_old_samples()
+        if wanted.sample not in self._samples:
+            raise Refused(
+                "no-samples",
+                f"there is no sample {wanted.sample} of the last {FRESH:g} s; take another with "
+                "sample-force",
+            )
+        _, sample = self._samples[wanted.sample]
         if sample.suspect:
             raise Refused("suspect", f"the forces are not to be believed: {sample.suspect}")
         async with self._changing:
-            before = self._resting_bench().sensor.calibration
+            before = resting_bench(self._loop).sensor.calibration
             restless = max(
                 math.hypot(before.xx * sample.vx_std, before.xy * sample.vy_std),
                 math.hypot(before.yx * sample.vx_std, before.yy * sample.vy_std),
@@ -104,14 +138,14 @@ class Workbench:
 
     async def _calibrate_force(self, wanted: CalibrateForce) -> Calibrations:
         calibration = wanted.calibration
-        numbers = (calibration.xx, calibration.xy, calibration.yx, calibration.yy)
-        if calibration.xx * calibration.yy - calibration.xy * calibration.yx == 0.0:
+        if calibration.singular:
+            numbers = (calibration.xx, calibration.xy, calibration.yx, calibration.yy)
             raise Refused("bad-arguments", f"the matrix {numbers} says the same of both forces")
         async with self._changing:
             return await self._adopt_force(calibration)
 
     async def _adopt_force(self, calibration: ForceCalibration) -> Calibrations:
-        self._resting_bench()
+        resting_bench(self._loop)
         saved, path = await self._save(calibration)
         # The newest file is in force from the next start on, so it is now, whatever else began.
         self._bench().sensor.recalibrate(saved)
@@ -122,53 +156,30 @@ class Workbench:
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
         async with self._changing:
             calibration = wanted.calibration
-            self._check_servo(calibration)
-            path = None
+            self._servo.check(calibration, wanted.loan)
             if wanted.save:
                 calibration, path = await self._save(calibration)
-                self._check_servo(calibration)
-            self._bench().servo.recalibrate(calibration)
-            self._loop.guard.restrict(*pulses.reach(calibrated(self._servo, calibration)))
-            if path:
+                self._servo.check(calibration, wanted.loan)
+                self._servo.keep(calibration)
                 self._servo_file = str(path)
                 self._announce("servo", path)
+            else:
+                self._servo.lend(calibration)
             return await self._calibrations(NoArguments())
 
-    def _check_servo(self, calibration: ServoCalibration) -> None:
-        """Raise `Refused` unless the calibration can be put in force just now."""
-        present = self._resting_bench().servo.calibration
-        servo = calibrated(self._servo, calibration)
-        lowest, highest = pulses.reach(servo)
-        if not lowest <= 0.0 <= highest:
-            raise Refused(
-                "bad-arguments",
-                f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to "
-                "2500 µs",
-            )
-        angle = self._loop.applied
-        same = (calibration.direction, calibration.scale) == (present.direction, present.scale)
-        if not (lowest <= angle <= highest and (same or angle == 0.0)):
-            raise Refused(
-                "not-neutral",
-                f"the tail is at {angle:+.3f} rad and would jump; bring it to neutral with "
-                "'fishctl stop'",
-            )
+    async def _renew_loan(self, wanted: ServoLoan) -> Calibrations:
+        self._servo.renew(wanted.loan)
+        return await self._calibrations(NoArguments())
+
+    async def _end_loan(self, wanted: ServoLoan) -> Calibrations:
+        self._servo.end(wanted.loan)
+        return await self._calibrations(NoArguments())
 
     def _bench(self) -> Bench:
         bench = self._loop.robot.bench
         if bench is None:
             raise Refused(
                 "simulated", "a simulated fish has nothing to calibrate; see robot: virtual-pi"
-            )
-        return bench
-
-    def _resting_bench(self) -> Bench:
-        """The bench, while nothing swims; `hold` may be in command."""
-        bench = self._bench()
-        loop = self._loop
-        if loop.supervisor.mode is Mode.RUNNING and loop.controller_name != "hold":
-            raise Refused(
-                "running", f"{loop.controller_name} is in command; stop it with 'fishctl stop'"
             )
         return bench
 

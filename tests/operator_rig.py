@@ -118,6 +118,8 @@ class Bench:
             "robot": "virtual-pi",
             "virtual_pi.socket": self.folder / "virtual-pi",
             "servo.pigpio.port": self._port,
+            "servo.pigpio.timeout": 0.1,  # machines that run tests may stall
+            "servo.pigpio.countdown": 2.0,
             "state_folder": self.folder / "state",
             "force_sensor.tare_limit": 0.5,
         }

@@ -74,7 +74,7 @@ def running(folder: Path, *arguments: str, under: Sequence[str] = ()) -> Iterato
     try:
         yield daemon.wait_until_up()
     finally:
-        daemon.end()
+        print(f"fishd said:\n{daemon.end()[2]}")  # which pytest shows for a test that failed
 
 
 class Subscriber:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fishd.calibrating import WORST_CONDITION, Load, PoorLoads, fit, missing_loads
+from fishd.calibrating import WORST_CONDITION, Load, PoorLoads, check, fit, missing_loads
 
 PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
@@ -75,6 +75,31 @@ def test_the_error_of_each_load_points_at_the_one_that_was_entered_wrongly() -> 
     loads[3] = loads[3]._replace(fy=0.35)
     errors = [math.hypot(*error) for error in fit(loads).errors]
     assert errors.index(max(errors)) == 3
+
+
+def test_a_fit_that_leaves_a_fifth_of_the_loads_is_refused_by_the_name_of_the_worst() -> None:
+    loads = measured([*PLAN, *PLAN], sensor(1, 1))
+    loads[1] = loads[1]._replace(vx=-loads[1].vx)
+    with pytest.raises(PoorLoads, match=r"residual is \d\d% of them .* measure b again first"):
+        check(fit(loads), loads, "abcdefghij")
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_voltages_that_have_nothing_to_do_with_the_loads_are_no_fit(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    voltages = random.standard_normal((3 * len(PLAN), 2)).tolist()
+    loads = [Load(*force, *v) for force, v in zip(PLAN * 3, voltages, strict=True)]
+    with pytest.raises(PoorLoads, match="do not follow the loads"):
+        check(fit(loads), loads, [""] * len(loads))
+
+
+@given(gains, gains, crosstalk, crosstalk, st.integers(0, 2**32 - 1))
+def test_a_sensor_with_some_noise_is_a_fit(
+    gx: float, gy: float, cx: float, cy: float, seed: int
+) -> None:
+    loads = measured(PLAN, sensor(gx, gy, cx, cy), noise=0.02 * 0.2 * min(gx, gy), seed=seed)
+    if np.linalg.cond(sensor(gx, gy, cx, cy)) < 0.3 * WORST_CONDITION:
+        check(fit(loads), loads, "abcde")
 
 
 def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gains_else() -> None:

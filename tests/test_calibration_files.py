@@ -4,9 +4,12 @@ import datetime
 from pathlib import Path
 
 import pytest
+import yaml
+from msgspec import Struct, inspect
 
 from fishd.errors import ConfigError
 from fishd.hardware.calibration import CalibrationFolder, ForceCalibration, ServoCalibration
+from fishd.hardware.settings import ServoSettings
 
 NOON = datetime.datetime(2026, 11, 21, 12, 0, 0, tzinfo=datetime.UTC)
 HOUR = datetime.timedelta(hours=1)
@@ -53,9 +56,10 @@ def test_a_time_zone_does_not_decide_which_is_newer(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("xx: [", ":1: not valid YAML"),
-        ("xx: lots\n", "xx: 'lots' is not valid"),
-        ("xxx: 1.0\n", "xxx: unknown key"),
         ("xx: 1e2\n", "1e2"),
+        ("", "nothing in this file"),
+        ("- 1.0\n", "a mapping of keys to values is needed"),
+        ("xx: 1.0\nxy: 0.0\nx0: 0.0\nyx: 0.0\n", "without yy, y0, date: nothing is filled in"),
     ],
 )
 def test_a_broken_file_is_an_error_and_no_older_one_is_taken_for_it(
@@ -69,6 +73,87 @@ def test_a_broken_file_is_an_error_and_no_older_one_is_taken_for_it(
         folder.newest(ForceCalibration)
     assert str(newer) in str(refusal.value)
     assert words in str(refusal.value)
+    assert str(refusal.value).endswith("; mend it, or move it away")
+
+
+FORCE = {"xx": 1.0, "xy": 0.0, "x0": 0.0, "yx": 0.0, "yy": 1.0, "y0": 0.0, "date": "2026-11-21"}
+SERVO = {"trim": 0.0, "direction": 1, "scale": 600.0, "lowest": -1.2, "highest": 1.2}
+
+
+def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], text: str) -> str:
+    """What is said of a file with this text."""
+    name = "force" if kind is ForceCalibration else "servo"
+    path = folder / f"{name}-2027.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as refusal:
+        CalibrationFolder(folder).newest(kind)
+    path.unlink()
+    line = str(refusal.value)
+    assert line.startswith(f"{path}: ")
+    assert line.endswith("; mend it, or move it away")
+    assert "\n" not in line
+    return line
+
+
+@pytest.mark.parametrize("key", [*FORCE, *SERVO])
+def test_a_file_without_one_of_its_keys_is_an_error_and_nothing_is_filled_in(
+    tmp_path: Path, key: str
+) -> None:
+    kind, whole = (ForceCalibration, FORCE) if key in FORCE else (ServoCalibration, SERVO)
+    text = yaml.safe_dump({name: value for name, value in whole.items() if name != key})
+    assert f"without {key}: " in complaint(tmp_path, kind, text)
+
+
+@pytest.mark.parametrize("length", range(0, 80, 5))
+def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
+    folder = CalibrationFolder(tmp_path)
+    _, path = folder.save(ForceCalibration(xx=1.5, xy=-0.25), NOON)
+    text = path.read_text()
+    assert length < text.index("loads:") - 1
+    path.write_text(text[:length])
+    with pytest.raises(ConfigError, match="mend it, or move it away"):
+        folder.newest(ForceCalibration)
+
+
+@pytest.mark.parametrize(
+    ("kind", "whole", "changes", "words"),
+    [
+        (ForceCalibration, FORCE, {"xx": float("nan")}, "xx: nan is not a finite number"),
+        (ForceCalibration, FORCE, {"y0": float("inf")}, "y0: inf is not a finite number"),
+        (ForceCalibration, FORCE, {"residual": float("nan")}, "residual: nan is not"),
+        (ForceCalibration, FORCE, {"xx": "lots"}, "xx: 'lots' is not valid"),
+        (ForceCalibration, FORCE, {"xxx": 1.0}, "xxx: unknown key"),
+        (ForceCalibration, FORCE, {"date": ""}, "date: '' is not when it was made"),
+        (ForceCalibration, FORCE, {"xx": 0.0, "yy": 0.0}, "says the same of both forces"),
+        (ForceCalibration, FORCE, {"xy": 2.0, "yx": 0.5}, "says the same of both forces"),
+        (ForceCalibration, FORCE, {"xy": 1e-9, "xx": 1e-9}, "says the same of both forces"),
+        (ServoCalibration, SERVO, {"trim": float("nan")}, "trim: nan is not"),
+        (ServoCalibration, SERVO, {"highest": 3.15}, "highest: 3.15 is not valid"),
+        (ServoCalibration, SERVO, {"scale": 0.0}, "scale: 0.0 is not valid"),
+        (ServoCalibration, SERVO, {"direction": 0}, "direction: 0 is not valid"),
+    ],
+)
+def test_a_file_that_makes_no_sense_is_an_error_that_says_where(
+    tmp_path: Path,
+    kind: type[ForceCalibration | ServoCalibration],
+    whole: dict[str, object],
+    changes: dict[str, object],
+    words: str,
+) -> None:
+    assert words in complaint(tmp_path, kind, yaml.safe_dump({**whole, **changes}))
+
+
+def bounds(struct: type[Struct], name: str) -> object:
+    """What a field takes."""
+    info = inspect.type_info(struct)
+    assert isinstance(info, inspect.StructType)
+    kind = next(field.type for field in info.fields if field.name == name)
+    return kind.type if isinstance(kind, inspect.Metadata) else kind
+
+
+@pytest.mark.parametrize("key", list(SERVO))
+def test_a_servo_calibration_has_the_bounds_of_the_same_keys_of_the_configuration(key: str) -> None:
+    assert bounds(ServoCalibration, key) == bounds(ServoSettings, key)
 
 
 def test_a_folder_that_cannot_be_read_is_an_error_and_not_no_calibration(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.config import Config, load, to_yaml
+from fishd.config import SERVICE_FILE, Config, load, to_yaml
 from fishd.errors import ConfigError
 from fishd.strict_yaml import YamlProblem, parse
 
@@ -189,6 +189,17 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
         (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),
         (["servo.centre=2300", "servo.trim=400"], "servo.trim", "2700 µs"),
+        (["servo.pigpio.host="], "servo.pigpio.host", "127.0.0.1"),
+        (["servo.pigpio.host=my pi"], "servo.pigpio.host", "'my pi' is not valid"),
+        (["virtual_pi.socket="], "virtual_pi.socket", "a path or null"),
+        ([f"virtual_pi.socket=/tmp/{'x' * 103}"], "virtual_pi.socket", "this one has 108"),
+        ([f"control.address=ipc:///tmp/{'x' * 103}"], "control.address", "at most 107 bytes"),
+        ([f"telemetry.address=ipc:///tmp/{'é' * 60}"], "telemetry.address", "this one has 125"),
+        (
+            ["start.controller=null", "start.parameters.C=0.6"],
+            "start.parameters",
+            "there is no start.controller to take these; name one, or remove them",
+        ),
         (["servo.frequency=100"], "servo.frequency", "hardware_pwm"),
         (["servo.gpio=17", "servo.pigpio.hardware_pwm=true"], "servo.gpio", "12, 13, 18 or 19"),
         (["panel.led_gpio=18"], "panel.led_gpio", "servo.gpio"),
@@ -210,3 +221,14 @@ def test_hardware_that_does_not_go_together_is_refused_by_key(
 
 def test_pins_of_another_bus_are_free() -> None:
     assert load(None, ["force_sensor.bus=3", "panel.estop_gpio=3"]).panel.estop_gpio == 3
+
+
+def test_the_longest_path_that_a_unix_socket_takes_is_good() -> None:
+    path = f"/tmp/{'x' * 102}"
+    config = load(None, [f"control.address=ipc://{path}", f"virtual_pi.socket={path}"])
+    assert len(config.virtual_pi.socket or "") == 107
+
+
+def test_what_is_installed_on_a_pi_is_the_file_that_the_verbs_look_for() -> None:
+    layout = (Path(__file__).parent.parent / "tools" / "pi_layout.sh").read_text()
+    assert f"\nCONFIG={SERVICE_FILE}\n" in layout

@@ -30,17 +30,40 @@ def test_a_soak_keeps_its_promises(arguments: list[str], promise: str) -> None:
     assert run.stderr == ""
 
 
-def test_a_broken_promise_is_noticed(tmp_path: Path) -> None:
-    """The same soak on a guard that lets everything through."""
-    sabotage = (
-        f"import sys; sys.path.insert(0, {str(TOOL.parent)!r}); sys.argv[1:] = "
-        "['simulated', '--ticks', '20000']\n"
-        "from fishd.guard import Guard\n"
-        "Guard.apply = lambda self, command, previous: float(command)\n"
-        "import soak; sys.exit(soak.main())"
+@pytest.mark.parametrize(
+    ("soak", "sabotage", "promise"),
+    [
+        (
+            ["simulated", "--ticks", "20000"],
+            "from fishd.guard import Guard\n"
+            "Guard.apply = lambda self, command, previous: float(command)",
+            "rad",
+        ),
+        (
+            ["simulated", "--ticks", "5000"],
+            "from fishd.statistics import Statistics\n"
+            "add, kept = Statistics.add, []\n"
+            "Statistics.add = lambda *given: (kept.append(given), add(*given))",
+            "objects are left behind per tick",
+        ),
+        (
+            ["virtual-pi", "--ticks", "800"],
+            "from fishd.hardware.ads1115 import Ads1115Sensor\n"
+            "read, kept = Ads1115Sensor.read, []\n"
+            "Ads1115Sensor.read = lambda *given: kept.append(read(*given)) or kept[-1]",
+            "objects are left behind per tick",
+        ),
+    ],
+)
+def test_a_broken_promise_is_noticed(soak: list[str], sabotage: str, promise: str) -> None:
+    """The same soaks with a guard that lets everything through, and with parts that leak."""
+    program = (
+        f"import sys; sys.path.insert(0, {str(TOOL.parent)!r}); sys.argv[1:] = {soak!r}\n"
+        f"{sabotage}\nimport soak; sys.exit(soak.main())"
     )
     run = subprocess.run(
-        [sys.executable, "-c", sabotage], capture_output=True, text=True, check=False, timeout=200
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=200
     )
     assert run.returncode == 1
     assert "BROKEN" in run.stderr
+    assert promise in run.stderr

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from fishd.errors import Refused
 from fishd.hardware.calibration import ForceCalibration, ServoCalibration
-from fishd.protocol import CalibrateForce, CalibrateServo, NoArguments, SampleForce
+from fishd.protocol import FRESH, CalibrateForce, CalibrateServo, NoArguments, SampleForce, Tare
 from fishd.robots import state_folder
 from fishd.workbench import Workbench
 
@@ -27,9 +27,15 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
 
 
 def perform(rig: LockstepRig, bench: Workbench, *requests: tuple[str, Any]) -> list[Any]:
-    """Answers to requests that are made at the same time, while the loop ticks."""
+    """Answers to requests that are made at the same time, while the loop ticks.
+
+    A tare is that of a sample that is taken first.
+    """
 
     async def answer(name: str, arguments: Any) -> Any:
+        if name == "tare" and isinstance(arguments, SampleForce):
+            sample = await bench.operations["sample-force"][1](arguments)
+            arguments = Tare(sample.number)
         return await bench.operations[name][1](arguments)
 
     async def run() -> list[Any]:
@@ -63,6 +69,23 @@ def test_two_tares_at_the_same_time_are_one(rig: LockstepRig) -> None:
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
     (found,) = perform(rig, bench, ("calibrations", NoArguments()))
     assert found.force.x0 == pytest.approx(-0.2, abs=1e-3)
+
+
+def test_a_sample_alone_changes_nothing(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+    perform(rig, bench, ("sample-force", BRIEFLY))
+    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    assert (found.force.x0, found.force_file) == (0.0, None)
+
+
+def test_a_sample_is_good_for_a_tare_only_while_it_is_fresh(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+    (sample,) = perform(rig, bench, ("sample-force", BRIEFLY))
+    rig.run_for(FRESH + 1.0)
+    for number in (sample.number, sample.number + 1, 0):
+        with pytest.raises(Refused, match=f"no sample {number} of the last 10 s") as refusal:
+            perform(rig, bench, ("tare", Tare(number)))
+        assert refusal.value.code == "no-samples"
 
 
 def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path: Path) -> None:
@@ -146,10 +169,27 @@ def test_a_calibration_that_cannot_be_written_is_not_in_force(
     assert rig.robot.bench.sensor.calibration.xx == 1.0
 
 
-@pytest.mark.parametrize("matrix", [{"xx": 0.0}, {"yy": 0.0}])
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        {"xx": 0.0},
+        {"yy": 0.0},
+        {"xx": 0.0, "yy": 0.0},
+        {"xx": 1e-3, "xy": 3e-3, "yx": 1e-3, "yy": 3e-3 * (1 + 1e-7)},
+        {"xx": 1e9, "xy": 1e9, "yx": 1e9, "yy": 1e9 + 1e2},
+        {"xx": 1e-9},
+    ],
+)
 def test_a_matrix_that_says_the_same_of_both_forces_is_refused(
     rig: LockstepRig, matrix: dict[str, float]
 ) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(**matrix)))
     with pytest.raises(Refused, match="says the same"):
         perform(rig, workbench(rig), request)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_a_matrix_is_judged_by_its_shape_and_not_by_its_size(rig: LockstepRig, size: float) -> None:
+    matrix = ForceCalibration(xx=size, xy=0.1 * size, yx=-0.1 * size, yy=8.0 * size)
+    (after,) = perform(rig, workbench(rig), ("calibrate-force", CalibrateForce(matrix)))
+    assert after.force.yy == 8.0 * size

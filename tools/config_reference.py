@@ -56,6 +56,12 @@ $ fishd --set start.controller=square --set start.parameters.frequency=1.7
 The value is read as a plain number where it is one, so `1e-3` and `.05` are numbers here. Anything
 else is read as YAML: `true`, `null`, `{C: 0.7}`, `"a text"`.
 
+## The file of this machine
+
+`fishctl doctor` and `fishctl release` read the file that `--config` names, else the one that the
+variable `FISHD_CONFIG` names, else `/etc/fishd/fishd.yaml` where there is one:
+[installing.md](installing.md#which-file-fishctl-goes-by).
+
 ## Check a file before it is used
 
 ```console

@@ -57,6 +57,17 @@ def signalled(number: signal.Signals) -> Deed:
     return lambda pi, process: process.send_signal(number)
 
 
+def stopped(seconds: float) -> Deed:
+    """Stop fishd for a while."""
+
+    def deed(pi: VirtualPi, process: "subprocess.Popen[bytes]") -> None:
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(seconds)
+        process.send_signal(signal.SIGCONT)
+
+    return deed
+
+
 def injected(fault: str) -> Deed:
     """Let a fault of the virtual Pi begin."""
     return lambda pi, process: pi.faults.inject(fault)
@@ -69,6 +80,7 @@ DEATHS: dict[str, tuple[str, Deed]] = {
     "SIGKILL": ("kill -9, or out of memory", signalled(signal.SIGKILL)),
     "SIGSEGV": ("a crash of the interpreter", signalled(signal.SIGSEGV)),
     "SIGSTOP": ("a hang of the whole process", signalled(signal.SIGSTOP)),
+    "SIGCONT": ("a hang that ends after 1 s", stopped(1.0)),
     "unplugged": ("the force sensor loses its power", injected("unplugged")),
     "stuck-busy": ("the ADC hangs", injected("stuck-busy")),
     "timeout": ("the I2C bus hangs", injected("timeout")),

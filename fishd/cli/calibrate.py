@@ -32,7 +32,7 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     """Call the present force zero; the fish must hang still.
 
     Refused while it swims, while the force varies, and for a force that is too large to be an
-    offset. It is saved as a new calibration file.
+    offset. It is saved as a new calibration file. Ctrl-C while it measures: nothing changes.
     """
     with Fish(endpoint) as fish:
         before = fish.calibrations().force

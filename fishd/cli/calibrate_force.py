@@ -90,26 +90,27 @@ def force(
 
 
 def _fitted(names: list[str], loads: list[tuple[float, ...]]) -> "Fit":
-    """Fit the loads and show how well that went."""
-    from fishd.calibrating import Load, fit
+    """Fit the loads and show how well that went; raises `PoorLoads`."""
+    from fishd.calibrating import Load, check, fit
 
     known = [Load(*load) for load in loads]
     fitted = fit(known)
     _show(names, known, fitted)
+    check(fitted, known, names)
+    _warn(names, known, fitted)
     return fitted
 
 
 def _fitted_with_help(dialogue: Dialogue) -> "Fit":
-    """Fit what was measured; while that is not enough, ask for more."""
+    """Fit what was measured; while that is no good, ask for more, and keep what there is."""
     from fishd.calibrating import PoorLoads
 
     while True:
+        dialogue.amend()
         try:
             return _fitted(*dialogue.result())
         except PoorLoads as error:
-            click.echo(f"{error}", err=True)
-            if not dialogue.extend():
-                raise
+            click.echo(f"\n{error}", err=True)
 
 
 def _show(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
@@ -127,12 +128,16 @@ def _show(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
         f"residual {found.residual * 1e3:.3f} mN rms over {found.loads} loads, "
         f"condition number {found.condition:.3g}"
     )
+
+
+def _warn(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
+    from fishd.calibrating import worst
+
     largest = max(math.hypot(load.fx, load.fy) for load in loads)
-    if found.residual > _POOR_FIT * largest:
-        sizes = [math.hypot(*error) for error in fitted.errors]
-        worst = names[sizes.index(max(sizes))]
+    residual = fitted.calibration.residual
+    if residual > _POOR_FIT * largest:
         click.echo(
-            f"warning: the residual is {found.residual / largest:.0%} of the largest load; "
-            f"look at {worst} first",
+            f"warning: the residual is {residual / largest:.0%} of the largest load; look at "
+            f"{worst(fitted, names)} first",
             err=True,
         )

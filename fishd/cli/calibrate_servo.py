@@ -1,10 +1,12 @@
 """`fishctl calibrate servo`: trim, direction and limits, found by small steps while one watches.
 
-Whatever ends it before the operator's yes (an error, Ctrl-C, a lost terminal), the servo is sent to
-neutral and the calibration of before is in force again.
+What is tried is in force for a loan. Whatever ends it before the operator's yes (an error, Ctrl-C,
+a lost terminal), the servo is sent to neutral and the calibration of before is in force again;
+fishd does that by itself where this process is killed.
 """
 
 import contextlib
+import math
 import signal
 from collections.abc import Iterator
 from typing import Any
@@ -12,7 +14,8 @@ from typing import Any
 import click
 
 from fishd.cli.options import endpoint_option
-from fishd.cli.servo_steps import Tail, orders, restore
+from fishd.cli.servo_loan import end, renewed
+from fishd.cli.servo_steps import Tail, orders
 from fishd.client import Fish
 from fishd.hardware.calibration import ServoCalibration
 
@@ -22,7 +25,7 @@ TEST_ANGLE = 0.1
 """Angle by which the direction is judged [rad]."""
 LIMIT_STEP = 0.02
 """[rad]"""
-WIDEST = 3.15
+WIDEST = math.pi
 """A soft limit that does not limit; what pulses can reach still does [rad]."""
 
 
@@ -37,17 +40,20 @@ def servo(endpoint: str | None) -> int:
     with Fish(endpoint) as fish:
         before = fish.calibrations().servo
         tail = Tail(fish, before)
-        tail.check_resting()
-        with _restored_unless_saved(endpoint, before):
-            click.echo("Keep hands and cables clear of the tail. Ctrl-C stops it at any prompt.")
-            _find_trim(tail)
-            _find_direction(tail)
-            _find_limit(tail, +1)
-            _find_limit(tail, -1)
-            _show(before, tail.calibration)
-            if not click.confirm("Save it?"):
-                raise click.ClickException("not saved")
-            saved = fish.calibrate_servo(tail.calibration, save=True)
+        tail.borrow()
+        with _ended_unless_saved(endpoint, tail.loan, before):
+            with renewed(endpoint, tail.loan):
+                click.echo(
+                    "Keep hands and cables clear of the tail. Ctrl-C stops it at any prompt."
+                )
+                _find_trim(tail)
+                _find_direction(tail)
+                _find_limit(tail, +1)
+                _find_limit(tail, -1)
+                _show(before, tail.calibration)
+                if not click.confirm("Save it?"):
+                    raise click.ClickException("not saved")
+            saved = fish.calibrate_servo(tail.calibration, save=True, loan=tail.loan)
     click.echo(f"in force, and saved in {saved.servo_file}")
     return 0
 
@@ -131,7 +137,9 @@ def _show(before: ServoCalibration, now: ServoCalibration) -> None:
 
 
 @contextlib.contextmanager
-def _restored_unless_saved(endpoint: str | None, before: ServoCalibration) -> Iterator[None]:
+def _ended_unless_saved(
+    endpoint: str | None, loan: str, before: ServoCalibration
+) -> Iterator[None]:
     """On any way out but the ordinary one: the fish at neutral, and `before` in force."""
 
     def interrupt(*_: Any) -> None:
@@ -145,14 +153,9 @@ def _restored_unless_saved(endpoint: str | None, before: ServoCalibration) -> It
     except BaseException:
         for number in numbers:
             signal.signal(number, signal.SIG_IGN)
-        problem = restore(endpoint, before)
+        outcome = end(endpoint, loan, before)
         with contextlib.suppress(OSError):  # of the lost terminal
-            click.echo(
-                f"\nthe calibration of before may not be in force: {problem}"
-                if problem
-                else "\nthe servo is at neutral, and its calibration as before",
-                err=True,
-            )
+            click.echo(f"\n{outcome}", err=True)
         raise
     finally:
         for number, handler in handlers.items():

@@ -6,9 +6,10 @@ import click
 
 from fishd.cli.options import json_option
 from fishd.cli.output import print_json
-from fishd.config import Config, load, to_yaml
+from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file, to_yaml
 from fishd.console import complain
 from fishd.errors import ConfigError
+from fishd.hardware import pulses
 
 set_option = click.option(
     "--set",
@@ -17,6 +18,15 @@ set_option = click.option(
     metavar="KEY=VALUE",
     help="Override one key of the configuration, such as plant.omega0=10. Repeatable.",
 )
+
+service_option = click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path),
+    help=f"YAML file of the daemon; default: ${FILE_VARIABLE}, else {SERVICE_FILE} where there is "
+    "one, else the defaults.",
+)
+"""`--config` of verbs that are about the fishd of this machine; goes with `load_service`."""
 
 EX_CONFIG = 78
 
@@ -31,8 +41,11 @@ def config() -> None:
 @set_option
 def check(file: Path, overrides: tuple[str, ...]) -> None:
     """Check a configuration file; exit status 78 when fishd would refuse it."""
-    load_or_exit(file, overrides)
+    loaded = load_or_exit(file, overrides)
     click.echo(f"{file}: good")
+    left = pulses.cut(loaded.servo, loaded.amplitude_limit)
+    if left and loaded.robot != "simulated":
+        click.echo(f"servo.lowest and servo.highest permit {left}, amplitude_limit")
 
 
 @config.command()
@@ -63,3 +76,15 @@ def load_or_exit(file: Path | None, overrides: tuple[str, ...]) -> Config:
         return load(file, overrides)
     except ConfigError as error:
         complain("fishctl", str(error), EX_CONFIG)
+
+
+def load_service(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path | None]:
+    """The configuration of the fishd of this machine, and its file; None for the defaults.
+
+    file: what `--config` says. A file that nobody named is told on standard error.
+    """
+    if file is None:
+        file = service_file()
+        if file is not None:
+            click.echo(f"fishctl: using {file}; --config names another file", err=True)
+    return load_or_exit(file, overrides), file

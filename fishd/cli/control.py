@@ -146,17 +146,15 @@ def _print_state(state: State, as_json: bool) -> None:
 def _status_text(status: Status) -> str:
     reason = f" ({_why(status.reason)})" if status.reason else ""
     timing = status.timing
+    thrust = "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
     scheduling = "real-time" if status.realtime else "normal"
     uptime = datetime.timedelta(seconds=int(status.uptime))
     survived = {name: count for name, count in status.counters.items() if count}
     rows = [
         ("mode", status.mode + reason),
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
-        ("thrust", f"{status.thrust * 1e3:.2f} mN at {status.frequency:.2f} Hz"),
-        (
-            "servo",
-            f"{'on' if status.servo_on else 'no pulses'}, within ±{status.amplitude_limit:g} rad",
-        ),
+        ("thrust", f"{thrust} mN at {status.frequency:.2f} Hz"),
+        ("servo", f"{_servo(status)}, {_range(status)}"),
         ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling"),
         ("", f"{status.missed} slots missed, {status.overruns} overruns"),
         ("late", _percentiles(timing.lateness)),
@@ -169,6 +167,23 @@ def _status_text(status: Status) -> str:
         ("telemetry", status.telemetry),
     ]
     return "\n".join(f"{name:<12}{text}" for name, text in rows)
+
+
+def _servo(status: Status) -> str:
+    if not status.servo_on:
+        return "no pulses"
+    return "cannot be reached, may still have pulses" if status.servo_lost else "on"
+
+
+def _range(status: Status) -> str:
+    """The angles that the tail can be sent to."""
+    limit = status.amplitude_limit
+    if (status.lowest, status.highest) == (-limit, limit):
+        return f"within ±{limit:g} rad"
+    return (
+        f"within {status.lowest:+.4g} to {status.highest:+.4g} rad, less than ±{limit:g} rad of "
+        "amplitude_limit"
+    )
 
 
 def _why(reason: Reason) -> str:

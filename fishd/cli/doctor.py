@@ -8,9 +8,9 @@ from msgspec import Struct
 
 from fishd.cli.checks import examine
 from fishd.cli.checks.base import Context
-from fishd.cli.config import load_or_exit, set_option
+from fishd.cli.config import load_service, service_option, set_option
 from fishd.cli.options import endpoint_option, json_option
-from fishd.cli.output import print_json
+from fishd.cli.output import counted, print_json
 
 _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "bright_black"}
 
@@ -27,12 +27,7 @@ class Finding(Struct, frozen=True):
 
 
 @click.command()
-@click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path),
-    help="YAML file of the daemon; without it, the defaults.",
-)
+@service_option
 @set_option
 @endpoint_option
 @json_option
@@ -45,8 +40,8 @@ def doctor(
     running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the
     configuration is wrong.
     """
-    config = load_or_exit(file, overrides)
-    context = Context(config, file, endpoint or config.control.address)
+    config, found = load_service(file, overrides)
+    context = Context(config, found, endpoint or config.control.address)
     findings = []
     for name, (level, message, mend) in examine(context):
         finding = Finding(name, level, " ".join(message.split()), mend)
@@ -58,7 +53,7 @@ def doctor(
         print_json(findings)
     else:
         click.echo(
-            f"robot {config.robot}: {counts['ok']} ok, {counts['warning']} warnings, "
+            f"robot {config.robot}: {counts['ok']} ok, {counted(counts['warning'], 'warning')}, "
             f"{counts['FAIL']} failed, {counts['skipped']} skipped"
         )
         if config.robot == "simulated":

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
@@ -27,6 +28,17 @@ _QUIET = 5e-5
 """No standard deviation below this is restless [V]."""
 
 
+class _Measured(NamedTuple):
+    """One load, how it is asked for, and what was measured under it."""
+
+    name: str
+    what: str
+    ask: Callable[[], tuple[float, float]]
+    load: tuple[float, float]
+    """[N]"""
+    sample: ForceSample
+
+
 class Dialogue:
     """Guides through the loads and keeps what was measured."""
 
@@ -36,46 +48,60 @@ class Dialogue:
         self._newtons = NEWTONS[unit]
         self._seconds = seconds
         self._record = record
-        self._names: list[str] = []
-        self._measured: list[tuple[tuple[float, float], ForceSample]] = []
+        self._measured: list[_Measured] = []
         self._usual = 0.0  # size of the latest load, in the unit
 
     def run(self, plan: list[tuple[float, float]]) -> None:
-        """Measure a plan [N], or the usual one, and whatever the operator adds."""
+        """Measure a plan [N], or the usual one."""
         click.echo(f"The loads, each measured for {self._seconds:g} s:")
         if plan:
             names = [self._spelled(load) for load in plan]
             for n, name in enumerate(names, 1):
                 click.echo(f"  {n}  {name}")
             for name, load in zip(names, plan, strict=True):
-                self._measure(name, "hang it", partial(_given, load))
+                self._add(name, "hang it", partial(_given, load))
         else:
             for n, (name, _, _, what) in enumerate(PLAN, 1):
                 click.echo(f"  {n}  {name:<5} {what}")
             for name, x, y, what in PLAN:
-                self._measure(name, what, partial(self._ask_size, x, y))
-        while self.extend():
-            pass
+                self._add(name, what, partial(self._ask_size, x, y))
 
-    def extend(self) -> bool:
-        """Measure another load, of the operator's choice; False where there is to be none."""
-        extra = self._ask_extra()
-        if extra is None:
-            return False
-        self._measure(self._spelled(extra), "hang it", partial(_given, extra))
-        return True
+    def amend(self) -> None:
+        """Let the operator add loads, and measure or leave out those that are there."""
+        while answer := _asked(
+            f"\nAnother load, as F_x F_y in {self._unit}; NAME to measure that one again, "
+            "drop NAME to leave it out; or Enter to fit"
+        ):
+            dropped = answer.removeprefix("drop ").strip()
+            places = {each.name: place for place, each in enumerate(self._measured)}
+            if answer in places:
+                again = self._measured[places[answer]]
+                self._measured[places[answer]] = self._measure(again.name, again.what, again.ask)
+                self._write()
+            elif dropped != answer and dropped in places:
+                del self._measured[places[dropped]]
+                self._write()
+            elif extra := self._parsed(answer):
+                self._add(self._spelled(extra), "hang it", partial(_given, extra))
+            else:
+                names = ", ".join(places)
+                click.echo(f"  two numbers, such as 10 -5, or one of {names} is needed", err=True)
 
     def result(self) -> tuple[list[str], list[tuple[float, ...]]]:
         """Names of the loads, and (F_x, F_y, V_x, V_y) of each."""
         self._warn_in_hindsight()
-        measured = self._measured
-        return self._names, [(fx, fy, sample.vx, sample.vy) for (fx, fy), sample in measured]
+        names = [each.name for each in self._measured]
+        return names, [(*each.load, each.sample.vx, each.sample.vy) for each in self._measured]
 
-    def _measure(self, name: str, what: str, ask: Callable[[], tuple[float, float]]) -> None:
+    def _add(self, name: str, what: str, ask: Callable[[], tuple[float, float]]) -> None:
+        self._measured.append(self._measure(name, what, ask))
+        self._write()
+
+    def _measure(self, name: str, what: str, ask: Callable[[], tuple[float, float]]) -> _Measured:
         while True:
             click.echo(f"\n{name}: {what}, and let it come to rest")
             load = ask()
-            click.prompt("  Enter when it is still", default="", show_default=False)
+            _choice("  Enter when it is still")
             try:
                 sample = self._fish.sample_force(self._seconds)
             except Refused as refusal:  # what was measured so far must not be lost
@@ -84,18 +110,14 @@ class Dialogue:
             click.echo(f"  {_spelled_sample(sample)}")
             if sample.suspect:
                 click.echo(f"  warning: not to be believed: {sample.suspect}", err=True)
-            others = [other for _, other in self._measured]
-            if _restless(sample, others):
+            if _restless(sample, [other.sample for other in self._measured]):
                 click.echo("  warning: it was not still, compared with other loads", err=True)
-            answer = click.prompt(
-                "  Enter to go on, r to measure it again", default="", show_default=False
-            )
-            if answer.strip().lower() not in ("r", "redo", "again"):
-                break
-        self._names.append(name)
-        self._measured.append((load, sample))
+            if _choice("  Enter to go on, r to measure it again", "r") != "r":
+                return _Measured(name, what, ask, load, sample)
+
+    def _write(self) -> None:
         if self._record:
-            load_files.write(self._record, self._measured)
+            load_files.write(self._record, [(each.load, each.sample) for each in self._measured])
 
     def _ask_size(self, x: int, y: int) -> tuple[float, float]:
         if not (x or y):
@@ -104,23 +126,13 @@ class Dialogue:
         self._usual = size
         return x * size * self._newtons, y * size * self._newtons
 
-    def _ask_extra(self) -> tuple[float, float] | None:
-        """Another load of the operator's own [N]; None when there are enough."""
-        while True:
-            answer = click.prompt(
-                f"\nAnother load, as F_x F_y in {self._unit}, or Enter to fit",
-                default="",
-                show_default=False,
-            )
-            if not answer.strip():
-                return None
-            try:
-                fx, fy = (float(word) * self._newtons for word in answer.split())
-            except ValueError:
-                fx = fy = math.nan
-            if math.isfinite(fx) and math.isfinite(fy):
-                return fx, fy
-            click.echo("  two numbers are needed, such as: 10 -5", err=True)
+    def _parsed(self, answer: str) -> tuple[float, float] | None:
+        """A load of the operator's own [N]; None where that is none."""
+        try:
+            fx, fy = (float(word) * self._newtons for word in answer.split())
+        except ValueError:
+            return None
+        return (fx, fy) if math.isfinite(fx) and math.isfinite(fy) else None
 
     def _spelled(self, load: tuple[float, float]) -> str:
         fx, fy = (component / self._newtons for component in load)
@@ -128,8 +140,8 @@ class Dialogue:
 
     def _warn_in_hindsight(self) -> None:
         """The first loads had nothing to be compared with."""
-        samples = [sample for _, sample in self._measured]
-        for name, sample in zip(self._names, samples, strict=True):
+        samples = [each.sample for each in self._measured]
+        for name, *_, sample in self._measured:
             if sample.suspect or _restless(sample, samples):
                 why = sample.suspect or "it was not still, compared with other loads"
                 click.echo(f"warning: {name}: {why}", err=True)
@@ -149,6 +161,20 @@ def _spelled_sample(sample: ForceSample) -> str:
         f"V_x {sample.vx:+.5f} ± {sample.vx_std:.5f} V   "
         f"V_y {sample.vy:+.5f} ± {sample.vy_std:.5f} V   {sample.pairs} pairs"
     )
+
+
+def _asked(prompt: str) -> str:
+    """What is typed at a prompt; empty for Enter alone."""
+    answer: str = click.prompt(prompt, default="", show_default=False)
+    return answer.strip()
+
+
+def _choice(prompt: str, *letters: str) -> str:
+    """Ask until the answer is one of these letters, or empty for Enter alone."""
+    while (answer := _asked(prompt).lower()) and answer not in letters:
+        possible = " or ".join(("Enter", *letters))
+        click.echo(f"  only {possible} is possible here; Ctrl-C ends it all", err=True)
+    return answer
 
 
 def _number(text: str, default: float | None) -> float:

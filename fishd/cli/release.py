@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 from msgspec.structs import replace
 
-from fishd.cli.config import load_or_exit, set_option
-from fishd.config import Config
+from fishd.cli.config import load_service, service_option, set_option
+from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config
 from fishd.errors import ConfigError, ServoError
 from fishd.hardware.base import CalibratedServo
 
@@ -16,27 +16,31 @@ _NO_FOLDER = "/proc/self/no-calibrations"
 
 
 @click.command()
-@click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path),
-    help="YAML file of the daemon; without it, the defaults.",
-)
+@service_option
 @set_option
-def release(file: Path | None, overrides: tuple[str, ...]) -> None:
+def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     """Send the servo to neutral and stop its pulses, without the daemon.
 
     systemd runs this when the service has ended (ExecStopPost). A servo without pulses is left
-    alone. Exit status 1 when the servo cannot be reached.
+    alone. Exit status 1 when the servo cannot be reached, and when no configuration says where a
+    servo is: the defaults are those of a simulated fish. One that a file says is simulated has
+    nothing to release, and that is no error.
     """
-    config = load_or_exit(file, overrides)
+    config, found = load_service(file, overrides)
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
-    if config.robot == "simulated":
-        click.echo(f"{why}a simulated fish has nothing to release")
-        return
-    done = _open(config).neutralise()
-    click.echo(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
+    if config.robot != "simulated":
+        done = _open(config).neutralise()
+        click.echo(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
+        return 0
+    if found is None:
+        raise click.ClickException(
+            f"{why}nothing was released: without a configuration file (${FILE_VARIABLE}, else "
+            f"{SERVICE_FILE}) the robot is simulated; name the one that fishd runs with: "
+            "fishctl release --config FILE"
+        )
+    click.echo(f"{why}a simulated fish, by {found}, has nothing to release")
+    return 0
 
 
 def _open(config: Config) -> CalibratedServo:

@@ -9,7 +9,7 @@ import click
 from msgspec.structs import replace
 
 from fishd.client import Fish
-from fishd.errors import FishError, Refused
+from fishd.errors import Refused
 from fishd.hardware.calibration import ServoCalibration
 
 SLOW_STEP = 0.02
@@ -22,11 +22,15 @@ _STEPS = {"+": 1, "-": -1, "++": 5, "--": -5}
 
 
 class Tail:
-    """The tail of a fish at rest, and the calibration of its servo that is being found."""
+    """The tail of a fish at rest, and the calibration of its servo that is being found.
+
+    What is found is in force for a loan; see `fishd.cli.servo_loan`.
+    """
 
     def __init__(self, fish: Fish, calibration: ServoCalibration) -> None:
         self.calibration = calibration
-        """What is in force now, saved or not."""
+        """What is in force now."""
+        self.loan = ""
         self.angle = 0.0
         """Where the tail is [rad]."""
         status = fish.status()
@@ -48,12 +52,17 @@ class Tail:
                 f"{status.controller} is in command; stop it with 'fishctl stop'"
             )
 
+    def borrow(self) -> None:
+        """Begin the loan: nobody else calibrates the servo, or makes the fish swim, meanwhile."""
+        self.check_resting()
+        self.loan = self._fish.calibrate_servo(self.calibration, save=False).loan or ""
+
     def adjust(self, **changes: Any) -> None:
         """Put a changed calibration in force, not saved; what cannot be is shown and left out."""
         self.check_resting()
         changed = replace(self.calibration, **changes)
         try:
-            self._fish.calibrate_servo(changed, save=False)
+            self._fish.calibrate_servo(changed, save=False, loan=self.loan)
         except Refused as refusal:
             if refusal.code != "bad-arguments":
                 raise
@@ -99,22 +108,3 @@ def orders(state: Callable[[], str], *others: str) -> Iterator[int | str]:
             yield _STEPS.get(answer, answer)
         else:
             click.echo(f"  one of {' '.join(words)} is needed; Ctrl-C leaves all as it was")
-
-
-def restore(endpoint: str | None, calibration: ServoCalibration) -> str:
-    """Neutral, and a calibration back in force, each even if the other fails; what failed, if any.
-
-    On a connection of its own: no half-made request is on it.
-    """
-    with Fish(endpoint) as fish:
-        steps: tuple[Callable[[], object], ...] = (
-            lambda: Tail(fish, calibration).neutral(),
-            lambda: fish.calibrate_servo(calibration, save=False),
-        )
-        problems = []
-        for step in steps:
-            try:
-                step()
-            except FishError as error:
-                problems.append(str(error))
-    return problems[0] if problems else ""

@@ -176,6 +176,7 @@ class View:
             (f" {tick.controller} ", "bold"),
             spelled(self.status.parameters),
             "" if tick.servo_on else ("  no pulses", "dim"),
+            ("  servo not reached", "red") if self.status.servo_lost else "",
             no_wrap=True,
             overflow="ellipsis",
         )
@@ -185,7 +186,7 @@ class View:
 
         tick = self._ticks[-1]
         figures = {
-            "thrust": f"{tick.thrust * 1e3:.2f} mN",
+            "thrust": "– mN" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f} mN",
             "tail beat": f"{tick.frequency:.2f} Hz",
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
             "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",

@@ -95,16 +95,39 @@ class Fish(Connection):
         return self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
 
     def tare(self, seconds: float = 2.0) -> Calibrations:
-        """Measure for a while and call that zero force; refused unless all is still."""
-        return self._call(Calibrations, "tare", patience=seconds, seconds=seconds)
+        """Measure for a while and call that zero force; refused unless all is still.
+
+        Nothing changes where that is given up while it measures.
+        """
+        sample = self.sample_force(seconds)
+        return self._call(Calibrations, "tare", sample=sample.number)
 
     def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
         """Put another calibration of the force sensor in force, and save it."""
         return self._call(Calibrations, "calibrate-force", calibration=calibration)
 
-    def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
-        """Put another calibration of the servo in force, and save it or not."""
-        return self._call(Calibrations, "calibrate-servo", calibration=calibration, save=save)
+    def calibrate_servo(
+        self, calibration: ServoCalibration, *, save: bool, loan: str | None = None
+    ) -> Calibrations:
+        """Put another calibration of the servo in force, and save it or not.
+
+        One that is not saved is a loan, the `loan` of the answer: it ends after `protocol.LOAN`
+        seconds unless it is renewed. Name it in further changes, and to save.
+        """
+        return self._call(
+            Calibrations, "calibrate-servo", calibration=calibration, save=save, loan=loan
+        )
+
+    def renew_loan(self, loan: str) -> Calibrations:
+        """Let a calibration of the servo that is not saved last for another while."""
+        return self._call(Calibrations, "renew-loan", loan=loan)
+
+    def end_loan(self, loan: str) -> Calibrations:
+        """Begin to end a loan: neutral, then the calibration of before is in force again.
+
+        That is done when `calibrations` says no `loan` any more.
+        """
+        return self._call(Calibrations, "end-loan", loan=loan)
 
     def ticks(self) -> Iterator[Tick]:
         """Every tick from now on; raises `NoDaemon` when none comes in time."""

@@ -5,7 +5,6 @@ Each message is one packet of a Unix socket, msgpack inside; each request gets o
 
 import contextlib
 import errno
-import os
 import socket
 import threading
 import time
@@ -99,7 +98,8 @@ AnyRequest = Transfer | SetTimeout | Inject | Clear | SetLevel | AwaitLevels | G
 class RemotePi:
     """A virtual Pi in another process; safe for use from several threads.
 
-    Where the other process ends, requests raise OSError ENODEV until there is one again.
+    Where the other process ends, requests raise OSError ENODEV until there is one again, and
+    ETIMEDOUT where it hangs; unlike an error of the bus, these say so in words of their own.
     """
 
     def __init__(self, path: Path) -> None:
@@ -186,11 +186,14 @@ class RemotePi:
                 return answer
         except TimeoutError:  # its reply, if it comes late, must not answer the next request
             self._hang_up()
-            raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT)) from None
+            raise TimeoutError(errno.ETIMEDOUT, self._words("does not answer")) from None
         except OSError:
             pass
         self._hang_up()
-        raise OSError(errno.ENODEV, f"the virtual Pi at {self._path} is gone")
+        raise OSError(errno.ENODEV, self._words("is gone"))
+
+    def _words(self, what: str) -> str:
+        return f"the virtual Pi at {self._path} {what}: is 'fishctl virtual-pi run' still running?"
 
     def _connect(self) -> socket.socket:
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -2,11 +2,9 @@
 
 import contextlib
 import errno
-import fcntl
 import os
 import socket
 import threading
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ from fishd.emulation.link import (
 )
 from fishd.emulation.virtual_pi import VirtualPi
 from fishd.errors import StartupError
+from fishd.lockfile import Taken, locked
 
 
 class LinkServer:
@@ -46,22 +45,31 @@ class LinkServer:
 
         Raises `StartupError` when another one does already, or an address is no good.
         """
+        path = self._path
         with ExitStack() as stack:
             try:
-                stack.enter_context(_claimed(self._path))
+                if path.exists() and not path.is_socket():
+                    what = f"{path} is there already and is no socket"
+                    raise StartupError(f"{what}; choose another path")
+                stack.enter_context(locked(path))
                 stack.enter_context(self._pi)
-                self._path.unlink(missing_ok=True)  # of one that was killed
+                path.unlink(missing_ok=True)  # of one that was killed
                 listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
                 mask = os.umask(0o177)  # for this user alone, from the first moment
                 try:
-                    listener.bind(str(self._path))
+                    listener.bind(str(path))
                 finally:
                     os.umask(mask)
-                stack.callback(self._path.unlink, missing_ok=True)
+                stack.callback(path.unlink, missing_ok=True)
                 listener.listen()
+            except Taken as taken:
+                raise StartupError(
+                    f"another virtual Pi (pid {taken.pid}) already listens on {path}; "
+                    "stop it, or give this one another virtual_pi.socket"
+                ) from None
             except OSError as error:
                 raise StartupError(
-                    f"virtual_pi.socket: cannot listen on {self._path}: "
+                    f"virtual_pi.socket: cannot listen on {path}: "
                     f"{error.strerror or error}; choose a path in a folder that exists"
                 ) from None
             acceptor = threading.Thread(target=self._accept, args=(listener,), daemon=True)
@@ -150,23 +158,3 @@ def _shut(connection: socket.socket) -> None:
     """Wake up the thread that waits on a socket."""
     with contextlib.suppress(OSError):  # not connected any more
         connection.shutdown(socket.SHUT_RDWR)
-
-
-@contextlib.contextmanager
-def _claimed(path: Path) -> Iterator[None]:
-    """Hold the lock file beside a socket: only a living process does, so a socket file may lie."""
-    if path.exists() and not path.is_socket():
-        raise StartupError(f"{path} is there already and is no socket; choose another path")
-    with path.with_name(path.name + ".lock").open("a+", encoding="ascii") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.seek(0)
-            raise StartupError(
-                f"another virtual Pi (pid {lock.read().strip() or 'unknown'}) already listens on "
-                f"{path}; stop it, or give this one another virtual_pi.socket"
-            ) from None
-        lock.truncate(0)
-        lock.write(f"{os.getpid()}\n")
-        lock.flush()
-        yield  # the lock file stays: to remove it would let two processes hold two of them

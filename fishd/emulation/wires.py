@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fishd.emulation.link import RemotePi
+from fishd.errors import StartupError
 
 _PAUSE = 0.2
 """Between attempts to find the virtual Pi again [s]."""
@@ -16,13 +17,17 @@ class Wires:
     def __init__(self, path: Path, set_level: Callable[[int, int | None], None]) -> None:
         """set_level: takes GPIO and level, None where nothing drives the pin any more.
 
-        Raises `StartupError` when no virtual Pi listens at `path`.
+        Raises `StartupError` when no virtual Pi listens at `path`, or it does not answer.
         """
         self._remote = RemotePi(path)
         self._set_level = set_level
         self._closing = threading.Event()
         self._levels: dict[int, int] = {}
-        self._adopt(self._remote.state().levels)
+        try:
+            self._adopt(self._remote.state().levels)
+        except OSError as error:
+            self._remote.close()
+            raise StartupError(error.strerror) from None
         self._thread = threading.Thread(target=self._follow, name="wires", daemon=True)
         self._thread.start()
 

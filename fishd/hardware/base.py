@@ -1,5 +1,6 @@
 """The seam between the loop and any fish: two protocols and the robot that joins them."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -78,6 +79,8 @@ class CalibratedServo(Servo, Protocol):
     calibration: ServoCalibration
     degraded: tuple[str, ...]
     """Why its pulses are not as good as they could be, a line each."""
+    countdown: float
+    """How long it goes on without a write; then it goes to neutral and ends its pulses [s]."""
 
     def recalibrate(self, calibration: ServoCalibration) -> None:
         """Use another calibration from the next write on."""
@@ -115,6 +118,8 @@ class Robot:
     """What keeps this robot from being as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
     """Errors that were survived, such as failed I2C transfers, since start."""
+    countdown: float = math.inf
+    """How long the servo goes on without a write before it ends its pulses by itself [s]."""
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,10 @@ A file is never overwritten; the newest one of a kind is in force.
 """
 
 import datetime
+import math
 import os
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -15,6 +16,9 @@ from fishd import strict_yaml
 from fishd.errors import ConfigError
 from fishd.hardware.settings import ServoSettings
 from fishd.schema import Problem, convert
+
+WORST_CONDITION = 1e5
+"""A matrix of a larger condition number says the same of both forces; that of a fit is less."""
 
 
 class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -46,18 +50,31 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             self.yx * vx + self.yy * vy + self.y0,
         )
 
+    @property
+    def singular(self) -> bool:
+        """True where the matrix, whatever its size, does not tell F_x from F_y."""
+        gains = (self.xx, self.xy, self.yx, self.yy)
+        largest = max(map(abs, gains))
+        if largest == 0.0:
+            return True
+        xx, xy, yx, yy = (gain / largest for gain in gains)
+        # With singular values s and t: s t = |det|, s² + t² = sum of squares, condition = s / t.
+        squares = xx * xx + xy * xy + yx * yx + yy * yy
+        determinant = abs(xx * yy - xy * yx)
+        return squares > determinant * (WORST_CONDITION + 1.0 / WORST_CONDITION)
+
 
 class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the same keys of section `servo` mean; a file of this takes precedence over them."""
+    """What the same keys of section `servo` mean, with their bounds; takes precedence over them."""
 
     trim: Annotated[float, Meta(ge=-500, le=500)] = 0.0
     """[µs]"""
     direction: Literal[1, -1] = 1
     scale: Annotated[float, Meta(ge=10, le=5000)] = 600.0
     """[µs/rad]"""
-    lowest: Annotated[float, Meta(ge=-3.15, le=0)] = -1.2
+    lowest: Annotated[float, Meta(ge=-math.pi, le=0)] = -1.2
     """[rad]"""
-    highest: Annotated[float, Meta(ge=0, le=3.15)] = 1.2
+    highest: Annotated[float, Meta(ge=0, le=math.pi)] = 1.2
     """[rad]"""
     date: str = ""
 
@@ -100,12 +117,19 @@ class ForceSample(Struct, frozen=True):
     fy: float
     suspect: str = ""
     """Why this is not to be believed; empty where it is."""
+    number: int = 0
+    """By which a tare names it, for a while."""
 
 
 C = TypeVar("C", ForceCalibration, ServoCalibration)
 
 _STAMP = "%Y-%m-%dT%H%M%S.%fZ"
 _NAMES: dict[type[Struct], str] = {ForceCalibration: "force", ServoCalibration: "servo"}
+_REQUIRED: dict[type[Struct], tuple[str, ...]] = {
+    ForceCalibration: ("xx", "xy", "x0", "yx", "yy", "y0", "date"),
+    ServoCalibration: ("trim", "direction", "scale", "lowest", "highest"),
+}
+_REMEDY = "mend it, or move it away"
 
 
 class CalibrationFolder:
@@ -117,19 +141,20 @@ class CalibrationFolder:
     def newest(self, kind: type[C]) -> tuple[C, Path] | None:
         """The calibration in force and its file; None where none was ever saved.
 
-        Raises `ConfigError` where the newest file, or the folder, cannot be read: an older one, or
-        none, would be wrong silently.
+        Raises `ConfigError` where the folder cannot be read, or the newest file cannot, is not
+        whole or makes no sense: an older one, or a default, would be wrong silently.
         """
         names = self._names(kind)
         if not names:
             return None
         path = self.folder / names[-1]
         try:
-            return convert(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
+            return _checked(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
         except strict_yaml.YamlProblem as problem:
-            raise ConfigError(f"{path}:{problem.line}: {problem}") from None
+            raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
         except Problem as problem:
-            raise ConfigError(f"{path}: {'.'.join(problem.path)}: {problem}") from None
+            where = ".".join(problem.path) + ": " if problem.path else ""
+            raise ConfigError(f"{path}: {where}{problem}; {_REMEDY}") from None
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: cannot be read: {error}") from None
 
@@ -174,3 +199,24 @@ class CalibrationFolder:
         start = f"{_NAMES[kind]}-"
         names = [name for name in found if name.startswith(start) and name.endswith(".yaml")]
         return sorted(names, key=lambda name: Path(name).stem)
+
+
+def _checked(data: Any, kind: type[C]) -> C:
+    """The calibration that a file holds; raises `Problem` unless it is whole and makes sense."""
+    if not data:
+        raise Problem((), "there is nothing in this file")
+    if not isinstance(data, dict):
+        raise Problem((), "a mapping of keys to values is needed")
+    missing = [key for key in _REQUIRED[kind] if key not in data]
+    if missing:
+        raise Problem((), f"without {', '.join(missing)}: nothing is filled in")
+    calibration = convert(data, kind)
+    for key, value in msgspec.structs.asdict(calibration).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Problem((key,), f"{value} is not a finite number")
+    if isinstance(calibration, ForceCalibration):
+        if not calibration.date:
+            raise Problem(("date",), "'' is not when it was made")
+        if calibration.singular:
+            raise Problem((), "the matrix xx xy, yx yy says the same of both forces")
+    return calibration

@@ -13,6 +13,7 @@ from fishd.hardware.calibration import ServoCalibration, calibrated
 from fishd.hardware.pigpio_client import ANSWER, Client, opened
 from fishd.hardware.pigpio_link import PigpioLink
 from fishd.hardware.pigpio_pulses import (
+    COUNT,
     MAGIC,
     OFF,
     PARAMETERS,
@@ -50,7 +51,8 @@ class PigpioServo:
         """
         self._settings = settings
         self._clock = clock
-        self._counts = counts(tick)
+        self._counts = counts(settings.pigpio.countdown, tick)
+        self.countdown = COUNT * self._counts
         self._pulses = (
             HardwarePwm(settings) if settings.pigpio.hardware_pwm else ServoPulses(settings)
         )
@@ -93,7 +95,7 @@ class PigpioServo:
             return
         self._closed = True
         try:
-            with self._link.session(ANSWER) as client:
+            with self._link.session(last=True) as client:
                 self._release(client)
                 client.delete_script(self._script)
         except ServoError:

@@ -64,19 +64,22 @@ class PigpioLink:
             self._connected.wait(START)
 
     @contextlib.contextmanager
-    def session(self, limit: float | None = None) -> Iterator[Client]:
-        """The client, all of whose commands must be done within `limit` [s].
+    def session(self, *, last: bool = False) -> Iterator[Client]:
+        """The client, all of whose commands must be done within the time limit of the settings.
 
-        Without a limit, that of the settings. Raises `ServoError` where there is no connection,
-        without waiting for one, and where a command fails, which ends the connection.
+        last: nobody will reconnect after it, and no tick waits: it may take 1 s
+        Raises `ServoError` where there is no connection, without waiting for one, and where a
+        command fails, which ends the connection.
         """
-        if limit is None:
-            limit = self._settings.timeout if self._thread else VIRTUAL_ANSWER
+        limit = self._settings.timeout if self._thread else VIRTUAL_ANSWER
+        if last:
+            limit = ANSWER
+        outlook = "" if last else "; reconnecting"
         deadline = time.monotonic() + limit
         if not self._lock.acquire(timeout=limit):
             raise ServoError(f"{where(self._settings)}: busy for more than {limit * 1e3:g} ms")
         try:
-            client = self._current()
+            client = self._current(outlook)
             client.within(deadline - time.monotonic() if self._thread else limit)
             try:
                 yield client
@@ -85,7 +88,7 @@ class PigpioLink:
                 self._drop(client, reason(error, limit))
                 if not isinstance(error, FAILURES):
                     raise
-                raise ServoError(f"{where(self._settings)}: {self._reason}; reconnecting") from None
+                raise ServoError(f"{where(self._settings)}: {self._reason}{outlook}") from None
         finally:
             self._lock.release()
 
@@ -102,7 +105,7 @@ class PigpioLink:
         if self._thread:
             self._thread.join(ANSWER)
 
-    def _current(self) -> Client:
+    def _current(self, outlook: str) -> Client:
         if self._closed.is_set():
             raise ServoError(f"{where(self._settings)}: closed")
         now = self._clock.monotonic()
@@ -110,9 +113,7 @@ class PigpioLink:
             self._next_attempt = now + VIRTUAL_PAUSE
             self._connect(VIRTUAL_CONNECT, VIRTUAL_ANSWER)
         if not self._client:
-            raise ServoError(
-                f"{where(self._settings)}: not connected: {self._reason}; reconnecting"
-            )
+            raise ServoError(f"{where(self._settings)}: not connected: {self._reason}{outlook}")
         return self._client
 
     def _drop(self, client: Client, why: str) -> None:

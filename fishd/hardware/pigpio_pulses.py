@@ -30,9 +30,9 @@ PARAMETERS = 10
 SCRIPTS = 32
 
 
-def counts(tick: float) -> int:
-    """What the countdown starts from: 0.2 s, or three ticks [s] of a slow loop."""
-    return max(20, math.ceil(round(3.0 * tick / COUNT, 6)))
+def counts(countdown: float, tick: float) -> int:
+    """What the script starts from: a countdown [s], or three ticks [s] of a slow loop."""
+    return math.ceil(round(max(countdown, 3.0 * tick) / COUNT, 6))
 
 
 class ServoPulses:

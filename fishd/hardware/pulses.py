@@ -5,6 +5,8 @@ from fishd.hardware.settings import ServoSettings
 
 SHORTEST, LONGEST = 500.0, 2500.0
 """No servo is sent a pulse outside of this [µs]."""
+ROUNDING = 1e-9
+"""Angles that differ by less are the same [rad]."""
 REST = 0.3
 """Time at neutral before the pulses end, for a servo that did not get there slowly [s]."""
 
@@ -15,7 +17,7 @@ def pulse_width(servo: ServoSettings, angle: float) -> float:
     Raises `ServoError` for an angle that is not finite or beyond the soft limits, and for a pulse
     that no servo takes. The guard keeps commands from coming this far.
     """
-    if not servo.lowest - 1e-9 <= angle <= servo.highest + 1e-9:  # NaN is not
+    if not servo.lowest - ROUNDING <= angle <= servo.highest + ROUNDING:  # NaN is not
         raise ServoError(
             f"the angle {angle:g} rad is not within the servo's soft limits, "
             f"{servo.lowest:g} to {servo.highest:g} rad"
@@ -31,6 +33,25 @@ def pulse_width(servo: ServoSettings, angle: float) -> float:
 
 def reach(servo: ServoSettings) -> tuple[float, float]:
     """The lowest and highest angle [rad] that soft limits and pulse widths permit."""
+    lowest, highest = widest(servo)
+    return max(servo.lowest, lowest), min(servo.highest, highest)
+
+
+def widest(servo: ServoSettings) -> tuple[float, float]:
+    """The lowest and highest angle [rad] that pulse widths permit."""
     neutral = servo.centre + servo.trim
-    ends = sorted((end - neutral) / (servo.direction * servo.scale) for end in (SHORTEST, LONGEST))
-    return max(servo.lowest, ends[0]), min(servo.highest, ends[1])
+    ends = ((end - neutral) / (servo.direction * servo.scale) for end in (SHORTEST, LONGEST))
+    lowest, highest = sorted(ends)
+    return lowest, highest
+
+
+def cut(servo: ServoSettings, amplitude: float) -> str:
+    """What `reach` leaves of ±Φ, such as `-0.3 to +0.42 rad of ±0.42 rad`; empty for all of it.
+
+    amplitude: Φ [rad]
+    """
+    lowest, highest = reach(servo)
+    if lowest <= -amplitude + ROUNDING and amplitude - ROUNDING <= highest:
+        return ""
+    left = (max(lowest, -amplitude), min(highest, amplitude))
+    return f"{left[0]:+.4g} to {left[1]:+.4g} rad of ±{amplitude:g} rad"

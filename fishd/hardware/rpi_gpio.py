@@ -1,5 +1,6 @@
 """The servo on software PWM of RPi.GPIO or rpi-lgpio: a last resort, whose pulses jitter."""
 
+import math
 from contextlib import suppress
 from typing import Any
 
@@ -13,6 +14,8 @@ from fishd.hardware.settings import ServoSettings
 
 class RpiGpioServo:
     """A servo on any pin of the header."""
+
+    countdown = math.inf
 
     degraded: tuple[str, ...] = (
         "software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",

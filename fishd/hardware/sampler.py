@@ -8,8 +8,8 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fishd.clock import Clock
-from fishd.errors import StartupError
 from fishd.hardware.i2c_errors import explain
+from fishd.hardware.packages import driver_packages
 from fishd.hardware.settings import ForceSensorSettings
 
 if TYPE_CHECKING:
@@ -39,13 +39,9 @@ class Sampler:
     """Owns the bus and the chip; only one thread may call it, save for what says otherwise."""
 
     def __init__(self, settings: ForceSensorSettings, clock: Clock) -> None:
-        """Raises `StartupError` where the driver is not installed; opens nothing yet."""
-        try:
+        """Raises `MissingPackage` where the driver is not installed; opens nothing yet."""
+        with driver_packages():
             from fishd.hardware import single_shot
-        except ImportError as error:
-            raise StartupError(
-                f"the driver of the force sensor is missing ({error}): install fishd[pi]"
-            ) from None
         self._driver = single_shot
         self._settings = settings
         self._clock = clock

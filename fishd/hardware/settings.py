@@ -90,6 +90,16 @@ class PigpioSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             extra_json_schema={"unit": "s"},
         ),
     ] = 0.008
+    countdown: Annotated[
+        float,
+        Meta(
+            ge=0.1,
+            le=2.0,
+            description="Without a tick for so long, three ticks at least, pigpiod takes the servo "
+            "to rest, and fishd is in fault if it goes on. Longer forgives a busy machine.",
+            extra_json_schema={"unit": "s"},
+        ),
+    ] = 0.2
     hardware_pwm: Annotated[
         bool,
         Meta(description="Finer pulses from the PWM peripheral; GPIO 12, 13, 18 or 19 only."),

@@ -3,6 +3,7 @@
 The hardware makes the pulses, so they outlive this process: see `neutralise`.
 """
 
+import math
 import os
 from contextlib import suppress
 
@@ -19,6 +20,8 @@ PATIENCE = 2.0
 
 class SysfsPwmServo:
     """A servo on one channel of the kernel's PWM."""
+
+    countdown = math.inf
 
     degraded: tuple[str, ...] = ()
 

@@ -10,6 +10,12 @@ from operator_rig import Bench, Dialogue, Talk, bench, pi_process
 from processes import Daemon
 
 
+@pytest.fixture(autouse=True)
+def _no_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The configuration of a service on this machine is none of these tests' business."""
+    monkeypatch.setenv("FISHD_CONFIG", "")
+
+
 @pytest.fixture(scope="session")
 def process() -> Iterator[Any]:
     with pi_process() as process:

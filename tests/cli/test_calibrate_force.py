@@ -80,6 +80,69 @@ def test_a_load_can_be_measured_again_and_one_that_shook_is_pointed_out(
     assert "nothing was changed" in dialogue.text
 
 
+def test_a_prompt_takes_nothing_for_enter_but_enter(talk: Talk, pi: Bench, daemon: Daemon) -> None:
+    dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.2")
+    dialogue.answer("Enter when it is still:", "x")
+    dialogue.expect("only Enter is possible here")
+    dialogue.answer("Enter when it is still:", "r")
+    dialogue.expect("only Enter is possible here")
+    dialogue.answer("Enter when it is still:")
+    dialogue.answer("r to measure it again:", "x")
+    dialogue.expect("only Enter or r is possible here")
+    dialogue.answer("r to measure it again:", "R")
+    dialogue.answer("Enter when it is still:")
+    dialogue.answer("r to measure it again:")
+    dialogue.expect("load [N]")
+    assert dialogue.finish() == 130
+
+
+def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    record = pi.folder / "loads.csv"
+    dialogue = talk(
+        daemon, "calibrate", "force", "--seconds", "0.3", "--yes", "--record", str(record)
+    )
+    measure(dialogue, pi, 0.0, 0.0)
+    measure(dialogue, pi, -0.2, 0.0, "0.2")  # pulled the wrong way
+    measure(dialogue, pi, -0.2, 0.0, "")
+    measure(dialogue, pi, 0.0, 0.2, "")
+    measure(dialogue, pi, 0.0, -0.2, "")
+    dialogue.answer("Another load", "7 7")
+    measure(dialogue, pi, 0.0, 0.0)
+    dialogue.answer("Another load", "")
+    dialogue.expect("do not follow the loads")
+    assert pi.files("force") == []
+    dialogue.answer("Another load", "+z")
+    dialogue.expect("or one of zero, +x, -x, +y, -y, (7, 7) N is needed")
+    dialogue.answer("Another load", "drop (7, 7) N")
+    dialogue.answer("Another load", "+x")
+    measure(dialogue, pi, 0.2, 0.0, "")
+    dialogue.answer("Another load", "")
+    dialogue.expect("over 5 loads")
+    assert dialogue.finish() == 0
+    assert len(record.read_text().splitlines()) == 6
+    pi.pi.load(0.1, -0.1)
+    assert forces(daemon) == pytest.approx((0.1, -0.1), abs=3e-3)
+
+
+def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(
+    pi: Bench, daemon: Daemon
+) -> None:
+    noise = [(0.3, 0.1), (-0.2, 0.3), (0.4, -0.2), (0.1, 0.4), (-0.3, -0.3)]
+    measured = pi.folder / "noise.csv"
+    lines = [f"{x},{y},{vx},{vy}" for (x, y), (vx, vy) in zip(PLAN, noise, strict=True)]
+    measured.write_text("\n".join(["fx_N,fy_N,vx_V,vy_V", *lines, ""]))
+    ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
+    assert ended.returncode == 1
+    assert "errors [mN]" in ended.stdout
+    assert re.fullmatch(
+        r"fishctl: the voltages do not follow the loads: [^\n]+ measure load \d again first\n",
+        ended.stderr,
+    )
+    assert pi.files("force") == []
+
+
 def test_a_load_that_is_clipped_is_not_to_be_believed(
     talk: Talk, pi: Bench, daemon: Daemon
 ) -> None:

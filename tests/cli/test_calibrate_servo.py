@@ -2,12 +2,14 @@
 
 import re
 import signal
+import time
 
 import pytest
 from operator_rig import Bench, Talk, calibrations
-from processes import Daemon
+from processes import PATIENCE, Daemon, Subscriber
 
 from fishd.client import Fish
+from fishd.protocol import LOAN
 
 
 def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
@@ -82,13 +84,72 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_what_was_in_force(
         dialogue.process.send_signal(how)
         dialogue.process.wait(20)
     assert dialogue.finish() == 130
-    assert "calibration as before" in dialogue.text
+    assert "the servo is at neutral; its calibration is as before\n" in dialogue.text
     assert "Traceback" not in dialogue.text
     assert calibrations(daemon) == before
     assert pi.files("servo") == []
     with Fish(daemon.endpoint) as fish:
         assert fish.status().mode == "idle"
     pi.wait_for_pulse(1499, 1501)
+
+
+def test_a_calibration_whose_fishctl_is_killed_is_taken_back_by_fishd(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    before = calibrations(daemon)
+    with Subscriber(daemon.telemetry, b"event") as events:
+        dialogue = talk(daemon, "calibrate", "servo")
+        dialogue.answer("trim +0 µs> ", "++")
+        dialogue.answer("trim +25 µs> ", "ok")
+        dialogue.expect("again: ")
+        pi.wait_for_pulse(1584, 1586)
+        dialogue.process.kill()
+        assert "not renewed" in events.until(kind="calibration", level="warning")["message"]
+    pi.wait_for_pulse(1499, 1501)
+    assert calibrations(daemon) == before
+
+
+def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    dialogue = talk(daemon, "calibrate", "servo")
+    dialogue.answer("trim +0 µs> ", "++")
+    dialogue.expect("trim +25 µs> ")
+    time.sleep(LOAN + 2.0)  # which is not renewed but by fishctl
+    swim, second = daemon.fishctl("set-controller", "swing"), daemon.fishctl("calibrate", "servo")
+    for ended in (swim, second):
+        assert re.fullmatch(
+            r"fishctl: the servo is being calibrated[^\n]* \[calibrating\]\n", ended.stderr
+        )
+    dialogue.answer("", "-")
+    dialogue.expect("trim +20 µs> ")
+    assert dialogue.finish() == 130
+
+
+def test_who_was_away_for_too_long_is_told_so_at_the_prompt(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    dialogue = talk(daemon, "calibrate", "servo")
+    dialogue.answer("trim +0 µs> ", "++")
+    dialogue.expect("trim +25 µs> ")
+    pi.wait_for_pulse(1524, 1526)
+    dialogue.process.send_signal(signal.SIGSTOP)
+    pi.wait_for_pulse(1499, 1501)
+    dialogue.process.send_signal(signal.SIGCONT)
+    said = dialogue.expect("[no-loan]\n")
+    assert "the servo is at neutral; its calibration is as before\n" in said
+    assert re.search(r"\nfishctl: this loan has ended[^\n]+\n$", said)
+    assert dialogue.process.wait(PATIENCE) == 1
+
+
+def test_a_restart_of_fishd_is_told_at_the_prompt(talk: Talk, pi: Bench) -> None:
+    with pi.daemon() as first:
+        dialogue = talk(first, "calibrate", "servo")
+        dialogue.answer("trim +0 µs> ", "++")
+        dialogue.expect("trim +25 µs> ")
+    with pi.daemon():
+        assert "its calibration is as before" in dialogue.expect("[no-loan]\n")
+        assert dialogue.process.wait(PATIENCE) == 1
 
 
 def test_who_does_not_save_the_servo_calibration_keeps_the_one_before(
@@ -117,7 +178,12 @@ def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_befor
                 break
     dialogue.answer("", "+")
     assert dialogue.finish() == 1
-    assert re.search(r"\nfishctl: fishd is in fault: [^\n]+clear-fault'\n$", dialogue.text)
+    assert re.search(
+        r"\nfishd is in fault, the servo is released; its calibration is as before\n"
+        r"fishctl: fishd is in fault: [^\n]+clear-fault'\n$",
+        dialogue.text,
+    )
+    assert pi.pi.pulse() == 0
     assert calibrations(daemon) == before
 
 
@@ -128,7 +194,9 @@ def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench, daem
     daemon.process.wait()
     dialogue.answer("", "+")
     assert dialogue.finish() == 1
-    assert re.search(r"may not be in force: [^\n]+\nfishctl: no fishd at [^\n]+\n$", dialogue.text)
+    assert re.search(
+        r"where the servo is cannot be told: [^\n]+\nfishctl: no fishd at [^\n]+\n$", dialogue.text
+    )
 
 
 def test_the_servo_is_not_calibrated_while_the_fish_swims_or_after_a_fault(
@@ -147,7 +215,7 @@ def test_a_trim_that_no_servo_takes_is_refused_and_the_dialogue_goes_on(
     talk: Talk,
     pi: Bench,
 ) -> None:
-    with pi.daemon("--set", "servo.centre=2480") as daemon:
+    with pi.daemon("--set", "servo.centre=2480", "--set", "servo.highest=0.02") as daemon:
         dialogue = talk(daemon, "calibrate", "servo")
         dialogue.answer("trim +0 µs> ", "++")
         assert "beyond 500 to 2500" in dialogue.expect("trim +0 µs> ")

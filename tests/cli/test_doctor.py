@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import socket
 import subprocess
 from pathlib import Path
@@ -62,7 +61,9 @@ def test_the_table_has_a_line_for_each_check_and_says_how_to_mend(pi: Bench) -> 
     )
     warned = lines.index(next(line for line in lines if line.startswith("warning  calibrations")))
     assert lines[warned + 1].strip() == "fishctl calibrate force"
-    assert re.fullmatch(r"robot virtual-pi: \d+ ok, \d+ warnings, 0 failed, 0 skipped", lines[-1])
+    warnings = sum(line.startswith("warning ") for line in lines)
+    noun = "warning" if warnings == 1 else "warnings"
+    assert f", {warnings} {noun}, 0 failed, 0 skipped" in lines[-1]
 
 
 def test_a_simulated_robot_says_that_no_hardware_was_checked(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Checks of `fishctl doctor` that look at a Raspberry Pi's own files, on a tree of such files."""
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -59,21 +60,64 @@ def test_the_i2c_bus_must_be_there(root: Path, examine: Examine) -> None:
     assert "there is i2c-1" in other.message
 
 
-def test_the_i2c_bus_must_be_accessible_to_this_user(root: Path, examine: Examine) -> None:
+@pytest.mark.parametrize(
+    ("group", "mode", "remedy"),
+    [
+        ("daemon", 0o660, "usermod -aG daemon"),
+        ("daemon", 0o600, "make install-pi"),  # to join the group would not help
+        ("root", 0o660, "make install-pi"),
+    ],
+)
+def test_the_i2c_bus_must_be_accessible_to_this_user(
+    root: Path, examine: Examine, group: str, mode: int, remedy: str
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("needs root: a device gets another group")
     device = put(root, "dev/i2c-1")
-    device.chmod(0)
-    group = device.group()  # while Python's own files may still be read
-    if os.geteuid() == 0:
-        os.setresuid(65534, 65534, 0)
-        try:
-            found = examine("i2c bus")
-        finally:
-            os.setresuid(0, 0, 0)
-    else:
+    shutil.chown(device, group=group)
+    device.chmod(mode)
+    with unprivileged():
         found = examine("i2c bus")
     assert level(found) == "FAIL"
     assert found is not None
-    assert f"usermod -aG {group}" in found.mend
+    assert remedy in found.mend
+
+
+@pytest.mark.parametrize(
+    ("owner", "remedy"),
+    [(0, "sudo -u fishd fishctl doctor"), (1, "sudo -u daemon fishctl doctor"), (65534, "chmod")],
+)
+def test_a_state_folder_of_another_user_is_not_taken_away_from_him(
+    root: Path, examine: Examine, owner: int, remedy: str
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("needs root: a folder gets another owner")
+    folder = root / "state" / "pi"
+    folder.mkdir(parents=True)
+    os.chown(folder, owner, owner)
+    folder.chmod(0o500)
+    with unprivileged():
+        found = examine("state folder")
+    assert level(found) == "FAIL"
+    assert found is not None
+    assert remedy in found.mend
+    assert "chown" not in found.mend
+    assert "set state_folder" in found.mend
+
+
+@contextlib.contextmanager
+def unprivileged() -> Iterator[None]:
+    """As user 65534; the groups are given back as well."""
+    groups = os.getgroups()
+    os.setgroups([])
+    os.setresgid(65534, 65534, 0)
+    os.setresuid(65534, 65534, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+        os.setresgid(0, 0, 0)
+        os.setgroups(groups)
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(400_000, "ok"), (100_000, "warning")])
@@ -194,12 +238,14 @@ def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) 
 
 def test_calibrations_are_asked_for_and_a_broken_file_fails(root: Path, examine: Examine) -> None:
     assert level(examine("calibrations")) == "warning"
-    put(root, "state/pi/force-2026-01-02.yaml", "xx: 2.0\nyy: 2.0\ndate: '2026-01-02'\n")
+    matrix = "{xx: 2.0, xy: 0.0, x0: 0.0, yx: 0.0, yy: 2.0, y0: 0.0, date: '2026-01-02'}\n"
+    put(root, "state/pi/force-2026-01-02.yaml", matrix)
     found = examine("calibrations")
     assert level(found) == "warning"
     assert found is not None
     assert found.mend == "fishctl calibrate servo"
-    put(root, "state/pi/servo-2026-01-03.yaml", "trim: 10.0\ndate: '2026-01-03'\n")
+    pulses = "trim: 10.0, direction: 1, scale: 600.0, lowest: -1.0, highest: 1.0"
+    put(root, "state/pi/servo-2026-01-03.yaml", f"{{{pulses}, date: '2026-01-03'}}\n")
     assert examine("calibrations") == ("ok", "force of 2026-01-02, servo of 2026-01-03", "")
     put(root, "state/pi/force-2026-02-02.yaml", "xx: a lot\n")
     assert level(examine("calibrations")) == "FAIL"

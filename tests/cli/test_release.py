@@ -3,6 +3,7 @@
 import datetime
 import os
 import re
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -37,10 +38,59 @@ def release(*settings: str, **env: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_simulated_fish_has_nothing_to_release() -> None:
-    ended = release()
+@pytest.fixture
+def simulated(tmp_path: Path) -> Path:
+    file = tmp_path / "fish.yaml"
+    file.write_text("robot: simulated\n")
+    return file
+
+
+def test_a_simulated_fish_that_a_file_names_has_nothing_to_release(simulated: Path) -> None:
+    ended = release("--config", str(simulated), SERVICE_RESULT="success")
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout == "a simulated fish has nothing to release\n"
+    assert ended.stdout == (
+        f"the service ended with 'success': a simulated fish, by {simulated}, has nothing to "
+        "release\n"
+    )
+
+
+def test_without_any_file_it_is_no_success_and_says_how_to_name_one() -> None:
+    ended = release()
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert re.fullmatch(r"fishctl: nothing was released: [^\n]+ --config FILE\n", ended.stderr)
+    assert "/etc/fishd/fishd.yaml" in ended.stderr
+
+
+def test_the_file_of_the_service_is_used_where_none_is_named(
+    pi: Bench, other_program: pigpio.pi
+) -> None:
+    file = pi.folder / "service.yaml"
+    file.write_text("robot: virtual-pi\n")
+    ended = release(*pi.settings[2:], FISHD_CONFIG=str(file))
+    assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
+    assert ended.stderr == f"fishctl: using {file}; --config names another file\n"
+
+
+def test_a_file_that_is_named_comes_before_that_of_the_service(simulated: Path) -> None:
+    ended = release("--config", str(simulated), FISHD_CONFIG="/nowhere/fishd.yaml")
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_file_of_the_service_that_is_not_there_is_exit_status_78() -> None:
+    ended = release(FISHD_CONFIG="/nowhere/fishd.yaml")
+    assert ended.returncode == 78
+    assert "/nowhere/fishd.yaml: no such file" in ended.stderr
+
+
+def test_the_last_resort_works_while_a_fishd_hangs(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        daemon.fishctl("set-controller", "hold", "--angle", "0.2")
+        daemon.process.send_signal(signal.SIGSTOP)
+        try:
+            ended = release(*pi.settings)
+        finally:
+            daemon.process.send_signal(signal.SIGCONT)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_pulses_that_were_left_on_end_at_neutral(pi: Bench, other_program: pigpio.pi) -> None:
@@ -77,7 +127,7 @@ def test_a_broken_calibration_does_not_keep_the_servo_energised(
     (folder / "servo-2026-01-01T000000.000000.yaml").write_text("trim: straight\n")
     ended = release(*pi.settings)
     assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
-    assert re.fullmatch(r"fishctl: [^\n]+ trim: [^\n]+; going on without it\n", ended.stderr)
+    assert re.fullmatch(r"fishctl: [^\n]+/servo-2026[^\n]+; going on without it\n", ended.stderr)
     assert pi.pi.widths()[-1] == 0
 
 

@@ -2,11 +2,14 @@
 
 import math
 import re
+import signal
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
 from operator_rig import Bench, fishctl_alone, forces
-from processes import Daemon, running
+from processes import FISHCTL, PATIENCE, Daemon, running
 
 
 def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(
@@ -32,6 +35,21 @@ def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(pi: Bench, daemon:
     for ended, code in ((restless, "not-still"), (large, "too-large"), (swimming, "running")):
         assert (ended.returncode, ended.stdout) == (1, "")
         assert re.fullmatch(rf"fishctl: [^\n]+ \[{code}\]\n", ended.stderr)
+    assert pi.files("force") == []
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
+    pi: Bench, daemon: Daemon, how: int
+) -> None:
+    command = [FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", "3"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    time.sleep(1.5)  # it measures
+    process.send_signal(how)
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode != 0
+    time.sleep(3.0)  # its measurement would have ended
+    assert math.hypot(*forces(daemon)) > 0.3
     assert pi.files("force") == []
 
 

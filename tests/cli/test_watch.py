@@ -266,6 +266,12 @@ def test_a_fault_is_explained_in_full_however_narrow_the_screen() -> None:
     assert "no pulses" in shown(faulty)[0]
 
 
+def test_a_thrust_of_before_is_not_shown_and_a_lost_servo_is() -> None:
+    lost = shown(view_of([tick(1)], sensor_lost=True, servo_lost=True))
+    assert "– mN" in lost[2]
+    assert "servo not reached" in lost[0]
+
+
 def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_change() -> None:
     assert not view_of([tick(1, t=100.5)], t=100.0).outdated
     assert view_of([tick(1, t=101.0)], t=100.0).outdated

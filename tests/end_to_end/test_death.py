@@ -36,6 +36,13 @@ def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then(
     assert found["neutral"] < found["off"] <= found["neutral"] + 0.8
 
 
+def test_a_fishd_that_goes_on_after_a_hang_leaves_the_servo_released() -> None:
+    found = outcome("SIGCONT")
+    assert (found["status"], found["reason"]) == (None, "overrun")
+    assert found["neutral"] <= 0.3
+    assert found["neutral"] < found["off"] <= found["neutral"] + 0.8
+
+
 @pytest.mark.parametrize("phase", ["statistics", "between ticks"])
 def test_an_exception_outside_the_phases_ends_fishd_and_the_servo_comes_to_rest_first(
     phase: str,

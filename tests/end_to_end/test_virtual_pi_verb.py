@@ -201,8 +201,13 @@ def test_one_that_hangs_costs_a_time_out_and_its_late_answer_confuses_nobody(pi:
         remote.set_timeout(0.01)
         pi.process.send_signal(signal.SIGSTOP)
         try:
-            with pytest.raises(TimeoutError):
+            with pytest.raises(TimeoutError, match="does not answer"):
                 remote.transfer(0x48, [Write(b"\x02"), Read(2)])
+            done = pi.fishctl("status")
         finally:
             pi.process.send_signal(signal.SIGCONT)
+        assert done.stderr == (
+            f"fishctl: the virtual Pi at {pi.path} does not answer: "
+            "is 'fishctl virtual-pi run' still running?\n"
+        )
         assert remote.transfer(0x48, CONFIG) == [b"\x85\x83"]

@@ -32,7 +32,7 @@ def test_the_thread_outlives_an_error_that_nobody_thought_of(settings: PigpioSet
             raise IndexError("out of range")
 
     link = PigpioLink(settings, SystemClock(), prepare, threaded=True)
-    with contextlib.closing(link), link.session(10.0) as client:
+    with contextlib.closing(link), link.session(last=True) as client:
         assert client is attempts[1]
         assert not attempts[0].connected
 

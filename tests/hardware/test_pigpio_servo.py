@@ -118,6 +118,16 @@ def test_a_slow_loop_has_three_ticks_before_the_countdown_ends(bench: PigpioBenc
     assert bench.width == 1500
 
 
+def test_a_longer_countdown_forgives_longer_stalls(bench: PigpioBench) -> None:
+    settings = bench.settings()
+    servo = bench.servo(replace(settings, pigpio=replace(settings.pigpio, countdown=1.0)))
+    servo.write(0.5)
+    bench.wait(0.95)
+    assert bench.width == 1800
+    bench.wait(0.1)
+    assert (bench.width, servo.countdown) == (1500, 1.0)
+
+
 def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench) -> None:
     servo = bench.servo()
     servo.write(0.5)

@@ -4,9 +4,9 @@ import errno
 import os
 
 import pytest
+from sysfs_pwm_kernel import SysfsPwm
 
 from fishd.clock import VirtualClock
-from fishd.emulation.sysfs_pwm import SysfsPwm
 from fishd.errors import ServoError
 from fishd.hardware.calibration import ServoCalibration
 from fishd.hardware.settings import ServoSettings

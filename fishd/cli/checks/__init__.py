@@ -3,7 +3,9 @@
 from collections.abc import Iterator
 
 from fishd.cli.checks import computer, sensor, service, servo, software, timing
-from fishd.cli.checks.base import Check, Context, Result, fail
+from fishd.cli.checks.base import INSTALL, Check, Context, Result, fail
+from fishd.errors import MissingPackage
+from fishd.hardware.packages import driver_packages
 
 CHECKS: tuple[Check, ...] = (
     *software.CHECKS,
@@ -24,7 +26,10 @@ def examine(context: Context) -> Iterator[tuple[str, Result]]:
         if context.config.robot not in check.robots:
             continue
         try:
-            result = check.function(context)
+            with driver_packages():
+                result = check.function(context)
+        except MissingPackage as error:
+            result = fail(str(error), INSTALL)
         except Exception as error:
             what = f"this check broke off: {type(error).__name__}: {error}"
             result = fail(what, "please report this, with the output of 'fishctl doctor --json'")

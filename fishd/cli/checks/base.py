@@ -1,13 +1,23 @@
 """What a check of `fishctl doctor` is given, and what it returns."""
 
+import os
+import pwd
+import shlex
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from fishd import robots
 from fishd.cli.checks.daemon import Running, Unreachable, ask
 from fishd.config import Config
+from fishd.errors import StartupError
+from fishd.hardware import ownership
+
+INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
+"""Mends a missing driver."""
 
 Level = Literal["ok", "warning", "FAIL", "skipped"]
 
@@ -35,7 +45,7 @@ class Context:
     def daemon(self) -> Running | Unreachable | None:
         """What the daemon says, or why it cannot be asked; None where there certainly is none.
 
-        That is about the endpoint: a fishd at another one is not known of.
+        That is about the endpoint: of a fishd at another one, `occupied` may know.
         """
         return ask(self.endpoint)
 
@@ -51,7 +61,13 @@ class Context:
         """
         if isinstance(self.daemon, Unreachable):
             return skipped(f"{self.daemon.why}; {self.reach(self.daemon)}")
-        return skipped(f"fishd is running and {by_fishd}") if self.daemon else None
+        if self.daemon:
+            return skipped(f"fishd is running and {by_fishd}")
+        try:
+            owner = ownership.owner(robots.parts_of(self.config))
+        except StartupError:  # where a virtual Pi would be is no good place; the check will say so
+            return None
+        return skipped(f"{owner}; name it with --endpoint") if owner else None
 
     def reach(self, daemon: Unreachable) -> str:
         """What to do so that the daemon can be asked."""
@@ -62,7 +78,12 @@ class Context:
     @property
     def as_fishd(self) -> str:
         """The command that makes these checks as the user of the service."""
-        return "sudo -u fishd fishctl doctor" + (f" --config {self.file}" if self.file else "")
+        return self.as_user("fishd")
+
+    def as_user(self, name: str) -> str:
+        """The command that makes these checks as another user."""
+        file = f" --config {self.file}" if self.file else ""
+        return f"sudo -u {shlex.quote(name)} fishctl doctor{file}"
 
     def path(self, absolute: str) -> Path:
         """A path of this machine, below `root`."""
@@ -88,6 +109,19 @@ class Check(NamedTuple):
     function: Callable[[Context], Result | None]
     robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi")
     """For which robots it is made."""
+
+
+def sudo_unless(uid: int) -> str:
+    """`sudo ` for a command that only this user, or root, may give; empty where that is us."""
+    return "" if os.geteuid() in (0, uid) else "sudo "
+
+
+def name_of(uid: int) -> str:
+    """The name of a user, or its number where it has none."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"#{uid}"
 
 
 def ok(message: str) -> Result:

@@ -5,7 +5,7 @@ import os
 import shutil
 from pathlib import Path
 
-from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
+from fishd.cli.checks.base import Check, Context, Result, fail, name_of, ok, skipped, warning
 from fishd.errors import ConfigError
 from fishd.hardware.calibration import CalibrationFolder, ForceCalibration, ServoCalibration
 from fishd.robots import state_folder
@@ -74,11 +74,22 @@ def state(context: Context) -> Result:
             f"{there} is no folder", f"move it away, or set state_folder; {folder} is needed"
         )
     if not os.access(there, os.W_OK | os.X_OK):
-        return fail(
-            f"{folder}: no permission to write to {there}",
-            f"run this as the user of fishd ({context.as_fishd}), or set state_folder",
-        )
+        return fail(f"{folder}: no permission to write to {there}", _permit(context, there))
     return ok(f"{folder}" + ("" if there == folder else ", which will be made when it is needed"))
+
+
+def _permit(context: Context, folder: Path) -> str:
+    """How to be one who may write to a folder; it is not taken away from its owner."""
+    uid = folder.stat().st_uid
+    if uid == os.geteuid():
+        return f"chmod u+wx {folder}, or set state_folder"
+    if uid == 0 or name_of(uid) == "fishd":
+        return f"run this as the user of fishd ({context.as_fishd}), or set state_folder"
+    user = name_of(uid)
+    return (
+        f"it belongs to user {user}: run fishd and this as {user} ({context.as_user(user)}), or "
+        "set state_folder to a folder of your own"
+    )
 
 
 def disk(context: Context) -> Result:

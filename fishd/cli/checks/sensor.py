@@ -1,14 +1,15 @@
 """Checks of the force sensor, from the bus to the force; a running fishd is asked instead."""
 
 import os
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
+from fishd.cli.checks.base import Check, Context, Result, fail, name_of, ok, skipped, warning
 from fishd.clock import SystemClock
-from fishd.errors import SensorError, StartupError
+from fishd.errors import MissingPackage, SensorError, StartupError
 from fishd.hardware.calibration import ForceCalibration
 from fishd.hardware.i2c_errors import explain
 
@@ -25,7 +26,7 @@ _OURS, _OUR_BITS = 0x0113, 0x011F
 """Single-shot, window comparator, off: no other program leaves that behind."""
 _ADS1115, _ADS1015 = 0x7FFF, 0x7FF0
 
-_START = {"virtual-pi": "fishctl virtual-pi run", "pi": "install what 'packages' says is missing"}
+_START = "fishctl virtual-pi run"
 
 
 def bus(context: Context) -> Result:
@@ -40,6 +41,12 @@ def bus(context: Context) -> Result:
             "dtparam=i2c_arm=on in /boot/firmware/config.txt, module i2c-dev loaded; restart",
         )
     if not os.access(device, os.R_OK | os.W_OK):
+        found = device.stat()
+        if found.st_gid == 0 or not found.st_mode & stat.S_IWGRP:
+            return fail(
+                f"/dev/i2c-{number} may be used by user {name_of(found.st_uid)} only",
+                "sudo make install-pi, then restart: its udev rule gives the bus to group i2c",
+            )
         group = device.group()
         return fail(
             f"/dev/i2c-{number} may be used by group {group} only",
@@ -73,8 +80,10 @@ def chip(context: Context) -> Result:
     try:
         with plugged_in(context):
             config, threshold = _registers(settings.bus, settings.address)
+    except MissingPackage:
+        raise
     except StartupError as error:
-        return fail(str(error), _START[context.config.robot])
+        return fail(str(error), _START)
     except (OSError, ValueError) as error:
         return fail(
             explain(error, settings.bus, settings.address),
@@ -110,8 +119,10 @@ def force(context: Context) -> Result:
             )
             stack.callback(sensor.close)
             trials = list(_windows(sensor, tick))
+    except MissingPackage:
+        raise
     except StartupError as error:
-        return fail(str(error), _START[context.config.robot])
+        return fail(str(error), _START)
     except SensorError as error:
         return fail(str(error), "mend what the lines above say first")
     samples, suspicions = [n for n, _ in trials], {why for _, why in trials if why}

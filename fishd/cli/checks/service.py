@@ -48,7 +48,7 @@ def control(context: Context) -> Result:
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:
-        return fail(str(error), "remove that folder, or set control.address")
+        return fail(str(error), "set control.address, or run this as the user whose folder it is")
     return _address(context, address, "control.address", zmq.ROUTER)
 
 

@@ -6,11 +6,10 @@ import stat
 import sys
 from importlib import metadata
 
-from fishd.cli.checks.base import Check, Context, Result, fail, ok, warning
+from fishd.cli.checks.base import Check, Context, Result, fail, ok, sudo_unless, warning
+from fishd.hardware.packages import PACKAGES
 
-_MODULES = {
-    "adafruit-circuitpython-ads1x15": "adafruit_ads1x15",
-    "adafruit-extended-bus": "adafruit_extended_bus",
+_MODULES = {package: module for module, package in PACKAGES.items()} | {
     "pyyaml": "yaml",
     "pyzmq": "zmq",
 }
@@ -27,12 +26,13 @@ def configuration(context: Context) -> Result:
     if file is None:
         return ok(f"the defaults: robot {context.config.robot}; --config FILE to check a file")
     try:
-        mode = file.stat().st_mode
+        found = file.stat()
     except OSError as error:
         return warning(f"{file}: {error.strerror}", "give a file that exists")
-    if mode & stat.S_IWOTH:
+    if stat.S_ISREG(found.st_mode) and found.st_mode & stat.S_IWOTH:
         return warning(
-            f"{file}: good, but everybody on this machine may change it", f"chmod o-w {file}"
+            f"{file}: good, but everybody on this machine may change it",
+            f"{sudo_unless(found.st_uid)}chmod o-w {file}",
         )
     return ok(f"{file}: good, robot {context.config.robot}")
 
@@ -108,6 +108,8 @@ def _problem(name: str, bounds: str) -> str:
             return f"{name} is {version}, {relation} {bound} is needed"
     try:
         importlib.import_module(_MODULES.get(name, name))
+    except ImportError as error:
+        return f"{name} cannot be imported: {error}"
     except Exception as error:
         return f"{name} cannot be imported: {type(error).__name__}: {error}"
     return ""

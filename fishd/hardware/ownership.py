@@ -1,0 +1,131 @@
+"""One fishd for one robot: what it drives, and how it is kept from a second fishd.
+
+Two programs on one bus would take each other's samples, without an error.
+"""
+
+import fcntl
+import logging
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from fishd.errors import StartupError
+from fishd.hardware.settings import ForceSensorSettings, ServoSettings
+from fishd.lockfile import Taken, lock_path, locked
+
+log = logging.getLogger(__name__)
+
+FOLDER = Path("/run/lock")
+"""Where every user of the machine may make lock files."""
+TRIES, PAUSE = 5, 0.02
+"""How often a claim is tried, as somebody may only be asking; and the time between [s]."""
+_LOCAL = ("127.0.0.1", "localhost", "::1")
+
+
+class Part(NamedTuple):
+    """What at most one fishd may drive."""
+
+    path: Path
+    """What is claimed; its lock file is beside it."""
+    what: str
+    """In words."""
+    key: str
+    """The configuration key that names another one."""
+
+
+def parts_of_pi(sensor: ForceSensorSettings, servo: ServoSettings) -> tuple[Part, ...]:
+    """What robot pi drives: its I2C bus, and the pin or the PWM channel of its servo."""
+    name, what, key = f"gpio{servo.gpio}", f"the servo on GPIO {servo.gpio}", "servo.gpio"
+    pigpio, sysfs = servo.pigpio, servo.sysfs
+    if servo.driver == "pigpio" and pigpio.host not in _LOCAL:
+        place = f"{pigpio.host}:{pigpio.port}"
+        name, what = f"{place}-{name}", f"{what} of {place}"
+    elif servo.driver == "sysfs-pwm" and sysfs.channel is not None:
+        name = f"{sysfs.chip or 'pwm'}-{sysfs.channel}"
+        what, key = f"channel {sysfs.channel} of the kernel's PWM", "servo.sysfs.channel"
+    bus = Part(FOLDER / f"fishd-i2c-{sensor.bus}", f"/dev/i2c-{sensor.bus}", "force_sensor.bus")
+    return bus, Part(FOLDER / f"fishd-{name.replace('/', '_')}", what, key)
+
+
+def parts_of_virtual_pi(socket: Path) -> tuple[Part, ...]:
+    """What robot virtual-pi drives: the virtual Pi that listens on `socket`."""
+    path = socket.with_name(f"{socket.name}.fishd")
+    return (Part(path, f"the virtual Pi on {socket}", "virtual_pi.socket"),)
+
+
+@contextmanager
+def owned(parts: Iterable[Part]) -> Iterator[None]:
+    """Drive these parts alone; raises `StartupError` that names the process which does already.
+
+    Where a lock file cannot be made, that is logged and no reason not to start.
+    """
+    with ExitStack() as stack:
+        for part in parts:
+            try:
+                _claim(part, stack)
+            except OSError as error:
+                log.warning(
+                    "%s: cannot be made: %s; nothing keeps a second fishd from driving %s",
+                    lock_path(part.path),
+                    error.strerror,
+                    part.what,
+                )
+        yield
+
+
+def owner(parts: Iterable[Part]) -> str:
+    """Which fishd drives one of these parts, and which; empty where none is known to."""
+    for part in parts:
+        if pid := _holder(part.path):
+            return f"a fishd (pid {pid}) drives {part.what}"
+    return ""
+
+
+def _claim(part: Part, stack: ExitStack) -> None:
+    for attempt in range(1, TRIES + 1):
+        try:
+            stack.enter_context(locked(part.path, _open_for_all))
+        except Taken as taken:
+            if attempt == TRIES:
+                raise StartupError(
+                    f"another fishd (pid {taken.pid}) drives {part.what}; stop it, or give this "
+                    f"one another {part.key}"
+                ) from None
+        else:
+            return
+        time.sleep(PAUSE)
+
+
+def _holder(path: Path) -> str:
+    """The pid of the process that holds the lock of `path`, or `unknown`; empty where none does.
+
+    Asking takes the lock for a moment.
+    """
+    try:
+        lock = open(lock_path(path), encoding="ascii", opener=_open_for_all)  # noqa: SIM115
+    except OSError:  # nobody has ever held it, or this user may not know
+        return ""
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return lock.read().strip() or "unknown"
+    return ""
+
+
+def _open_for_all(path: str, flags: int) -> int:
+    """Open a lock file that every user's fishd may lock, in a folder where all may make files."""
+    flags |= os.O_NOFOLLOW
+    try:
+        # First without O_CREAT: there, Linux refuses that for an existing file of another user.
+        return os.open(path, flags & ~os.O_CREAT)
+    except FileNotFoundError:
+        if not flags & os.O_CREAT:
+            raise
+        file = os.open(path, flags, 0o666)
+    if os.fstat(file).st_uid == os.geteuid():
+        os.fchmod(file, 0o666)  # whatever the umask
+    return file

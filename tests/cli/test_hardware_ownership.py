@@ -1,0 +1,123 @@
+"""One fishd for one robot: a second one is refused, whoever runs it, until the first has ended."""
+
+import os
+import re
+import shutil
+import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from operator_rig import Bench
+from processes import Daemon, running
+from test_doctor import doctor, free_telemetry
+
+from fishd.hardware import ownership
+
+NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+BUS = 150 + os.getpid() % 50
+"""A bus that no machine has, and no other test just now."""
+PI = [
+    *("--set", "robot=pi", "--set", f"force_sensor.bus={BUS}"),
+    *("--set", "servo.pigpio.host=127.0.0.2", "--set", f"servo.pigpio.port={20000 + BUS}"),
+]
+
+
+@pytest.fixture
+def folders() -> Iterator[tuple[Path, Path]]:
+    """Two folders that every user may write to; and no lock files stay behind."""
+    parent = Path(tempfile.mkdtemp())
+    for folder in (parent, parent / "one", parent / "other"):
+        folder.mkdir(exist_ok=True)
+        folder.chmod(0o777)
+    yield parent / "one", parent / "other"
+    shutil.rmtree(parent)
+    for lock in ownership.FOLDER.glob("fishd-*"):
+        if lock.name.startswith((f"fishd-i2c-{BUS}.", f"fishd-127.0.0.2:{20000 + BUS}-")):
+            lock.unlink()
+
+
+def refusal(folder: Path, *arguments: str, under: tuple[str, ...] = ()) -> str:
+    """What a fishd that does not start says."""
+    status, _, err = Daemon(folder, *arguments, under=under).finish()
+    assert status == 1
+    assert err.count("\n") == 1
+    return err
+
+
+def pi_settings(folder: Path) -> list[str]:
+    return [*PI, "--set", f"state_folder={folder}"]
+
+
+def test_a_second_fishd_on_the_same_bus_is_refused_and_told_the_pid(
+    folders: tuple[Path, Path],
+) -> None:
+    one, other = folders
+    with running(one, *pi_settings(one)) as first:
+        said = refusal(other, *pi_settings(other))
+        assert f"another fishd (pid {first.process.pid}) drives /dev/i2c-{BUS}; " in said
+        assert "force_sensor.bus" in said
+        elsewhere = [*pi_settings(other), "--set", f"force_sensor.bus={BUS + 50}"]
+        said = refusal(other, *elsewhere)
+        assert f"another fishd (pid {first.process.pid}) drives the servo on GPIO 18" in said
+        assert first.fishctl("status").returncode == 0
+    (ownership.FOLDER / f"fishd-i2c-{BUS + 50}.lock").unlink()
+
+
+def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
+    folders: tuple[Path, Path],
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("needs root: one fishd runs as another user")
+    one, other = folders
+    with running(one, *pi_settings(one), under=("sh", "-c", 'umask 077; exec "$@"', "sh", *NOBODY)):
+        assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other))
+    with running(one, *pi_settings(one), under=NOBODY) as killed:
+        killed.end(signal.SIGKILL)
+    with running(other, *pi_settings(other)) as mine:  # whose lock files are somebody else's
+        said = refusal(one, *pi_settings(one), under=NOBODY)
+        assert f"(pid {mine.process.pid})" in said
+
+
+def test_one_virtual_pi_takes_one_fishd_even_one_that_hangs(pi: Bench, tmp_path: Path) -> None:
+    (tmp_path / "second").mkdir()
+    with pi.daemon() as first:
+        first.process.send_signal(signal.SIGSTOP)
+        try:
+            said = refusal(tmp_path / "second", *pi.settings)
+        finally:
+            first.process.send_signal(signal.SIGCONT)
+    assert re.search(rf"another fishd \(pid {first.process.pid}\) drives the virtual Pi on ", said)
+    with running(tmp_path / "second", *pi.settings):  # free again
+        pass
+
+
+def test_doctor_leaves_the_bus_of_a_fishd_at_another_endpoint_alone(
+    pi: Bench, tmp_path: Path
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    with running(tmp_path / "elsewhere", *pi.settings) as daemon:
+        _, found = doctor(pi.folder, *pi.settings, *free_telemetry())
+    for name in ("adc", "force"):
+        assert found[name][0] == "skipped"
+        assert f"(pid {daemon.process.pid})" in found[name][1]
+        assert "--endpoint" in found[name][1]
+
+
+def test_without_a_place_for_lock_files_fishd_says_so_and_starts(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    part = ownership.Part(tmp_path / "nowhere" / "bus", "/dev/i2c-7", "force_sensor.bus")
+    with ownership.owned([part]):
+        assert "nothing keeps a second fishd from driving /dev/i2c-7" in caplog.text
+    assert ownership.owner([part]) == ""
+
+
+def test_a_link_that_somebody_put_there_is_not_followed(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / "bus.lock").symlink_to(victim)
+    with ownership.owned([ownership.Part(tmp_path / "bus", "a bus", "force_sensor.bus")]):
+        pass
+    assert victim.read_text() == "precious"

@@ -1,0 +1,105 @@
+"""A servo that cannot go as far as ±Φ: refused where pulses end, shown where limits are chosen."""
+
+import datetime
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from operator_rig import Bench, calibrations
+from processes import FISHCTL
+
+from fishd.client import Fish
+from fishd.config import load
+from fishd.errors import ConfigError
+from fishd.hardware import pulses
+from fishd.hardware.calibration import CalibrationFolder, ServoCalibration
+from fishd.hardware.settings import ServoSettings
+
+
+def test_status_shows_the_whole_range_where_nothing_cuts_it(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        status = json.loads(daemon.fishctl("status", "--json").stdout)
+        assert (status["lowest"], status["highest"]) == (-0.42, 0.42)
+        assert "within ±0.42 rad\n" in daemon.fishctl("status").stdout
+
+
+def test_a_soft_limit_of_the_configuration_is_shown_and_no_complaint(pi: Bench) -> None:
+    with pi.daemon("--set", "servo.highest=0.3") as daemon:
+        with Fish(daemon.endpoint) as fish:
+            status = fish.status()
+        assert (status.lowest, status.highest) == (-0.42, 0.3)
+        assert not any("servo" in line for line in status.degraded)
+        assert "within -0.42 to +0.3 rad, less than ±0.42 rad" in daemon.fishctl("status").stdout
+        _, _, err = daemon.end()
+    assert "servo.lowest and servo.highest permit -0.42 to +0.3 rad of ±0.42 rad" in err
+
+
+def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Bench) -> None:
+    folder = CalibrationFolder(pi.folder / "state" / "virtual-pi")
+    now = datetime.datetime.now().astimezone()
+    saved, _ = folder.save(ServoCalibration(trim=-500.0, scale=2000.0), now)
+    with pi.daemon() as daemon:
+        with Fish(daemon.endpoint) as fish:
+            status = fish.status()
+        (line,) = (line for line in status.degraded if "servo" in line)
+        assert line == (
+            f"the servo's calibration of {saved.date} permits -0.25 to +0.42 rad of ±0.42 rad, "
+            "amplitude_limit: fishctl calibrate servo"
+        )
+        assert status.lowest == pytest.approx(-0.25)
+        assert calibrations(daemon).servo.trim == -500.0
+
+
+def test_config_check_tells_of_a_range_that_is_chosen(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("robot: pi\nservo: {lowest: -0.25}\n")
+    ended = subprocess.run(
+        [FISHCTL, "config", "check", str(file)], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout == (
+        f"{file}: good\n"
+        "servo.lowest and servo.highest permit -0.25 to +0.42 rad of ±0.42 rad, amplitude_limit\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["servo.scale=3000"],
+            "servo.scale: 3000 is not valid: angles from -0.42 to +0.42 rad would need pulses of "
+            "240 to 2760 µs, beyond 500 to 2500 µs; at most 2380 µs/rad is needed, or an "
+            "amplitude_limit of at most 0.333 rad",
+        ),
+        (
+            ["servo.centre=2300"],
+            "servo.centre: 2300 is not valid: angles from -0.42 to +0.42 rad would need pulses of "
+            "2048 to 2552 µs, beyond 500 to 2500 µs; centre + trim from 752 to 2248 µs is needed, "
+            "or an amplitude_limit of at most 0.333 rad",
+        ),
+        (["servo.centre=1000", "servo.trim=-400"], "servo.trim: -400 is not valid: "),
+        (["servo.centre=2300", "servo.direction=-1"], "servo.centre: 2300 is not valid: "),
+    ],
+)
+def test_pulses_that_end_before_the_amplitude_are_refused(
+    overrides: list[str], message: str
+) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(None, overrides)
+    assert message in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "remedy", ["amplitude_limit=0.333", "servo.highest=0.333", "servo.trim=-52"]
+)
+def test_each_remedy_for_pulses_that_end_too_early_is_one(remedy: str) -> None:
+    config = load(None, ["servo.centre=2300", remedy])
+    wanted = min(config.amplitude_limit, config.servo.highest)
+    assert pulses.reach(config.servo)[1] >= wanted - pulses.ROUNDING
+
+
+def test_a_limit_that_is_off_by_rounding_cuts_nothing() -> None:
+    assert pulses.cut(ServoSettings(highest=0.42 - 1e-12), 0.42) == ""
+    assert pulses.cut(ServoSettings(highest=0.41), 0.42) == "-0.42 to +0.41 rad of ±0.42 rad"

@@ -1,0 +1,33 @@
+"""A fishd that ends while its pigpiod is stopped says that the servo may keep its pulses."""
+
+import signal
+import subprocess
+from pathlib import Path
+
+from processes import FISHCTL, PATIENCE, Subscriber, running
+from virtual_pi_process import virtual_pi
+
+
+def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_path: Path) -> None:
+    with virtual_pi(tmp_path) as pi, running(tmp_path, *pi.settings) as daemon:
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            ticks.until(mode="running", servo_on=True)
+            pi.control("inject", "pigpiod-frozen")
+            ticks.until(mode="fault")
+        code, _, errors = daemon.end(signal.SIGTERM)
+        assert code == 1
+        last = errors.splitlines()[-1]
+        assert "the servo could not be released and may keep its pulses: pigpiod at 127." in last
+        assert last.endswith("; once it can be reached, 'fishctl release' releases it")
+        assert "reconnecting" not in last
+        assert pi.pulse() > 0.0
+        pi.control("clear")
+        release = subprocess.run(
+            [FISHCTL, "release", *pi.settings],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
+        )
+        assert "pulses were on: neutral, then off" in release.stdout, release.stderr
+        assert pi.pulse() == 0.0

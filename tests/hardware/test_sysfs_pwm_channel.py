@@ -1,0 +1,162 @@
+"""How the servo's channel of the kernel's PWM is found, waited for, lost and found again."""
+
+import pytest
+from sysfs_pwm_bench import FAN, PI4, PI5, Bench
+from sysfs_pwm_kernel import SysfsPwm
+
+from fishd.errors import ServoError
+from fishd.hardware.settings import ServoSettings, SysfsPwmSettings
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.mark.parametrize(
+    ("chips", "gpio", "device", "channel"),
+    [
+        ({FAN: 4, PI5: 4}, 18, PI5, 2),
+        ({PI5: 4, FAN: 4}, 19, PI5, 3),
+        ({PI5: 4}, 13, PI5, 1),
+        ({PI4: 2}, 18, PI4, 0),
+        ({PI4: 2}, 13, PI4, 1),
+        ({"3f20c000.pwm": 2}, 12, "3f20c000.pwm", 0),
+    ],
+)
+def test_the_chip_is_found_by_its_device_whatever_its_number(
+    chips: dict[str, int], gpio: int, device: str, channel: int
+) -> None:
+    bench = Bench(chips)
+    servo = bench.servo(ServoSettings(driver="sysfs-pwm", gpio=gpio))
+    servo.write(0.0)
+    bench.clock.sleep(0.02)
+    assert bench.width(channel, device) == 1500.0
+    servo.close()
+
+
+def test_chip_and_channel_can_be_named() -> None:
+    bench = Bench({PI5: 4, "soc:pwm": 1})
+    named = SysfsPwmSettings(chip="soc:pwm", channel=0)
+    servo = bench.servo(ServoSettings(driver="sysfs-pwm", gpio=4, sysfs=named))
+    servo.write(0.0)
+    bench.clock.sleep(0.02)
+    assert bench.width(0, "soc:pwm") == 1500.0
+    servo.close()
+
+
+def test_a_start_waits_for_udev_but_a_tick_does_not() -> None:
+    bench = Bench(udev_delay=1.5)
+    servo = bench.servo()
+    assert 1.5 <= bench.clock.now < 1.6
+    servo.write(0.0)
+    bench.shell("pwmchip1/unexport", 2)
+    with pytest.raises(ServoError):
+        servo.write(0.0)
+    before = bench.clock.now
+    with pytest.raises(ServoError, match=r"pwm2/period may not be used .* group gpio"):
+        servo.write(0.0)
+    assert bench.clock.now == before
+    bench.clock.sleep(1.6)
+    assert bench.write(servo, 0.0) == 1500.0
+    servo.close()
+
+
+def test_permissions_that_never_come_are_an_error_of_each_write() -> None:
+    bench = Bench(udev_delay=1e6)
+    servo = bench.servo()
+    assert bench.clock.now == pytest.approx(2.0, abs=0.02)
+    for _ in range(2):
+        with pytest.raises(ServoError, match="udev rule"):
+            servo.write(0.0)
+    servo.close()  # without a word: there never were pulses
+    assert bench.exported() == []
+
+
+def test_an_unexported_channel_is_an_error_and_then_opened_again(bench: Bench) -> None:
+    servo = bench.servo()
+    bench.write(servo, 0.2)
+    bench.shell("pwmchip1/unexport", 2)
+    with pytest.raises(ServoError, match=r"pwm2/enable is gone"):
+        servo.write(0.2)
+    assert servo.counters() == {"servo_reconnects": 0}
+    with pytest.raises(ServoError):
+        servo.write(0.2)  # exported again, but udev has not seen it yet
+    bench.clock.sleep(0.05)
+    assert bench.write(servo, 0.2) == 1620.0
+    assert servo.counters() == {"servo_reconnects": 1}
+    servo.close()
+
+
+def test_a_reloaded_driver_is_found_under_its_new_number(bench: Bench) -> None:
+    servo = bench.servo()
+    bench.write(servo, 0.2)
+    bench.kernel.unload(PI5)
+    for _ in range(2):
+        with pytest.raises(ServoError):
+            servo.write(0.2)
+    with pytest.raises(ServoError):
+        servo.release()
+    bench.kernel.load(PI5, 7)
+    with pytest.raises(ServoError):
+        servo.write(0.2)
+    bench.clock.sleep(0.05)
+    assert bench.write(servo, 0.2) == 1620.0
+    servo.close()
+    assert bench.exported(7) == []
+
+
+def test_a_servo_that_is_not_there_at_start_is_found_later(bench: Bench) -> None:
+    bench.kernel.unload(PI5)
+    servo = bench.servo()
+    with pytest.raises(ServoError, match=r"no PWM chip 1f00098000.pwm or .* has 1f0009c000.pwm"):
+        servo.write(0.0)
+    bench.kernel.load(PI5, 1)
+    with pytest.raises(ServoError):
+        servo.write(0.0)
+    bench.clock.sleep(0.05)
+    assert bench.write(servo, 0.0) == 1500.0
+    servo.close()
+
+
+@pytest.mark.parametrize(
+    ("chips", "settings", "message"),
+    [
+        ({FAN: 4}, ServoSettings(), r"add dtoverlay=pwm-2chan to /boot/firmware/config.txt"),
+        ({}, ServoSettings(gpio=12), r"has none: add dtoverlay=pwm-2chan,pin=12,func=4,pin2=13"),
+        ({PI5: 4}, ServoSettings(gpio=17), r"^servo.gpio: GPIO 17 .*; 12, 13, 18, 19 have$"),
+        (
+            {FAN: 4},
+            ServoSettings(sysfs=SysfsPwmSettings(chip=FAN)),
+            r"^servo.sysfs.channel is missing: for chip 1f0009c000.pwm",
+        ),
+        (
+            {PI5: 4},
+            ServoSettings(sysfs=SysfsPwmSettings(channel=4)),
+            r"^servo.sysfs.channel: /sys/class/pwm/pwmchip0 has no channel 4$",
+        ),
+        (
+            {PI5: 4},
+            ServoSettings(sysfs=SysfsPwmSettings(root="/sys/nowhere")),
+            r"^no PWM chips can be found in /sys/nowhere: No such file",
+        ),
+    ],
+)
+def test_a_mistake_is_named_with_what_would_be_right(
+    chips: dict[str, int], settings: ServoSettings, message: str
+) -> None:
+    bench = Bench()
+    bench.kernel = SysfsPwm(bench.clock, chips)
+    servo = bench.servo(settings)
+    with pytest.raises(ServoError, match=message) as caught:
+        servo.write(0.0)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ServoError):
+        servo.neutralise()
+
+
+def test_a_channel_that_the_kernel_uses_itself_is_refused(bench: Bench) -> None:
+    bench.kernel.take(PI5, 2)
+    servo = bench.servo()
+    with pytest.raises(ServoError, match=r"channel 2 of .* is in use by a driver of the kernel"):
+        servo.write(0.0)

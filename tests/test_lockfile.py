@@ -1,0 +1,44 @@
+"""A lock that one process holds, and that its death ends."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fishd.lockfile import Taken, lock_path, locked
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from fishd.lockfile import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_lock_names_the_process_that_holds_it_and_ends_when_that_is_killed(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "control"
+    command = [sys.executable, "-c", HOLDER, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(Taken) as caught, locked(path):
+            pass
+        assert caught.value.pid == str(holder.pid)
+        holder.kill()
+    with locked(path):
+        assert lock_path(path).read_text() == f"{os.getpid()}\n"
+
+
+def test_a_holder_without_a_name_is_unknown(tmp_path: Path) -> None:
+    path = tmp_path / "control"
+    with locked(path):
+        lock_path(path).write_text("")
+        with pytest.raises(Taken) as caught, locked(path):
+            pass
+    assert caught.value.pid == "unknown"
