@@ -170,9 +170,9 @@ class ControlLoop:
         """Stop the pulses now, without waiting for a tick."""
         before = self.supervisor.mode
         self.supervisor.estop(message)
+        self._write(neutral=False)  # first of all
         self._rest()
         self.reporter.mode(before, self.supervisor, level="error")
-        self._write(neutral=False)
 
     def close(self) -> None:
         """Let go of the controller in command; nothing ticks after this."""
