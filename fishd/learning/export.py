@@ -74,7 +74,7 @@ def _swim(
     state = checkpoints.read_state(checkpoint)
     seen = state.latest
     if seen and state.on == "robot" and seen.steps == state.steps:
-        return Trial(seen.thrust, seen.frequency, seen.fullness)
+        return Trial(seen.thrust, seen.frequency, seen.fullness, card.tick)
     decide = Deterministic(policy, card.observation, card.amplitude)
     return in_simulation(_fish(checkpoint, card), decide, settings.evaluation)
 

@@ -17,6 +17,8 @@ from fishd.signals import Observation
 
 STALLED = 0.05
 """A mean |φ_c| below this share of Φ is no swimming."""
+CHATTER = 0.9
+"""Nor is it to reverse in more than this share of the ticks: the fin does not follow."""
 
 Decide = Callable[[Observation], float]
 """A policy: observation in, instruction angle out [rad]."""
@@ -31,18 +33,23 @@ class Trial(Struct, frozen=True):
     """Tail beats per second; 0 where the tail does not beat [Hz]."""
     fullness: float
     """Mean |φ_c|/Φ."""
+    tick: float
+    """Period of the loop [s]."""
 
     @property
     def stalled(self) -> bool:
-        """Does the policy hold still, or nearly so?"""
-        return self.frequency == 0.0 or self.fullness < STALLED
+        """Does the policy hold still, or nearly so, or reverse in nearly every tick?"""
+        reversals = 2.0 * self.frequency * self.tick
+        return self.frequency == 0.0 or self.fullness < STALLED or reversals > CHATTER
 
 
 def in_simulation(config: Config, decide: Decide, settings: EvaluationSettings) -> Trial:
     """A fresh fish as configured, not one of a randomised training, and with other noise."""
     other = replace(config.simulation, seed=config.simulation.seed + 1)
     found = judge(replace(config, simulation=other), decide, settings.seconds, settings.settle)
-    return Trial(float(found.mean_thrust), float(found.frequency), float(found.fullness))
+    return Trial(
+        float(found.mean_thrust), float(found.frequency), float(found.fullness), config.tick
+    )
 
 
 def worst_of_others(config: Config, decide: Decide, settings: TrainingSettings) -> float:
@@ -80,6 +87,7 @@ def on_link(
         thrust=float(np.mean(thrusts)),
         frequency=beat_frequency(shares, tick),
         fullness=float(np.mean(np.abs(shares))),
+        tick=tick,
     )
 
 

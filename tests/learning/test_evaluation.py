@@ -2,6 +2,7 @@
 
 import csv
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -122,3 +123,22 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     assert outcome.best_evaluation.worst == max(
         float(row["worst"]) for row in rows if row["stalled"] == "0"
     )
+
+
+@pytest.mark.parametrize(
+    ("decide", "stalls"),
+    [
+        (square_of_six_ticks, False),
+        (lambda _: 0.42, True),
+        (lambda seen: 0.01 * square_of_six_ticks(seen), True),
+        (lambda seen: -0.42 if seen.instruction_angle > 0.0 else 0.42, True),
+    ],
+    ids=["swims", "holds still", "hardly moves", "reverses in every tick"],
+)
+def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
+    decide: Callable[[Observation], float], stalls: bool
+) -> None:
+    pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
+    from fishd.learning.trials import in_simulation
+
+    assert in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
