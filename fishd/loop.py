@@ -151,6 +151,7 @@ class ControlLoop:
         self.controller_name = "hold"
         self.controller = Hold(HoldParameters(), self.limits)
         self._fresh = False
+        self._estimator.rest()
 
     def _attend_panel(self, slot: Slot) -> None:
         """Show the mode on the operator's panel, and stop at once while its button is pressed."""

@@ -44,7 +44,7 @@ class Operations:
         self._clock = clock
         self._telemetry = telemetry
         self._realtime = realtime
-        self._check_calibration = workbench.check_startable
+        self._workbench = workbench
         self._started = clock.monotonic()
         self._decisions = 0
         self._loading = 0
@@ -104,6 +104,7 @@ class Operations:
             telemetry=self._telemetry,
             servo_lost=loop.servo_lost,
             sensor_lost=loop.supervisor.sensor_lost,
+            calibrating=self._workbench.calibrating,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
@@ -114,7 +115,7 @@ class Operations:
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
-        self._check_calibration(wanted.name)
+        self._workbench.check_startable(wanted.name)
         if self._loading >= MOST_LOADING:
             raise Refused("busy", f"{self._loading} controllers are being loaded; try again")
         decision = self._decide()
@@ -137,7 +138,7 @@ class Operations:
             raise Refused(
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
-        self._check_calibration(wanted.name)
+        self._workbench.check_startable(wanted.name)
         self._loop.set_controller(wanted.name, controller)
         return self._state()
 
