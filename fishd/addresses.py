@@ -130,6 +130,12 @@ def bind(server: "zmq.Socket[Any]", address: str, key: str) -> None:
         server.close(linger=0)
         if error.errno == zmq.EADDRINUSE:
             why = "it is in use, by another fishd perhaps; stop that, or choose another address"
+        elif error.errno in (errno.ENODEV, errno.EADDRNOTAVAIL) and address.startswith("tcp://"):
+            host, _, port = address.removeprefix("tcp://").rpartition(":")
+            why = (
+                f"{host} is no address of this machine; write tcp://127.0.0.1:{port}, or "
+                f"tcp://0.0.0.0:{port} for all"
+            )
         else:
             why = f"{zmq.strerror(error.errno or 0)}; choose another address"
         raise StartupError(f"{key}: cannot listen on {address}: {why}") from None

@@ -98,13 +98,8 @@ def check_force_sensor(sensor: ForceSensorSettings) -> None:
 
 def check_servo(servo: ServoSettings, amplitude: float) -> None:
     """Each angle within ±Φ [rad] has a pulse, and the driver can send it on that pin."""
-    low, high = pulses.reach(servo)
-    if not low <= 0.0 <= high:
-        raise Problem(
-            ("servo", "trim"),
-            f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to 2500 µs",
-        )
-    _check_pulses(servo, amplitude)
+    check_neutral(servo)
+    check_pulses(servo, amplitude)
     if not re.fullmatch(r"\S+", servo.pigpio.host):
         raise Problem(
             ("servo", "pigpio", "host"),
@@ -125,7 +120,17 @@ def check_servo(servo: ServoSettings, amplitude: float) -> None:
         )
 
 
-def _check_pulses(servo: ServoSettings, amplitude: float) -> None:
+def check_neutral(servo: ServoSettings) -> None:
+    """Neutral has a pulse."""
+    low, high = pulses.reach(servo)
+    if not low <= 0.0 <= high:
+        raise Problem(
+            ("servo", "trim"),
+            f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to 2500 µs",
+        )
+
+
+def check_pulses(servo: ServoSettings, amplitude: float) -> None:
     """Pulse widths permit what Φ [rad] and the soft limits do; who wants less says so by those."""
     wanted = max(servo.lowest, -amplitude), min(servo.highest, amplitude)
     possible = pulses.widest(servo)

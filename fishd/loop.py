@@ -181,6 +181,7 @@ class ControlLoop:
     def _rest(self) -> None:
         """Put `hold` in command, at neutral."""
         self._swap("hold", Hold(HoldParameters(), self.limits), fresh=False)
+        self._estimator.rest()
 
     def _swap(self, name: str, controller: Controller[Any], *, fresh: bool) -> None:
         former = self.controller

@@ -49,7 +49,7 @@ class Operations:
         self._clock = clock
         self._telemetry = telemetry
         self._realtime = realtime
-        self._check_calibration = workbench.check_startable
+        self._workbench = workbench
         self._started = clock.monotonic()
         self._decisions = 0
         self._loading = 0
@@ -110,6 +110,7 @@ class Operations:
             telemetry=self._telemetry,
             servo_lost=loop.servo_lost,
             sensor_lost=loop.supervisor.sensor_lost,
+            calibrating=self._workbench.calibrating,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
@@ -125,7 +126,7 @@ class Operations:
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
-        self._check_calibration(wanted.name)
+        self._workbench.check_startable(wanted.name)
         self._check_busy()
         decision = self._decide()
         try:
@@ -145,7 +146,7 @@ class Operations:
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
         try:
-            self._check_calibration(wanted.name)
+            self._workbench.check_startable(wanted.name)
             self._loop.set_controller(wanted.name, controller)
         except Refused:  # a fault since, or a calibration
             controller.close()

@@ -125,13 +125,15 @@ class ServoLoan(Struct, frozen=True, forbid_unknown_fields=True):
 class Calibrations(Struct, frozen=True):
     """The calibrations in force, and their files; null where they come from the configuration.
 
-    `loan` is null unless that of the servo is in force for a loan only.
+    `loan` is null unless that of the servo is in force for a loan only. A force beyond
+    ±`force_limit` [N] is not believed.
     """
 
     force: ForceCalibration
     force_file: str | None
     servo: ServoCalibration
     servo_file: str | None
+    force_limit: float
     loan: str | None = None
 
 

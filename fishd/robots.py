@@ -17,12 +17,12 @@ from fishd.errors import SensorError
 from fishd.hardware import ownership, pulses
 from fishd.hardware.base import Bench, CalibratedServo, Panel, Robot
 from fishd.hardware.calibration import (
-    CalibrationFolder,
     ForceCalibration,
     ServoCalibration,
     as_configured,
     calibrated,
 )
+from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.packages import driver_packages
 from fishd.hardware.simulated import SimulatedFish
 from fishd.signals import Truth
@@ -155,7 +155,10 @@ def _assemble(
     from fishd.hardware.ads1115 import Ads1115Sensor
 
     panel = _open_panel(config, clock, stack)
-    found = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
+    folder = CalibrationFolder(state_folder(config))
+    found = folder.newest(ForceCalibration)
+    for line in folder.ignored():
+        log.warning("%s", line)
     sensor = Ads1115Sensor(
         config.force_sensor,
         found[0] if found else ForceCalibration(),
@@ -171,19 +174,15 @@ def _assemble(
 
     if left := pulses.cut(config.servo, config.amplitude_limit):
         log.info("servo.lowest and servo.highest permit %s, amplitude_limit", left)
+    if line := _cut_by_calibration(config, servo.calibration):
+        log.warning("%s", line)
 
     def degraded() -> tuple[str, ...]:
         lines = servo.degraded
-        if not sensor.calibration.date:
+        if sensor.calibration.untouched:
             lines += ("the force is not calibrated: fishctl calibrate force",)
-        left = pulses.cut(calibrated(config.servo, servo.calibration), config.amplitude_limit)
-        if left and servo.calibration != as_configured(config.servo):
-            date = servo.calibration.date or "no date"
-            lines += (
-                f"the servo's calibration of {date} permits {left}, amplitude_limit: "
-                "fishctl calibrate servo",
-            )
-        return lines
+        cut = _cut_by_calibration(config, servo.calibration)
+        return (*lines, cut) if cut else lines
 
     return Robot(
         name=config.robot,
@@ -195,6 +194,17 @@ def _assemble(
         degraded=degraded,
         counters=lambda: {**sensor.counters(), **servo.counters()},
         countdown=servo.countdown,
+    )
+
+
+def _cut_by_calibration(config: Config, calibration: ServoCalibration) -> str:
+    """A line about a calibration of the servo with which it cannot go to ±Φ; empty if it can."""
+    left = pulses.cut(calibrated(config.servo, calibration), config.amplitude_limit)
+    if not left or calibration == as_configured(config.servo):
+        return ""
+    return (
+        f"the servo's calibration of {calibration.date or 'no date'} permits {left}, "
+        "amplitude_limit: fishctl calibrate servo"
     )
 
 

@@ -7,6 +7,7 @@ import asyncio
 import secrets
 
 from fishd.clock import Clock
+from fishd.config_checks import check_neutral, check_pulses
 from fishd.errors import Refused
 from fishd.hardware import pulses
 from fishd.hardware.base import Bench
@@ -14,6 +15,7 @@ from fishd.hardware.calibration import ServoCalibration, calibrated
 from fishd.hardware.settings import ServoSettings
 from fishd.loop import ControlLoop
 from fishd.protocol import LOAN
+from fishd.schema import Problem
 from fishd.supervisor import Mode
 
 _WATCH = 0.1
@@ -74,8 +76,11 @@ class ServoBench:
                 f"or for {LOAN:g} s after it was given up",
             )
 
-    def check(self, calibration: ServoCalibration, loan: str | None) -> None:
-        """Raises `Refused` unless whoever has this loan may put that in force just now."""
+    def check(self, calibration: ServoCalibration, loan: str | None, *, keep: bool) -> None:
+        """Raises `Refused` unless whoever has this loan may put that in force just now.
+
+        keep: for good, so that its pulses must do what a configuration's must; a loan is for trying
+        """
         bench = resting_bench(self._loop)
         if loan is not None:
             self._mine(loan)
@@ -86,13 +91,13 @@ class ServoBench:
                 f"{LOAN:g} s after it was given up",
             )
         servo = calibrated(self._settings, calibration)
+        try:
+            check_neutral(servo)
+            if keep:
+                check_pulses(servo, self._loop.limits.amplitude)
+        except Problem as problem:
+            raise Refused("bad-arguments", f"{problem.path[-1]}: {problem}") from None
         lowest, highest = pulses.reach(servo)
-        if not lowest <= 0.0 <= highest:
-            raise Refused(
-                "bad-arguments",
-                f"neutral would be a pulse of {servo.centre + servo.trim:g} µs, beyond 500 to "
-                "2500 µs",
-            )
         present, angle = bench.servo.calibration, self._loop.applied
         same = (calibration.direction, calibration.scale) == (present.direction, present.scale)
         if not (lowest <= angle <= highest and (same or angle == 0.0)):

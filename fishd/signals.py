@@ -223,5 +223,7 @@ class Status(Struct, frozen=True):
     """Address of the telemetry socket."""
     servo_lost: bool = False
     """True while the servo cannot be reached; with `servo_on`, it may still have pulses."""
+    calibrating: bool = False
+    """True while a client has the servo on loan, to calibrate it."""
     sensor_lost: bool = False
     """True while there is no force to believe; `thrust` is then that of the time before."""

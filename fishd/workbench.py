@@ -14,13 +14,8 @@ from fishd.clock import Clock
 from fishd.config import Config
 from fishd.errors import ConfigError, Refused
 from fishd.hardware.base import Bench
-from fishd.hardware.calibration import (
-    C,
-    CalibrationFolder,
-    ForceCalibration,
-    ForceSample,
-    ServoCalibration,
-)
+from fishd.hardware.calibration import C, ForceCalibration, ForceSample, ServoCalibration
+from fishd.hardware.calibration_files import CalibrationFolder, check
 from fishd.loop import ControlLoop
 from fishd.protocol import (
     FRESH,
@@ -32,7 +27,11 @@ from fishd.protocol import (
     ServoLoan,
     Tare,
 )
+from fishd.schema import Problem
 from fishd.servo_bench import ServoBench, resting_bench
+
+_GLANCE = 0.2
+"""How long the present force is looked at before another calibration is put in force [s]."""
 
 Operations = dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]]
 """What can be asked for: the arguments, and what answers."""
@@ -67,6 +66,11 @@ class Workbench:
         self.check_startable = self._servo.check_startable
         """Raises `Refused` while a controller of that name must not take over."""
 
+    @property
+    def calibrating(self) -> bool:
+        """True while a client has the servo on loan."""
+        return self._servo.loan is not None
+
     async def _calibrations(self, _: NoArguments) -> Calibrations:
         bench = self._bench()
         return Calibrations(
@@ -75,6 +79,7 @@ class Workbench:
             servo=bench.servo.calibration,
             servo_file=self._servo_file,
             loan=self._servo.loan,
+            force_limit=self._sensor.force_limit,
         )
 
     async def _sample_force(self, wanted: SampleForce) -> ForceSample:
@@ -137,12 +142,27 @@ class Workbench:
             )
 
     async def _calibrate_force(self, wanted: CalibrateForce) -> Calibrations:
-        calibration = wanted.calibration
-        if calibration.singular:
-            numbers = (calibration.xx, calibration.xy, calibration.yx, calibration.yy)
-            raise Refused("bad-arguments", f"the matrix {numbers} says the same of both forces")
+        calibration = _sensible(wanted.calibration)
         async with self._changing:
+            await self._check_present_force(calibration)
             return await self._adopt_force(calibration)
+
+    async def _check_present_force(self, calibration: ForceCalibration) -> None:
+        """Of what the sensor says now, the calibration must not make a fault in the next ticks."""
+        watch = resting_bench(self._loop).sensor.watch()
+        try:
+            await asyncio.sleep(_GLANCE)
+        finally:
+            sample = watch.close()
+        fx, fy = calibration.forces(sample.vx, sample.vy)
+        limit = self._sensor.force_limit
+        if sample.pairs and max(abs(fx), abs(fy)) > limit:
+            raise Refused(
+                "too-large",
+                f"({fx:.4g}, {fy:.4g}) N would be the present force, beyond "
+                f"force_sensor.force_limit, {limit:g} N; were the loads in another unit, such as "
+                "grams? Else take off what pulls at the fish",
+            )
 
     async def _adopt_force(self, calibration: ForceCalibration) -> Calibrations:
         resting_bench(self._loop)
@@ -155,11 +175,11 @@ class Workbench:
 
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
         async with self._changing:
-            calibration = wanted.calibration
-            self._servo.check(calibration, wanted.loan)
+            calibration = _sensible(wanted.calibration)
+            self._servo.check(calibration, wanted.loan, keep=wanted.save)
             if wanted.save:
                 calibration, path = await self._save(calibration)
-                self._servo.check(calibration, wanted.loan)
+                self._servo.check(calibration, wanted.loan, keep=True)
                 self._servo.keep(calibration)
                 self._servo_file = str(path)
                 self._announce("servo", path)
@@ -202,3 +222,12 @@ class Workbench:
 
     def _announce(self, what: str, path: Path) -> None:
         self._loop.reporter.event("calibration", f"{what}: {path}", file=str(path))
+
+
+def _sensible(calibration: C) -> C:
+    """The same calibration; raises `Refused` where it is one that a file could not hold."""
+    try:
+        return check(calibration)
+    except Problem as problem:
+        where = ".".join(problem.path) + ": " if problem.path else ""
+        raise Refused("bad-arguments", f"{where}{problem}") from None

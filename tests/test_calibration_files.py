@@ -1,6 +1,9 @@
 """The dated files that calibrations are kept in: never overwritten, the newest in force."""
 
+import contextlib
 import datetime
+import resource
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,7 +11,8 @@ import yaml
 from msgspec import Struct, inspect
 
 from fishd.errors import ConfigError
-from fishd.hardware.calibration import CalibrationFolder, ForceCalibration, ServoCalibration
+from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.settings import ServoSettings
 
 NOON = datetime.datetime(2026, 11, 21, 12, 0, 0, tzinfo=datetime.UTC)
@@ -67,7 +71,7 @@ def test_a_broken_file_is_an_error_and_no_older_one_is_taken_for_it(
 ) -> None:
     folder = CalibrationFolder(tmp_path)
     folder.save(ForceCalibration(xx=1.0), NOON)
-    newer = tmp_path / "force-2027.yaml"
+    newer = tmp_path / "force-2027-01-01T000000.000000Z.yaml"
     newer.write_text(text)
     with pytest.raises(ConfigError) as refusal:
         folder.newest(ForceCalibration)
@@ -83,7 +87,7 @@ SERVO = {"trim": 0.0, "direction": 1, "scale": 600.0, "lowest": -1.2, "highest":
 def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], text: str) -> str:
     """What is said of a file with this text."""
     name = "force" if kind is ForceCalibration else "servo"
-    path = folder / f"{name}-2027.yaml"
+    path = folder / f"{name}-2027-01-01T000000.000000Z.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as refusal:
         CalibrationFolder(folder).newest(kind)
@@ -124,6 +128,10 @@ def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
         (ForceCalibration, FORCE, {"xx": "lots"}, "xx: 'lots' is not valid"),
         (ForceCalibration, FORCE, {"xxx": 1.0}, "xxx: unknown key"),
         (ForceCalibration, FORCE, {"date": ""}, "date: '' is not when it was made"),
+        (ForceCalibration, FORCE, {"date": "soon"}, "date: 'soon' is no date: one in ISO 8601"),
+        (ForceCalibration, FORCE, {"date": "2026-02-30"}, "date: '2026-02-30' is no date"),
+        (ForceCalibration, FORCE, {"tared": "today"}, "tared: 'today' is no date"),
+        (ServoCalibration, SERVO, {"date": "21.11.2026"}, "date: '21.11.2026' is no date"),
         (ForceCalibration, FORCE, {"xx": 0.0, "yy": 0.0}, "says the same of both forces"),
         (ForceCalibration, FORCE, {"xy": 2.0, "yx": 0.5}, "says the same of both forces"),
         (ForceCalibration, FORCE, {"xy": 1e-9, "xx": 1e-9}, "says the same of both forces"),
@@ -163,5 +171,66 @@ def test_a_folder_that_cannot_be_read_is_an_error_and_not_no_calibration(tmp_pat
 
 
 def test_what_is_half_written_is_not_a_calibration(tmp_path: Path) -> None:
-    (tmp_path / "force-2027.part").write_text("xx: ")
+    (tmp_path / "force-2027-01-01T000000.000000Z.part").write_text("xx: ")
     assert CalibrationFolder(tmp_path).newest(ForceCalibration) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "force-backup.yaml",
+        "force-2027.yaml",
+        "force-2027-01-01T000000.000000Z-old.yaml",
+        "force-2027-01-01T000000.000000Z (copy).yaml",
+        "force-2027-02-30T000000.000000Z.yaml",
+        "force-2027-01-01T250000.000000Z.yaml",
+        "servo-of-the-old-fish.yaml",
+    ],
+)
+def test_a_file_without_a_date_in_its_name_is_ignored_and_told_about(
+    tmp_path: Path, name: str
+) -> None:
+    folder = CalibrationFolder(tmp_path)
+    force, _ = folder.save(ForceCalibration(xx=2.0), NOON)
+    servo, _ = folder.save(ServoCalibration(trim=3.0), NOON)
+    assert folder.ignored() == []
+    (tmp_path / name).write_text("xx: 7.0\n")
+    found = folder.newest(ForceCalibration), folder.newest(ServoCalibration)
+    assert [each and each[0] for each in found] == [force, servo]
+    line = f"{tmp_path / name} is no dated calibration file and is ignored"
+    assert folder.ignored() == [line]
+    _, path = folder.save(ForceCalibration(xx=3.0), NOON + HOUR)
+    assert path.name == "force-2026-11-21T130000.000000Z.yaml"
+
+
+def test_what_a_clock_that_went_back_has_named_counts(tmp_path: Path) -> None:
+    folder = CalibrationFolder(tmp_path)
+    for _ in range(4):
+        _, path = folder.save(ForceCalibration(), NOON)
+    assert path.stem.endswith("Z+++")
+    assert folder.ignored() == []
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """No file can be given a byte, but made."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_save_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    folder = CalibrationFolder(tmp_path)
+    with full_disk(), pytest.raises(OSError, match="too large"):
+        folder.save(ForceCalibration(), NOON)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_volts_count_as_newtons_until_a_matrix_was_found_whatever_was_tared() -> None:
+    assert ForceCalibration().untouched
+    assert ForceCalibration(x0=0.1, tared="2026-11-21", date="2026-11-21").untouched
+    assert not ForceCalibration(loads=5).untouched
+    assert not ForceCalibration(xx=2.0).untouched

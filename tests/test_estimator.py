@@ -88,6 +88,16 @@ def test_a_tail_that_stops_is_noticed_after_twice_its_longest_half_beat() -> Non
     assert beats([5] * 10 + [14]).frequency == 0.0
 
 
+def test_a_tail_that_is_brought_to_rest_does_not_beat_and_keeps_its_mean_force() -> None:
+    beat = beats([5] * 10)
+    thrust = beat.thrust
+    beat.rest()
+    assert (beat.frequency, beat.thrust) == (0.0, thrust)
+    for angle in (0.3, 0.2, 0.1, 0.0, 0.0):
+        beat.update(angle, 0.02, DT)
+        assert beat.frequency == 0.0
+
+
 def test_a_new_frequency_is_followed() -> None:
     slow = beats([5] * 20 + [8] * 30)
     assert slow.frequency == pytest.approx(1 / 0.8)

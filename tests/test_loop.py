@@ -308,3 +308,17 @@ def test_the_wrapped_robot_of_these_tests_changes_nothing() -> None:
         rig.start("swing")
         rig.run(50)
     assert plain.recorder.ticks == wrapped.recorder.ticks
+
+
+@pytest.mark.parametrize("how", ["stop", "estop", "fault"])
+def test_a_tail_that_nobody_moves_has_no_frequency(how: str) -> None:
+    rig, wrapped = fragile_rig()
+    rig.start("square", frequency=0.5)
+    assert rig.run_for(10)[-1].frequency > 0.4
+    if how == "fault":
+        wrapped.read_error = SensorError("no answer")
+        rig.run(3)
+    else:
+        rig.loop.stop() if how == "stop" else rig.loop.estop("a test")
+    assert rig.mode == {"stop": "idle"}.get(how, how)
+    assert all(tick.frequency == 0.0 for tick in rig.run_for(5))

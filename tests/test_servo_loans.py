@@ -119,6 +119,17 @@ def test_a_loan_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> N
     tell(rig, story)
 
 
+def test_status_tells_that_the_servo_is_on_loan(rig: LockstepRig) -> None:
+    async def story(client: Client) -> None:
+        assert not (await client.ask("status")).calibrating
+        loan = (await client.calibrate(WIDE)).loan
+        assert (await client.ask("status")).calibrating
+        await client.calibrate(WIDE, save=True, loan=loan)
+        assert not (await client.ask("status")).calibrating
+
+    tell(rig, story)
+
+
 def test_a_loan_that_is_given_back_ends_at_once_and_without_a_warning(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo

@@ -63,6 +63,18 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
     assert Path(after.force_file).exists()
 
 
+def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> None:
+    not_calibrated = "the force is not calibrated: fishctl calibrate force"
+    bench = workbench(rig)
+    perform(rig, bench, ("tare", BRIEFLY))
+    assert not_calibrated in rig.robot.degraded()
+    with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
+        assert not_calibrated in again.robot.degraded()
+    fitted = ForceCalibration(x0=-0.2, loads=5)
+    perform(rig, bench, ("calibrate-force", CalibrateForce(fitted)))
+    assert not_calibrated not in rig.robot.degraded()
+
+
 def test_two_tares_at_the_same_time_are_one(rig: LockstepRig) -> None:
     bench = workbench(rig)
     perform(rig, bench, ("tare", BRIEFLY), ("tare", BRIEFLY), ("tare", SampleForce(seconds=0.3)))
@@ -188,8 +200,58 @@ def test_a_matrix_that_says_the_same_of_both_forces_is_refused(
         perform(rig, workbench(rig), request)
 
 
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 4.0])
 def test_a_matrix_is_judged_by_its_shape_and_not_by_its_size(rig: LockstepRig, size: float) -> None:
     matrix = ForceCalibration(xx=size, xy=0.1 * size, yx=-0.1 * size, yy=8.0 * size)
     (after,) = perform(rig, workbench(rig), ("calibrate-force", CalibrateForce(matrix)))
     assert after.force.yy == 8.0 * size
+
+
+def test_a_calibration_that_would_be_a_fault_at_once_is_refused_before_it_is_saved(
+    rig: LockstepRig,
+) -> None:
+    bench = workbench(rig)
+    with pytest.raises(Refused, match=r"beyond force_sensor.force_limit, 10 N.*grams") as refusal:
+        perform(rig, bench, ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0))))
+    assert refusal.value.code == "too-large"
+    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    assert (found.force_file, found.force_limit) == (None, 10.0)
+    good = ForceCalibration(xx=100.0, x0=-20.0)
+    perform(rig, bench, ("calibrate-force", CalibrateForce(good)))
+
+
+def test_a_calibration_can_be_saved_while_the_sensor_says_nothing(rig: LockstepRig) -> None:
+    rig.pi.faults.inject("unplugged")
+    rig.run_until_fault(3.0)
+    request = ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0)))
+    (after,) = perform(rig, workbench(rig), request)
+    assert after.force.xx == 100.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scale": 4000.0}, "scale: 4000 is not valid: .*; at most 2380 µs/rad is needed"),
+        ({"trim": 500.0, "scale": 1500.0}, "trim: 500 is not valid: .* from 1130 to 1870 µs is"),
+        ({"trim": -490.0, "scale": 1500.0, "direction": -1, "lowest": -0.2}, "trim: -490 is not"),
+    ],
+    ids=["scale", "trim", "direction"],
+)
+def test_a_servo_calibration_is_saved_only_if_the_configuration_would_take_it(
+    rig: LockstepRig, change: dict[str, Any], words: str
+) -> None:
+    bench = workbench(rig)
+    calibration = replace(ServoCalibration(), **change)
+    with pytest.raises(Refused, match=f"^{words}") as refusal:
+        perform(rig, bench, ("calibrate-servo", CalibrateServo(calibration, save=True)))
+    assert refusal.value.code == "bad-arguments"
+    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    assert (found.servo, found.servo_file) == (ServoCalibration(), None)
+    within = replace(calibration, lowest=-0.1, highest=0.0)  # who wants less says so
+    perform(rig, bench, ("calibrate-servo", CalibrateServo(within, save=True)))
+
+
+def test_a_date_that_a_file_could_not_hold_is_refused(rig: LockstepRig) -> None:
+    request = ("calibrate-force", CalibrateForce(ForceCalibration(tared="today")))
+    with pytest.raises(Refused, match="tared: 'today' is no date: one in ISO 8601 is needed"):
+        perform(rig, workbench(rig), request)

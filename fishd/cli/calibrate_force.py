@@ -67,14 +67,21 @@ def force(
     missing = missing_loads([(step.fx, step.fy) for step in steps])
     if steps and missing:
         raise PoorLoads(f"{plan}: {', '.join(missing)}")
+    measured = any(step.volts for step in steps)
+    if measured and record:
+        raise click.UsageError(
+            f"--record keeps what is measured now, but {plan} holds loads measured earlier; give "
+            "one of the two"
+        )
     with Fish(endpoint) as fish:
-        fish.calibrations()  # refused for a robot that has nothing to calibrate
+        limit = fish.calibrations().force_limit  # refused where there is nothing to calibrate
+        load_files.check_limit(steps, limit)
         try:
-            if any(step.volts for step in steps):
+            if measured:
                 names = [f"load {n}" for n in range(1, len(steps) + 1)]
                 fitted = _fitted(names, [(s.fx, s.fy, *(s.volts or ())) for s in steps])
             else:
-                dialogue = Dialogue(fish, unit, seconds, record)
+                dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
                 fitted = _fitted_with_help(dialogue)
             good = yes or click.confirm("Put this calibration in force, and save it?")

@@ -100,6 +100,7 @@ def _find_limit(tail: Tail, side: int) -> None:
         f"{5 * LIMIT_STEP:g} rad; ok where it may go no further, keep for {was:+g} rad as it was."
     )
     tail.adjust(**{key: side * WIDEST})
+    end = abs(tail.reach[side > 0])
     limit = was
     for order in orders(lambda: f"{key} {tail.angle:+.2f} rad", "keep"):
         if isinstance(order, int):
@@ -117,6 +118,9 @@ def _find_limit(tail: Tail, side: int) -> None:
         else:
             limit = round(tail.angle, 4) if order == "ok" else was
             break
+    if end < tail.amplitude and abs(limit) > end:
+        limit = side * math.floor(end * 1e4) / 1e4
+        click.echo(f"  {key} is {limit:+g} rad now, where the pulses of a servo end")
     tail.neutral()
     tail.adjust(**{key: limit})
 

@@ -160,6 +160,7 @@ def _status_text(status: Status) -> str:
         ("late", _percentiles(timing.lateness)),
         ("busy", _percentiles(timing.busy)),
         *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
+        *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         ("robot", status.robot),
         *(("degraded", line) for line in status.degraded),
         *([("survived", spelled(survived))] if survived else []),

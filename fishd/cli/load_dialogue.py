@@ -42,12 +42,16 @@ class _Measured(NamedTuple):
 class Dialogue:
     """Guides through the loads and keeps what was measured."""
 
-    def __init__(self, fish: Fish, unit: str, seconds: float, record: Path | None) -> None:
+    def __init__(
+        self, fish: Fish, unit: str, seconds: float, record: Path | None, limit: float
+    ) -> None:
+        """limit: no load is larger, along x or y [N]"""
         self._fish = fish
         self._unit = unit
         self._newtons = NEWTONS[unit]
         self._seconds = seconds
         self._record = record
+        self._limit = limit
         self._measured: list[_Measured] = []
         self._usual = 0.0  # size of the latest load, in the unit
 
@@ -82,7 +86,8 @@ class Dialogue:
                 del self._measured[places[dropped]]
                 self._write()
             elif extra := self._parsed(answer):
-                self._add(self._spelled(extra), "hang it", partial(_given, extra))
+                if self._possible(*extra):
+                    self._add(self._spelled(extra), "hang it", partial(_given, extra))
             else:
                 names = ", ".join(places)
                 click.echo(f"  two numbers, such as 10 -5, or one of {names} is needed", err=True)
@@ -122,9 +127,18 @@ class Dialogue:
     def _ask_size(self, x: int, y: int) -> tuple[float, float]:
         if not (x or y):
             return 0.0, 0.0
-        size = _number(f"  load [{self._unit}]", self._usual or None)
-        self._usual = size
-        return x * size * self._newtons, y * size * self._newtons
+        while True:
+            size = _number(f"  load [{self._unit}]", self._usual or None)
+            if self._possible(size * self._newtons, 0.0):
+                self._usual = size
+                return x * size * self._newtons, y * size * self._newtons
+
+    def _possible(self, fx: float, fy: float) -> bool:
+        """Is it a load [N] that the sensor will believe? If not, that is said."""
+        if why := load_files.beyond(fx, fy, self._limit):
+            hint = "; did you mean --unit g?" if self._unit == "N" else ""
+            click.echo(f"  {why}{hint}", err=True)
+        return not why
 
     def _parsed(self, answer: str) -> tuple[float, float] | None:
         """A load of the operator's own [N]; None where that is none."""

@@ -22,6 +22,26 @@ class Step(NamedTuple):
     fx: float
     fy: float
     volts: tuple[float, float] | None
+    where: str
+    """File and line."""
+    unit: str
+    """That the forces are given in."""
+
+
+def beyond(fx: float, fy: float, limit: float) -> str:
+    """Why a load [N] is none for a sensor that believes forces within ±`limit`; empty if it is."""
+    largest = max(fx, fy, key=abs)
+    if abs(largest) <= limit:
+        return ""
+    return f"{largest:.4g} N is beyond force_sensor.force_limit, {limit:g} N"
+
+
+def check_limit(steps: Sequence[Step], limit: float) -> None:
+    """Raises `click.ClickException` for the first load that is `beyond` the limit [N]."""
+    for step in steps:
+        if why := beyond(step.fx, step.fy, limit):
+            hint = "; are these grams? Then name the columns fx_g,fy_g" if step.unit == "N" else ""
+            raise click.ClickException(f"{step.where}: {why}{hint}")
 
 
 def read(path: Path, unit: str) -> list[Step]:
@@ -80,6 +100,7 @@ def _columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, fl
 
 def _step(where: str, row: dict[str, str], columns: dict[str, tuple[str, float]]) -> Step:
     values = {}
+    unit = "N" if {columns["fx"][1], columns["fy"][1]} == {1.0} else "g"
     for quantity, (column, factor) in columns.items():
         text = row[column]
         try:
@@ -89,4 +110,4 @@ def _step(where: str, row: dict[str, str], columns: dict[str, tuple[str, float]]
         if not math.isfinite(values[quantity]):
             raise click.ClickException(f"{where}: {column}: '{text or ''}' is not a number")
     volts = (values["vx"], values["vy"]) if "vx" in values else None
-    return Step(values["fx"], values["fy"], volts)
+    return Step(values["fx"], values["fy"], volts, where, unit)

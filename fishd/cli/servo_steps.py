@@ -84,6 +84,12 @@ class Tail:
             time.sleep(PAUSE)
         return True
 
+    @property
+    def reach(self) -> tuple[float, float]:
+        """The lowest and highest angle that Φ, limits and pulses permit now [rad]."""
+        status = self._fish.status()
+        return status.lowest, status.highest
+
     def neutral(self) -> None:
         """Fade to neutral, and wait until the tail is there."""
         self._fish.stop()

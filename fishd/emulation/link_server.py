@@ -114,6 +114,8 @@ class LinkServer:
         with connection:
             try:
                 while packet := connection.recv(PACKET):
+                    if _has_hung_up(connection):  # what it asked for, it was told is not done
+                        break
                     connection.send(encode(self._answer(decode, packet)))
             except OSError:  # the client went away before it had its reply
                 pass
@@ -152,6 +154,13 @@ class LinkServer:
 
 def _message(spoken: bytes | int) -> Message:
     return Read(spoken) if isinstance(spoken, int) else Write(spoken)
+
+
+def _has_hung_up(connection: socket.socket) -> bool:
+    try:
+        return not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
 
 
 def _shut(connection: socket.socket) -> None:

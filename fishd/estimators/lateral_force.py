@@ -47,6 +47,10 @@ class LateralForceEstimator:
         self._fy = 0.0
         self._beat = TailBeat()
 
+    def rest(self) -> None:
+        """Note that nobody moves the tail any more: it does not beat."""
+        self._beat.rest()
+
     def update(
         self, measurement: Measurement, instruction_angle: float, time: float, dt: float
     ) -> Observation:

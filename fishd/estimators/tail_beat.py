@@ -16,18 +16,18 @@ class TailBeat:
     def __init__(self, span: float = 4.0) -> None:
         """`span` bounds the time that the means look back [s]; they cover at least one beat."""
         self._span = span
-        self.reset()
+        self.thrust = 0.0
+        """Mean force over the same beats; over the last second or so when not beating [N]."""
+        self.rest()
 
-    def reset(self) -> None:
-        """Forget all beats."""
+    def rest(self) -> None:
+        """Forget all beats, but not the mean force."""
         self._halves: deque[tuple[float, float]] = deque()  # (duration [s], impulse [N s])
         self._side = 0.0
         self._open: tuple[float, float] | None = None
         self._longest = 0.0
         self.frequency = 0.0
         """Beats per second over the latest whole beats; 0 when not beating [Hz]."""
-        self.thrust = 0.0
-        """Mean force over the same beats; over the last second or so when not beating [N]."""
 
     def update(self, angle: float, force: float, duration: float) -> None:
         """Add a window.

@@ -1,21 +1,12 @@
-"""Calibrations of force sensor and servo, and the dated files that they are kept in.
+"""Calibrations of force sensor and servo: what voltages and angles are believed to mean."""
 
-A file is never overwritten; the newest one of a kind is in force.
-"""
-
-import datetime
 import math
-import os
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
-from fishd import strict_yaml
-from fishd.errors import ConfigError
 from fishd.hardware.settings import ServoSettings
-from fishd.schema import Problem, convert
 
 WORST_CONDITION = 1e5
 """A matrix of a larger condition number says the same of both forces; that of a fit is less."""
@@ -49,6 +40,11 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             self.xx * vx + self.xy * vy + self.x0,
             self.yx * vx + self.yy * vy + self.y0,
         )
+
+    @property
+    def untouched(self) -> bool:
+        """True while nobody found the matrix, and volts count as newtons; a tare does not."""
+        return self.loads == 0 and (self.xx, self.xy, self.yx, self.yy) == (1.0, 0.0, 0.0, 1.0)
 
     @property
     def singular(self) -> bool:
@@ -122,101 +118,3 @@ class ForceSample(Struct, frozen=True):
 
 
 C = TypeVar("C", ForceCalibration, ServoCalibration)
-
-_STAMP = "%Y-%m-%dT%H%M%S.%fZ"
-_NAMES: dict[type[Struct], str] = {ForceCalibration: "force", ServoCalibration: "servo"}
-_REQUIRED: dict[type[Struct], tuple[str, ...]] = {
-    ForceCalibration: ("xx", "xy", "x0", "yx", "yy", "y0", "date"),
-    ServoCalibration: ("trim", "direction", "scale", "lowest", "highest"),
-}
-_REMEDY = "mend it, or move it away"
-
-
-class CalibrationFolder:
-    """The folder with the dated files of one robot."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def newest(self, kind: type[C]) -> tuple[C, Path] | None:
-        """The calibration in force and its file; None where none was ever saved.
-
-        Raises `ConfigError` where the folder cannot be read, or the newest file cannot, is not
-        whole or makes no sense: an older one, or a default, would be wrong silently.
-        """
-        names = self._names(kind)
-        if not names:
-            return None
-        path = self.folder / names[-1]
-        try:
-            return _checked(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
-        except strict_yaml.YamlProblem as problem:
-            raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
-        except Problem as problem:
-            where = ".".join(problem.path) + ": " if problem.path else ""
-            raise ConfigError(f"{path}: {where}{problem}; {_REMEDY}") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read: {error}") from None
-
-    def save(self, calibration: C, now: datetime.datetime) -> tuple[C, Path]:
-        """Write a new file, dated `now`; the calibration with its date, and the path.
-
-        Raises OSError when it cannot be written, and `ConfigError` as `newest` does. An older file
-        is never touched, and the new one sorts after it, even where the clock went back.
-        """
-        import yaml
-
-        dated = msgspec.structs.replace(calibration, date=now.isoformat(timespec="seconds"))
-        self.folder.mkdir(parents=True, exist_ok=True)
-        stem = f"{_NAMES[type(calibration)]}-{now.astimezone(datetime.UTC):{_STAMP}}"
-        names = self._names(type(calibration))
-        if names and stem <= Path(names[-1]).stem:
-            stem = f"{Path(names[-1]).stem}+"
-        path = self.folder / f"{stem}.yaml"
-        text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
-        temporary = path.with_suffix(".part")
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        path.hardlink_to(temporary)  # unlike a rename, never onto another file
-        temporary.unlink()
-        folder = os.open(self.folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # else a power cut takes the name away again
-        finally:
-            os.close(folder)
-        return dated, path
-
-    def _names(self, kind: type[C]) -> list[str]:
-        """The files of a kind, oldest first."""
-        try:
-            found = [path.name for path in self.folder.iterdir()]
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise ConfigError(f"{self.folder}: cannot be read: {error.strerror}") from None
-        start = f"{_NAMES[kind]}-"
-        names = [name for name in found if name.startswith(start) and name.endswith(".yaml")]
-        return sorted(names, key=lambda name: Path(name).stem)
-
-
-def _checked(data: Any, kind: type[C]) -> C:
-    """The calibration that a file holds; raises `Problem` unless it is whole and makes sense."""
-    if not data:
-        raise Problem((), "there is nothing in this file")
-    if not isinstance(data, dict):
-        raise Problem((), "a mapping of keys to values is needed")
-    missing = [key for key in _REQUIRED[kind] if key not in data]
-    if missing:
-        raise Problem((), f"without {', '.join(missing)}: nothing is filled in")
-    calibration = convert(data, kind)
-    for key, value in msgspec.structs.asdict(calibration).items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise Problem((key,), f"{value} is not a finite number")
-    if isinstance(calibration, ForceCalibration):
-        if not calibration.date:
-            raise Problem(("date",), "'' is not when it was made")
-        if calibration.singular:
-            raise Problem((), "the matrix xx xy, yx yy says the same of both forces")
-    return calibration

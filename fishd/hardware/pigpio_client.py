@@ -19,6 +19,10 @@ FAILURES = (OSError, struct.error, pigpio.error, UnicodeError)
 """What a command raises; the client is then good for nothing more."""
 
 
+_UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
+_TAKEN_AWAY = "somebody else took fishd's script away, as 'fishctl release' does"
+
+
 class TimedSocket:
     """A socket with one deadline for all that goes through it, and an error where others end."""
 
@@ -104,7 +108,7 @@ def reason(error: BaseException, limit: float) -> str:
     if isinstance(error, struct.error):
         return "it broke off in mid-answer"
     if isinstance(error, pigpio.error):
-        return str(error.value)
+        return _TAKEN_AWAY if error.value == _UNKNOWN_SCRIPT else str(error.value)
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 

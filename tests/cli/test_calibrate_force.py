@@ -2,7 +2,6 @@
 
 import re
 import signal
-from pathlib import Path
 
 import pytest
 from operator_rig import (
@@ -13,7 +12,6 @@ from operator_rig import (
     Dialogue,
     Talk,
     calibrations,
-    fishctl_alone,
     forces,
 )
 from processes import Daemon
@@ -126,21 +124,19 @@ def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
     assert forces(daemon) == pytest.approx((0.1, -0.1), abs=3e-3)
 
 
-def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(
-    pi: Bench, daemon: Daemon
+def test_a_load_beyond_what_the_sensor_is_believed_is_refused_where_it_is_typed(
+    talk: Talk, pi: Bench, daemon: Daemon
 ) -> None:
-    noise = [(0.3, 0.1), (-0.2, 0.3), (0.4, -0.2), (0.1, 0.4), (-0.3, -0.3)]
-    measured = pi.folder / "noise.csv"
-    lines = [f"{x},{y},{vx},{vy}" for (x, y), (vx, vy) in zip(PLAN, noise, strict=True)]
-    measured.write_text("\n".join(["fx_N,fy_N,vx_V,vy_V", *lines, ""]))
-    ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
-    assert ended.returncode == 1
-    assert "errors [mN]" in ended.stdout
-    assert re.fullmatch(
-        r"fishctl: the voltages do not follow the loads: [^\n]+ measure load \d again first\n",
-        ended.stderr,
-    )
-    assert pi.files("force") == []
+    dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.2")
+    measure(dialogue, pi, 0.0, 0.0)
+    dialogue.answer("load [N]", "20")
+    dialogue.expect("20 N is beyond force_sensor.force_limit, 10 N; did you mean --unit g?")
+    for _ in range(4):
+        measure(dialogue, pi, 0.0, 0.0, "0.2")
+    dialogue.answer("Another load", "5 -15")
+    dialogue.expect("-15 N is beyond force_sensor.force_limit, 10 N; did you mean --unit g?")
+    dialogue.expect("Another load")
+    assert dialogue.finish() == 130
 
 
 def test_a_load_that_is_clipped_is_not_to_be_believed(
@@ -189,19 +185,6 @@ def test_whoever_does_not_say_yes_changes_nothing(
     assert pi.files("force") == []
 
 
-def test_loads_measured_earlier_are_fitted_without_a_question(pi: Bench, daemon: Daemon) -> None:
-    measured = pi.folder / "measured.csv"
-    lines = [f"{x / GRAM}, {y / GRAM}, {2 * x + 0.3}, {1.5 * y - 0.2}, ignored" for x, y in PLAN]
-    measured.write_text("\n".join(["fx_g, fy_g, vx_V, vy_V, remark", *lines, ""]))
-    ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
-    assert (ended.returncode, ended.stderr) == (0, "")
-    with Fish(daemon.endpoint) as fish:
-        found = fish.calibrations().force
-    assert (found.xx, found.xy, found.x0) == pytest.approx((0.5, 0.0, -0.15))
-    assert (found.yx, found.yy, found.y0) == pytest.approx((0.0, 1 / 1.5, 0.2 / 1.5))
-    assert (found.loads, found.residual) == (5, pytest.approx(0.0, abs=1e-12))
-
-
 def test_a_plan_of_ones_own_is_gone_through_load_by_load(
     talk: Talk, pi: Bench, daemon: Daemon
 ) -> None:
@@ -220,27 +203,3 @@ def test_a_plan_of_ones_own_is_gone_through_load_by_load(
     determinant = 1 - CROSSTALK**2
     assert found.xx == pytest.approx(1 / SENSITIVITY_X / determinant, rel=0.02)
     assert found.yy == pytest.approx(1 / SENSITIVITY_Y / determinant, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("fx_N,fy_N,vx_V,vy_V\n0,0,0,0\n1,0,1,0\n", r"a load along -x is missing"),
-        ("fx_N,fy_N\n0,0\n1,0\n-1,0\n2,0\n3,0\n", r"a load along \+y is missing"),
-        ("fx_N,fy_N,vx_V\n0,0,0\n", r":1: vx_V and vy_V are needed"),
-        ("force,volts\n0,0\n", r":1: one column fx_N or fx_g is needed"),
-        ("fx_N,fy_N\n0,0\n0.1,\n", r":3: fy_N: '' is not a number"),
-        ("fx_N,fy_N\n0,nan\n", r":2: fy_N: 'nan' is not a number"),
-        ("fx_N,fy_N\n", r"there is no load in it"),
-        (None, r"cannot be read: No such file"),
-    ],
-)
-def test_a_file_of_loads_that_is_no_good_is_refused_in_one_line(
-    tmp_path: Path, text: str | None, complaint: str
-) -> None:
-    path = tmp_path / "loads.csv"
-    if text is not None:
-        path.write_text(text)
-    ended = fishctl_alone(tmp_path, "calibrate", "force", "--loads", str(path), "--yes")
-    assert (ended.returncode, ended.stdout) == (1, "")
-    assert re.fullmatch(rf"fishctl: {path}[^\n]*{complaint}[^\n]*\n", ended.stderr)

@@ -126,6 +126,38 @@ def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
     assert dialogue.finish() == 130
 
 
+def test_status_shows_that_somebody_calibrates_the_servo(
+    talk: Talk, pi: Bench, daemon: Daemon
+) -> None:
+    assert "calibrating" not in daemon.fishctl("status").stdout
+    dialogue = talk(daemon, "calibrate", "servo")
+    dialogue.expect("trim +0 µs> ")
+    assert "\ncalibrating the servo, by a client\n" in daemon.fishctl("status").stdout
+    assert dialogue.finish() == 130
+    assert "calibrating" not in daemon.fishctl("status").stdout
+
+
+def test_where_pulses_end_before_the_amplitude_the_limit_is_there_and_can_be_saved(
+    talk: Talk, pi: Bench
+) -> None:
+    with pi.daemon("--set", "servo.centre=2300", "--set", "servo.highest=0.3") as daemon:
+        dialogue = talk(daemon, "calibrate", "servo")
+        for prompt, line in (
+            ("trim +0 µs> ", "+"),  # 2305 µs: 195 µs, 0.325 rad are left
+            ("trim +5 µs> ", "++"),  # 0.2833 rad are left, less than the limit of before
+            ("trim +30 µs> ", "ok"),
+            ("again: ", "y"),
+            ("highest +0.00 rad> ", "keep"),
+        ):
+            dialogue.answer(prompt, line)
+        dialogue.expect("highest is +0.2833 rad now, where the pulses of a servo end")
+        dialogue.answer("lowest +0.00 rad> ", "keep")
+        dialogue.answer("Save it?", "y")
+        assert dialogue.finish() == 0
+        found = calibrations(daemon).servo
+    assert (found.highest, found.lowest) == (0.2833, -1.2)
+
+
 def test_who_was_away_for_too_long_is_told_so_at_the_prompt(
     talk: Talk, pi: Bench, daemon: Daemon
 ) -> None:

@@ -168,6 +168,20 @@ def test_a_daemon_that_drives_another_robot_is_pointed_out(tmp_path: Path) -> No
     assert "robot simulated" in findings["daemon"][1]
 
 
+def test_what_a_fishd_of_another_robot_measures_is_not_taken_for_this_ones(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        own = ("--set", "robot=pi", "--set", f"state_folder={pi.folder}/of-pi")
+        _, findings = doctor(pi.folder, *own)
+    for name in ("adc", "force"):
+        assert findings[name] == (
+            "skipped",
+            f"the fishd at {daemon.endpoint} drives another robot, virtual-pi; "
+            "name this one's with --endpoint",
+        )
+    assert f"{pi.folder}/of-pi" in findings["state folder"][1]
+    assert findings["control"][0] == "ok"
+
+
 def test_an_address_that_is_taken_fails(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

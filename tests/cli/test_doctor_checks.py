@@ -3,11 +3,13 @@
 import contextlib
 import os
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from test_doctor import doctor, free_telemetry
 
 from fishd.cli.checks import CHECKS
 from fishd.cli.checks.base import Context, Result
@@ -190,6 +192,24 @@ def test_a_clock_that_systemd_has_synchronised_is_well(root: Path, examine: Exam
     assert level(examine("clock")) == "ok"
 
 
+def test_why_nobody_can_see_who_uses_pins_is_told(root: Path, examine: Examine) -> None:
+    def said() -> str:
+        found = examine("gpio pins")
+        assert level(found) == "skipped"
+        assert found is not None
+        return found.message
+
+    if os.geteuid() != 0:
+        assert "only root can see" in said()
+        return
+    (root / "sys/kernel/debug").mkdir(parents=True)
+    assert "debugfs is not mounted: mount -t debugfs none /sys/kernel/debug" in said()
+    put(root, "sys/kernel/debug/clk/clk_summary")
+    assert "this kernel does not say who uses GPIO pins" in said()
+    with unprivileged():
+        assert "only root can see" in said()
+
+
 def test_a_gpio_pin_of_somebody_else_is_a_warning(root: Path, examine: Examine) -> None:
     assert level(examine("gpio pins")) == "skipped"
     put(
@@ -239,16 +259,51 @@ def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) 
 def test_calibrations_are_asked_for_and_a_broken_file_fails(root: Path, examine: Examine) -> None:
     assert level(examine("calibrations")) == "warning"
     matrix = "{xx: 2.0, xy: 0.0, x0: 0.0, yx: 0.0, yy: 2.0, y0: 0.0, date: '2026-01-02'}\n"
-    put(root, "state/pi/force-2026-01-02.yaml", matrix)
+    put(root, "state/pi/force-2026-01-02T000000.000000Z.yaml", matrix)
     found = examine("calibrations")
     assert level(found) == "warning"
     assert found is not None
     assert found.mend == "fishctl calibrate servo"
     pulses = "trim: 10.0, direction: 1, scale: 600.0, lowest: -1.0, highest: 1.0"
-    put(root, "state/pi/servo-2026-01-03.yaml", f"{{{pulses}, date: '2026-01-03'}}\n")
+    put(
+        root, "state/pi/servo-2026-01-03T000000.000000Z.yaml", f"{{{pulses}, date: '2026-01-03'}}\n"
+    )
     assert examine("calibrations") == ("ok", "force of 2026-01-02, servo of 2026-01-03", "")
-    put(root, "state/pi/force-2026-02-02.yaml", "xx: a lot\n")
+    backup = put(root, "state/pi/force-backup.yaml", matrix)
+    ignored = examine("calibrations")
+    assert level(ignored) == "warning"
+    assert ignored is not None
+    assert ignored.message == (
+        "force of 2026-01-02, servo of 2026-01-03; "
+        f"{backup} is no dated calibration file and is ignored"
+    )
+    backup.unlink()
+    put(root, "state/pi/force-2026-02-02T000000.000000Z.yaml", "xx: a lot\n")
     assert level(examine("calibrations")) == "FAIL"
+
+
+def test_a_force_that_was_only_tared_is_not_calibrated(root: Path, examine: Examine) -> None:
+    matrix = "xx: 1.0, xy: 0.0, x0: 0.3, yx: 0.0, yy: 1.0, y0: 0.0"
+    name = "state/pi/force-2026-01-02T000000.000000Z.yaml"
+    put(root, name, f"{{{matrix}, date: '2026-01-02', tared: '2026-01-02'}}\n")
+    found = examine("calibrations")
+    assert level(found) == "warning"
+    assert found is not None
+    assert "tared 2026-01-02, but never calibrated" in found.message
+    assert found.mend == "fishctl calibrate force"
+
+
+def test_a_read_only_file_system_is_not_taken_for_a_permission(root: Path) -> None:
+    (root / "state").mkdir()
+    mount = 'mount -t tmpfs -o ro none "$0" && exec "$@"'
+    apart = ["unshare", *([] if os.geteuid() == 0 else ["-r"]), "-m", "sh", "-c", mount]
+    if subprocess.run([*apart, str(root / "state"), "true"], check=False).returncode:
+        pytest.skip("needs a file system of its own")
+    settings = ("--set", "robot=pi", "--set", f"state_folder={root}/state", *free_telemetry())
+    _, found = doctor(root, *settings, under=(*apart, str(root / "state")))
+    level, message = found["state folder"]
+    assert level == "FAIL"
+    assert f"{root}/state is on a read-only file system" in message
 
 
 def test_the_state_folder_must_be_one_that_can_be_written_to(root: Path, examine: Examine) -> None:

@@ -103,6 +103,11 @@ def test_doctor_leaves_the_bus_of_a_fishd_at_another_endpoint_alone(
         assert found[name][0] == "skipped"
         assert f"(pid {daemon.process.pid})" in found[name][1]
         assert "--endpoint" in found[name][1]
+    level, message = found["daemon"]
+    assert level == "warning"
+    assert (
+        f"no fishd at ipc://{pi.folder}/control, but a fishd (pid {daemon.process.pid})" in message
+    )
 
 
 def test_without_a_place_for_lock_files_fishd_says_so_and_starts(

@@ -14,7 +14,8 @@ import pytest
 from operator_rig import Bench
 from processes import FISHCTL, PATIENCE
 
-from fishd.hardware.calibration import CalibrationFolder, ServoCalibration
+from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.calibration_files import CalibrationFolder
 
 
 @pytest.fixture
@@ -124,7 +125,7 @@ def test_a_broken_calibration_does_not_keep_the_servo_energised(
 ) -> None:
     folder = pi.folder / "state" / "virtual-pi"
     folder.mkdir(parents=True)
-    (folder / "servo-2026-01-01T000000.000000.yaml").write_text("trim: straight\n")
+    (folder / "servo-2026-01-01T000000.000000Z.yaml").write_text("trim: straight\n")
     ended = release(*pi.settings)
     assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
     assert re.fullmatch(r"fishctl: [^\n]+/servo-2026[^\n]+; going on without it\n", ended.stderr)

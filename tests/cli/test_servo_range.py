@@ -13,7 +13,8 @@ from fishd.client import Fish
 from fishd.config import load
 from fishd.errors import ConfigError
 from fishd.hardware import pulses
-from fishd.hardware.calibration import CalibrationFolder, ServoCalibration
+from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.settings import ServoSettings
 
 
@@ -49,6 +50,8 @@ def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Benc
         )
         assert status.lowest == pytest.approx(-0.25)
         assert calibrations(daemon).servo.trim == -500.0
+        _, _, err = daemon.end()
+    assert err.count(line) == 1
 
 
 def test_config_check_tells_of_a_range_that_is_chosen(tmp_path: Path) -> None:

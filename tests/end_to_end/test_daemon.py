@@ -129,6 +129,20 @@ def test_a_second_daemon_on_the_same_telemetry_address_says_so_and_exits(
     assert "Traceback" not in errors
 
 
+def test_a_telemetry_address_of_another_machine_is_one_line_with_what_would_be_right(
+    tmp_path: Path,
+) -> None:
+    for host in ("nohost.invalid", "192.0.2.1"):  # which is nobody's
+        status, _, errors = Daemon(
+            tmp_path, "--set", f"telemetry.address=tcp://{host}:9872"
+        ).finish()
+        assert status == 1
+        assert (
+            f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is no address of this "
+            "machine; write tcp://127.0.0.1:9872, or tcp://0.0.0.0:9872 for all\n"
+        ) in errors
+
+
 def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
     precious = tmp_path / "precious.txt"
     precious.write_text("data")

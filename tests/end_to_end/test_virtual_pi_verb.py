@@ -211,3 +211,16 @@ def test_one_that_hangs_costs_a_time_out_and_its_late_answer_confuses_nobody(pi:
             "is 'fishctl virtual-pi run' still running?\n"
         )
         assert remote.transfer(0x48, CONFIG) == [b"\x85\x83"]
+
+
+def test_what_a_stopped_virtual_pi_was_asked_in_vain_is_not_done_later(pi: Process) -> None:
+    pi.process.send_signal(signal.SIGSTOP)
+    try:
+        asked = pi.fishctl("inject", "nack")
+    finally:
+        pi.process.send_signal(signal.SIGCONT)
+    assert asked.returncode == 1
+    assert "does not answer" in asked.stderr
+    assert pi.fishctl("inject", "clipped").returncode == 0  # and nothing before it is left
+    time.sleep(0.2)
+    assert list(json.loads(pi.fishctl("status", "--json").stdout)["faults"]) == ["clipped"]

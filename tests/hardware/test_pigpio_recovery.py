@@ -181,3 +181,13 @@ def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
     with pytest.raises(ServoError, match="reconnecting"):
         servo.write(0.5)
     assert bench.width == 0
+
+
+def test_a_fishd_whose_script_was_taken_away_says_so(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.servo().neutralise()
+    with pytest.raises(
+        ServoError, match=r"took fishd's script away, as 'fishctl release' does; re"
+    ):
+        servo.write(0.5)

@@ -51,8 +51,19 @@ class Context:
 
     @property
     def running(self) -> Running | None:
-        """What the daemon says; None where none answers."""
-        return self.daemon if isinstance(self.daemon, Running) else None
+        """What the daemon of this robot says; None where none answers, or that of another robot."""
+        found = self.daemon
+        if isinstance(found, Running) and found.status.robot == self.config.robot:
+            return found
+        return None
+
+    @cached_property
+    def owner(self) -> str:
+        """Which fishd, at whatever endpoint, drives a part of this robot; empty where none does."""
+        try:
+            return ownership.owner(robots.parts_of(self.config))
+        except StartupError:  # where a virtual Pi would be is no good place; the check will say so
+            return ""
 
     def occupied(self, by_fishd: str) -> Result | None:
         """Why a check leaves the hardware alone; None where no fishd uses it.
@@ -61,13 +72,14 @@ class Context:
         """
         if isinstance(self.daemon, Unreachable):
             return skipped(f"{self.daemon.why}; {self.reach(self.daemon)}")
-        if self.daemon:
+        if self.running:
             return skipped(f"fishd is running and {by_fishd}")
-        try:
-            owner = ownership.owner(robots.parts_of(self.config))
-        except StartupError:  # where a virtual Pi would be is no good place; the check will say so
-            return None
-        return skipped(f"{owner}; name it with --endpoint") if owner else None
+        if self.daemon:
+            return skipped(
+                f"the fishd at {self.daemon.endpoint} drives another robot, "
+                f"{self.daemon.status.robot}; name this one's with --endpoint"
+            )
+        return skipped(f"{self.owner}; name it with --endpoint") if self.owner else None
 
     def reach(self, daemon: Unreachable) -> str:
         """What to do so that the daemon can be asked."""

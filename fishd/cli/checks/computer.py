@@ -3,11 +3,13 @@
 import errno
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from fishd.cli.checks.base import Check, Context, Result, fail, name_of, ok, skipped, warning
 from fishd.errors import ConfigError
-from fishd.hardware.calibration import CalibrationFolder, ForceCalibration, ServoCalibration
+from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.robots import state_folder
 
 LITTLE_DISK, NO_DISK = 1e9, 50e6
@@ -73,6 +75,12 @@ def state(context: Context) -> Result:
         return fail(
             f"{there} is no folder", f"move it away, or set state_folder; {folder} is needed"
         )
+    if os.statvfs(there).f_flag & os.ST_RDONLY:
+        return fail(
+            f"{folder}: {there} is on a read-only file system",
+            "mount it read-write ('mount' shows how it is mounted, 'dmesg' whether it broke), or "
+            "set state_folder",
+        )
     if not os.access(there, os.W_OK | os.X_OK):
         return fail(f"{folder}: no permission to write to {there}", _permit(context, there))
     return ok(f"{folder}" + ("" if there == folder else ", which will be made when it is needed"))
@@ -105,28 +113,38 @@ def disk(context: Context) -> Result:
 
 def calibrations(context: Context) -> Result:
     """Both calibrations that are, or would be, in force."""
-    if context.running and context.running.calibrations:
-        found = context.running.calibrations
-        force, servo = found.force.date, found.servo.date
+    folder = CalibrationFolder(state_folder(context.config))
+    if context.running and (found := context.running.calibrations):
+        file = found.force_file or found.servo_file
+        if file:
+            folder = CalibrationFolder(Path(file).parent)
+        result = _in_force(found.force, found.servo.date)
     else:
-        folder = CalibrationFolder(state_folder(context.config))
         try:
             newest_force = folder.newest(ForceCalibration)
             newest_servo = folder.newest(ServoCalibration)
         except ConfigError as error:
             return _unreadable(context, folder.folder, str(error))
-        force = newest_force[0].date if newest_force else ""
-        servo = newest_servo[0].date if newest_servo else ""
-    if not force:
-        return warning(
-            "the force sensor is not calibrated: forces are volts", "fishctl calibrate force"
-        )
+        force = newest_force[0] if newest_force else ForceCalibration()
+        result = _in_force(force, newest_servo[0].date if newest_servo else "")
+    with suppress(ConfigError):  # that of a fishd which answers is not always for us to read
+        if ignored := folder.ignored():
+            mend = result.mend or "rename it as it was, or move it away"
+            return warning("; ".join([result.message, *ignored]), mend)
+    return result
+
+
+def _in_force(force: ForceCalibration, servo: str) -> Result:
+    """servo: the date of its calibration"""
+    if force.untouched:
+        tared = f"tared {force.tared}, but never calibrated" if force.tared else "not calibrated"
+        return warning(f"the force sensor is {tared}: forces are volts", "fishctl calibrate force")
     if not servo:
         return warning(
-            f"force of {force}; the servo has no calibration but the configuration's",
+            f"force of {force.date}; the servo has no calibration but the configuration's",
             "fishctl calibrate servo",
         )
-    return ok(f"force of {force}, servo of {servo}")
+    return ok(f"force of {force.date}, servo of {servo}")
 
 
 def _unreadable(context: Context, folder: Path, complaint: str) -> Result:

@@ -7,7 +7,7 @@ import zmq
 
 from fishd import addresses
 from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
-from fishd.cli.checks.daemon import Unreachable
+from fishd.cli.checks.daemon import Running, Unreachable
 from fishd.errors import StartupError
 
 UNIT = "fishd.service"
@@ -17,6 +17,11 @@ _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/l
 def daemon(context: Context) -> Result:
     """Whether one runs, and what it is doing."""
     if context.daemon is None:
+        if context.owner:
+            return warning(
+                f"no fishd at {context.endpoint or addresses.find_control()}, but {context.owner}",
+                "name its control.address with --endpoint",
+            )
         return ok("no fishd is running")
     if isinstance(context.daemon, Unreachable):
         return warning(context.daemon.why, context.reach(context.daemon))
@@ -44,7 +49,7 @@ def telemetry(context: Context) -> Result:
 
 def control(context: Context) -> Result:
     """Free, or the daemon's."""
-    served = context.running.endpoint if context.running else None
+    served = context.daemon.endpoint if isinstance(context.daemon, Running) else None
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:
@@ -68,10 +73,10 @@ def unit(context: Context) -> Result:
 
 
 def _address(context: Context, address: str, key: str, kind: int) -> Result:
-    running = context.running
-    if isinstance(context.daemon, Unreachable):  # to bind could take its socket away
+    found = context.daemon
+    if isinstance(found, Unreachable):  # to bind could take its socket away
         return skipped("not tried; see daemon")
-    if running and address in (running.status.telemetry, running.endpoint):
+    if found and address in (found.status.telemetry, found.endpoint):
         return ok(f"{address} is served by the running fishd")
     context_of_sockets: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     with ExitStack() as stack:

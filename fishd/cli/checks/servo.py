@@ -1,5 +1,6 @@
 """Checks of what drives the servo: pigpiod, the kernel's PWM, or GPIO pins."""
 
+import os
 import re
 import time
 
@@ -11,6 +12,7 @@ from fishd.errors import ServoError
 
 SLOW_ANSWER = 5e-3
 """An answer of pigpiod that takes longer may keep a tick waiting [s]."""
+_DEBUG = "/sys/kernel/debug"
 _LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
 
 
@@ -78,9 +80,9 @@ def pins(context: Context) -> Result | None:
     wanted = {config.panel.estop_gpio: "panel.estop_gpio", config.panel.led_gpio: "panel.led_gpio"}
     wanted[config.servo.gpio] = "servo.gpio"
     wanted.pop(None, None)
-    text = context.text("/sys/kernel/debug/gpio")
+    text = context.text(f"{_DEBUG}/gpio")
     if not text:
-        return skipped("only root can see who uses GPIO pins: sudo fishctl doctor")
+        return skipped(_why_unseen(context))
     if occupied := context.occupied("uses its pins"):
         return occupied
     users = {int(found["pin"]): found["user"].strip() for found in _LINE.finditer(text)}
@@ -94,6 +96,20 @@ def pins(context: Context) -> Result | None:
             "; ".join(taken), "stop that program, remove its dtoverlay, or choose another pin"
         )
     return ok(", ".join(f"GPIO{pin}" for pin in wanted) + " free")
+
+
+def _why_unseen(context: Context) -> str:
+    if os.geteuid() != 0:
+        return "only root can see who uses GPIO pins: sudo fishctl doctor"
+    try:
+        mounted = any(context.path(_DEBUG).iterdir())
+    except OSError as error:
+        return f"who uses GPIO pins cannot be seen: {_DEBUG}: {error.strerror}"
+    if mounted:
+        return f"this kernel does not say who uses GPIO pins: there is no {_DEBUG}/gpio"
+    return (
+        f"who uses GPIO pins cannot be seen, debugfs is not mounted: mount -t debugfs none {_DEBUG}"
+    )
 
 
 CHECKS = (

@@ -1,0 +1,163 @@
+"""The dated files that calibrations are kept in.
+
+None is ever overwritten; the newest one of a kind is in force.
+"""
+
+import datetime
+import math
+import os
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd import strict_yaml
+from fishd.errors import ConfigError
+from fishd.hardware.calibration import C, ForceCalibration, ServoCalibration
+from fishd.schema import Problem, convert
+
+_STAMP = "%Y-%m-%dT%H%M%S.%fZ"
+_NAME = re.compile(r"(force|servo)-(?P<stamp>\d{4}-\d\d-\d\dT\d{6}\.\d{6}Z)\+*\.yaml", re.ASCII)
+_NAMES: dict[type[Struct], str] = {ForceCalibration: "force", ServoCalibration: "servo"}
+_REQUIRED: dict[type[Struct], tuple[str, ...]] = {
+    ForceCalibration: ("xx", "xy", "x0", "yx", "yy", "y0", "date"),
+    ServoCalibration: ("trim", "direction", "scale", "lowest", "highest"),
+}
+_REMEDY = "mend it, or move it away"
+
+
+class CalibrationFolder:
+    """The folder with the dated files of one robot."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def newest(self, kind: type[C]) -> tuple[C, Path] | None:
+        """The calibration in force and its file; None where none was ever saved.
+
+        Raises `ConfigError` where the folder cannot be read, or the newest file cannot, is not
+        whole or makes no sense: an older one, or a default, would be wrong silently.
+        """
+        names = self._names(kind)
+        if not names:
+            return None
+        path = self.folder / names[-1]
+        try:
+            return _whole(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
+        except strict_yaml.YamlProblem as problem:
+            raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
+        except Problem as problem:
+            where = ".".join(problem.path) + ": " if problem.path else ""
+            raise ConfigError(f"{path}: {where}{problem}; {_REMEDY}") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: cannot be read: {error}") from None
+
+    def save(self, calibration: C, now: datetime.datetime) -> tuple[C, Path]:
+        """Write a new file, dated `now`; the calibration with its date, and the path.
+
+        Raises OSError when it cannot be written, and `ConfigError` as `newest` does. An older file
+        is never touched, and the new one sorts after it, even where the clock went back.
+        """
+        import yaml
+
+        dated = msgspec.structs.replace(calibration, date=now.isoformat(timespec="seconds"))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        stem = f"{_NAMES[type(calibration)]}-{now.astimezone(datetime.UTC):{_STAMP}}"
+        names = self._names(type(calibration))
+        if names and stem <= Path(names[-1]).stem:
+            stem = f"{Path(names[-1]).stem}+"
+        path = self.folder / f"{stem}.yaml"
+        text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
+        temporary = path.with_suffix(".part")
+        try:
+            with temporary.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            path.hardlink_to(temporary)  # unlike a rename, never onto another file
+        finally:
+            with suppress(OSError):  # what went wrong before is to be told
+                temporary.unlink()
+        folder = os.open(self.folder, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # else a power cut takes the name away again
+        finally:
+            os.close(folder)
+        return dated, path
+
+    def ignored(self) -> list[str]:
+        """A line about each file whose name looks like a calibration's but has no date.
+
+        Raises `ConfigError` where the folder cannot be read.
+        """
+        return [
+            f"{self.folder / name} is no dated calibration file and is ignored"
+            for name in sorted(self._all())
+            if not _is_dated(name)
+        ]
+
+    def _names(self, kind: type[C]) -> list[str]:
+        """The files of a kind, oldest first."""
+        start = f"{_NAMES[kind]}-"
+        names = [name for name in self._all() if name.startswith(start) and _is_dated(name)]
+        return sorted(names, key=lambda name: Path(name).stem)
+
+    def _all(self) -> list[str]:
+        try:
+            found = [path.name for path in self.folder.iterdir()]
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise ConfigError(f"{self.folder}: cannot be read: {error.strerror}") from None
+        starts = tuple(f"{name}-" for name in _NAMES.values())
+        return [name for name in found if name.startswith(starts) and name.endswith(".yaml")]
+
+
+def check(calibration: C) -> C:
+    """The same calibration; raises `Problem` unless it makes sense."""
+    for key, value in msgspec.structs.asdict(calibration).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Problem((key,), f"{value} is not a finite number")
+        if key in ("date", "tared") and value and not _is_date(value):
+            raise Problem((key,), f"'{value}' is no date: one in ISO 8601 is needed")
+    if isinstance(calibration, ForceCalibration) and calibration.singular:
+        raise Problem((), "the matrix xx xy, yx yy says the same of both forces")
+    return calibration
+
+
+def _is_dated(name: str) -> bool:
+    """Is it the name of a file as `save` makes it?"""
+    found = _NAME.fullmatch(name)
+    if not found:
+        return False
+    try:
+        datetime.datetime.strptime(found["stamp"], _STAMP)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_date(text: str) -> bool:
+    try:
+        datetime.datetime.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _whole(data: Any, kind: type[C]) -> C:
+    """The calibration that a file holds; raises `Problem` unless it is whole and makes sense."""
+    if not data:
+        raise Problem((), "there is nothing in this file")
+    if not isinstance(data, dict):
+        raise Problem((), "a mapping of keys to values is needed")
+    missing = [key for key in _REQUIRED[kind] if key not in data]
+    if missing:
+        raise Problem((), f"without {', '.join(missing)}: nothing is filled in")
+    calibration = convert(data, kind)
+    if isinstance(calibration, ForceCalibration) and not calibration.date:
+        raise Problem(("date",), "'' is not when it was made")
+    return check(calibration)
