@@ -73,6 +73,8 @@ install_package() {
     step "$other: removed, it excludes $extra"
   fi
   extras=pi hint="gcc python3-dev"
+  # For the controller `ppo`; neither of its packages has a wheel for 32 bits.
+  case $(uname -m) in aarch64 | x86_64) extras+=,policy ;; esac
   if [[ $extra != none ]]; then extras+=,$extra; fi
   # No ready-made lgpio for Python 3.13; liblgpio-dev is in Raspberry Pi OS, not in Debian.
   if [[ $extra == rpi-lgpio ]]; then hint+=" swig liblgpio-dev"; fi

@@ -65,6 +65,12 @@ INTERRUPTED = 130
     "to fine-tune on the robot what was trained in simulation.",
 )
 @endpoint_option
+@click.option(
+    "--agent",
+    metavar="ADDRESS",
+    help="On a robot elsewhere: where its fishd reaches this program, such as "
+    "tcp://127.0.0.1:9873 at the end of an ssh tunnel. [default: any free port of this machine]",
+)
 @click.option("--seeds", type=click.IntRange(min=1), help="Train with so many seeds, in parallel.")
 @click.option(
     "--jobs", type=click.IntRange(min=1), help="With --seeds: processes. [default: one per core]"
@@ -83,6 +89,7 @@ def ppo(
     resume: Path | None,
     parent: Path | None,
     endpoint: str | None,
+    agent: str | None,
     seeds: int | None,
     jobs: int | None,
     cluster: str | None,
@@ -105,6 +112,9 @@ def ppo(
         config, settings = _chosen(on, file, overrides, settings_file, endpoint, parent)
         settings = _changed(settings, steps=steps, seed=seed)
         job = _new(config, settings, folder, on, endpoint, parent)
+    if job.on == "simulation":
+        _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
+    job = replace(job, agent=agent)
     if seeds is not None:
         from fishd.cli.learn_seeds import train_seeds
 
@@ -196,16 +206,17 @@ def _train(job: "Job") -> int:
             outcome = train(job, show, stop)
     except ConfigError as error:
         complain("fishctl", str(error), EX_CONFIG)
-    return _report(outcome, job.endpoint)
+    return _report(outcome, job)
 
 
-def _report(outcome: "Outcome", endpoint: str | None) -> int:
+def _report(outcome: "Outcome", job: "Job") -> int:
     """Say how it ended; the exit status."""
     from fishd.learning.progress import described, minutes
 
     again = f"fishctl learn ppo --resume {outcome.folder}"
-    if endpoint:
-        again += f" --endpoint {endpoint}"
+    for option, address in (("--endpoint", job.endpoint), ("--agent", job.agent)):
+        if address:
+            again += f" {option} {address}"
     if outcome.ended in ("lost", "diverged"):
         click.echo(f"fishctl: {outcome.message}; to go on: {again}", err=True)
         return 1

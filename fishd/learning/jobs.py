@@ -25,6 +25,8 @@ class Job(Struct, frozen=True, kw_only=True):
     """A fish in this process on the virtual clock, or that of a running fishd."""
     endpoint: str | None = None
     """Control socket of that fishd; None looks for the one on this machine."""
+    agent: str | None = None
+    """Where that fishd reaches this program; None: any free port, for a fishd on this machine."""
     resume: bool = False
     """Go on from the newest checkpoint in `folder`."""
     parent: Path | None = None

@@ -18,11 +18,11 @@ def in_process(config: Config, settings: TrainingSettings) -> InProcess:
     return InProcess(config, settings.randomisation if varied else None)
 
 
-def on_daemon(endpoint: str | None) -> Link:
-    """The fish of a running fishd; raises `FishError`."""
+def on_daemon(endpoint: str | None, agent: str | None = None) -> Link:
+    """The fish of a running fishd, which reaches this agent there; raises `FishError`."""
     from fishd.learning.on_daemon import OnDaemon
 
-    return OnDaemon(endpoint)
+    return OnDaemon(endpoint, address=agent)
 
 
 def daemon_config(endpoint: str | None, file: Path | None, overrides: Iterable[str]) -> Config:

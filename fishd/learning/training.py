@@ -47,7 +47,10 @@ def train(job: Job, show: Show | None = None, stop: Callable[[], bool] = lambda:
     Raises `ConfigError`, `CheckpointError` and `FishError` before anything has moved.
     """
     torch.set_num_threads(1)
-    link = on_daemon(job.endpoint) if job.on == "robot" else in_process(job.config, job.settings)
+    if job.on == "robot":
+        link = on_daemon(job.endpoint, job.agent)
+    else:
+        link = in_process(job.config, job.settings)
     try:
         check_agreement(link, job.config)
         return Training(job, link, show or Quiet(), stop).run()
