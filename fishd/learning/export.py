@@ -16,6 +16,7 @@ from fishd.learning.settings import TrainingSettings
 from fishd.learning.trials import Trial, in_simulation
 from fishd.plant.optimum import best_square_wave
 from fishd.plant.parameters import PlantParameters
+from fishd.policies import runtime
 from fishd.policies.card import Card
 from fishd.policies.network import to_onnx
 
@@ -111,8 +112,7 @@ def _completed(card: Card, trial: Trial, note: str) -> Card:
 
 def _verify(content: bytes, policy: ActorCriticPolicy, inputs: int) -> None:
     """Compare file and policy on random observations; raises `PolicyError`."""
-    import onnxruntime
-
+    onnxruntime = runtime.load()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

@@ -1,6 +1,7 @@
 """Runs the network of a policy file with onnxruntime: one input, one thread, on the spot."""
 
 import contextlib
+import os
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,19 @@ _LARGEST_PROBE = 1e3
 """In units of a feature's scale."""
 
 
+def load() -> Any:
+    """The package onnxruntime, quiet; raises ImportError.
+
+    By itself, newer versions keep an identifier of the device in the user's folder and report to
+    their maker.
+    """
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(4)  # what is wrong comes as an exception as well
+    return onnxruntime
+
+
 def preload() -> None:
     """Load onnxruntime, where it is installed.
 
@@ -22,7 +36,7 @@ def preload() -> None:
     before the first one.
     """
     with contextlib.suppress(ImportError):
-        import onnxruntime  # noqa: F401
+        load()
 
 
 class Network:
@@ -53,11 +67,10 @@ class Network:
 
     def _bound(self, inputs: NDArray[np.float32]) -> Any:
         """Input and output stay where they are: half the time of an ordinary run."""
-        from onnxruntime import OrtValue
-
+        value = load().OrtValue.ortvalue_from_numpy
         binding = self._session.io_binding()
-        binding.bind_ortvalue_input(INPUT, OrtValue.ortvalue_from_numpy(inputs))
-        binding.bind_ortvalue_output(OUTPUT, OrtValue.ortvalue_from_numpy(self._output))
+        binding.bind_ortvalue_input(INPUT, value(inputs))
+        binding.bind_ortvalue_output(OUTPUT, value(self._output))
         return binding
 
     def _try(self) -> None:
@@ -75,10 +88,9 @@ class Network:
 
 def _session(content: bytes) -> Any:
     try:
-        import onnxruntime
+        onnxruntime = load()
     except ImportError:
         raise PolicyError(f"it cannot be run: onnxruntime {MISSING}") from None
-    onnxruntime.set_default_logger_severity(4)  # what is wrong comes as an exception as well
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

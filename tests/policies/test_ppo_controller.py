@@ -1,5 +1,7 @@
 """The controller `ppo`: a policy in the loop, and which policies it refuses."""
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 from harness import LIMITS, Rig, observe
 from onnx import TensorProto, helper, numpy_helper
 from policy_files import FLIP, answer, card, linear, random_layers, write
+from processes import FISHCTL
 
 from fishd.config import load
 from fishd.controllers import registry
@@ -209,3 +212,19 @@ def test_a_fishd_without_the_extra_says_what_to_install(
     message = refusal(path)
     assert message.startswith(f"ppo: policy: {path}: it cannot be ")
     assert f": {package} is not installed: install fishd[policy], or onnx and onnx" in message
+
+
+def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path) -> None:
+    path = write(tmp_path, to_onnx(linear(0.5), "tanh", card()))
+    home = tmp_path / "home"
+    home.mkdir()
+    run = subprocess.run(
+        [FISHCTL, "simulate", "ppo", "--policy", str(path)],
+        env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": "", "XDG_STATE_HOME": ""},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+    assert list(home.iterdir()) == []
