@@ -75,7 +75,10 @@ def test_a_policy_that_loads_costs_no_tick(daemon: Daemon, folder: Path) -> None
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        ("flop", "ppo: policy: no policy is named 'flop'; did you mean 'flip'? There are: flip, "),
+        (
+            "flop",
+            "ppo: policy: no policy is named 'flop'; did you mean 'flip'? There are: default-fish, ",
+        ),
         ("torch", "this is a pickle, which could run any code"),
         ("quick", "it was trained at a tick of 20 ms, this robot's is 50 ms"),
         ("/nowhere/x.onnx", "ppo: policy: /nowhere/x.onnx: no such file [bad-parameter]"),
