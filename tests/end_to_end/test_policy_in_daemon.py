@@ -77,7 +77,7 @@ def test_a_policy_that_loads_costs_no_tick(daemon: Daemon, folder: Path) -> None
     [
         (
             "flop",
-            "ppo: policy: no policy is named 'flop'; did you mean 'flip'? There are: default-fish, ",
+            "no policy is named 'flop'; did you mean 'flip'? There are: default-fish, ",
         ),
         ("torch", "this is a pickle, which could run any code"),
         ("quick", "it was trained at a tick of 20 ms, this robot's is 50 ms"),
