@@ -6,15 +6,15 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
 pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
 
-from gymnasium.utils.env_checker import check_env  # noqa: E402
-from processes import Daemon, running  # noqa: E402
-from stable_baselines3.common.env_checker import check_env as check_for_baselines  # noqa: E402
-from swimming import BRIEF, Resting, brief_job  # noqa: E402
+from gymnasium.utils.env_checker import check_env
+from processes import Daemon, running
+from stable_baselines3.common.env_checker import check_env as check_for_baselines
+from swimming import BRIEF, Resting, brief_job
 
 import fishd.learning  # noqa: E402, F401 (registers the environments)
-from fishd.config import load  # noqa: E402
-from fishd.errors import ConfigError, NoDaemon  # noqa: E402
-from fishd.learning.environment import SwimEnv  # noqa: E402
+from fishd.config import load
+from fishd.errors import ConfigError, NoDaemon
+from fishd.learning.environment import SwimEnv
 
 STILL = ("simulation.noise=0.0",)
 

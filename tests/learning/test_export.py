@@ -9,22 +9,22 @@ pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
 pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
 pytest.importorskip("onnx", reason="the extra 'policy' is not installed")
 
-from click.testing import CliRunner  # noqa: E402
-from harness import Rig, observe  # noqa: E402
-from msgspec.structs import replace  # noqa: E402
-from swimming import NOISY, brief_job  # noqa: E402
+from click.testing import CliRunner
+from harness import Rig, observe
+from msgspec.structs import replace
+from swimming import NOISY, brief_job
 
-from fishd.cli.main import fishctl  # noqa: E402
-from fishd.controllers import registry  # noqa: E402
-from fishd.controllers.base import Limits  # noqa: E402
-from fishd.errors import ParameterError, PolicyError  # noqa: E402
-from fishd.learning import checkpoints  # noqa: E402
-from fishd.learning.checkpoints import CheckpointError  # noqa: E402
-from fishd.learning.export import export  # noqa: E402
-from fishd.learning.jobs import Outcome  # noqa: E402
-from fishd.learning.ppo import Deterministic  # noqa: E402
-from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings  # noqa: E402
-from fishd.learning.training import train  # noqa: E402
+from fishd.cli.main import fishctl
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.errors import ParameterError, PolicyError
+from fishd.learning import checkpoints
+from fishd.learning.checkpoints import CheckpointError
+from fishd.learning.export import export
+from fishd.learning.jobs import Outcome
+from fishd.learning.ppo import Deterministic
+from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
+from fishd.learning.training import train
 
 
 @pytest.fixture(scope="module")

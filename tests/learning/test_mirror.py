@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
+
+torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
+pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
 
 from fishd.errors import ConfigError
 from fishd.learning.ppo import layers_of, make_policy

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from processes import Daemon, Subscriber, running
 
+pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
+
 from fishd.client import Fish, NoDaemon
 from fishd.config import load
 from fishd.learning.environment import SwimEnv

@@ -6,18 +6,18 @@ import pytest
 torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
 pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
 
-from harness import observe  # noqa: E402
+from harness import observe
 
-from fishd.learning.environment import spaces  # noqa: E402
-from fishd.learning.ppo import (  # noqa: E402
+from fishd.learning.environment import spaces
+from fishd.learning.ppo import (
     Deterministic,
     Rollout,
     layers_of,
     learning_rate,
     make_policy,
 )
-from fishd.learning.settings import PpoSettings  # noqa: E402
-from fishd.policies.card import Feature, Layout  # noqa: E402
+from fishd.learning.settings import PpoSettings
+from fishd.policies.card import Feature, Layout
 
 FEATURES = (Feature("fy", 0.4), Feature("instruction_angle", 0.42))
 

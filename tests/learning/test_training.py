@@ -9,19 +9,19 @@ torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed"
 pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
 pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
 
-from msgspec.structs import replace  # noqa: E402
-from stable_baselines3.common.save_util import load_from_zip_file  # noqa: E402
-from swimming import BRIEF, Failing, Losing, Resting, brief_job, rows  # noqa: E402
+from msgspec.structs import replace
+from stable_baselines3.common.save_util import load_from_zip_file
+from swimming import BRIEF, Failing, Losing, Resting, brief_job, rows
 
-from fishd.errors import ConfigError  # noqa: E402
-from fishd.learning import checkpoints, runs  # noqa: E402
-from fishd.learning.checkpoints import CheckpointError, Evaluation  # noqa: E402
-from fishd.learning.jobs import Job  # noqa: E402
-from fishd.learning.progress import Quiet  # noqa: E402
-from fishd.learning.scales import features, thrust_scale  # noqa: E402
-from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings  # noqa: E402
-from fishd.learning.training import Training, train  # noqa: E402
-from fishd.policies.card import Layout  # noqa: E402
+from fishd.errors import ConfigError
+from fishd.learning import checkpoints, runs
+from fishd.learning.checkpoints import CheckpointError, Evaluation
+from fishd.learning.jobs import Job
+from fishd.learning.progress import Quiet
+from fishd.learning.scales import features, thrust_scale
+from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
+from fishd.learning.training import Training, train
+from fishd.policies.card import Layout
 
 
 @dataclass
