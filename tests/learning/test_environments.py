@@ -11,7 +11,7 @@ from processes import Daemon, running
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
 from swimming import BRIEF, Resting, brief_job
 
-import fishd.learning  # noqa: E402, F401 (registers the environments)
+import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.config import load
 from fishd.errors import ConfigError, NoDaemon
 from fishd.learning.environment import SwimEnv
