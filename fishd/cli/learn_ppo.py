@@ -243,14 +243,14 @@ def _run_of(path: Path) -> Path:
 
 @contextmanager
 def _until_signalled() -> Iterator[Callable[[], bool]]:
-    """Tells whether SIGINT or SIGTERM has come; a second one ends the program as ever."""
+    """Tells whether SIGINT, SIGTERM or SIGHUP has come; a second one ends the program as ever."""
     asked = threading.Event()
 
     def ask(number: int, _: object) -> None:
         asked.set()
         signal.signal(number, former[signal.Signals(number)])
 
-    former = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    former = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     for number in former:
         signal.signal(number, ask)
     try:

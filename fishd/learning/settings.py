@@ -107,7 +107,7 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     ] = True
     hidden: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1024)], ...],
-        Meta(description="Sizes of the hidden layers, of policy and value each."),
+        Meta(min_length=1, description="Sizes of the hidden layers, of policy and value each."),
     ] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
 
@@ -194,6 +194,11 @@ def _check(settings: TrainingSettings) -> None:
             ("ppo", "symmetric"),
             "true is not valid where environment.observation has fx, which is the same for a "
             "mirrored fish; false is needed",
+        )
+    seen = settings.environment.observation
+    if len(set(seen)) < len(seen):
+        raise Problem(
+            ("environment", "observation"), f"{list(seen)} is not valid: each may be in it once"
         )
     if evaluation.settle >= evaluation.seconds:
         raise Problem(

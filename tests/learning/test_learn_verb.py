@@ -139,7 +139,7 @@ def wait_for_rows(process: "subprocess.Popen[str]", folder: Path, number: int) -
     raise AssertionError(f"it did not come to {number} updates: {process.communicate()}")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_a_checkpoint_to_go_on_from(
     tmp_path: Path, settings: str, number: int
 ) -> None:

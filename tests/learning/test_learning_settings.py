@@ -70,3 +70,15 @@ def test_an_evaluation_must_be_longer_than_it_may_settle(tmp_path: Path) -> None
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read"):
         load(tmp_path / "none.yaml")
+
+
+def test_a_network_needs_a_hidden_layer(tmp_path: Path) -> None:
+    found = complaint(tmp_path, "ppo:\n  hidden: []\n")
+    assert found.startswith("learning.yaml:2: ppo.hidden: [] is not valid: ")
+
+
+def test_nothing_is_seen_twice(tmp_path: Path) -> None:
+    assert complaint(tmp_path, "environment:\n  observation: [fy, fy]\n") == (
+        "learning.yaml:2: environment.observation: ['fy', 'fy'] is not valid: each may be in it "
+        "once"
+    )
