@@ -4,13 +4,14 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from operator_rig import Bench
-from processes import Daemon, running
+from processes import FISHD, Daemon, running
 from test_doctor import doctor, free_telemetry
 
 from fishd.hardware import ownership
@@ -70,6 +71,8 @@ def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
 ) -> None:
     if os.geteuid() != 0:
         pytest.skip("needs root: one fishd runs as another user")
+    if subprocess.run([*NOBODY, FISHD, "--version"], capture_output=True, check=False).returncode:
+        pytest.skip("another user cannot start this fishd: its folder, or Python's, is private")
     one, other = folders
     with running(one, *pi_settings(one), under=("sh", "-c", 'umask 077; exec "$@"', "sh", *NOBODY)):
         assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other))
