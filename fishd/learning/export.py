@@ -16,9 +16,10 @@ from fishd.learning.settings import TrainingSettings
 from fishd.learning.trials import Trial, in_simulation
 from fishd.plant.optimum import best_square_wave
 from fishd.plant.parameters import PlantParameters
-from fishd.policies import runtime
 from fishd.policies.card import Card
+from fishd.policies.file import PolicyFile
 from fishd.policies.network import to_onnx
+from fishd.policies.runtime import Network
 
 TOLERANCE = 1e-5
 """The file must say what the trained policy says, to this share of Φ."""
@@ -57,7 +58,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
         )
     card = _completed(card, trial, note)
     content = to_onnx(layers_of(policy), settings.ppo.activation, card)
-    _verify(content, policy, len(card.observation))
+    _verify(PolicyFile(target, content, card), policy)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         part = target.with_name(f".{target.name}.part")
@@ -110,19 +111,19 @@ def _completed(card: Card, trial: Trial, note: str) -> Card:
     )
 
 
-def _verify(content: bytes, policy: ActorCriticPolicy, inputs: int) -> None:
-    """Compare file and policy on random observations; raises `PolicyError`."""
-    onnxruntime = runtime.load()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    name = session.get_inputs()[0].name
-    probes = np.random.default_rng(0).normal(0.0, 1.5, (_PROBES, inputs)).astype(np.float32)
+def _verify(file: PolicyFile, policy: ActorCriticPolicy) -> None:
+    """Compare what the robot will run with the policy, on random observations.
+
+    Raises `PolicyError`.
+    """
+    network = Network(file)
+    shape = (_PROBES, len(file.card.observation))
+    probes = np.random.default_rng(0).normal(0.0, 1.5, shape).astype(np.float32)
     wanted, _ = policy.predict(probes, deterministic=True)
     worst = 0.0
     for probe, action in zip(probes, wanted, strict=True):
-        (found,) = session.run(None, {name: probe[np.newaxis]})
-        worst = max(worst, abs(float(np.clip(found, -1.0, 1.0).item()) - float(action[0])))
+        network.row[:] = probe
+        worst = max(worst, abs(network.run() - float(action[0])))
     if not worst <= TOLERANCE:
         raise PolicyError(
             f"the file would say something else than the policy, by up to {worst:.2g} of Φ: "

@@ -67,8 +67,8 @@ def train_seeds(
         extra `learn`, but no folder in common with this machine
     ended: called with each outcome as it comes
 
-    SIGINT and SIGTERM end all of them, each with a checkpoint. Raises `ConfigError` where the
-    folder is in use, and `FishdError` where there is no scheduler.
+    SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
+    the folder is in use, and `FishdError` where there is no scheduler.
     """
     folder = job.folder.absolute()
     waiting = {index: _job_of(job, folder, index) for index in range(seeds)}
@@ -176,7 +176,7 @@ def _failed(job: Job, message: str) -> SeedOutcome:
 
 @contextmanager
 def _ask_to_stop(file: Path, event: Any) -> Iterator[None]:
-    """While this lasts, SIGINT and SIGTERM say stop to all; a second one ends this process."""
+    """While this lasts, SIGINT, SIGTERM and SIGHUP say stop; a second one ends this process."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -189,7 +189,8 @@ def _ask_to_stop(file: Path, event: Any) -> Iterator[None]:
             file.touch()
 
     former: dict[int, Any] = {
-        number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)
+        number: signal.signal(number, ask)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     }
     try:
         yield
