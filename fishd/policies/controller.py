@@ -14,6 +14,8 @@ if TYPE_CHECKING:  # numbers and onnxruntime are loaded with the first policy
     from fishd.policies.card import Card
     from fishd.policies.runtime import Network
 
+_REHEARSALS = 3
+
 
 class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `ppo`."""
@@ -63,8 +65,9 @@ class Ppo(Controller[PpoParameters]):
             )
 
     def rehearse(self) -> None:
-        """Choose once more as in the latest tick: three times as fast is the next one then."""
-        self.update(self._latest)
+        """Choose as in the latest tick, a few times: the first brings the network to the caches."""
+        for _ in range(_REHEARSALS):
+            self.update(self._latest)
 
     def update(self, observation: Observation) -> float:
         """Φ times the network's output, which is cut to ±1 [rad].
