@@ -28,6 +28,7 @@ from fishd.errors import ConfigError
 from fishd.estimators.lateral_force import EstimatorSettings
 from fishd.hardware.imperfections import SimulationSettings
 from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
+from fishd.overrides import apply_overrides
 from fishd.plant.parameters import PlantParameters
 from fishd.schema import Problem, convert, without_empty_sections
 
@@ -203,9 +204,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: keys and values are needed, such as 'tick: 0.05'")
     sources = {key: f"{path}:{line}" for key, line in document.lines.items()}
-    for override in overrides:
-        key = _override(document.data, override)
-        sources[key] = f"--set {override}"
+    sources |= apply_overrides(document.data, overrides)
     try:
         config = convert(without_empty_sections(document.data, Config), Config)
         check_start(config.start.controller, config.start.parameters, config.limits)
@@ -220,6 +219,19 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     except Problem as problem:
         raise ConfigError(_located(problem, sources)) from None
     return config
+
+
+def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
+    """The configuration that a running fishd tells (`Fish.config`), with overrides.
+
+    What must fit together, that fishd has checked. Raises `ConfigError`.
+    """
+    sources = apply_overrides(data, overrides)
+    try:
+        return convert(data, Config)
+    except Problem as problem:
+        where = sources.get(problem.path, "the configuration of the fishd that runs")
+        raise ConfigError(_located(problem, {problem.path: where})) from None
 
 
 def _read(path: Path) -> strict_yaml.Document:
@@ -237,34 +249,6 @@ def _read(path: Path) -> strict_yaml.Document:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _override(data: dict[str, Any], override: str) -> tuple[str, ...]:
-    """Put one KEY=VALUE into the data; return the key as a path."""
-    dotted, equals, text = override.partition("=")
-    keys = tuple(dotted.strip().split("."))
-    if not equals or not all(keys):
-        raise ConfigError(f"--set {override}: write KEY=VALUE, such as plant.omega0=10")
-    section = data
-    for key in keys[:-1]:
-        section = section.setdefault(key, {})
-        if not isinstance(section, dict):
-            raise ConfigError(f"--set {override}: {key} is a single value, not a section")
-    section[keys[-1]] = _value(text.strip(), dotted, override)
-    return keys
-
-
-def _value(text: str, dotted: str, override: str) -> Any:
-    """A value from the command line, where a plain `1e-3` is a number."""
-    for number in (int, float):
-        try:
-            return number(text)
-        except ValueError:
-            continue
-    try:
-        return strict_yaml.parse(text, name=dotted).data if text else ""
-    except strict_yaml.YamlProblem as problem:
-        raise ConfigError(f"--set {override}: {problem}") from None
-
-
 def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:
     """Name the place of the problem: its own, one within it, or the nearest section above it."""
     path = problem.path
@@ -274,7 +258,7 @@ def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:
     return ": ".join(part for part in (where, ".".join(path), str(problem)) if part)
 
 
-def to_yaml(config: Config) -> str:
+def to_yaml(config: Config | dict[str, Any]) -> str:
     """The whole configuration, defaults included, as YAML that `load` reads back."""
     import yaml
 

@@ -21,6 +21,7 @@ from fishd.hardware.settings import (
     ServoSettings,
 )
 from fishd.schema import Problem
+from fishd.zmq_address import is_address
 
 PWM_PINS = (12, 13, 18, 19)
 SLOWEST_CONVERSION = 1.25
@@ -29,7 +30,6 @@ I2C_PINS = (2, 3)
 """SDA and SCL of bus 1."""
 LONGEST_SOCKET = 107
 """Of the path of a Unix socket, by Linux [bytes]."""
-_ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
 _LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
 
@@ -52,7 +52,7 @@ def check_start(controller: str | None, parameters: Mapping[str, Any], limits: L
 
 def check_addresses(telemetry: str, control: str | None) -> None:
     """Both are addresses, not the same, and requests come from this machine only."""
-    if not _is_address(telemetry):
+    if not is_address(telemetry):
         raise Problem(
             ("telemetry", "address"),
             f"'{telemetry}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
@@ -60,7 +60,7 @@ def check_addresses(telemetry: str, control: str | None) -> None:
     _check_length(("telemetry", "address"), telemetry)
     if control is None:
         return
-    if not (_is_address(control) and _LOCAL.match(control)):
+    if not (is_address(control) and _LOCAL.match(control)):
         raise Problem(
             ("control", "address"),
             f"'{control}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
@@ -213,8 +213,3 @@ def _check_length(key: tuple[str, ...], address: str) -> None:
             f"'{address}' is not valid: the path of a Unix socket has at most {LONGEST_SOCKET} "
             f"bytes, this one has {length}; choose a shorter one, such as in /run or /tmp",
         )
-
-
-def _is_address(text: str) -> bool:
-    found = _ADDRESS.fullmatch(text)
-    return found is not None and int(found["port"] or 0) < 65536

@@ -85,7 +85,13 @@ class Daemon:
                 config.realtime.priority, config.realtime.lock_memory
             )
             self._operations = Operations(
-                self._loop, self._clock, workbench, controllers, self._telemetry.address, fifo
+                self._loop,
+                self._clock,
+                workbench,
+                config,
+                controllers,
+                self._telemetry.address,
+                fifo,
             )
             self._server = ControlServer(context, address, self._operations.perform)
             self._stack = stack.pop_all()

@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from fishd import __version__, protocol
 from fishd.clock import Clock
+from fishd.config import Config
 from fishd.controllers import registry
 from fishd.errors import ParameterError, Refused, UnknownController
 from fishd.loop import ControlLoop
@@ -36,11 +37,13 @@ class Operations:
         loop: ControlLoop,
         clock: Clock,
         workbench: Workbench,
+        config: Config,
         controllers: list[ControllerInfo],
         telemetry: str,
         realtime: bool,
     ) -> None:
         """
+        config: what fishd was started with
         controllers: all that can be put in command
         telemetry: the address that clients are told
         realtime: is SCHED_FIFO in force?
@@ -50,6 +53,7 @@ class Operations:
         self._telemetry = telemetry
         self._realtime = realtime
         self._workbench = workbench
+        self._config = config
         self._started = clock.monotonic()
         self._decisions = 0
         self._loading = 0
@@ -58,6 +62,7 @@ class Operations:
             "status": (protocol.NoArguments, self._status),
             "controllers": (protocol.NoArguments, self._list_controllers),
             "policies": (protocol.NoArguments, self._list_policies),
+            "config": (protocol.NoArguments, self._tell_config),
             "set-controller": (protocol.SetController, self._set_controller),
             "set-parameter": (protocol.SetParameter, self._set_parameter),
             "stop": (protocol.NoArguments, self._stop),
@@ -123,6 +128,9 @@ class Operations:
         self._check_busy()
         limits = self._loop.limits
         return await self._aside(library.describe_all, limits.tick, limits.amplitude)
+
+    async def _tell_config(self, _: protocol.NoArguments) -> Config:
+        return self._config
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain

@@ -65,7 +65,7 @@ class State(Struct, frozen=True):
 
 
 class NoArguments(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of status, controllers, policies, stop and clear-fault."""
+    """Arguments of status, controllers, policies, config, stop and clear-fault."""
 
 
 class SetController(Struct, frozen=True, forbid_unknown_fields=True):

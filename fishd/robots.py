@@ -60,14 +60,14 @@ def parts_of(config: Config) -> tuple[ownership.Part, ...]:
     return ()
 
 
-class Lockstep(NamedTuple):
+class InVirtualTime(NamedTuple):
     """A robot whose whole hardware path runs in virtual time, and the virtual Pi behind it."""
 
     robot: Robot
     pi: "VirtualPi"
 
 
-def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
+def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
     """A virtual Pi and the drivers on it in virtual time: it moves when the loop reads the sensor.
 
     Its own clock runs ahead of the loop's by the rest of a conversion.
@@ -90,7 +90,7 @@ def open_lockstep(config: Config, stack: ExitStack) -> Lockstep:
     robot = _assemble(
         with_pigpio_port(config, pi.pigpiod.port), clock, stack, threaded=False, truth=pi.tank.truth
     )
-    return Lockstep(robot, pi)
+    return InVirtualTime(robot, pi)
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:

@@ -22,7 +22,7 @@ from fishd.hardware.simulated import SimulatedFish
 from fishd.plant.optimum import best_square_wave
 from fishd.plant.tethered import TrueWindow
 from fishd.reporting import Publisher
-from fishd.robots import open_lockstep
+from fishd.robots import open_in_virtual_time
 from fishd.signals import Event, Reason, Tick
 
 LONGEST = 1e8
@@ -243,7 +243,7 @@ def judge(
 def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], TrueWindow]]:
     """What swims, and how to ask what it truly did since the last time."""
     if config.robot == "virtual-pi":
-        robot, pi = open_lockstep(config, stack)
+        robot, pi = open_in_virtual_time(config, stack)
         return robot, pi.tank.take_window
     fish = SimulatedFish(config.plant, config.simulation, config.tick)
     return fish.robot(), fish.take_window

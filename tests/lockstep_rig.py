@@ -12,7 +12,7 @@ from fishd.clock import Slot, VirtualClock
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
-from fishd.robots import open_lockstep
+from fishd.robots import open_in_virtual_time
 from fishd.signals import Tick
 
 GPIO = 18
@@ -25,7 +25,7 @@ class LockstepRig:
     def __init__(self, folder: Path, stack: ExitStack, *overrides: str) -> None:
         self.config = load(None, ["robot=virtual-pi", f"state_folder={folder}", *overrides])
         self.clock = VirtualClock()
-        self.robot, self.pi = open_lockstep(self.config, stack)
+        self.robot, self.pi = open_in_virtual_time(self.config, stack)
         self.recorder = Recorder()
         self.loop = build_loop(self.config, self.robot, self.clock, self.recorder)
         self.index = 0

@@ -44,7 +44,7 @@ from fishd.hardware.calibration import ForceCalibration
 from fishd.hardware.settings import ForceSensorSettings
 from fishd.hardware.simulated import SimulatedFish
 from fishd.loop import ControlLoop
-from fishd.robots import open_lockstep
+from fishd.robots import open_in_virtual_time
 
 SIMULATED_TICKS = 1_000_000
 VIRTUAL_PI_TICKS = 20_000
@@ -90,7 +90,7 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         config = virtual_pi_config(folder, seed)
         clock = VirtualClock()
-        robot, pi = open_lockstep(config, stack)
+        robot, pi = open_in_virtual_time(config, stack)
         publisher = Counting()
         loop = build_loop(config, robot, clock, publisher)
         rest = Rest(loop, patience=30)  # one attempt to connect to pigpiod takes up to ten

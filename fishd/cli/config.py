@@ -1,11 +1,13 @@
 """Verbs about the configuration: check a file, show what is in force, print the schema."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from fishd.cli.options import json_option
+from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import print_json
+from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file, to_yaml
 from fishd.console import complain
 from fishd.errors import ConfigError
@@ -51,14 +53,28 @@ def check(file: Path, overrides: tuple[str, ...]) -> None:
 @config.command()
 @click.argument("file", type=click.Path(path_type=Path), required=False)
 @set_option
+@click.option("--running", is_flag=True, help="What the fishd that runs was started with, instead.")
+@endpoint_option
 @json_option
-def show(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
+def show(
+    file: Path | None,
+    overrides: tuple[str, ...],
+    running: bool,
+    endpoint: str | None,
+    as_json: bool,
+) -> None:
     """Print every key with its value in FILE, or its default."""
-    loaded = load_or_exit(file, overrides)
-    if as_json:
-        print_json(loaded)
+    if running:
+        if file or overrides:
+            raise click.UsageError("--running shows what fishd was started with: no FILE, no --set")
+        with Fish(endpoint) as fish:
+            shown: Config | dict[str, Any] = fish.config()
     else:
-        click.echo(to_yaml(loaded), nl=False)
+        shown = load_or_exit(file, overrides)
+    if as_json:
+        print_json(shown)
+    else:
+        click.echo(to_yaml(shown), nl=False)
 
 
 @config.command()

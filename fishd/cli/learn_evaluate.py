@@ -1,5 +1,6 @@
 """The verb that compares policies and controllers on the same simulated fish."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
     from fishd.learning.comparison import Standing
 
+WIDE = 1000
 _HEADS = ("mN", "Hz", "|φ_c|/Φ", "square")
 
 
@@ -78,7 +80,8 @@ def evaluate(
     else:
         from rich.console import Console
 
-        Console().print(_table(standings))
+        # In a file or a pipe nothing is wrapped.
+        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings))
     faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
     for contestant, fault in faults:
         click.echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)

@@ -1,9 +1,6 @@
 """The verb that trains."""
 
-import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -34,7 +31,7 @@ INTERRUPTED = 130
     "--config",
     "file",
     type=click.Path(path_type=Path),
-    help="Configuration of the fish; for a robot, the file that its fishd was started with.",
+    help="Configuration of the fish. [default: the defaults; for a robot, that of its fishd]",
 )
 @set_option
 @click.option(
@@ -114,6 +111,8 @@ def ppo(
         job = _new(config, settings, folder, on, endpoint, parent)
     if job.on == "simulation":
         _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
+    else:
+        _warn_of_other_plant(job)
     job = replace(job, agent=agent)
     if seeds is not None:
         from fishd.cli.learn_seeds import train_seeds
@@ -142,14 +141,26 @@ def _chosen(
     from fishd.learning.links import daemon_config
 
     try:
-        settings = training.load(settings_file)
-        if parent and not settings_file:
-            settings = runs.read(_run_of(parent))[1]
+        of_parent = runs.read(_run_of(parent))[1] if parent else None
+        settings = of_parent if of_parent and not settings_file else training.load(settings_file)
         if on == "robot":
             return daemon_config(endpoint, file, overrides), settings
     except ConfigError as error:
         complain("fishctl", str(error), EX_CONFIG)
     return load_or_exit(file, overrides), settings
+
+
+def _warn_of_other_plant(job: "Job") -> None:
+    """What the network sees is scaled by the plant, so that of fishd is most likely meant."""
+    from fishd.learning.links import other_plant
+
+    other = other_plant(job.endpoint, job.config)
+    if other:
+        click.echo(
+            "fishctl: careful: scales and efficiency are made for another plant than that of the "
+            f"fishd that runs: {other}",
+            err=True,
+        )
 
 
 def _new(
@@ -199,11 +210,13 @@ def _resumed(
 
 def _train(job: "Job") -> int:
     from fishd.learning.progress import on_terminal
+    from fishd.learning.stopping import on_signal
     from fishd.learning.training import train
 
+    asked = threading.Event()
     try:
-        with _until_signalled() as stop, on_terminal() as show:
-            outcome = train(job, show, stop)
+        with on_signal(asked.set), on_terminal() as show:
+            outcome = train(job, show, asked.is_set)
     except ConfigError as error:
         complain("fishctl", str(error), EX_CONFIG)
     return _report(outcome, job)
@@ -217,15 +230,25 @@ def _report(outcome: "Outcome", job: "Job") -> int:
     for option, address in (("--endpoint", job.endpoint), ("--agent", job.agent)):
         if address:
             again += f" {option} {address}"
-    if outcome.ended in ("lost", "diverged"):
+    if outcome.ended == "diverged":  # and would again
+        best = f"; the best so far: fishctl learn export {outcome.folder}" if outcome.best else ""
+        click.echo(f"fishctl: {outcome.message}{best}", err=True)
+        return 1
+    if outcome.ended == "lost":
         click.echo(f"fishctl: {outcome.message}; to go on: {again}", err=True)
         return 1
     if outcome.ended == "interrupted":
-        click.echo(f"fishctl: stopped after {outcome.steps} steps; to go on: {again}", err=True)
+        lost = f", {outcome.dropped} of an unfinished rollout dropped" if outcome.dropped else ""
+        click.echo(
+            f"fishctl: stopped after {outcome.steps} steps{lost}; to go on: {again}", err=True
+        )
         return INTERRUPTED
     click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time")
     if outcome.best_evaluation:
         click.echo(f"best: {described(outcome.best_evaluation).strip()}")
+    elif outcome.latest_evaluation:
+        click.echo("it stalled in every evaluation; train it for longer, or with another --seed")
+        return 0
     click.echo(f"to write it to a policy file: fishctl learn export {outcome.folder}")
     return 0
 
@@ -235,26 +258,14 @@ def _changed(settings: "TrainingSettings", **given: int | None) -> "TrainingSett
 
 
 def _run_of(path: Path) -> Path:
-    """The run folder of a run or of one of its checkpoints."""
+    """The run folder of a run or of one of its checkpoints; raises `ConfigError`."""
     from fishd.learning.runs import SETTINGS
 
+    if not path.is_dir():
+        what = (
+            "no folder: of a policy file the value network is gone"
+            if path.exists()
+            else ("no such folder")
+        )
+        raise ConfigError(f"--from {path}: {what}; give a run folder or one of its checkpoints")
     return path if (path / SETTINGS).exists() else path.parent
-
-
-@contextmanager
-def _until_signalled() -> Iterator[Callable[[], bool]]:
-    """Tells whether SIGINT, SIGTERM or SIGHUP has come; a second one ends the program as ever."""
-    asked = threading.Event()
-
-    def ask(number: int, _: object) -> None:
-        asked.set()
-        signal.signal(number, former[signal.Signals(number)])
-
-    former = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    for number in former:
-        signal.signal(number, ask)
-    try:
-        yield asked.is_set
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)

@@ -20,7 +20,7 @@ def train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) -
     """Train them all, a line as each ends, and a summary; the exit status."""
     from fishd.learning import seeds as learning
 
-    click.echo(f"{job.folder}: {seeds} seeds of {job.settings.steps} steps")
+    click.echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps")
     try:
         outcomes = learning.train_seeds(job, seeds, jobs, cluster, _tell)
     except ConfigError as error:

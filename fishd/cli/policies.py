@@ -16,6 +16,8 @@ from fishd.policies.info import PolicyInfo
 from fishd.schema import names_file
 
 HEAD = ("name", "Φ [rad]", "tick", "trained in", "steps", "efficiency", "created", "folder")
+WIDEST = 40
+"""Longer cells are cut, but for the last."""
 
 
 @click.group(invoke_without_command=True)
@@ -100,7 +102,7 @@ def _row(info: PolicyInfo) -> tuple[str, ...]:
         past["created"][:10],
         folder,
     )
-    return tuple(_printable(cell) for cell in cells)
+    return (*(_short(_printable(cell)) for cell in cells[:-1]), _printable(folder))
 
 
 def _as_text(info: PolicyInfo) -> str:
@@ -119,3 +121,7 @@ def _as_text(info: PolicyInfo) -> str:
 
 def _printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def _short(cell: str) -> str:
+    return cell if len(cell) <= WIDEST else cell[: WIDEST - 1] + "…"

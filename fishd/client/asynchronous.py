@@ -55,6 +55,10 @@ class AsyncFish(Connection):
         """The named policies that the daemon finds, with what their files say about themselves."""
         return await self._call(list[PolicyInfo], "policies")
 
+    async def config(self) -> dict[str, Any]:
+        """The configuration that the daemon was started with, defaults included."""
+        return await self._call(dict[str, Any], "config")
+
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
         """Put another controller in command; parameters left out take their defaults."""
         return await self._call(State, "set-controller", name=name, parameters=parameters)

@@ -62,6 +62,10 @@ class Fish(Connection):
         """The named policies that the daemon finds, with what their files say about themselves."""
         return self._call(list[PolicyInfo], "policies")
 
+    def config(self) -> dict[str, Any]:
+        """The configuration that the daemon was started with, defaults included."""
+        return self._call(dict[str, Any], "config")
+
     def set_controller(self, name: str, /, **parameters: Any) -> State:
         """Put another controller in command; parameters left out take their defaults."""
         return self._call(State, "set-controller", name=name, parameters=parameters)

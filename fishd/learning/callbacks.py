@@ -48,6 +48,11 @@ class Watch(BaseCallback):
         self._lost = self._counted = 0
         self._forget()
 
+    @property
+    def moves(self) -> int:
+        """Steps of the latest rollout so far."""
+        return len(self._actions)
+
     def figures(self) -> Figures:
         """Those of the rollout that has just ended."""
         actions = np.array(self._actions)

@@ -14,6 +14,7 @@ from fishd.controllers import registry
 from fishd.errors import ParameterError, PolicyError
 from fishd.learning.evaluation import best_on_grid
 from fishd.policies import library
+from fishd.schema import names_file, nearest
 from fishd.signals import Event, Tick
 from fishd.simulation import Report, judge
 
@@ -66,10 +67,15 @@ class Standing(Struct, frozen=True, kw_only=True):
 def parse(text: str) -> Contestant:
     """`swing:C=0.6`, `square:frequency=1.7,amplitude=0.3`, the name of a policy, a policy file.
 
-    Raises `ParameterError`; who that is, `compare` looks up.
+    Raises `ParameterError`.
     """
     name, _, values = text.partition(":")
     if name not in registry.names():
+        if not (names_file(text, library.SUFFIX) or text in library.names()):
+            hint = nearest(name, [*registry.names(), *library.names()])
+            raise ParameterError(
+                f"'{name}' is no controller, named policy or {library.SUFFIX} file; {hint}"
+            )
         return Contestant(text, "ppo", {"policy": text})
     parameters = {}
     for pair in filter(None, values.split(",")):

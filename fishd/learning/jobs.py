@@ -1,5 +1,6 @@
 """What a training is asked for, and what it comes to."""
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +33,11 @@ class Job(Struct, frozen=True, kw_only=True):
     parent: Path | None = None
     """Checkpoint whose networks a new run begins with."""
 
+    def last_step(self, done: int = 0) -> int:
+        """The step with which it ends: PPO learns from whole rollouts; done: steps before."""
+        rollout = self.settings.ppo.n_steps
+        return done + math.ceil((self.settings.steps - done) / rollout) * rollout
+
 
 class Outcome(Struct, frozen=True, kw_only=True):
     """How a training ended."""
@@ -39,6 +45,8 @@ class Outcome(Struct, frozen=True, kw_only=True):
     folder: Path
     steps: int
     """Control steps that were learned from."""
+    dropped: int
+    """Steps of a rollout that was stopped midway: nothing was learned from them."""
     tank_time: float
     """[s]"""
     ended: Ended

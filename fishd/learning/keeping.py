@@ -46,6 +46,7 @@ class Keeper:
         elif job.parent:
             self._begin_with(job.parent)
         self._open(self.resumed)
+        self.keep()  # whatever happens from now on, there is something to resume
 
     def log(self, figures: Figures) -> None:
         """One row about the latest rollout and update."""
@@ -135,7 +136,8 @@ class Keeper:
             )
         if state.steps >= job.settings.steps:
             raise ConfigError(
-                f"{job.folder} has all of its {state.steps} steps; --steps gives it more in all"
+                f"{job.folder} is finished, with {state.steps} steps; to train it for longer, give "
+                f"more in all, such as --steps {state.steps + job.settings.steps}"
             )
         checkpoints.load_parameters(self._model, start)
         self._note = checkpoints.read_card(start).provenance.note

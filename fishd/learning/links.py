@@ -3,9 +3,12 @@
 import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from fishd.client import Fish
-from fishd.config import Config, load
+from fishd.config import Config, adopt, load
 from fishd.errors import ConfigError
 from fishd.learning.in_process import InProcess
 from fishd.learning.link import Link
@@ -26,18 +29,29 @@ def on_daemon(endpoint: str | None, agent: str | None = None) -> Link:
 
 
 def daemon_config(endpoint: str | None, file: Path | None, overrides: Iterable[str]) -> Config:
-    """The configuration for a training on a running fishd.
+    """The configuration for a training on a running fishd: its own, unless a file is given.
 
-    The daemon tells only its tick and Φ, so that the plant, which the scales are made from, must
-    come from here: from its own file, or from the defaults. Without a file, tick and Φ are those of
-    the daemon. Raises `ConfigError` and `FishError`.
+    Raises `ConfigError` and `FishError`.
     """
-    if file is None:
-        with Fish(endpoint) as fish:
-            status = fish.status()
-        found = (f"tick={status.tick!r}", f"amplitude_limit={status.amplitude_limit!r}")
-        overrides = (*found, *overrides)
-    return load(file, overrides)
+    if file is not None:
+        return load(file, overrides)
+    with Fish(endpoint) as fish:
+        return adopt(fish.config(), overrides)
+
+
+def other_plant(endpoint: str | None, config: Config) -> str:
+    """Where the plant that the scales are made for is not the one of fishd; empty if it is.
+
+    Raises `FishError`.
+    """
+    with Fish(endpoint) as fish:
+        theirs: dict[str, Any] = fish.config()["plant"]
+    ours: dict[str, Any] = msgspec.to_builtins(config.plant)
+    return ", ".join(
+        f"plant.{key} is {value!r} here, {theirs.get(key)!r} there"
+        for key, value in ours.items()
+        if theirs.get(key) != value
+    )
 
 
 def check_agreement(link: Link, config: Config) -> None:

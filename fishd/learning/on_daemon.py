@@ -39,11 +39,18 @@ class OnDaemon:
         patience: how long the fish may take to begin, or to go on [s]
         deadline: how long a tick waits for an action [s]; None for fishd's default
 
-        Raises `NoDaemon` when no fishd answers, `FishError` when the address cannot be bound.
+        Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop, and
+        `FishError` when the address cannot be bound.
         """
         self._fish = Fish(endpoint)
         try:
             status = self._fish.status()
+            if status.reason:
+                raise Refused(
+                    status.mode,
+                    f"fishd is in mode {status.mode}: {status.reason.message}; "
+                    "when that is mended, leave it with 'fishctl clear-fault'",
+                )
             self._agent = _agent(address, status)
         except FishError:
             self._fish.close()

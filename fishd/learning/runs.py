@@ -19,14 +19,25 @@ def default_folder() -> Path:
 
 def create(folder: Path, config: Config, settings: TrainingSettings) -> None:
     """Make a run folder; raises `ConfigError` where something is there already."""
+    make_folder(folder, f", or go on with --resume {folder}")
     try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ConfigError(
-                f"{folder} is there already; give another --folder, or go on with --resume {folder}"
-            )
-        folder.mkdir(parents=True, exist_ok=True)
         (folder / CONFIG).write_text(configuration.to_yaml(config), encoding="utf-8")
         keep_settings(folder, settings)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def make_folder(folder: Path, otherwise: str = "") -> None:
+    """Make a folder, or use an empty one.
+
+    otherwise: what can be done where it is not empty, other than to take another one
+
+    Raises `ConfigError`.
+    """
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ConfigError(f"{folder} is there already; give another --folder{otherwise}")
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
 

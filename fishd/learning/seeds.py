@@ -18,11 +18,13 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.errors import ConfigError, FishdError
+from fishd.errors import FishdError
 from fishd.learning.checkpoints import Evaluation
 from fishd.learning.cluster import asked, packed, scheduler, unpack
 from fishd.learning.jobs import Job
+from fishd.learning.runs import make_folder
 from fishd.learning.seed_table import write_summary
+from fishd.learning.stopping import on_signal
 from fishd.learning.training import train
 
 STOP = "stop"
@@ -79,7 +81,7 @@ def train_seeds(
         ended(outcome)
 
     with scheduler(cluster) as event, _ask_to_stop(folder / STOP, event):
-        _make(folder)
+        make_folder(folder)
         name = event.name if event else str(folder / STOP)
         for attempt in range(_ATTEMPTS):
             tasks = [
@@ -99,15 +101,6 @@ def train_seeds(
             break
     write_summary(folder / "seeds.csv", [waiting[index].folder for index in range(seeds)])
     return [outcomes[index] for index in range(seeds)]
-
-
-def _make(folder: Path) -> None:
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ConfigError(f"{folder} is there already; give another --folder")
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
 
 
 def _job_of(job: Job, folder: Path, index: int) -> Job:
@@ -176,25 +169,16 @@ def _failed(job: Job, message: str) -> SeedOutcome:
 
 @contextmanager
 def _ask_to_stop(file: Path, event: Any) -> Iterator[None]:
-    """While this lasts, SIGINT, SIGTERM and SIGHUP say stop; a second one ends this process."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """While this lasts, signals say stop to all of them."""
 
-    def ask(number: int, _: object) -> None:
-        signal.signal(number, former[number])
+    def ask() -> None:
         if event:
             threading.Thread(target=event.set).start()  # it waits for the scheduler
         else:
             file.touch()
 
-    former: dict[int, Any] = {
-        number: signal.signal(number, ask)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    }
     try:
-        yield
+        with on_signal(ask):
+            yield
     finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
         file.unlink(missing_ok=True)

@@ -23,14 +23,14 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Meta(description="What the agent sees, in order.", min_length=1),
     ] = ("fy", "fy_rate", "instruction_angle", "fin_velocity")
     force_scale: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
+        Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         Meta(
             description="F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant.",
             extra_json_schema={"unit": "N"},
         ),
     ] = None
     thrust_scale: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
+        Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         Meta(
             description="F_x whose reward is `reward_scale`; null: the best square wave's thrust.",
             extra_json_schema={"unit": "N"},

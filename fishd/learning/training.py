@@ -92,6 +92,7 @@ class Training:
         return Outcome(
             folder=job.folder,
             steps=keeper.steps,
+            dropped=self._watch.moves if self._watch.stopped else 0,
             tank_time=self._env.tank_time,
             ended=ended,
             message=message,
@@ -103,17 +104,19 @@ class Training:
 
     def _introduce(self) -> None:
         keeper, job = self._keeper, self._job
-        where = f"{job.folder}: {job.settings.steps} steps on {job.on}"
+        last, rollout = job.last_step(keeper.steps), job.settings.ppo.n_steps
+        whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
+        where = f"{job.folder}: {last} steps{whole} on {job.on}"
         if keeper.resumed:
             where += (
                 f", on from {keeper.checkpoint}, {minutes(keeper.resumed.tank_time)} in the tank"
             )
-        self._show.begin(keeper.steps, job.settings.steps, where)
+        self._show.begin(keeper.steps, last, where)
 
     def _reset(self) -> None:
         """Let the first episode begin; of a resumed run, with random numbers that go on."""
         self._start_with(cast(NDArray[np.float32], self._vec_env.reset()))
-        if self._keeper.resumed:
+        if self._keeper.resumed and self._keeper.steps:  # else it begins as it did before
             checkpoints.restore_random_state(self._keeper.resumed.random, self._env.np_random)
 
     def _start_with(self, observations: NDArray[np.float32]) -> None:

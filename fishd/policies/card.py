@@ -4,7 +4,6 @@ The card travels inside the ONNX file, so that a network is never run without it
 another tick or for another amplitude than it was trained for.
 """
 
-import math
 from operator import attrgetter
 from typing import Annotated, Any, Literal
 
@@ -29,7 +28,8 @@ SAME_TICK = 1e-9
 FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle"]
 """Fields of `Observation` that a policy may see."""
 
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(ge=1e-30, le=1e30)]
+"""What a float32 can hold, and its inverse too."""
 
 
 class Feature(Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,9 +123,13 @@ def decode(text: str) -> Card:
     """The card in `text`; raises `PolicyError` that names what is missing or wrong."""
     try:
         data = msgspec.json.decode(text)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except RecursionError:
+        raise PolicyError("its card is JSON that is nested too deeply") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise PolicyError(f"its card is no JSON: {error}") from None
-    found = data.get("format") if isinstance(data, dict) else None
+    if not isinstance(data, dict):
+        raise PolicyError("its card is no JSON object")
+    found = data.get("format")
     if found != FORMAT:
         raise PolicyError(f"its card has format {found!r}; this fishd reads format {FORMAT}")
     try:
@@ -134,7 +138,4 @@ def decode(text: str) -> Card:
         raise PolicyError(f"its card: {'.'.join(problem.path)}: {problem}") from None
     if not card.observation:
         raise PolicyError("its card names no observation")
-    numbers = (card.tick, card.amplitude, *(feature.scale for feature in card.observation))
-    if not all(math.isfinite(number) for number in numbers):
-        raise PolicyError("its card holds a number that is not finite")
     return card

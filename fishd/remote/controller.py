@@ -8,8 +8,9 @@ from fishd.controllers.base import Controller, Limits
 from fishd.errors import ControllerFault, ParameterError
 from fishd.remote.messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.remote.parameters import RemoteParameters
-from fishd.remote.wire import Wire, is_address
+from fishd.remote.wire import Wire
 from fishd.signals import Observation
+from fishd.zmq_address import is_address
 
 DEADLINE = 0.4
 """Time that the agent has by default, as a share of the tick."""

@@ -1,6 +1,5 @@
 """The socket between the controller `remote` and its agent; nothing here waits but `wait`."""
 
-import re
 import select
 
 import msgspec
@@ -9,7 +8,6 @@ import zmq
 from fishd.errors import ControllerFault
 from fishd.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
 
-_ADDRESS = re.compile(r"tcp://[^/\s]+:(?P<port>[0-9]+)|ipc://[^@\s]\S*")
 _QUEUE = 100
 """Messages kept in either direction; an agent that does not read gets no more than these."""
 _FAREWELL = 200
@@ -20,12 +18,6 @@ class _Versioned(msgspec.Struct):
     """Any message, as far as every version will have it."""
 
     v: int = VERSION
-
-
-def is_address(text: str) -> bool:
-    """Can a socket connect to it?"""
-    found = _ADDRESS.fullmatch(text)
-    return found is not None and 0 <= int(found["port"] or 1) < 65536
 
 
 class Wire:

@@ -95,6 +95,21 @@ def test_a_strangers_file_says_nothing_to_the_terminal(nobody: Path) -> None:
         assert "\x1b" not in done.stdout
 
 
+def test_absurd_words_in_a_file_do_not_spoil_the_table(nobody: Path) -> None:
+    import msgspec
+
+    from fishd.policies.network import to_onnx
+
+    past = msgspec.structs.replace(PROVENANCE, on="x" * 10_000, steps=10**50)
+    write(
+        nobody,
+        to_onnx(linear(1.0), "tanh", msgspec.structs.replace(card(), provenance=past)),
+        "odd",
+    )
+    table = call("policies").stdout
+    assert max(len(line) for line in table.splitlines()) < 200 + len(str(nobody))
+
+
 def test_a_policy_can_be_simulated_by_name_and_by_a_relative_path(
     nobody: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,6 +131,10 @@ def test_a_parameter_that_the_controller_lacks_is_refused_by_name(daemon: Daemon
 def test_the_configuration_can_be_checked_shown_and_explained(idle_daemon: Daemon) -> None:
     shown = idle_daemon.fishctl("config", "show", "--set", "plant.xi=0.5").stdout
     assert "  xi: 0.5" in shown
+    running = json.loads(idle_daemon.fishctl("config", "show", "--running", "--json").stdout)
+    assert running["control"]["address"] == idle_daemon.endpoint
+    done = idle_daemon.fishctl("config", "show", "--running", "--set", "plant.xi=0.5")
+    assert done.returncode == 2
     schema = json.loads(idle_daemon.fishctl("config", "schema").stdout)
     assert "tick" in schema["$defs"]["Config"]["properties"]
     done = idle_daemon.fishctl("config", "check", "nowhere.yaml")

@@ -54,10 +54,11 @@ def test_without_names_the_best_square_wave_of_whole_ticks_meets_swing() -> None
 
 
 def test_what_is_no_controller_is_taken_for_a_policy() -> None:
-    assert parse("champion") == ("champion", "ppo", {"policy": "champion"})
+    assert parse("default-fish") == ("default-fish", "ppo", {"policy": "default-fish"})
     assert parse("C:/a.onnx").parameters == {"policy": "C:/a.onnx"}
-    with pytest.raises(ParameterError, match="champion"):
-        swum("champion")
+    for text, hint in (("sqare:frequency=2", "square"), ("defaultfish", "default-fish")):
+        with pytest.raises(ParameterError, match=f"is no controller, named .* '{hint}'"):
+            parse(text)
 
 
 def test_nobody_swims_before_everybody_is_known_to_be_able_to() -> None:

@@ -1,5 +1,6 @@
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -57,12 +58,12 @@ def _arguments(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_it_trains_and_says_how_it_went(tmp_path: Path, settings: str) -> None:
     folder = tmp_path / "run"
-    found = learn("ppo", "--settings", settings, "--folder", str(folder), "--seed", "3")
+    found = learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "512")
     assert found.exit_code == 0, found.output
-    assert "128 steps in 0:0" in found.output
+    assert "512 steps in 0:2" in found.output
     assert f"fishctl learn export {folder}" in found.output
     assert found.output.count(" in the tank: ") >= 2  # a line for each evaluation
-    assert runs.read(folder)[1].seed == 3
+    assert runs.read(folder)[1].steps == 512
 
 
 def test_it_goes_on_with_more_steps(tmp_path: Path, settings: str) -> None:
@@ -107,16 +108,40 @@ def test_mistakes_are_one_line(
     assert complaint(capsys, "ppo", "--folder", folder)[0] == 78
     status, line = complaint(capsys, "ppo", "--resume", folder)
     assert status == 78
-    assert "has all of its 128 steps; --steps gives it more in all" in line
+    assert "is finished, with 128 steps; to train it for longer, give more in all" in line
     status, line = complaint(capsys, "ppo", "--resume", folder, "--seed", "2")
     assert status == 2
     assert "--seed cannot be given here" in line
     status, line = complaint(capsys, "ppo", "--resume", str(tmp_path))
     assert status == 78
     assert "it holds no settings.yaml" not in line  # there is one, but nothing else of a run
+    for name, what in (("a.onnx", "of a policy file the value network is gone"), ("b", "no such")):
+        (tmp_path / "a.onnx").touch()
+        status, line = complaint(capsys, "ppo", "--from", str(tmp_path / name))
+        assert status == 78
+        assert what in line
     status, line = complaint(capsys, "ppo", "--seeds", "2", "--on", "robot")
     assert status == 2
     assert "there is only one robot" in line
+
+
+def test_it_says_that_it_learns_from_whole_rollouts(tmp_path: Path, settings: str) -> None:
+    found = learn("ppo", "--settings", settings, "--folder", str(tmp_path / "a"), "--steps", "65")
+    assert "128 steps, in whole rollouts of 64 on simulation" in found.output
+    assert "\n128 steps in " in found.output
+
+
+def test_a_policy_that_never_swam_is_not_for_a_file(tmp_path: Path) -> None:
+    idle = tmp_path / "idle.yaml"
+    idle.write_text(
+        SETTINGS.replace("n_epochs: 4", "n_epochs: 1, learning_rate: 1.0e-9"), encoding="utf-8"
+    )
+    found = learn(
+        "ppo", "--settings", str(idle), "--folder", str(tmp_path / "run"), "--steps", "64"
+    )
+    assert found.exit_code == 0, found.output
+    assert "it stalled in every evaluation; train it for longer" in found.output
+    assert "learn export" not in found.output
 
 
 def start(folder: Path, *arguments: str) -> "subprocess.Popen[str]":
@@ -150,9 +175,9 @@ def test_a_signal_leaves_a_checkpoint_to_go_on_from(
     _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, err
     done = checkpoints.read_state(checkpoints.newest(folder)).steps
-    assert err == (
-        f"fishctl: stopped after {done} steps; to go on: fishctl learn ppo --resume {folder}\n"
-    )
+    dropped = r"(, \d+ of an unfinished rollout dropped)?"
+    go_on = re.escape(f"to go on: fishctl learn ppo --resume {folder}\n")
+    assert re.fullmatch(f"fishctl: stopped after {done} steps{dropped}; {go_on}", err)
     assert int(rows(folder / "progress.csv")[-1]["steps"]) == done
     found = learn("ppo", "--resume", str(folder), "--steps", str(done + 64))
     assert found.exit_code == 0, found.output
@@ -227,7 +252,8 @@ def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
     )
     assert found.exit_code == 0, found.output
     config, _ = runs.read(folder)
-    assert config.tick == 0.01
+    assert (config.tick, config.simulation.noise) == (0.01, 0.001)  # all of it is that of fishd
+    assert found.stderr == ""
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["64", "128"]
     evaluations = rows(folder / "evaluations.csv")
     assert float(evaluations[0]["tank_time"]) >= 0.64 + 1.0  # those are swum in the tank, too
@@ -261,6 +287,28 @@ def test_an_estop_ends_it_with_the_reason_and_a_checkpoint(
         f"to go on: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
     )
     assert checkpoints.read_state(checkpoints.newest(folder)).steps >= 64
+
+
+def test_nothing_begins_while_an_emergency_stop_is_latched(tmp_path: Path, daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        fish.estop("the tail hit the glass")
+    folder = tmp_path / "run"
+    found = learn("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--folder", str(folder))
+    assert "fishd is in mode estop: the tail hit the glass; " in str(found.exception)
+    assert not folder.exists()
+
+
+def test_another_plant_than_that_of_the_fishd_is_told(
+    tmp_path: Path, hasty: str, daemon: Daemon
+) -> None:
+    found = learn(
+        *("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--steps", "64"),
+        *("--settings", hasty, "--folder", str(tmp_path / "run"), "--set", "plant.omega0=11"),
+    )
+    assert found.exit_code == 0, found.output
+    assert "another plant than that of the fishd that runs: plant.omega0 is 11.0 here" in (
+        found.stderr
+    )
 
 
 def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(

@@ -103,7 +103,7 @@ def test_checkpoints_come_when_they_are_due(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=320, checkpoint_every=150, evaluation=never())
     train(job)
     found = sorted(path.name for path in job.folder.glob("step-*"))
-    assert found == ["step-000192", "step-000320"]
+    assert found == ["step-000000", "step-000192", "step-000320"]
 
 
 def never() -> EvaluationSettings:
@@ -173,10 +173,28 @@ def test_a_resume_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path) -> No
     assert not half.exists()
 
 
+def test_a_run_that_was_killed_in_its_first_rollout_goes_on_as_if_it_had_not_been(
+    tmp_path: Path,
+) -> None:
+    job, whole = brief_job(tmp_path / "run"), brief_job(tmp_path / "whole")
+
+    def die() -> bool:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(job, stop=die)
+    (left,) = job.folder.glob("step-*")
+    assert left.name == "step-000000"
+    train(replace(job, resume=True))
+    train(whole)
+    table = (job.folder / "progress.csv").read_bytes()
+    assert table == (whole.folder / "progress.csv").read_bytes()
+
+
 def test_a_run_that_has_all_its_steps_or_no_checkpoint_says_so(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     train(job)
-    with pytest.raises(ConfigError, match="has all of its 128 steps; --steps gives it more"):
+    with pytest.raises(ConfigError, match="is finished, with 128 steps; to train it for longer"):
         train(replace(job, resume=True))
     with pytest.raises(CheckpointError, match="no checkpoint is in there"):
         train(replace(job, resume=True, folder=tmp_path))
@@ -195,6 +213,7 @@ def test_when_told_to_stop_it_keeps_what_it_has_learned(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=10_000)
     outcome = train(job, witness, lambda: witness.after(64 + 20))
     assert (outcome.ended, outcome.steps, witness.steps) == ("interrupted", 64, 84)
+    assert outcome.dropped == 20
     assert outcome.checkpoint == job.folder / "step-000064"
     assert outcome.tank_time >= 84 * 0.05
     saved, _, _ = load_from_zip_file(outcome.checkpoint / "model.zip")
@@ -263,7 +282,8 @@ def test_a_run_that_blows_up_says_so_and_keeps_no_broken_policy(tmp_path: Path) 
     outcome = training.run()
     assert outcome.ended == "diverged"
     assert "learning blew up in the update after 64 steps; lower ppo.learning" in outcome.message
-    assert outcome.checkpoint is None
+    assert outcome.checkpoint == job.folder / "step-000000"
+    assert all(bool(v.isfinite().all()) for v in parameters(outcome.checkpoint).values())
 
 
 def test_another_run_can_begin_with_its_networks(tmp_path: Path) -> None:

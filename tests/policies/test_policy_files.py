@@ -115,7 +115,7 @@ def test_two_cards_are_refused() -> None:
     [
         ({"format": 2}, "its card has format 2; this fishd reads format 1"),
         ({"format": None}, "its card has format None; this fishd reads format 1"),
-        ({"tick": None}, "its card: tick: is missing: a number in (0, inf) is needed"),
+        ({"tick": None}, "its card: tick: is missing: a number in [1e-30, 1e+30] is needed"),
         ({"tick": 0}, "its card: tick: 0 is not valid"),
         ({"amplitude": -0.42}, "its card: amplitude: -0.42 is not valid"),
         ({"amplitude": "wide"}, "its card: amplitude: 'wide' is not valid"),
@@ -126,11 +126,15 @@ def test_two_cards_are_refused() -> None:
         ),
         (
             {"observation": [{"name": "fy"}]},
-            "its card: observation.scale: is missing: a number in (0, inf) is needed",
+            "its card: observation.scale: is missing: a number in [1e-30, 1e+30]",
         ),
         (
             {"observation": [{"name": "fy", "scale": 0.0}]},
             "its card: observation.scale: 0.0 is not valid: ",
+        ),
+        (
+            {"observation": [{"name": "fy", "scale": 1e-320}]},
+            "its card: observation.scale: 1e-320 is not valid: ",
         ),
         ({"provenance": None}, "its card: provenance: is missing"),
     ],
@@ -139,10 +143,19 @@ def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], mes
     assert refusal(with_card(**values)).startswith(message)
 
 
-@pytest.mark.parametrize("text", ["", "NaN", "[1]", '"', "[" * 100_000])
-def test_a_card_that_is_not_json_or_no_object_is_refused(text: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "is no JSON: "),
+        ("NaN", "is no JSON: "),
+        ("[1]", "is no JSON object"),
+        ('"', "is no JSON: "),
+        ("[" * 100_000, "is JSON that is nested too deeply"),
+    ],
+)
+def test_a_card_that_is_not_json_or_no_object_is_refused(text: str, why: str) -> None:
     content = changed(lambda model: helper.set_model_props(model, {KEY: text}))
-    assert refusal(content).startswith("its card ")
+    assert refusal(content).startswith(f"its card {why}")
 
 
 def test_a_card_with_an_infinite_number_is_refused() -> None:

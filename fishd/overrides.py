@@ -1,0 +1,43 @@
+"""`KEY=VALUE` of the command line, which overrides a key of a configuration."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from fishd import strict_yaml
+from fishd.errors import ConfigError
+
+
+def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[tuple[str, ...], str]:
+    """Put each `KEY=VALUE` into the data; where each key now comes from, for messages.
+
+    Raises `ConfigError`.
+    """
+    return {_apply(data, override): f"--set {override}" for override in overrides}
+
+
+def _apply(data: dict[str, Any], override: str) -> tuple[str, ...]:
+    """Put one KEY=VALUE into the data; return the key as a path."""
+    dotted, equals, text = override.partition("=")
+    keys = tuple(dotted.strip().split("."))
+    if not equals or not all(keys):
+        raise ConfigError(f"--set {override}: write KEY=VALUE, such as plant.omega0=10")
+    section = data
+    for key in keys[:-1]:
+        section = section.setdefault(key, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"--set {override}: {key} is a single value, not a section")
+    section[keys[-1]] = _value(text.strip(), dotted, override)
+    return keys
+
+
+def _value(text: str, dotted: str, override: str) -> Any:
+    """A value from the command line, where a plain `1e-3` is a number."""
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            continue
+    try:
+        return strict_yaml.parse(text, name=dotted).data if text else ""
+    except strict_yaml.YamlProblem as problem:
+        raise ConfigError(f"--set {override}: {problem}") from None
