@@ -69,6 +69,7 @@ $ fishctl config check fish.yaml
 fish.yaml: good
 $ fishctl config show fish.yaml      # every key with its value, defaults included, as YAML
 $ fishctl config show --json         # the defaults alone, as JSON
+$ fishctl config show --running      # what the fishd that runs was started with
 $ fishctl config schema              # JSON Schema, for editors
 ```
 
