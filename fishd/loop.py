@@ -226,8 +226,8 @@ class ControlLoop:
             return self._estimator.update(measurement, self.applied, slot.deadline, dt)
         except Exception as error:
             self._fail("estimate-error", "the estimator failed", error)
-            fx, fy = measurement.fx, measurement.fy
-            return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, self.applied, 0.0, 0.0)
+            fx, fy, angle = measurement.fx, measurement.fy, self.applied
+            return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
 
     def _update(self, observation: Observation) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral."""

@@ -54,6 +54,8 @@ class Observation(Struct, frozen=True, gc=False):
     """Fin angular velocity up to an unknown positive scale; its sign is that of the true one."""
     instruction_angle: float
     """The instruction angle in force since the previous tick [rad]."""
+    previous_angle: float
+    """The instruction angle in force before that one, until the previous tick [rad]."""
     thrust: float
     """Mean longitudinal force over the latest whole tail beats [N]."""
     frequency: float

@@ -97,6 +97,7 @@ def observe(angle: float = 0.0, fin_velocity: float = 0.0, dt: float = 0.05) -> 
         fy_rate=0.0,
         fin_velocity=fin_velocity,
         instruction_angle=angle,
+        previous_angle=angle,
         thrust=0.0,
         frequency=0.0,
     )

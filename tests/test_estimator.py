@@ -47,6 +47,16 @@ def test_the_force_rate_is_the_change_over_the_time_between_ticks() -> None:
     assert observation.fy_rate == pytest.approx(0.06)
 
 
+def test_it_remembers_the_angle_before_the_one_in_force() -> None:
+    estimator = LateralForceEstimator(EstimatorSettings())
+    seen = [
+        estimator.update(Measurement(0.1 * tick, 0.0, 0.0, 10), angle, 0.1 * tick, DT)
+        for tick, angle in enumerate((0.1, 0.2, -0.3))
+    ]
+    angles = [(one.previous_angle, one.instruction_angle) for one in seen]
+    assert angles == [(0.1, 0.1), (0.1, 0.2), (0.2, -0.3)]
+
+
 def test_nothing_but_the_measurement_and_the_own_command_goes_in() -> None:
     """A fish that tells no truth swims exactly as one that does."""
     here, there = Rig(), Rig()

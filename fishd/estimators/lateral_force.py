@@ -45,6 +45,7 @@ class LateralForceEstimator:
         self._bias: float | None = None
         self._fin_velocity = 0.0
         self._fy = 0.0
+        self._angle: float | None = None
         self._beat = TailBeat()
 
     def rest(self) -> None:
@@ -68,6 +69,8 @@ class LateralForceEstimator:
         self._fin_velocity -= (fy - self._bias) * dt
         fy_rate = (fy - self._fy) / dt
         self._fy = fy
+        before = instruction_angle if self._angle is None else self._angle
+        self._angle = instruction_angle
         self._beat.update(instruction_angle, measurement.fx, dt)
         return Observation(
             time=time,
@@ -77,6 +80,7 @@ class LateralForceEstimator:
             fy_rate=fy_rate,
             fin_velocity=self._fin_velocity,
             instruction_angle=instruction_angle,
+            previous_angle=before,
             thrust=self._beat.thrust,
             frequency=self._beat.frequency,
         )

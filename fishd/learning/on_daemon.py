@@ -186,6 +186,7 @@ def _observation(message: Observed) -> Observation:
         fy_rate=message.fy_rate,
         fin_velocity=message.fin_velocity,
         instruction_angle=message.instruction_angle,
+        previous_angle=message.previous_angle,
         thrust=message.thrust,
         frequency=message.frequency,
     )

@@ -26,6 +26,7 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
         "fy_rate": force * omega0,
         "fin_velocity": force / omega0,  # the estimate is an integral of F_y
         "instruction_angle": config.amplitude_limit,
+        "previous_angle": config.amplitude_limit,
     }
     return tuple(Feature(name, scales[name]) for name in settings.observation)
 

@@ -21,7 +21,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     observation: Annotated[
         tuple[FeatureName, ...],
         Meta(description="What the agent sees, in order.", min_length=1),
-    ] = ("fy", "fy_rate", "instruction_angle", "fin_velocity")
+    ] = ("fy", "fy_rate", "instruction_angle", "previous_angle", "fin_velocity")
     force_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         Meta(
@@ -48,7 +48,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Meta(
             ge=0,
             le=1000,
-            description="An episode begins after up to so many ticks at a random angle.",
+            description="An episode begins after up to so many ticks of a random square wave.",
             extra_json_schema={"unit": "ticks"},
         ),
     ] = 10

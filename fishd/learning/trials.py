@@ -1,5 +1,6 @@
 """Deterministic evaluations during a training: how does the policy swim without exploration?"""
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -19,6 +20,9 @@ STALLED = 0.05
 """A mean |φ_c| below this share of Φ is no swimming."""
 CHATTER = 0.9
 """Nor is it to reverse in more than this share of the ticks: the fin does not follow."""
+
+SHAKE = 1.0
+"""How long a fish is shaken [s]."""
 
 Decide = Callable[[Observation], float]
 """A policy: observation in, instruction angle out [rad]."""
@@ -53,14 +57,33 @@ def in_simulation(config: Config, decide: Decide, settings: EvaluationSettings) 
 
 
 def worst_of_others(config: Config, decide: Decide, settings: TrainingSettings) -> float:
-    """Lowest efficiency on fish at the edges of the randomisation, each over its own optimum."""
+    """Lowest efficiency on fish at the edges of the randomisation, each over its own optimum.
+
+    They begin in rapid reversals, a place where some policies stay for ever.
+    """
     trial = settings.evaluation
     return min(
         judge(
-            at_edge(config, settings.randomisation, seed), decide, trial.seconds, trial.settle
+            at_edge(config, settings.randomisation, seed),
+            shaken(decide, config),
+            trial.seconds,
+            trial.settle,
         ).efficiency
         for seed in range(trial.others)
     )
+
+
+def shaken(decide: Decide, config: Config) -> Decide:
+    """Reverse in every tick at first, and decide only then."""
+    ticks = itertools.count()
+
+    def decided(observation: Observation) -> float:
+        tick = next(ticks)
+        if tick * config.tick < SHAKE:
+            return config.amplitude_limit * (-1.0) ** tick
+        return decide(observation)
+
+    return decided
 
 
 def on_link(

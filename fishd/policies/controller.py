@@ -50,7 +50,7 @@ class Ppo(Controller[PpoParameters]):
         card, self._network = _open(parameters, limits)
         self._write = Layout(card.observation).write
         self._amplitude = card.amplitude
-        self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
     def check(cls, parameters: PpoParameters, limits: Limits) -> None:

@@ -156,6 +156,7 @@ class Remote(Controller[RemoteParameters]):
                 fy_rate=o.fy_rate,
                 fin_velocity=o.fin_velocity,
                 instruction_angle=o.instruction_angle,
+                previous_angle=o.previous_angle,
                 thrust=o.thrust,
                 frequency=o.frequency,
                 tick=self.limits.tick,

@@ -35,6 +35,7 @@ class Observed(Struct, frozen=True, tag="observation", tag_field="kind", kw_only
     fy_rate: float
     fin_velocity: float
     instruction_angle: float
+    previous_angle: float
     thrust: float
     frequency: float
     tick: float

@@ -89,7 +89,24 @@ def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
     settings = TrainingSettings(randomisation=weak, evaluation=EvaluationSettings(others=6))
     others = [at_edge(CONFIG, weak, seed) for seed in range(6)]
     own = [judge(fish, square_of_six_ticks, 20.0, 5.0).efficiency for fish in others]
-    assert worst_of_others(CONFIG, square_of_six_ticks, settings) == min(own)
+    worst = worst_of_others(CONFIG, square_of_six_ticks, settings)
+    assert worst == pytest.approx(min(own), abs=1e-3)
+
+
+def test_a_policy_that_stays_in_rapid_reversals_once_it_is_there_is_worth_nothing() -> None:
+    pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
+    from fishd.learning.trials import worst_of_others
+
+    def stuck(observation: Observation) -> float:
+        """Goes on with what it finds when it is first asked."""
+        found.append(observation.previous_angle * observation.instruction_angle < 0.0)
+        return -observation.instruction_angle if found[0] else square_of_six_ticks(observation)
+
+    found: list[bool] = []
+    assert judge(CONFIG, stuck, 20.0, 5.0).efficiency > 0.95
+    found.clear()
+    settings = TrainingSettings(evaluation=EvaluationSettings(others=1))
+    assert worst_of_others(CONFIG, stuck, settings) < 0.05
 
 
 def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
