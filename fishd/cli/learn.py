@@ -37,7 +37,10 @@ class LearnVerbs(Verbs):
                 raise
             extra = _EXTRA[package]
             complain(
-                "fishctl", f"{package} is not installed: install fishd[{extra}], with that extra", 1
+                "fishctl",
+                f"{package} is not installed; where the sources of fishd are: "
+                f"pip install --constraint tools/constraints.txt --editable '.[{extra}]'",
+                1,
             )
 
 

@@ -116,6 +116,14 @@ def find(path: Path, *, latest: bool = False) -> Path:
     """
     if (path / MODEL).is_file():
         return path
+    if not path.is_dir():
+        what = "is no folder" if path.exists() else "no such folder"
+        raise CheckpointError(f"{path}: {what}; the run folder of a training is needed")
+    seeds = sorted(path.glob("seed-*"), key=lambda one: (len(one.name), one.name))
+    if seeds:
+        raise CheckpointError(
+            f"{path} holds several trainings, {seeds[0].name} to {seeds[-1].name}; name one of them"
+        )
     return (None if latest else best(path)) or newest(path)
 
 

@@ -2,7 +2,7 @@
 
 | | | |
 |---|---|---|
-| observation | F_y, Ḟ_y, φ_c, fin velocity | each over its scale (`scales.features`) |
+| observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`scales`) |
 | action | φ_c/Φ in [-1, 1] | in force from the tick that it answers until the next |
 | reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
 
@@ -39,9 +39,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     """One fish that swims for thrust.
 
     `info` of each step holds `thrust` (mean F_x in the tick that followed [N]), `lost` (ticks in
-    which another angle than the action's was in force: such an episode is truncated), `paused` (how
-    long the fish has waited at neutral since the step before [s], mostly 0) and `tank_time` (how
-    long it has been in the agent's command [s]).
+    which another angle than the action's was in force: such an episode is truncated) and `paused`
+    (how long the fish has waited at neutral since the step before [s], mostly 0).
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
@@ -52,6 +51,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         config: the fish that the scales are made for
         """
         self.link = link
+        self.config = config
         self.features = features(config, settings)
         self.settings = settings
         self._layout = Layout(self.features)

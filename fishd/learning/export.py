@@ -1,4 +1,4 @@
-"""From a checkpoint to the one file that the controller `ppo` runs."""
+"""From a checkpoint, or a model of one's own, to the one file that the controller `ppo` runs."""
 
 from pathlib import Path
 
@@ -6,13 +6,18 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.config import Config
 from fishd.errors import FishdError, PolicyError
 from fishd.learning import checkpoints, runs
-from fishd.learning.ppo import Deterministic, layers_of
-from fishd.learning.settings import TrainingSettings
+from fishd.learning.environment import SwimEnv
+from fishd.learning.ppo import Deterministic, activation_of, layers_of
+from fishd.learning.provenance import make_card
+from fishd.learning.settings import EvaluationSettings, TrainingSettings
 from fishd.learning.trials import Trial, in_simulation
 from fishd.plant.optimum import best_square_wave
 from fishd.plant.parameters import PlantParameters
@@ -57,7 +62,49 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
             "another checkpoint, or export it all the same with --force"
         )
     card = _completed(card, trial, note)
-    content = to_onnx(layers_of(policy), settings.ppo.activation, card)
+    size = _write(target, card, policy)
+    return Exported(target, checkpoint, card, trial, size)
+
+
+def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Path:
+    """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
+
+    model: PPO or A2C with an `MlpPolicy` of tanh or relu, and without `VecNormalize`: it would see
+        what the policy file does not know of
+    note: for people, kept in the file
+
+    Raises `PolicyError` for any other, and where the file would not say what the policy says.
+    """
+    path = Path(target)
+    vec_env, policy = model.get_env(), model.policy
+    env = vec_env.envs[0].unwrapped if isinstance(vec_env, DummyVecEnv) else None
+    if not isinstance(env, SwimEnv):
+        raise PolicyError(
+            f"{path}: the environment of this model, {type(vec_env).__name__}, is not a SwimEnv "
+            "alone: what the network sees cannot be told"
+        )
+    if not isinstance(policy, ActorCriticPolicy) or not isinstance(
+        policy.features_extractor, FlattenExtractor
+    ):
+        raise PolicyError(f"{path}: {type(policy).__name__} is no MlpPolicy of PPO or A2C")
+    card = make_card(env.config, TrainingSettings(), env.features, "a SwimEnv", 0, None, note)
+    past = replace(
+        card.provenance,
+        algorithm=type(model).__name__,
+        steps=model.num_timesteps,
+        seed=model.seed or 0,
+        settings={"environment": msgspec.to_builtins(env.settings)},
+    )
+    card = replace(card, provenance=past)
+    decide = Deterministic(policy, card.observation, card.amplitude)
+    trial = in_simulation(env.config, decide, EvaluationSettings())
+    _write(path, _completed(card, trial, ""), policy)
+    return path
+
+
+def _write(target: Path, card: Card, policy: ActorCriticPolicy) -> int:
+    """Write the file, whole or not at all; its size [bytes]. Raises `PolicyError`."""
+    content = to_onnx(layers_of(policy), activation_of(policy), card)
     _verify(PolicyFile(target, content, card), policy)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -66,7 +113,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
         part.replace(target)
     except OSError as error:
         raise PolicyError(f"{target}: cannot be written: {error.strerror}") from None
-    return Exported(target, checkpoint, card, trial, len(content))
+    return len(content)
 
 
 def _swim(

@@ -1,7 +1,7 @@
 """The learner: PPO of stable-baselines3, and its policy as plain layers."""
 
 from collections.abc import Generator
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -14,13 +14,17 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
+from fishd.errors import PolicyError
 from fishd.learning.environment import spaces
 from fishd.learning.mirror import Layers, MirrorPolicy, plain_layers
 from fishd.learning.settings import PpoSettings, TrainingSettings
 from fishd.policies.card import Feature, Layout
 from fishd.signals import Observation
 
-_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+_ACTIVATIONS: dict[Literal["tanh", "relu"], type[torch.nn.Module]] = {
+    "tanh": torch.nn.Tanh,
+    "relu": torch.nn.ReLU,
+}
 
 
 class Rollout(RolloutBuffer):
@@ -115,6 +119,16 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
         for linear in (*hidden, last)
     ]
     return plain_layers(layers) if isinstance(policy, MirrorPolicy) else layers
+
+
+def activation_of(policy: ActorCriticPolicy) -> Literal["tanh", "relu"]:
+    """What is between its layers; raises `PolicyError` for anything else."""
+    for name, kind in _ACTIVATIONS.items():
+        if policy.activation_fn is kind:
+            return name
+    raise PolicyError(
+        f"{policy.activation_fn.__name__} is no activation of a policy file; Tanh or ReLU is needed"
+    )
 
 
 def is_finite(model: PPO) -> bool:

@@ -52,13 +52,19 @@ class Quiet:
 class Lines(Quiet):
     """A line for each evaluation, for logs and pipes."""
 
+    _best = 0.0
+    """The highest merit so far, as shown."""
+
     def begin(self, steps: int, target: int, says: str) -> None:
         """Where the run is."""
         self.say(says)
 
     def evaluated(self, evaluation: "Evaluation", best: bool) -> None:
-        """One line."""
-        self.say(described(evaluation) + (", the best so far" if best else ""))
+        """One line; best is said of what is better to the eye."""
+        merit = round(evaluation.merit, 3)
+        better = best and merit > self._best
+        self._best = max(self._best, merit) if best else self._best
+        self.say(described(evaluation) + (", the best so far" if better else ""))
 
     def say(self, text: str) -> None:
         """One line, at once."""
@@ -146,6 +152,8 @@ def described(evaluation: "Evaluation") -> str:
         swims = "stalled: the tail does not beat"
     else:
         swims = figures(evaluation.thrust, evaluation.efficiency, evaluation.frequency)
+    if evaluation.worst is not None:
+        swims += f", worst of other fish {evaluation.worst:.1%}"
     return f"{evaluation.steps:7d} steps, {minutes(evaluation.tank_time):>8} in the tank: {swims}"
 
 

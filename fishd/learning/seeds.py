@@ -125,13 +125,24 @@ def _run(
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         workers = min(jobs or joblib.cpu_count(), len(tasks))
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-        yield from parallel(joblib.delayed(_train_here)(task) for task in tasks)
+        with _spared_by_the_terminal():
+            outcomes = parallel(joblib.delayed(_train_here)(task) for task in tasks)
+        yield from outcomes
+
+
+@contextmanager
+def _spared_by_the_terminal() -> Iterator[None]:
+    """Processes that begin in here never hear Ctrl-C or the terminal's end: this one says stop."""
+    signals = (signal.SIGINT, signal.SIGHUP)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _train_here(task: _Task) -> tuple[int, SeedOutcome, bytes]:
     """In a process of its own on this machine."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told too, and says stop
     stop = Path(task.stop)
     return task.number, _train(task.job, stop.exists), b""
 

@@ -131,6 +131,16 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             extra_json_schema={"unit": "s"},
         ),
     ] = 5.0
+    rest: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=60,
+            description="On a robot, the tail rests for so long before; F_x of the last third is "
+            "then its zero, whatever the sensor has drifted. 0: the sensor's own zero.",
+            extra_json_schema={"unit": "s"},
+        ),
+    ] = 3.0
     others: Annotated[
         int,
         Meta(

@@ -91,9 +91,11 @@ def on_link(
 ) -> Trial | None:
     """The very fish that learns, by its measured thrust; None where `stop` says so on the way.
 
-    The fish must not be at pause. Raises `LinkLost`.
+    It rests before, so that the thrust can be told from what the sensor has drifted. The fish must
+    not be at pause. Raises `LinkLost`.
     """
     tick, amplitude = env.link.tick, env.link.amplitude
+    zero = _force_at_rest(env, settings.rest, stop)
     ticks = math.ceil(settings.seconds / tick)
     settled = round(settings.settle / tick)
     thrusts, angles = [], []
@@ -107,11 +109,22 @@ def on_link(
             angles.append(angle)
     shares = np.array(angles) / amplitude
     return Trial(
-        thrust=float(np.mean(thrusts)),
+        thrust=float(np.mean(thrusts)) - zero,
         frequency=beat_frequency(shares, tick),
         fullness=float(np.mean(np.abs(shares))),
         tick=tick,
     )
+
+
+def _force_at_rest(env: SwimEnv, seconds: float, stop: Callable[[], bool]) -> float:
+    """Mean F_x of the last third of a rest [N]; 0 for no rest."""
+    forces = []
+    for _ in range(math.ceil(seconds / env.link.tick)):
+        if stop():
+            return 0.0
+        env.advance(0.0)
+        forces.append(env.latest.fx)
+    return float(np.mean(forces[-max(1, len(forces) // 3) :])) if forces else 0.0
 
 
 def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:

@@ -25,9 +25,7 @@ FORMAT = 1
 SAME_TICK = 1e-9
 """Largest difference between two ticks that are the same [s]."""
 
-FeatureName = Literal[
-    "fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle"
-]
+FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle"]
 """Fields of `Observation` that a policy may see."""
 
 Positive = Annotated[float, Meta(ge=1e-30, le=1e30)]

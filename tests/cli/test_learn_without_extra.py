@@ -31,7 +31,8 @@ def test_training_without_the_extra_names_it_in_one_line(
     found = call(missing, "learn", "ppo", "--folder", str(tmp_path / "run"))
     assert found.returncode == 1
     assert found.stderr.count("\n") == 1
-    assert found.stderr.endswith("is not installed: install fishd[learn], with that extra\n")
+    assert " is not installed; where the sources of fishd are: pip install " in found.stderr
+    assert found.stderr.endswith(" --editable '.[learn]'\n")
     assert not (tmp_path / "run").exists()
 
 

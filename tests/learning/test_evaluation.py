@@ -159,3 +159,24 @@ def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
     from fishd.learning.trials import in_simulation
 
     assert in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
+
+
+@pytest.mark.parametrize(("rest", "drifted"), [(3.0, 0.0), (0.0, 0.02)])
+def test_on_a_robot_the_force_at_rest_is_taken_for_zero(
+    tmp_path: Path, rest: float, drifted: float
+) -> None:
+    pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
+    from fishd.learning.environment import SwimEnv
+    from fishd.learning.in_process import InProcess
+    from fishd.learning.settings import EnvironmentSettings
+    from fishd.learning.trials import on_link
+
+    def thrust(offset: float) -> float:
+        config = load(None, [f"simulation.offset_x={offset}"])
+        env = SwimEnv(InProcess(config), config, EnvironmentSettings())
+        env.reset(seed=1)
+        trial = on_link(env, square_of_six_ticks, EvaluationSettings(rest=rest), lambda: False)
+        assert trial
+        return trial.thrust
+
+    assert thrust(0.02) - thrust(0.0) == pytest.approx(drifted, abs=2e-4)

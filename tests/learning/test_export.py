@@ -1,8 +1,10 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+gymnasium = pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
 torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
 pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
 pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
@@ -12,6 +14,8 @@ pytest.importorskip("onnx", reason="the extra 'policy' is not installed")
 from click.testing import CliRunner
 from harness import Rig, observe
 from msgspec.structs import replace
+from stable_baselines3 import A2C, PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from swimming import NOISY, brief_job
 
 from fishd.cli.main import fishctl
@@ -20,11 +24,13 @@ from fishd.controllers.base import Limits
 from fishd.errors import ParameterError, PolicyError
 from fishd.learning import checkpoints
 from fishd.learning.checkpoints import CheckpointError
-from fishd.learning.export import export
+from fishd.learning.export import export, export_model
 from fishd.learning.jobs import Outcome
 from fishd.learning.ppo import Deterministic
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
 from fishd.learning.training import train
+from fishd.policies.card import Layout
+from fishd.policies.file import read
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +154,58 @@ def test_the_verb_takes_the_best_of_a_run_or_a_checkpoint(
     assert f"from {trained.checkpoint}" in written(str(trained.folder), "--newest")
     assert f"from {trained.checkpoint}" in written(str(trained.checkpoint), "--to", "a/b.onnx")
     assert (tmp_path / "a" / "b.onnx").exists()
+
+
+def own_env(**options: Any) -> Any:
+    return gymnasium.make("fishd/Swim-v0", overrides=("amplitude_limit=0.3",), **options)
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C])
+def test_a_model_of_ones_own_becomes_a_policy_file(tmp_path: Path, kind: Any) -> None:
+    model = kind("MlpPolicy", own_env(), n_steps=64, seed=4, device="cpu")
+    model.learn(64)
+    path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
+    controller = registry.create("ppo", {"policy": str(path)}, Limits(amplitude=0.3, tick=0.05))
+    card = read(path).card
+    env = model.get_env()
+    assert env
+    env.reset()
+    seen = env.envs[0].unwrapped.latest
+    action, _ = model.predict(Layout(card.observation).vector(seen), deterministic=True)
+    assert controller.update(seen) == pytest.approx(0.3 * float(action[0]), abs=1e-5)
+    past = card.provenance
+    assert (past.algorithm, past.steps, past.seed) == (kind.__name__, 64, 4)
+    assert past.note == "tried on a whim"
+    assert set(past.settings) == {"environment"}
+
+
+def test_a_model_that_sees_more_than_a_policy_file_can_say_is_refused(tmp_path: Path) -> None:
+    normalised = PPO("MlpPolicy", VecNormalize(DummyVecEnv([own_env])), device="cpu")
+    elsewhere = PPO("MlpPolicy", "Pendulum-v1", device="cpu")
+    for model in (normalised, elsewhere):
+        with pytest.raises(PolicyError, match="is not a SwimEnv alone"):
+            export_model(model, tmp_path / "a.onnx")
+    with pytest.raises(PolicyError, match="is no MlpPolicy of PPO or A2C"):
+        export_model(SAC("MlpPolicy", own_env(), device="cpu"), tmp_path / "a.onnx")
+    elu = PPO("MlpPolicy", own_env(), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu")
+    with pytest.raises(PolicyError, match="ELU is no activation of a policy file"):
+        export_model(elu, tmp_path / "a.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nowhere", "no such folder; the run folder of a training is needed"),
+        ("model.zip", "is no folder; the run folder of a training is needed"),
+        ("several", "holds several trainings, seed-0 to seed-10; name one of them"),
+        ("empty", "no checkpoint is in there"),
+    ],
+)
+def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "model.zip").write_bytes(b"PK")
+    (tmp_path / "empty").mkdir()
+    for seed in (0, 2, 10):
+        (tmp_path / "several" / f"seed-{seed}").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=f"{name}:? {message}"):
+        checkpoints.find(tmp_path / name)

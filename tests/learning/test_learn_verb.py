@@ -237,7 +237,7 @@ def daemon(tmp_path: Path):  # type: ignore[no-untyped-def]
 @pytest.fixture
 def hasty(settings: str) -> str:
     """Settings with evaluations that take little time in the tank."""
-    text = SETTINGS.replace("seconds: 4.0, settle: 2.0", "seconds: 1.0, settle: 0.2")
+    text = SETTINGS.replace("seconds: 4.0, settle: 2.0", "seconds: 1.0, settle: 0.2, rest: 0.3")
     Path(settings).write_text(text, encoding="utf-8")
     return settings
 
