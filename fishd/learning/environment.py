@@ -70,7 +70,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Vector, dict[str, Any]]:
-        """Begin an episode: up to `longest_start` ticks of a random square wave come first.
+        """Begin an episode: up to `longest_start` ticks at a random angle come first.
 
         With a seed, and where episodes differ by their randomisation, a new fish begins at rest, if
         the link can do that. Otherwise the fish swims on from where it is.
@@ -84,20 +84,11 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             self.latest = link.start()
         self._begun = True
         self._steps = 0
-        lost = self._swim_in(int(draw.integers(self.settings.longest_start + 1)))
+        angle = link.amplitude * float(draw.uniform(-1.0, 1.0))
+        lost = sum(
+            self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
+        )
         return self._layout.vector(self.latest), self._info(lost)
-
-    def _swim_in(self, ticks: int) -> int:
-        """Swim a random square wave; how many ticks were lost on the way.
-
-        Its half period is any up to `ticks`, so that episodes also begin where a policy that is
-        good by now never comes, such as in reversing at every tick. Left unlearned, that is where a
-        policy may stay for ever once a fish that it does not know has brought it there.
-        """
-        draw = self.np_random
-        angle = self.link.amplitude * float(draw.uniform(-1.0, 1.0))
-        half = int(draw.integers(1, max(ticks, 1) + 1))
-        return sum(self.advance(angle * (-1.0) ** (tick // half)) for tick in range(ticks))
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Put an instruction angle in force for one tick; raises `LinkLost`."""

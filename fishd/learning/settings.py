@@ -48,7 +48,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Meta(
             ge=0,
             le=1000,
-            description="An episode begins after up to so many ticks of a random square wave.",
+            description="An episode begins after up to so many ticks at a random angle.",
             extra_json_schema={"unit": "ticks"},
         ),
     ] = 10

@@ -1,4 +1,3 @@
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.config import load
 from fishd.errors import ConfigError, NoDaemon
 from fishd.learning.environment import SwimEnv
-from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)
 
@@ -57,28 +55,6 @@ def test_the_same_seed_swims_the_same_way() -> None:
 
     assert course(3) == course(3)
     assert course(3) != course(4)
-
-
-def test_an_episode_begins_with_a_square_wave_of_any_half_period(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run")
-    link = Resting(job)
-    angles: list[float] = []
-    swim = link.step
-    link.step = lambda angle: angles.append(angle) or swim(angle)  # type: ignore[method-assign,func-returns-value]
-    env = SwimEnv(link, job.config, EnvironmentSettings(longest_start=12))
-    longest = 0
-    halves = set()
-    for seed in range(200):
-        angles.clear()
-        env.reset(seed=seed)
-        longest = max(longest, len(angles))
-        assert len({abs(angle) for angle in angles}) <= 1
-        assert all(abs(angle) <= link.amplitude for angle in angles)
-        runs = [len(list(run)) for _, run in groupby(angles)]
-        assert len(set(runs[:-1])) <= 1  # the last may be cut short
-        halves.update(runs[:1])
-    assert longest == 12
-    assert halves == set(range(1, 13))
 
 
 def test_randomised_fish_differ_from_episode_to_episode(tmp_path: Path) -> None:
