@@ -75,31 +75,39 @@ def _private_socket(name: str) -> Path:
 
 
 @contextmanager
-def claimed(address: str) -> Iterator[None]:
-    """Make sure that no other daemon serves an ipc address, and take its files away at the end.
+def claimed(
+    address: str,
+    rival: str = "another fishd",
+    advice: str = "stop it, or give this one another control.address and telemetry.address",
+) -> Iterator[None]:
+    """Make sure that nobody else serves an ipc address, and take its files away at the end.
 
-    Binding alone does not tell: ZeroMQ takes the socket file of a living daemon away from it, and
-    leaves its own behind. Raises `StartupError` when another daemon is there.
+    Binding alone does not tell: ZeroMQ takes the socket file of a living process away from it, and
+    leaves its own behind. Raises `StartupError`, which names the `rival` and gives the `advice`,
+    when somebody is there, this process included.
     """
     if not address.startswith("ipc://"):
         yield
         return
     path = socket_path(address)
-    if path.exists() and not path.is_socket():
-        raise StartupError(f"{path} is there already and is no socket; choose another address")
     with ExitStack() as stack:
         try:
-            stack.enter_context(locked(path))
+            if path.exists() and not path.is_socket():
+                raise StartupError(
+                    f"{path} is there already and is no socket; choose another address"
+                )
+            stack.enter_context(locked(path, remove=True))
         except Taken as taken:
             raise StartupError(
-                f"another fishd (pid {taken.pid}) already serves {address}; stop it, or give this "
-                "one another control.address and telemetry.address"
+                f"{rival} (pid {taken.pid}) already serves {address}; {advice}"
             ) from None
         except OSError as error:
             raise StartupError(
                 f"{lock_path(path)}: cannot be made: {error.strerror}; "
                 "choose an address in a folder that exists"
             ) from None
+        if path.is_socket() and not is_deserted(address):  # of a program that locks nothing
+            raise StartupError(f"another program already serves {address}; {advice}")
         try:
             yield
         finally:

@@ -42,3 +42,30 @@ def test_a_holder_without_a_name_is_unknown(tmp_path: Path) -> None:
         with pytest.raises(Taken) as caught, locked(path):
             pass
     assert caught.value.pid == "unknown"
+
+
+def test_a_lock_that_is_to_be_removed_is_gone_afterwards_and_held_before(tmp_path: Path) -> None:
+    path = tmp_path / "agent"
+    with locked(path, remove=True):
+        with pytest.raises(Taken, match=str(os.getpid())), locked(path, remove=True):
+            pass
+        with pytest.raises(Taken), locked(path):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_its_holder_removed_while_another_opened_it_is_no_lock(tmp_path: Path) -> None:
+    path = tmp_path / "agent"
+
+    def late(name: str, flags: int) -> int:
+        found = os.open(name, flags)
+        if not removed:
+            removed.append(name)
+            lock_path(path).unlink()  # as a holder does that ends now
+        return found
+
+    removed: list[str] = []
+    with locked(path, late):
+        assert lock_path(path).read_text() == f"{os.getpid()}\n"
+        with pytest.raises(Taken), locked(path):
+            pass

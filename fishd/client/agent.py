@@ -5,13 +5,15 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Self
 
 import msgspec
 import zmq
 
+from fishd.addresses import claimed
 from fishd.client.connection import milliseconds_until
-from fishd.errors import FishError, NoDaemon, ParameterError
+from fishd.errors import FishError, NoDaemon, ParameterError, StartupError
 from fishd.remote.messages import (
     MAX_MESSAGE,
     VERSION,
@@ -23,6 +25,7 @@ from fishd.remote.messages import (
     decode_from_fish,
     encode,
 )
+from fishd.zmq_address import why_not_bound
 
 PATIENCE = 10.0
 """How long to wait for an observation [s]."""
@@ -42,7 +45,7 @@ class Agent:
         address: where fishd can reach this program, tcp://HOST:PORT or ipc://PATH; port * is any
         timeout: how long to wait for an observation [s]; None for ever
 
-        Raises `FishError` when the address cannot be bound.
+        Raises `FishError` when the address is none, or somebody is there already.
         """
         self.timeout = timeout
         self.latest: Observed | None = None
@@ -56,18 +59,9 @@ class Agent:
         """Sessions that are over, whatever may still come from them."""
         self._strange = ""
         """What came last that was no message of a fishd."""
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.ROUTER)
-        self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
-        self._socket.set(zmq.LINGER, 100)
-        try:
-            self._socket.bind(address)
-        except zmq.ZMQError as error:
-            self.close()
-            raise FishError(
-                f"an agent cannot listen on '{address}': {zmq.strerror(error.errno or 0)}; "
-                "write tcp://127.0.0.1:* for any free port, tcp://HOST:PORT or ipc://PATH"
-            ) from None
+        with ExitStack() as stack:
+            self._socket = _bound(address, stack)
+            self._stack = stack.pop_all()
         self.address = self._socket.get_string(zmq.LAST_ENDPOINT)
         """What fishd has to be told."""
 
@@ -79,7 +73,7 @@ class Agent:
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
-        self._context.destroy(linger=100)
+        self._stack.close()
 
     def __iter__(self) -> Iterator[Observed]:
         """Every observation, to be answered with `act`; raises `NoDaemon` when none comes."""
@@ -182,3 +176,26 @@ class Agent:
             f"{why}: is a fishd running, and in command "
             f"'fishctl set-controller remote --agent {self.address}'?"
         )
+
+
+def _bound(address: str, stack: ExitStack) -> "zmq.Socket[bytes]":
+    """A socket that listens there until the stack is closed; raises `FishError`."""
+    why = why_not_bound(address)
+    if not why:
+        try:
+            stack.enter_context(claimed(address, "another program", "choose another address"))
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            stack.callback(context.destroy, linger=100)
+            socket = context.socket(zmq.ROUTER)
+            socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
+            socket.set(zmq.LINGER, 100)
+            socket.bind(address)
+            return socket
+        except StartupError as error:
+            raise FishError(f"an agent cannot listen on '{address}': {error}") from None
+        except zmq.ZMQError as error:
+            why = zmq.strerror(error.errno or 0)
+    raise FishError(
+        f"an agent cannot listen on '{address}': {why}; "
+        "write tcp://127.0.0.1:* for any free port, tcp://HOST:PORT or ipc://PATH"
+    )

@@ -1,6 +1,9 @@
 """`Agent`, the agent's side for Python, against the true controller `remote`."""
 
 import math
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -10,8 +13,9 @@ from pathlib import Path
 import pytest
 import zmq
 from harness import Rig
+from processes import running
 
-from fishd.client import Agent, FishError, NoDaemon
+from fishd.client import Agent, Fish, FishError, NoDaemon
 from fishd.errors import ParameterError
 from fishd.signals import Tick
 
@@ -183,3 +187,87 @@ def test_what_is_no_message_of_a_fishd_is_left_aside(tmp_path: Path) -> None:
 def test_an_address_in_use_is_named(agent: Agent) -> None:
     with Agent() as other, pytest.raises(FishError, match="cannot listen on 'tcp://"):
         Agent(other.address)
+
+
+@contextmanager
+def holding(address: str) -> Iterator[int]:
+    """An agent in another process; its pid."""
+    code = "import sys; from fishd.client import Agent; a = Agent(sys.argv[1]); print(flush=True)"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{code}; sys.stdin.read()", address],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdout
+        process.stdout.readline()
+        yield process.pid
+        process.kill()
+
+
+def test_a_second_agent_at_an_ipc_address_is_refused_and_the_first_goes_on(agent: Agent) -> None:
+    with pytest.raises(FishError) as caught:
+        Agent(agent.address)
+    assert f"cannot listen on '{agent.address}': another program (pid {os.getpid()})" in str(
+        caught.value
+    )
+    rig = Rig("lockstep=true")
+    with swimming(rig, agent, 1) as ticks:
+        agent.observe()
+        agent.act(0.1)
+        assert agent.poll(PATIENCE) is None
+    assert ticks[0].phi_c == 0.1
+
+
+def test_the_address_of_an_agent_that_was_killed_is_free(tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/agent"
+    with holding(address) as pid, pytest.raises(FishError, match=rf"\(pid {pid}\) already serves"):
+        Agent(address)
+    assert (tmp_path / "agent").is_socket()  # left behind
+    Agent(address).close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_control_socket_of_a_fishd_is_not_taken_from_it(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon, Fish(daemon.endpoint) as fish:
+        with pytest.raises(FishError, match=rf"\(pid {daemon.process.pid}\) already serves"):
+            Agent(daemon.endpoint)
+        assert fish.status().pid == daemon.process.pid
+        with Fish(daemon.endpoint) as another:
+            assert another.status().mode == "idle"
+
+
+def test_a_socket_that_anyone_listens_at_is_not_taken(tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/agent"
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    stranger = context.socket(zmq.ROUTER)
+    stranger.bind(address)
+    with pytest.raises(FishError, match="another program already serves ipc://"):
+        Agent(address)
+    assert [path.name for path in tmp_path.iterdir()] == ["agent"]
+    context.destroy(linger=0)
+
+
+def test_a_file_is_not_taken_for_a_socket(tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    notes.write_text("precious")
+    with pytest.raises(FishError, match="notes is there already and is no socket"):
+        Agent(f"ipc://{notes}")
+    assert notes.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("address", "complaint"),
+    [
+        ("tcp://127.0.0.1:99999", "99999 is no port, 65535 is the highest"),
+        ("tcp://127.0.0.1", "tcp://HOST:PORT or ipc://PATH is needed"),
+        ("ipc://@hidden", "tcp://HOST:PORT or ipc://PATH is needed"),
+        ("ipc:///" + 119 * "a", "at most 107 bytes, this one has 120"),
+        ("ipc:///nowhere/agent", "choose an address in a folder that exists"),
+        ("tcp://nowhere.invalid:*", "No such device"),
+    ],
+)
+def test_where_no_agent_can_listen_is_said_in_one_line(address: str, complaint: str) -> None:
+    with pytest.raises(FishError, match=r"^an agent cannot listen on '") as caught:
+        Agent(address)
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
