@@ -10,7 +10,7 @@ from fishd.remote.messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.remote.parameters import RemoteParameters
 from fishd.remote.wire import Wire
 from fishd.signals import Observation
-from fishd.zmq_address import is_address
+from fishd.zmq_address import why_not_connected
 
 DEADLINE = 0.4
 """Time that the agent has by default, as a share of the tick."""
@@ -61,10 +61,10 @@ class Remote(Controller[RemoteParameters]):
     def check(cls, parameters: Any, limits: Limits) -> None:
         """Refuse what is no address, and a deadline that the tick has no room for."""
         super().check(parameters, limits)
-        if not is_address(parameters.agent):
+        complaint = why_not_connected(parameters.agent)
+        if complaint:
             raise ParameterError(
-                f"agent: '{parameters.agent}' is not valid: tcp://HOST:PORT or ipc://PATH is "
-                "needed, the address that the agent has bound",
+                f"agent: '{parameters.agent}' is not valid: {complaint}",
                 ("agent",),
             )
         longest = LONGEST_DEADLINE * limits.tick

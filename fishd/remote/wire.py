@@ -5,7 +5,7 @@ import select
 import msgspec
 import zmq
 
-from fishd.errors import ControllerFault
+from fishd.errors import ControllerFault, ParameterError
 from fishd.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
 
 _QUEUE = 100
@@ -24,6 +24,7 @@ class Wire:
     """A DEALER socket that connects to the agent, and connects again when it was lost."""
 
     def __init__(self, address: str) -> None:
+        """Raises `ParameterError` where ZeroMQ takes the address for none."""
         self._address = address
         # The context of the whole process: its thread has fishd's priority, and to end one of its
         # own would take time, in a tick.
@@ -33,7 +34,15 @@ class Wire:
         self._socket.set(zmq.SNDHWM, _QUEUE)
         self._socket.set(zmq.RCVHWM, _QUEUE)
         self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
-        self._socket.connect(address)
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self._socket.close(linger=0)
+            raise ParameterError(
+                f"agent: cannot connect to '{address}': {zmq.strerror(error.errno or 0)}; "
+                "tcp://HOST:PORT or ipc://PATH is needed",
+                ("agent",),
+            ) from None
 
     def fileno(self) -> int:
         """A descriptor that is readable once `state` may have changed."""

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import Rig
+from harness import LIMITS, Rig
 from scripted_agent import ScriptedAgent, connect
 
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.controllers.base import Limits
 from fishd.errors import ConfigError, ParameterError
+from fishd.remote.wire import Wire
 
 SLOW = ("tick=0.2",)
 """A tick with a deadline of 80 ms, so that a busy machine does not spoil a test."""
@@ -300,14 +300,43 @@ def test_an_agent_that_does_not_read_costs_no_time(rig: Rig, agent: ScriptedAgen
     [
         ({"agent": "localhost"}, "agent: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH"),
         ({"agent": "tcp://127.0.0.1:99999"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
+        ({"agent": "tcp://127.0.0.1:99999"}, "99999 is no port, 65535 is the highest"),
         ({"agent": "tcp://127.0.0.1:*"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
+        ({"agent": "tcp://*:1"}, "* is what an agent binds, here give the host that it runs on"),
+        ({"agent": "tcp://127.0.0.1:0"}, "0 is what an agent binds, here give the port"),
+        ({"agent": "tcp://user@host:90"}, "'user@host' is no host"),
+        ({"agent": "tcp://-a:90"}, "'-a' is no host"),
+        ({"agent": "ipc://*"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
+        ({"agent": "ipc:///" + 119 * "a"}, "at most 107 bytes, this one has 120"),
         ({"deadline": 0.024}, "deadline: 0.024 s is not valid: at most 0.0225 s, 0.45 of a tick"),
     ],
 )
 def test_parameters_that_cannot_work_are_refused(values: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ParameterError, match="remote: ") as caught:
-        registry.check("remote", values, Limits(amplitude=0.42, tick=0.05))
+        registry.check("remote", values, LIMITS)
     assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["tcp://127.0.0.1:9873", "tcp://my-pi_4.local:1", "tcp://[::1]:65535", "ipc:///" + 106 * "a"],
+)
+def test_what_passes_as_an_address_can_be_connected_to(address: str) -> None:
+    registry.create("remote", {"agent": address}, LIMITS).close()
+
+
+def test_what_only_zeromq_refuses_is_a_parameter_error() -> None:
+    with pytest.raises(
+        ParameterError, match=r"agent: cannot connect to 'udp://host:1': "
+    ) as caught:
+        Wire("udp://host:1")
+    assert caught.value.path == ("agent",)
+
+
+@pytest.mark.parametrize("address", ["tcp://*:1", "tcp://user@host:90", "ipc:///" + 119 * "a"])
+def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to(address: str) -> None:
+    with pytest.raises(ConfigError, match=r"start\.parameters\.agent: .* is not valid: "):
+        load(None, ["start.controller=remote", f"start.parameters.agent='{address}'"])
 
 
 def test_deadlines_change_in_command_but_not_the_agent(rig: Rig, agent: ScriptedAgent) -> None:
