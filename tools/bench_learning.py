@@ -65,7 +65,7 @@ def efficiency(seeds: int, jobs: int) -> str:
     blind = replace(plain, ppo=replace(plain.ppo, symmetric=False))
     rows = {
         "Φ = 0.42 rad": (rig(), plain),
-        "Φ = 0.42 rad, not symmetric": (rig(), blind),
+        "Φ = 0.42 rad, without the mirror": (rig(), blind),
         "Φ = 0.42 rad, as in the paper": (
             rig(),
             settings_of("learning-paper.yaml", MILESTONES[-1]),

@@ -3,6 +3,7 @@
 import json
 import subprocess
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from processes import FISHCTL
@@ -95,6 +96,55 @@ def test_the_picture_begins_with_an_upward_reversal() -> None:
     shown = figures._from_upward_reversal(Trace(times, command, times, times))
     assert (shown.time[0], shown.command[0]) == (0.0, 0.4)
     assert shown.time[-1] == pytest.approx(comparison.TRACE)
+
+
+def letters_of(picture: Path) -> str:
+    """What is written in an SVG picture whose text was kept as text, without any spaces."""
+    return "".join("".join(ElementTree.parse(picture).getroot().itertext()).split())
+
+
+def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path: Path) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    from fishd.learning.figures import picture
+
+    contestants = [parse("swing"), parse("sine:frequency=1.8")]
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        for runs in (1, 3):
+            standings, traces = compare(CONFIG, contestants, 20.0, 5.0, runs)
+            picture(tmp_path / f"{runs}.svg", standings, traces, 0.42)
+    one, three = letters_of(tmp_path / "1.svg"), letters_of(tmp_path / "3.svg")
+    for name in ("command", "finangle", "asmeasured", "truemean", "efficiency", "Φ=0.42rad"):
+        assert name in one
+        assert name in three
+    assert "lowesttohighestof3runs" in three
+    assert "lowest" not in one
+
+
+def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    from fishd.learning.figures import _draw_angles
+
+    axis = Figure().subplots()
+    _draw_angles(axis, Trace([0.0, 0.05, 0.1], [0.4, 0.4, -0.4], [0.0] * 3, [0.0] * 3), 0.42)
+    (command,) = axis.patches
+    assert list(command.get_data().values) == [0.4, 0.4]
+    assert list(command.get_data().edges) == [0.0, 0.05, 0.1]
+
+
+def test_learning_curves_name_their_goal_and_where_the_axis_begins(tmp_path: Path) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    from fishd.learning.figures import learning_curves
+
+    curve = [([200, 400], [0.5, 0.98]), ([200, 400], [0.6, 0.99])]
+    trainings = {f"training-{k}": curve for k in range(7)}
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        learning_curves(tmp_path / "curves.svg", trainings, 0.97)
+    letters = letters_of(tmp_path / "curves.svg")
+    assert "97%" in letters
+    assert "from60%up" in letters
+    assert all(name in letters for name in trainings)
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
