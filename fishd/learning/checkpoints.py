@@ -6,18 +6,20 @@ and `state.json` (counts, evaluations, random numbers). One is written under a t
 renamed: whatever kills the writer, no half a checkpoint is ever taken for a whole one.
 """
 
+import io
 import json
+import pickle
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 from zipfile import BadZipFile
 
 import msgspec
 import numpy as np
 import torch
-from msgspec import Struct
+from msgspec import Meta, Struct
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -30,8 +32,20 @@ from fishd.policies.card import Card, decode, encode
 MODEL, CARD, STATE = "model.zip", "card.json", "state.json"
 
 
+_UNREADABLE = (
+    RuntimeError,
+    ValueError,
+    KeyError,
+    OSError,
+    EOFError,
+    BadZipFile,
+    pickle.UnpicklingError,
+)
+_OTHERWISE = "move this checkpoint away to go on from the one before"
+
+
 class CheckpointError(FishdError, RuntimeError):
-    """There is no checkpoint where one is needed, or it cannot be read."""
+    """There is no checkpoint where one is needed, or a run folder cannot be read or written."""
 
 
 class Evaluation(Struct, frozen=True):
@@ -64,7 +78,7 @@ class State(Struct, frozen=True):
     """What a training must know to go on, beside the networks and their optimiser."""
 
     on: Literal["simulation", "robot"]
-    steps: int
+    steps: Annotated[int, Meta(ge=0)]
     updates: int
     """Passes over rollouts so far, as stable-baselines3 counts them."""
     tank_time: float
@@ -83,7 +97,9 @@ def save(folder: Path, kind: str, model: PPO, card: Card, state: State) -> Path:
     final, part = folder / name, folder / f".{name}.part"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
-    model.save(part / MODEL)
+    archive = io.BytesIO()  # it leaves a file open where the disk is full
+    model.save(archive)
+    (part / MODEL).write_bytes(archive.getvalue())
     (part / CARD).write_text(_indented(encode(card)), encoding="utf-8")
     (part / STATE).write_text(json.dumps(msgspec.to_builtins(state)), encoding="utf-8")
     if final.exists():  # a run that was stopped before it learned any more
@@ -130,7 +146,10 @@ def find(path: Path, *, latest: bool = False) -> Path:
 def sweep(folder: Path) -> None:
     """Remove what a killed writer left half-written, or half-removed."""
     for left in (*folder.glob(".*.part"), *folder.glob(".*.old")):
-        shutil.rmtree(left)
+        if left.is_dir():
+            shutil.rmtree(left)
+        else:
+            left.unlink()
 
 
 def read_card(checkpoint: Path) -> Card:
@@ -177,9 +196,9 @@ def _readable(path: Path) -> Iterator[Path]:
         yield path
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
-    except (RuntimeError, ValueError, KeyError, OSError, BadZipFile) as error:
-        why = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{path}: does not fit these settings: {why}") from None
+    except _UNREADABLE as error:
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise CheckpointError(f"{path}: cannot be read: {why}; {_OTHERWISE}") from None
 
 
 def random_state(generator: np.random.Generator) -> dict[str, Any]:
@@ -193,7 +212,16 @@ def random_state(generator: np.random.Generator) -> dict[str, Any]:
 
 
 def restore_random_state(state: dict[str, Any], generator: np.random.Generator) -> None:
-    """The reverse of `random_state`."""
+    """The reverse of `random_state`; raises `CheckpointError`."""
+    try:
+        _restore(state, generator)
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{STATE}: random: not the state of random numbers: {error}; {_OTHERWISE}"
+        ) from None
+
+
+def _restore(state: dict[str, Any], generator: np.random.Generator) -> None:
     torch.set_rng_state(torch.frombuffer(bytearray.fromhex(state["torch"]), dtype=torch.uint8))
     keys, position, has_gauss, gauss = state["numpy"]
     np.random.set_state(("MT19937", np.array(keys, np.uint32), position, has_gauss, gauss))

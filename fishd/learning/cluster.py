@@ -25,7 +25,7 @@ def scheduler(address: str | None) -> Iterator[Any]:
 
     try:
         client = Client(address, timeout=10, name="fishctl learn")
-    except (OSError, ValueError, TimeoutError) as error:
+    except (OSError, ValueError, TypeError, TimeoutError) as error:
         raise FishdError(f"no Dask scheduler answers at {address}: {error}") from None
     with client:
         if not client.scheduler_info()["workers"]:

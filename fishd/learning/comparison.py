@@ -70,6 +70,10 @@ def parse(text: str) -> Contestant:
     Raises `ParameterError`.
     """
     name, _, values = text.partition(":")
+    if name == "remote":
+        raise ParameterError(
+            "remote: its agent is another program; let that one swim a fishd and watch it there"
+        )
     if name not in registry.names():
         if not (names_file(text, library.SUFFIX) or text in library.names()):
             hint = nearest(name, [*registry.names(), *library.names()])

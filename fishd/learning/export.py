@@ -19,6 +19,7 @@ from fishd.learning.ppo import Deterministic, activation_of, layers_of
 from fishd.learning.provenance import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 from fishd.learning.trials import Trial, in_simulation
+from fishd.learning.whole import write_whole
 from fishd.plant.optimum import best_square_wave
 from fishd.plant.parameters import PlantParameters
 from fishd.policies.card import Card
@@ -106,11 +107,11 @@ def _write(target: Path, card: Card, policy: ActorCriticPolicy) -> int:
     """Write the file, whole or not at all; its size [bytes]. Raises `PolicyError`."""
     content = to_onnx(layers_of(policy), activation_of(policy), card)
     _verify(PolicyFile(target, content, card), policy)
+    if not target.name or (target.exists() and not target.is_file()):
+        raise PolicyError(f"{target}: is there already, and is no regular file")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(f".{target.name}.part")
-        part.write_bytes(content)
-        part.replace(target)
+        write_whole(target, content)
     except OSError as error:
         raise PolicyError(f"{target}: cannot be written: {error.strerror}") from None
     return len(content)

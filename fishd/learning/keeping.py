@@ -1,5 +1,6 @@
 """What a training leaves in its run folder: tables, TensorBoard logs, checkpoints."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from fishd.learning.environment import SwimEnv
 from fishd.learning.jobs import Job
 from fishd.learning.provenance import make_card
 from fishd.learning.tables import Progress, Table
+from fishd.lockfile import Taken, locked
 from fishd.policies.card import Card
 
 
@@ -35,18 +37,23 @@ class Keeper:
         """Updates."""
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
-        self.checkpoint = checkpoints.newest(job.folder) if job.resume else None
+        self.checkpoint: Path | None = None
         """The newest, but for those of best evaluations."""
         self.resumed: State | None = None
         """Where a resumed run goes on."""
+        self._best_kept = -1
         self._note = ""
-        if self.checkpoint:
-            self.resumed = checkpoints.read_state(self.checkpoint)
-            self._go_on(self.checkpoint, self.resumed)
-        elif job.parent:
-            self._begin_with(job.parent)
-        self._open(self.resumed)
-        self.keep()  # whatever happens from now on, there is something to resume
+        with ExitStack() as lock:
+            if job.resume:
+                self._lock_folder(lock)
+                self.checkpoint = checkpoints.newest(job.folder)
+                self.resumed = checkpoints.read_state(self.checkpoint)
+                self._go_on(self.checkpoint, self.resumed)
+            elif job.parent:
+                self._begin_with(job.parent)
+            self._open(self.resumed, lock)
+            self.keep()  # whatever happens from now on, there is something to resume
+            self._lock = lock.pop_all()
 
     def log(self, figures: Figures) -> None:
         """One row about the latest rollout and update."""
@@ -69,23 +76,45 @@ class Keeper:
         logger.dump(self.steps)
 
     def evaluated(self, evaluation: Evaluation) -> bool:
-        """One row about a deterministic evaluation; was it the best so far? Then it is kept."""
+        """One row about a deterministic evaluation; was it the best so far?
+
+        Then `keep` writes a checkpoint of it.
+        """
         self.latest = evaluation
         best = not evaluation.stalled and (self.best is None or evaluation.merit >= self.best.merit)
         self._evaluations.add(msgspec.structs.asdict(evaluation) | {"best": best})
         if best:
             self.best = evaluation
-            self._save("best")
         return best
 
-    def keep(self) -> None:
-        """Write a checkpoint, if the newest is not of this step."""
+    def keep(self, *, due: bool = True) -> None:
+        """Write a checkpoint where the policy is the best so far.
+
+        due: write one in any case, if the newest is not of this step
+
+        After the rows of the tables: those that are newer than the newest checkpoint are dropped
+        when a run is resumed, but none is ever made up for.
+        """
+        if self.best and self.best.steps == self.steps and self._best_kept != self.steps:
+            self._save("best")
+            self._best_kept = self.steps
+        if not due:
+            return
         if self.checkpoint is None or self.checkpoint.name != f"step-{self.steps:06d}":
             self.checkpoint = self._save("step")
 
     def close(self) -> None:
-        """Close the logs."""
+        """Close the logs, and leave the folder to others."""
         self._model.logger.close()
+        self._lock.close()
+
+    def _lock_folder(self, lock: ExitStack) -> None:
+        """Keep other trainings out; raises `ConfigError` where there is one."""
+        folder = self._job.folder
+        try:
+            lock.enter_context(locked(folder / "training", remove=True))
+        except Taken as taken:
+            raise ConfigError(f"{folder} is being trained in, by process {taken.pid}") from None
 
     def _save(self, kind: Literal["step", "best"]) -> Path:
         state = State(
@@ -113,19 +142,35 @@ class Keeper:
         )
 
     def _begin_with(self, parent: Path) -> None:
-        card, own = checkpoints.read_card(parent), self._card()
-        for what in ("observation", "tick", "amplitude"):
-            if getattr(card, what) != getattr(own, what):
-                raise CheckpointError(
-                    f"{parent}: its {what}, with scales, differs from that of this training; use "
-                    "the configuration and the environment settings that it was trained with"
-                )
+        card = self._check_same(parent)
         checkpoints.load_parameters(self._model, parent, optimiser=False)
         past = card.provenance
         self._note = (
             f"began with {parent.resolve().parent.name}/{parent.name}, {past.steps} steps in "
             f"{past.on}"
         )
+
+    def _check_same(self, start: Path) -> Card:
+        """The card of a checkpoint that sees and does what this training does.
+
+        Raises `CheckpointError`.
+        """
+        card, own = checkpoints.read_card(start), self._card()
+        for what in ("observation", "tick", "amplitude"):
+            if getattr(card, what) != getattr(own, what):
+                raise CheckpointError(
+                    f"{start}: its {what}, with scales, differs from that of this training; use "
+                    "the configuration and the environment settings that it was trained with"
+                )
+        theirs = card.provenance.settings.get("ppo", {})
+        ours = msgspec.json.decode(msgspec.json.encode(self._job.settings.ppo))  # lists, as theirs
+        for key in ("hidden", "activation", "symmetric"):
+            if theirs.get(key) != ours.get(key):
+                raise CheckpointError(
+                    f"{start}: its ppo.{key} is {theirs.get(key)}, that of this training is "
+                    f"{ours.get(key)}; the networks must be alike"
+                )
+        return card
 
     def _go_on(self, start: Path, state: State) -> None:
         job = self._job
@@ -134,23 +179,26 @@ class Keeper:
                 f"{job.folder} was trained on {state.on}; to go on with its networks on another "
                 f"fish, begin a new run: --on {job.on} --from {job.folder}"
             )
+        card = self._check_same(start)
         if state.steps >= job.settings.steps:
             raise ConfigError(
                 f"{job.folder} is finished, with {state.steps} steps; to train it for longer, give "
                 f"more in all, such as --steps {state.steps + job.settings.steps}"
             )
         checkpoints.load_parameters(self._model, start)
-        self._note = checkpoints.read_card(start).provenance.note
+        self._note = card.provenance.note
         self.steps = self._model.num_timesteps = state.steps
         self._model._n_updates = state.updates
         self.rollouts = state.rollouts
         self.latest, self.best = state.latest, state.best
+        self._best_kept = state.best.steps if state.best else -1
         self._env.tank_time = state.tank_time
 
-    def _open(self, resumed: State | None) -> None:
+    def _open(self, resumed: State | None, lock: ExitStack) -> None:
         folder = self._job.folder
         if resumed is None:
             runs.create(folder, self._job.config, self._job.settings)
+            self._lock_folder(lock)
         else:
             checkpoints.sweep(folder)
             runs.keep_settings(folder, self._job.settings)

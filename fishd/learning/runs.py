@@ -3,11 +3,15 @@
 from datetime import datetime
 from pathlib import Path
 
+from msgspec import Struct
+
 from fishd import config as configuration
+from fishd import strict_yaml
 from fishd.config import Config
 from fishd.errors import ConfigError
 from fishd.learning import settings as training
 from fishd.learning.settings import TrainingSettings
+from fishd.learning.whole import write_whole
 
 CONFIG, SETTINGS = "config.yaml", "settings.yaml"
 
@@ -21,7 +25,7 @@ def create(folder: Path, config: Config, settings: TrainingSettings) -> None:
     """Make a run folder; raises `ConfigError` where something is there already."""
     make_folder(folder, f", or go on with --resume {folder}")
     try:
-        (folder / CONFIG).write_text(configuration.to_yaml(config), encoding="utf-8")
+        write_whole(folder / CONFIG, configuration.to_yaml(config))
         keep_settings(folder, settings)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
@@ -44,11 +48,26 @@ def make_folder(folder: Path, otherwise: str = "") -> None:
 
 def keep_settings(folder: Path, settings: TrainingSettings) -> None:
     """Write the settings of a run; a resumed one may go on for longer."""
-    (folder / SETTINGS).write_text(training.to_yaml(settings), encoding="utf-8")
+    write_whole(folder / SETTINGS, training.to_yaml(settings))
 
 
 def read(folder: Path) -> tuple[Config, TrainingSettings]:
     """Configuration and settings of a run; raises `ConfigError`."""
     if not (folder / SETTINGS).is_file():
         raise ConfigError(f"{folder}: no folder of a training: it holds no {SETTINGS}")
+    for file, kind in ((folder / CONFIG, Config), (folder / SETTINGS, TrainingSettings)):
+        _check_whole(file, kind)
     return configuration.load(folder / CONFIG), training.load(folder / SETTINGS)
+
+
+def _check_whole(file: Path, kind: type[Struct]) -> None:
+    """Nothing in a run is left to defaults, which may not be those that it began with."""
+    try:
+        data = strict_yaml.parse(file.read_text(encoding="utf-8")).data
+    except (OSError, UnicodeDecodeError, strict_yaml.YamlProblem):
+        return  # which `load` says better
+    missing = [
+        key for key in kind.__struct_fields__ if not isinstance(data, dict) or key not in data
+    ]
+    if missing:
+        raise ConfigError(f"{file}: not the whole file of a run: {missing[0]} is missing")

@@ -120,7 +120,14 @@ def _run(
     """Outcomes as they come, where the backend can do that; else in the end."""
     if cluster:
         with joblib.parallel_config(backend="dask", scheduler_host=cluster):
-            yield from joblib.Parallel()(joblib.delayed(_train_remotely)(task) for task in tasks)
+            try:
+                found = joblib.Parallel()(joblib.delayed(_train_remotely)(task) for task in tasks)
+            except Exception as error:  # joblib, Dask and their connections have many of their own
+                raise FishdError(
+                    f"the Dask cluster at {cluster} was lost, and with it the trainings that it "
+                    f"had not sent back: {type(error).__name__}: {error}"
+                ) from error
+        yield from found
         return
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         workers = min(jobs or joblib.cpu_count(), len(tasks))

@@ -79,9 +79,13 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Hyper-parameters of PPO, named as stable-baselines3 names them."""
 
-    n_steps: Annotated[int, Meta(ge=2, description="Steps between two updates.")] = 128
-    batch_size: Annotated[int, Meta(ge=2, description="Size of a minibatch.")] = 64
-    n_epochs: Annotated[int, Meta(ge=1, description="Passes over the steps of an update.")] = 10
+    n_steps: Annotated[int, Meta(ge=2, le=1_000_000, description="Steps between two updates.")] = (
+        128
+    )
+    batch_size: Annotated[int, Meta(ge=2, le=1_000_000, description="Size of a minibatch.")] = 64
+    n_epochs: Annotated[
+        int, Meta(ge=1, le=1000, description="Passes over the steps of an update.")
+    ] = 10
     gamma: Annotated[float, Meta(ge=0, le=1, description="Discount factor.")] = 0.95
     gae_lambda: Annotated[
         float, Meta(ge=0, le=1, description="Bias against variance of the advantages.")
@@ -120,7 +124,7 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     ] = 1
     seconds: Annotated[
         float,
-        Meta(gt=0, le=3600, description="Its length.", extra_json_schema={"unit": "s"}),
+        Meta(ge=1, le=3600, description="Its length.", extra_json_schema={"unit": "s"}),
     ] = 20.0
     settle: Annotated[
         float,
@@ -156,7 +160,9 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """A whole training; the defaults suit the default fish."""
 
     steps: Annotated[int, Meta(ge=1, description="Control steps to learn from.")] = 8000
-    seed: Annotated[int, Meta(ge=0, description="Of networks, exploration and start.")] = 0
+    seed: Annotated[
+        int, Meta(ge=0, le=2**32 - 1, description="Of networks, exploration and start.")
+    ] = 0
     checkpoint_every: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 5000
     environment: EnvironmentSettings = EnvironmentSettings()
     randomisation: Randomisation = Randomisation()

@@ -1,11 +1,15 @@
 """The CSV files of a run: one row an update, one row an evaluation; they go on after a resume."""
 
 import csv
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
+
+from fishd.learning.checkpoints import CheckpointError
+from fishd.learning.whole import write_whole
 
 PROGRESS = {
     "steps": "tank/steps",
@@ -37,23 +41,32 @@ class Table:
         self._path = path
         self._columns = columns
         if not path.exists():
-            self._write([list(columns)], "w")
+            write_whole(path, _lines([list(columns)]))
 
     def add(self, row: Mapping[str, Any]) -> None:
         """One row; numbers in full precision."""
-        self._write([[_plain(row[column]) for column in self._columns]], "a")
+        self._append([_plain(row[column]) for column in self._columns])
 
     def keep_until(self, steps: int) -> None:
-        """Drop the rows of steps that a resumed run is going to do again."""
-        with self._path.open(newline="", encoding="utf-8") as file:
-            head, *rows = csv.reader(file)
-        at = head.index("steps")
-        whole = [row for row in rows if len(row) == len(head)]  # the last may be cut off
-        self._write([head, *(row for row in whole if int(row[at]) <= steps)], "w")
+        """Drop the rows of steps that a resumed run is going to do again.
 
-    def _write(self, rows: list[list[Any]], mode: str) -> None:
-        with self._path.open(mode, newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
+        Raises `CheckpointError` where it is no such table.
+        """
+        try:
+            with self._path.open(newline="", encoding="utf-8") as file:
+                head, *rows = csv.reader(file)
+            at = head.index("steps")
+            whole = [row for row in rows if len(row) == len(head)]  # the last may be cut off
+            kept = [row for row in whole if int(row[at]) <= steps]
+        except (ValueError, csv.Error):  # UnicodeDecodeError is one
+            raise CheckpointError(
+                f"{self._path}: no table of a training; move it away, and a new one is begun"
+            ) from None
+        write_whole(self._path, _lines([head, *kept]))
+
+    def _append(self, row: list[Any]) -> None:
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            file.write(_lines([row]))
 
 
 class Progress(KVWriter):
@@ -73,6 +86,12 @@ class Progress(KVWriter):
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+def _lines(rows: list[list[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def _plain(value: Any) -> Any:

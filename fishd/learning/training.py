@@ -7,6 +7,7 @@ keep       a row in the tables, a checkpoint where one is due, another where it 
 """
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import cast
 
 import numpy as np
@@ -14,9 +15,10 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from fishd.errors import FishdError
 from fishd.learning import checkpoints
-from fishd.learning.callbacks import LONGEST_UPDATE, Watch
-from fishd.learning.checkpoints import Evaluation
+from fishd.learning.callbacks import Watch
+from fishd.learning.checkpoints import CheckpointError, Evaluation
 from fishd.learning.environment import SwimEnv
 from fishd.learning.jobs import Ended, Job, Outcome
 from fishd.learning.keeping import Keeper
@@ -44,7 +46,8 @@ def train(job: Job, show: Show | None = None, stop: Callable[[], bool] = lambda:
 
     stop: asked after each step whether to end here; what the present rollout has seen is then lost
 
-    Raises `ConfigError`, `CheckpointError` and `FishError` before anything has moved.
+    Raises `ConfigError`, `CheckpointError` and `FishError` before anything has moved, and
+    `CheckpointError` where the run folder cannot be written any more.
     """
     torch.set_num_threads(1)
     if job.on == "robot":
@@ -54,6 +57,13 @@ def train(job: Job, show: Show | None = None, stop: Callable[[], bool] = lambda:
     try:
         check_agreement(link, job.config)
         return Training(job, link, show or Quiet(), stop).run()
+    except OSError as error:
+        if isinstance(error, FishdError):
+            raise
+        raise CheckpointError(
+            f"{error.filename or job.folder}: cannot be written: {error.strerror}; when that is "
+            f"mended, go on from the newest checkpoint with --resume {job.folder}"
+        ) from error
     finally:
         link.close()
 
@@ -74,6 +84,10 @@ class Training:
 
     def run(self) -> Outcome:
         """Learn until all steps are done, or something ends it."""
+        with closing(self._keeper):
+            return self._run()
+
+    def _run(self) -> Outcome:
         keeper, job = self._keeper, self._job
         self._introduce()
         ended: Ended = "finished"
@@ -88,7 +102,6 @@ class Training:
             self._env.close()  # neutral first, then all that takes time
         if ended != "diverged":
             keeper.keep()
-        keeper.close()
         return Outcome(
             folder=job.folder,
             steps=keeper.steps,
@@ -158,9 +171,8 @@ class Training:
         if every and (last or keeper.rollouts % every == 0):
             self._evaluate()
         keeper.log(figures)
-        due = settings.checkpoint_every
-        if last or before // due < keeper.steps // due:
-            keeper.keep()
+        every = settings.checkpoint_every
+        keeper.keep(due=last or before // every < keeper.steps // every)
         return ("interrupted" if self._stop() and not last else "finished"), ""
 
     def _evaluate(self) -> None:
@@ -176,7 +188,7 @@ class Training:
         else:
             env.resume()
             found = on_link(env, decide, job.settings.evaluation, self._stop)
-            env.pause(LONGEST_UPDATE)
+            env.pause()
             if found is None:
                 return
             trial = found
