@@ -11,9 +11,6 @@ from fishd.learning.link import LinkLost
 from fishd.learning.ppo import Rollout
 from fishd.learning.trials import beat_frequency
 
-LONGEST_UPDATE = 120.0
-"""The fish may wait at neutral so long for an update, an evaluation and a checkpoint [s]."""
-
 
 class Figures(Struct, frozen=True):
     """How the fish swam in a rollout, exploration included; means over its steps."""
@@ -86,7 +83,7 @@ class Watch(BaseCallback):
         return not self.stopped
 
     def _on_rollout_end(self) -> None:
-        self._env.pause(LONGEST_UPDATE)
+        self._env.pause()
         self._lost, self._counted = self._env.lost - self._counted, self._env.lost
         steps = len(self._buffer.void)
         if np.count_nonzero(self._buffer.void) > steps // 2:

@@ -9,10 +9,13 @@
 An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
 """
 
+import math
+import time
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from fishd.config import Config
@@ -26,6 +29,10 @@ Vector = NDArray[np.float32]
 
 _FARTHEST = 1e6
 """Bound of the observation space: finite, as tools expect, and never reached."""
+SHORTEST_PAUSE, LONGEST_PAUSE = 10.0, 120.0
+"""Bounds of a pause whose length is not given; the first one is the longest [s]."""
+_ALLOWANCE = 4.0
+"""Such a pause may last so many times the longest one so far."""
 
 
 def spaces(features: int) -> tuple[gymnasium.Space[Vector], gymnasium.Space[Vector]]:
@@ -58,7 +65,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
         self.observation_space, self.action_space = spaces(len(self.features))
         self._steps = 0
-        self._begun = False
+        self._begun = self._closed = False
         self.latest: Observation
         """What was observed last, once an episode has begun."""
         self.tank_time = 0.0
@@ -66,6 +73,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.lost = 0
         """Ticks in which another angle than the agent's was in force."""
         self._paused = 0.0
+        self._pause_began = 0.0
+        self._longest_pause: float | None = None
+        """In real time [s]."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -73,14 +83,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         """Begin an episode: up to `longest_start` ticks at a random angle come first.
 
         With a seed, and where episodes differ by their randomisation, a new fish begins at rest, if
-        the link can do that. Otherwise the fish swims on from where it is.
+        the link can do that. Otherwise the fish swims on from where it is; command of it is taken
+        again where it was lost. Raises `LinkLost`.
         """
+        self._check_open()
         super().reset(seed=seed)
         link, draw = self.link, self.np_random
         fish = int(draw.integers(2**31))
         if link.restartable and (seed is not None or link.varies):
             self.latest = link.restart(fish)
-        elif not self._begun:
+        else:
             self.latest = link.start()
         self._begun = True
         self._steps = 0
@@ -91,8 +103,15 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         return self._layout.vector(self.latest), self._info(lost)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Put an instruction angle in force for one tick; raises `LinkLost`."""
-        lost = self.advance(max(-1.0, min(1.0, float(action[0]))) * self.link.amplitude)
+        """Put an instruction angle in force for one tick.
+
+        Raises `LinkLost`, ValueError for an action that is none, `ResetNeeded` before the first
+        episode and RuntimeError after `close`.
+        """
+        self._check_open()
+        if not self._begun:
+            raise ResetNeeded("no episode has begun: call reset before step")
+        lost = self.advance(_share(action) * self.link.amplitude)
         self._steps += 1
         reward = self._reward_per_newton * self.latest.fx
         truncated = self._steps >= self.settings.episode or lost > 0
@@ -111,8 +130,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.lost += lost
         return lost
 
-    def pause(self, seconds: float) -> None:
-        """Let the fish wait at neutral, for `seconds` at most, while the agent learns."""
+    def pause(self, seconds: float | None = None) -> None:
+        """Let the fish wait at neutral while the agent learns.
+
+        seconds: at most so long; None: some times as long as pauses have taken so far
+        """
+        if seconds is None:
+            seconds = LONGEST_PAUSE
+            if self._longest_pause is not None:
+                seconds = min(seconds, max(SHORTEST_PAUSE, _ALLOWANCE * self._longest_pause))
+        self._pause_began = time.monotonic()
         self.link.pause(seconds)
 
     def resume(self) -> Vector:
@@ -122,6 +149,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         has come to rest meanwhile.
         """
         before = self.latest.time
+        took = time.monotonic() - self._pause_began
+        self._longest_pause = max(took, self._longest_pause or 0.0)
         self.latest = self.link.resume()
         waited = self.latest.time - before
         self._paused += waited
@@ -130,7 +159,23 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
     def close(self) -> None:
         """Leave the fish at neutral."""
+        self._closed = True
         self.link.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("this environment is closed; make another one")
 
     def _info(self, lost: int) -> dict[str, Any]:
         return {"thrust": self.latest.fx, "lost": lost, "paused": self._paused}
+
+
+def _share(action: Vector) -> float:
+    """The one number of an action, clipped to [-1, 1]; raises ValueError."""
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (1,):
+        raise ValueError(f"an action of shape {values.shape} is not valid: (1,) is needed, φ_c/Φ")
+    share = float(values[0])
+    if not math.isfinite(share):
+        raise ValueError(f"an action of {share} is not valid: a number in [-1, 1] is needed, φ_c/Φ")
+    return max(-1.0, min(1.0, share))

@@ -57,22 +57,41 @@ class OnDaemon:
             raise
         self._patience = patience
         self._deadline = deadline
-        self._begun = False
+        self._begun = self._paused = self._closed = False
+        self._known = status
+        """What fishd said when command was taken."""
+        self._taken = 0.0
+        """When the latest observation came [s, monotonic]."""
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
 
     def start(self) -> Observation:
-        """Take command, unless fishd waits for this agent already; raises `LinkLost`."""
-        self._begun = True
+        """The observation that the next action answers.
+
+        Takes command where fishd does not wait for this agent already, the first time from another
+        controller too. Raises `LinkLost`: after that, it begins anew once fishd is idle.
+        """
+        self._check_open()
+        if self._paused and self._agent.in_command:
+            return self.resume()
+        if self._begun and self._is_fresh():
+            return _observation(self._asked())
+        self._paused = False
         try:
-            if not self._is_ours(self._fish.status()):
+            status = self._fish.status()
+            if not self._is_ours(status):
+                if self._begun and status.mode == "running":
+                    raise LinkLost(f"{self._lost(status)}; 'fishctl stop' frees the fish")
                 self._fish.set_controller(
                     "remote", agent=self._agent.address, deadline=self._deadline
                 )
-            elif self._agent.latest and not self._agent.poll(SILENCE):
-                return _observation(self._agent.latest)  # which fishd still waits for, in lockstep
+                self._agent.in_command = False
+            elif self._agent.latest and (self._agent.poll(SILENCE) or self._agent.in_command):
+                self._begun, self._known, self._taken = True, status, time.monotonic()
+                return _observation(self._agent.latest)  # for which fishd still waits, in lockstep
         except (NoDaemon, Refused) as error:
             raise LinkLost(str(error)) from None
+        self._begun, self._known = True, status
         return _observation(self._next(begun=False))
 
     def restart(self, seed: int) -> Observation:
@@ -92,28 +111,43 @@ class OnDaemon:
         """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""
         self._asked()
         self._agent.pause(min(seconds, 3600.0))
+        self._paused = True
 
     def resume(self) -> Observation:
         """End the pause; an observation from after it. Raises `LinkLost`."""
+        self._paused = False
         self._asked()
         self._agent.resume()
         return _observation(self._next())
 
     def close(self) -> None:
         """Leave the fish at neutral, where this agent is still in command; may be called twice."""
+        if self._closed:
+            return
+        self._closed = True
         if self._begun:
-            self._begun = False
             with contextlib.suppress(FishError):
                 if self._is_ours(self._fish.status()):
                     self._fish.stop()
         self._agent.close()
         self._fish.close()
 
+    def _check_open(self) -> None:
+        if self._closed:
+            raise LinkLost("this link to fishd is closed; make another one")
+
     def _asked(self) -> Observed:
         """The observation to be answered, while this agent is in command of it."""
+        self._check_open()
         if self._agent.latest is None or not self._agent.in_command:
             raise self._lost()
         return self._agent.latest
+
+    def _is_fresh(self) -> bool:
+        """Does fishd still wait for the answer to the latest observation, as far as is known?"""
+        if self._agent.poll():
+            self._taken = time.monotonic()
+        return self._agent.in_command and time.monotonic() - self._taken < SILENCE
 
     def _next(self, *, begun: bool = True) -> Observed:
         """The next observation, of the same session if one had begun."""
@@ -121,6 +155,8 @@ class OnDaemon:
         deadline = time.monotonic() + self._patience
         while time.monotonic() < deadline:
             found = self._agent.poll(SILENCE)
+            if found:
+                self._taken = time.monotonic()
             if found and begun and before and found.session != before.session:
                 raise LinkLost("fishd has put the agent in command anew: it was restarted, perhaps")
             if found:
@@ -135,6 +171,7 @@ class OnDaemon:
         try:
             status = self._fish.status()
         except NoDaemon as error:
+            self._agent.in_command = False
             raise LinkLost(str(error)) from None
         if not self._is_ours(status):
             raise self._lost(status)
@@ -142,8 +179,14 @@ class OnDaemon:
     def _is_ours(self, status: Status) -> bool:
         """Is this agent in command, or waited for?"""
         return _waits_for_an_agent(status) and (
-            self._agent.in_command or status.parameters["agent"] == self._agent.address
+            (self._agent.in_command and not self._is_another(status))
+            or status.parameters["agent"] == self._agent.address
         )
+
+    def _is_another(self, status: Status) -> bool:
+        """Is that fishd not the one of which command was taken?"""
+        known = self._known
+        return status.pid != known.pid or status.uptime < known.uptime
 
     def _lost(self, status: Status | None = None) -> LinkLost:
         """Why, in fishd's own words."""
@@ -152,6 +195,10 @@ class OnDaemon:
             status = status or self._fish.status()
         except NoDaemon as error:
             return LinkLost(str(error))
+        if self._is_another(status):
+            return LinkLost(
+                f"fishd was restarted: it is process {status.pid} now, and was {self._known.pid}"
+            )
         if status.reason:
             return LinkLost(f"fishd is in mode {status.mode}: {status.reason.message}")
         if self._is_ours(status):
@@ -159,6 +206,8 @@ class OnDaemon:
                 f"fishd at {self._fish.endpoint} has sent no observation to {self._agent.address} "
                 f"within {self._patience:g} s"
             )
+        if _waits_for_an_agent(status):
+            return LinkLost(f"another agent has taken command: {status.parameters['agent']}")
         if status.mode == "running":
             return LinkLost(f"another controller has taken command: {status.controller}")
         return LinkLost("fishd was told to stop")

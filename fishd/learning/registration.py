@@ -50,12 +50,15 @@ def swim_on_daemon(
     config: str | Path | None = None,
     settings: str | Path | None = None,
     overrides: Iterable[str] = (),
+    agent: str | None = None,
 ) -> "SwimEnv":
     """The fish of a running fishd; this process takes command of it when an episode begins.
 
     endpoint: control socket of the daemon; None looks for the one on this machine
     config, overrides: what the daemon was given, for the scales; without a file, tick and Φ are
         those of the daemon
+    agent: where the daemon can reach this process, as for `Agent`; None: any free port of this
+        machine
 
     Raises `ConfigError`, also where tick or Φ are not the daemon's, and `FishError`.
     """
@@ -64,7 +67,7 @@ def swim_on_daemon(
 
     chosen: EnvironmentSettings = training.load(_path(settings)).environment
     fish = daemon_config(endpoint, _path(config), overrides)
-    link = on_daemon(endpoint)
+    link = on_daemon(endpoint, agent)
     try:
         check_agreement(link, fish)
         return SwimEnv(link, fish, chosen)

@@ -1,4 +1,6 @@
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +14,12 @@ from stable_baselines3.common.env_checker import check_env as check_for_baseline
 from swimming import BRIEF, Resting, brief_job
 
 import fishd.learning  # noqa: F401 (registers the environments)
+from fishd.client import Fish
 from fishd.config import load
 from fishd.errors import ConfigError, NoDaemon
 from fishd.learning.environment import SwimEnv
+from fishd.learning.in_process import InProcess
+from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)
 
@@ -88,6 +93,63 @@ def test_after_a_pause_the_agent_sees_the_fish_as_it_is_now(tmp_path: Path) -> N
     assert info["paused"] == 0.0
 
 
+@pytest.mark.parametrize("action", [[np.nan], [np.inf], np.array([-np.inf], np.float32)])
+def test_an_action_that_is_no_number_is_refused_and_the_episode_goes_on(action: Any) -> None:
+    env = gymnasium.make("fishd/Swim-v0").unwrapped
+    before, _ = env.reset(seed=1)
+    with pytest.raises(ValueError, match=r"^an action of -?(nan|inf) is not valid: a number in "):
+        env.step(action)
+    assert env.step(np.zeros(1, np.float32))[0].shape == before.shape
+
+
+@pytest.mark.parametrize("action", [0.5, np.zeros(2), np.zeros((1, 1)), [], None])
+def test_an_action_of_another_shape_is_refused(action: Any) -> None:
+    env = gymnasium.make("fishd/Swim-v0").unwrapped
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=r"^an action of shape \(.*\) is not valid: \(1,\) is "):
+        env.step(action)
+
+
+def test_an_action_beyond_its_space_is_clipped() -> None:
+    env = gymnasium.make("fishd/Swim-v0").unwrapped
+    env.reset(seed=1)
+    env.step([7])
+    assert env.latest.instruction_angle == 0.42  # type: ignore[attr-defined]
+
+
+def test_a_step_before_the_first_episode_and_after_the_end_says_what_is_wrong() -> None:
+    env = gymnasium.make("fishd/Swim-v0").unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
+        env.step(np.zeros(1))
+    env.reset()
+    env.close()
+    with pytest.raises(RuntimeError, match="this environment is closed"):
+        env.step(np.zeros(1))
+    with pytest.raises(RuntimeError, match="this environment is closed"):
+        env.reset()
+    env.close()
+
+
+def test_the_pause_asked_for_follows_the_longest_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+    now = 1000.0
+
+    class Asked(InProcess):
+        def pause(self, seconds: float) -> None:
+            asked.append(seconds)
+
+    env = SwimEnv(Asked(load(None)), load(None), EnvironmentSettings())
+    env.reset(seed=1)
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    for took in (0.5, 5.0, 1.0, 60.0, 0.0):
+        env.pause()
+        now += took
+        env.resume()
+    assert asked == [120.0, 10.0, 20.0, 20.0, 120.0]
+    env.pause(300.0)
+    assert asked[-1] == 300.0
+
+
 @pytest.fixture
 def daemon(tmp_path: Path):  # type: ignore[no-untyped-def]
     with running(tmp_path, "--set", "simulation.noise=0.001") as found:
@@ -99,6 +161,19 @@ def test_the_environment_on_a_running_fishd_passes_both_checkers(daemon: Daemon)
     try:
         check_env(env, skip_render_check=True, skip_close_check=True)
         check_for_baselines(env, warn=True)
+    finally:
+        env.close()
+
+
+def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    address = f"ipc://{tmp_path}/agent"
+    env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address)
+    try:
+        env.reset()
+        with Fish(daemon.endpoint) as fish:
+            assert fish.status().parameters["agent"] == address
     finally:
         env.close()
 
