@@ -51,6 +51,9 @@ class Remote(Controller[RemoteParameters]):
         self._answered = 0
         self._lost = 0
         self._late = 0
+        """Answers for a tick that was over, since the latest one in time."""
+        self._foreign = 0
+        """Messages that named another session, since then."""
         self._silent = 0
         """Ticks in a row without an action."""
         self._waited = 0.0
@@ -188,28 +191,29 @@ class Remote(Controller[RemoteParameters]):
 
     def _take(self, message: FromAgent) -> None:
         if message.session != self._session:
-            self._late += 1  # for another fishd, or from before this agent took over
+            self._foreign += 1  # for another fishd, or from before this agent took over
         elif isinstance(message, Pause):
             over = self._pause > 0.0 and message.seconds == 0.0
             self._pause = message.seconds
             if self._open:  # this tick has been asked about, and once more when the pause is over
                 self._resting = self._pause > 0.0 and not self.limits.virtual
                 self._unsent = over
-        elif message.seq == self._open:
-            self._command = message.phi_c
-        elif message.seq <= self._seq:
-            self._late += 1
-        else:
+        elif not 0 < message.seq <= self._seq:
             raise ControllerFault(
                 "remote-error",
                 f"the agent at {self.parameters.agent} sent an action for observation "
-                f"{message.seq}, but {self._seq} is the latest that it was sent",
+                f"{message.seq}, which was never sent; the latest is {self._seq}",
             )
+        elif message.seq == self._open:
+            self._command = message.phi_c
+        else:
+            self._late += 1
 
     def _decide(self, observation: Observation) -> float:
         """What the tick has come to, and how long that may go on."""
         if self._command is not None:
-            self._answered, self._silent = self._open, 0
+            self._answered = self._open
+            self._silent = self._late = self._foreign = 0
             return self._command
         if self._settled:
             self._silent = 0
@@ -222,17 +226,23 @@ class Remote(Controller[RemoteParameters]):
             self._waited += observation.dt
             if self._waited + 0.5 * self.limits.tick < self.parameters.first_action:
                 return 0.0
-            raise _silence(
-                f"no action has come from the agent at {agent} within "
-                f"{self.parameters.first_action:g} s: does it run, and is that its address?"
-            )
+            what = f"from the agent at {agent} within {self.parameters.first_action:g} s"
+            if self._late or self._foreign:
+                raise _silence(f"no action has come in time {what} ({self._wrong})")
+            raise _silence(f"no action has come {what}: does it run, and is that its address?")
         self._silent += 1
         if self._silent >= self.parameters.misses:
             raise _silence(
                 f"the agent at {agent} has not answered within {patience * 1e3:g} ms, "
-                f"{self._silent} ticks in a row ({self._late} answers came too late)"
+                f"{self._silent} ticks in a row ({self._wrong})"
             )
         return 0.0
+
+    @property
+    def _wrong(self) -> str:
+        """What came instead of actions in time."""
+        foreign = f", {self._foreign} named another session" if self._foreign else ""
+        return f"{self._late} answers came too late{foreign}"
 
 
 def _silence(what: str) -> ControllerFault:

@@ -1,5 +1,6 @@
 """The socket between the controller `remote` and its agent; nothing here waits but `wait`."""
 
+import re
 import select
 
 import msgspec
@@ -12,6 +13,8 @@ _QUEUE = 100
 """Messages kept in either direction; an agent that does not read gets no more than these."""
 _FAREWELL = 200
 """How long the last message may take to leave, in the background [ms]."""
+_SHOWN = 200
+"""How much of a bad message is shown [bytes]."""
 
 
 class _Versioned(msgspec.Struct):
@@ -97,8 +100,16 @@ def _why(payload: bytes, error: msgspec.DecodeError) -> str:
         version = VERSION
     if version != VERSION:
         return _other_version(version)
-    shown = payload[:60].decode(errors="replace") + ("…" if len(payload) > 60 else "")
-    return f"{shown!r}, which is no action or pause: {error}"
+    return f"{_excerpt(payload, str(error))!r}, which is no action or pause: {error}"
+
+
+def _excerpt(payload: bytes, error: str) -> str:
+    """As much of a message as shows what is wrong: around the byte that the decoder names."""
+    found = re.search(r"\(byte (\d+)\)", error)
+    begin = max(0, int(found[1]) - _SHOWN // 2) if found and len(payload) > _SHOWN else 0
+    shown = payload[begin : begin + _SHOWN]
+    before, after = "…" * (begin > 0), "…" * (begin + len(shown) < len(payload))
+    return f"{before}{shown.decode(errors='replace')}{after}"
 
 
 def _other_version(version: int) -> str:

@@ -91,3 +91,9 @@ def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]
             if message["session"] not in before:
                 return message
     raise AssertionError("no observation has come")
+
+
+def reason(rig: Rig) -> str:
+    """Of the fault, in words."""
+    assert rig.loop.supervisor.reason
+    return rig.loop.supervisor.reason.message

@@ -1,50 +1,18 @@
-"""The controller `remote` against agents on true sockets: deadlines, numbers, pauses, rubbish."""
+"""The controller `remote` against agents on true sockets: deadlines, numbers, pauses, addresses."""
 
 import math
 import time
-from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
 from harness import LIMITS, Rig
-from scripted_agent import ScriptedAgent, connect
+from scripted_agent import ScriptedAgent, connect, reason
 
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.errors import ConfigError, ParameterError
 from fishd.remote.wire import Wire
-
-SLOW = ("tick=0.2",)
-"""A tick with a deadline of 80 ms, so that a busy machine does not spoil a test."""
-
-
-@pytest.fixture
-def agent(tmp_path: Path) -> Iterator[ScriptedAgent]:
-    agent = ScriptedAgent(tmp_path)
-    yield agent
-    agent.close()
-
-
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    rig = Rig(*SLOW)
-    yield rig
-    rig.loop.close()
-
-
-@pytest.fixture
-def still() -> Iterator[Rig]:
-    """A loop whose virtual time stands still while an agent thinks."""
-    rig = Rig("lockstep=true")
-    yield rig
-    rig.loop.close()
-
-
-def reason(rig: Rig) -> str:
-    assert rig.loop.supervisor.reason
-    return rig.loop.supervisor.reason.message
 
 
 def test_an_action_is_in_force_in_the_tick_whose_observation_it_answers(
@@ -216,61 +184,6 @@ def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) 
         ticks = still.run(5)
     assert [tick.phi_c for tick in ticks] == [0.1] * 5
     assert [seen["seq"] for seen in agent.seen] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
-
-
-def spoiled(**changes: Any) -> dict[str, Any]:
-    return {"kind": "action", "v": 1, "session": "s", "seq": 1, "phi_c": 0.1, **changes}
-
-
-@pytest.mark.parametrize(
-    ("rubbish", "complaint"),
-    [
-        (b"\xff\x00", "which is no action or pause"),
-        (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
-        (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
-        (spoiled(phi_c="0.1"), "Expected `float`, got `str` - at `$.phi_c`"),
-        (spoiled(speed=1), "Object contains unknown field `speed`"),
-        (spoiled(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
-        (spoiled(v=2), "a message of version 2; this fishd needs version 1"),
-        (spoiled(v=2, angle=1), "a message of version 2; this fishd needs version 1"),
-        ({"kind": "pause", "v": 1, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
-    ],
-)
-def test_rubbish_is_a_fault_that_says_what_came(
-    rig: Rig, agent: ScriptedAgent, rubbish: dict[str, Any] | bytes, complaint: str
-) -> None:
-    connect(rig, agent)
-    agent.send(rubbish)
-    time.sleep(0.02)
-    rig.run()
-    assert rig.reason == "remote-error"
-    assert f"the agent at {agent.address} sent " in reason(rig)
-    assert complaint in reason(rig)
-    assert "\n" not in reason(rig)
-
-
-def test_more_frames_than_one_are_rubbish(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent)
-    agent.send(b"", agent.action(0.1))
-    time.sleep(0.02)
-    rig.run()
-    assert "a message of 2 frames; one frame of JSON is needed" in reason(rig)
-
-
-def test_an_action_for_what_was_never_asked_is_a_fault(rig: Rig, agent: ScriptedAgent) -> None:
-    latest = connect(rig, agent)["seq"]
-    agent.send(agent.action(0.1, seq=latest + 7))
-    time.sleep(0.02)
-    rig.run()
-    assert rig.reason == "remote-error"
-    assert f"an action for observation {latest + 7}" in reason(rig)
-
-
-def test_an_action_of_another_session_is_not_for_this_one(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent)
-    with agent.answering(lambda seen: agent.action(0.3, session="0123")):
-        assert {tick.phi_c for tick in rig.run(5)} == {0.0}
-    assert rig.mode == "running"
 
 
 def test_each_take_over_has_a_session_of_its_own_whose_end_is_told(

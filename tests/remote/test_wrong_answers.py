@@ -1,0 +1,120 @@
+"""Answers that are none, to the controller `remote`: what they do, and what the fault says."""
+
+import re
+import time
+from typing import Any
+
+import pytest
+from harness import Rig
+from scripted_agent import ScriptedAgent, connect, reason
+
+
+def spoiled(**changes: Any) -> dict[str, Any]:
+    return {"kind": "action", "v": 1, "session": "s", "seq": 1, "phi_c": 0.1, **changes}
+
+
+@pytest.mark.parametrize(
+    ("rubbish", "complaint"),
+    [
+        (b"\xff\x00", "which is no action or pause"),
+        (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
+        (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
+        (spoiled(phi_c="0.1"), "Expected `float`, got `str` - at `$.phi_c`"),
+        (spoiled(speed=1), "Object contains unknown field `speed`"),
+        (spoiled(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
+        (spoiled(v=2), "a message of version 2; this fishd needs version 1"),
+        (spoiled(v=2, angle=1), "a message of version 2; this fishd needs version 1"),
+        ({"kind": "pause", "v": 1, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
+    ],
+)
+def test_rubbish_is_a_fault_that_says_what_came(
+    rig: Rig, agent: ScriptedAgent, rubbish: dict[str, Any] | bytes, complaint: str
+) -> None:
+    connect(rig, agent)
+    agent.send(rubbish)
+    time.sleep(0.02)
+    rig.run()
+    assert rig.reason == "remote-error"
+    assert f"the agent at {agent.address} sent " in reason(rig)
+    assert complaint in reason(rig)
+    assert "\n" not in reason(rig)
+
+
+def test_more_frames_than_one_are_rubbish(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent)
+    agent.send(b"", agent.action(0.1))
+    time.sleep(0.02)
+    rig.run()
+    assert "a message of 2 frames; one frame of JSON is needed" in reason(rig)
+
+
+@pytest.mark.parametrize(
+    ("angle", "fill", "shown"),
+    [
+        (b"nul", 0, b'"phi_c":nul}'),
+        (b"nul", 900, b'"phi_c":nul}'),
+        (b"[0.1]", 0, b'"phi_c":[0.1]}'),
+    ],
+)
+def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
+    rig: Rig, agent: ScriptedAgent, angle: bytes, fill: int, shown: bytes
+) -> None:
+    session = connect(rig, agent)["session"].encode()
+    head = b'{"kind":"action","v":1,' + fill * b" " + b'"session":"' + session + b'","seq":12,'
+    agent.send(head + b'"phi_c":' + angle + b"}" + fill * b" ")
+    time.sleep(0.02)
+    rig.run()
+    assert shown.decode() in reason(rig)
+    assert ("…" in reason(rig)) == bool(fill)
+    assert len(reason(rig)) < 450
+
+
+@pytest.mark.parametrize("seq", [-3, 0, 2, 8, 10**18])
+def test_an_action_for_what_was_never_sent_is_a_fault(
+    rig: Rig, agent: ScriptedAgent, seq: int
+) -> None:
+    assert connect(rig, agent)["seq"] == 1
+    agent.send(agent.action(0.1, seq=seq))
+    time.sleep(0.02)
+    assert rig.run()[-1].phi_c == 0.0
+    assert rig.reason == "remote-error"
+    assert f"an action for observation {seq}, which was never sent; the latest is 1" in reason(rig)
+
+
+def test_answers_that_name_another_session_are_told_from_late_ones(
+    rig: Rig, agent: ScriptedAgent
+) -> None:
+    connect(rig, agent)
+    with agent.answering(lambda seen: agent.action(0.1)):
+        while rig.run()[-1].phi_c == 0.0:
+            pass
+    with agent.answering(lambda seen: agent.action(0.3, session="0123")):
+        assert {tick.phi_c for tick in rig.run(5)} == {0.0}
+    assert rig.reason == "remote-silent"
+    said = re.search(r"5 ticks in a row \((\d) answers came too late, (\d) named", reason(rig))
+    assert said
+    assert int(said[1]) <= 1
+    assert int(said[2]) >= 4
+
+
+def test_before_the_first_action_the_wrong_answers_are_counted_too(
+    rig: Rig, agent: ScriptedAgent
+) -> None:
+    connect(rig, agent, first_action=2.0)
+    with agent.answering(lambda seen: agent.action(0.3, session="0123")):
+        rig.run(10)
+    assert rig.reason == "remote-silent"
+    assert "no action has come in time from the agent at" in reason(rig)
+    assert "named another session)" in reason(rig)
+
+
+def test_late_answers_from_the_session_before_do_no_harm(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent)
+    before = agent.action(0.3)
+    connect(rig, agent)
+    now = agent.action(0.2)
+    for number in range(20):
+        agent.send({**before, "seq": before["seq"] + number})
+    with agent.answering(lambda seen: {**now, "seq": seen["seq"]}):
+        assert {tick.phi_c for tick in rig.run(5)} <= {0.0, 0.2}
+    assert rig.mode == "running"
