@@ -140,12 +140,18 @@ def _run(
 @contextmanager
 def _spared_by_the_terminal() -> Iterator[None]:
     """Processes that begin in here never hear Ctrl-C or the terminal's end: this one says stop."""
-    signals = (signal.SIGINT, signal.SIGHUP)
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    # What is ignored stays so in a child, unlike what is handled.
+    former = {
+        number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGHUP)
+    }
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 def _train_here(task: _Task) -> tuple[int, SeedOutcome, bytes]:

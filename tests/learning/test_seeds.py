@@ -149,6 +149,18 @@ def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
     assert (run / "seeds.csv").exists()
 
 
+def test_ctrl_c_before_any_has_begun_is_heeded_as_well(tmp_path: Path) -> None:
+    with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG) as process:
+        wait_for(lambda: trainers(process.pid))  # which have all to import as yet
+        time.sleep(0.1)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 130
+        wait_for(lambda: not members(process.pid))
+    assert "Traceback" not in errors
+    assert errors.count("interrupted (it had not begun)") == 3
+
+
 def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     run = tmp_path / "run"
     with started(tmp_path, "--seeds", "2", "--jobs", "2", steps=2048) as process:
