@@ -14,7 +14,7 @@ import msgspec
 import pytest
 import zmq
 from documents import FENCE, ROOT, text_of
-from processes import FISHCTL, PATIENCE, Daemon, Subscriber, running
+from processes import FISHCTL, FISHD, PATIENCE, Daemon, Subscriber, running
 
 from fishd.client import Agent, Fish, Refused
 
@@ -204,16 +204,47 @@ def test_in_lockstep_a_signal_ends_the_wait(tmp_path: Path, address: str) -> Non
     assert "Traceback" not in errors
 
 
-def test_the_example_of_the_documentation_swims(daemon: Daemon) -> None:
+def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(
+    daemon: Daemon,
+) -> None:
     document = text_of(ROOT / "docs" / "remote.md")
     example = next(block for kind, block in FENCE.findall(document) if kind == "python")
-    with Subscriber(daemon.telemetry, b"tick") as ticks:
-        process = subprocess.Popen(
-            [sys.executable, "-c", example], env={"FISHD_ENDPOINT": daemon.endpoint}
-        )
+    assert "400" in example
+    brief = example.replace("400", "60")
+    with (
+        Subscriber(daemon.telemetry, b"tick") as ticks,
+        subprocess.Popen(
+            [sys.executable, "-c", brief], env={"FISHD_ENDPOINT": daemon.endpoint}
+        ) as process,
+    ):
         try:
             ticks.until(controller="remote", phi_c=0.42)
             ticks.until(controller="remote", phi_c=-0.42)
+            assert process.wait(PATIENCE) == 0
         finally:
             process.kill()
-            process.wait()
+    assert status(daemon)["mode"] == "idle"
+
+
+def test_an_agent_that_cannot_be_connected_to_ends_no_simulation_with_a_traceback() -> None:
+    command = [FISHCTL, "simulate", "remote", "--agent", "tcp://*:9000"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
+    assert done.returncode != 0
+    assert done.stderr.startswith("fishctl: remote: agent: 'tcp://*:9000' is not valid: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_fishd_does_not_take_the_socket_of_an_agent(daemon: Daemon, tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/agent"
+    with Agent(address) as agent, Fish(daemon.endpoint) as fish:
+        second = subprocess.run(
+            [FISHD, "--set", f"control.address={address}"],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
+        )
+        assert second.returncode == 1
+        assert f"already serves {address}" in second.stderr
+        fish.set_controller("remote", agent=address)
+        assert agent.observe().seq >= 1
