@@ -64,6 +64,9 @@ def evaluate(
     A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
     with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. Without any: the
     best square wave, swing, and the named policies that are made for this fish.
+
+    Efficiency is the thrust over that of the best square wave. |φ_c|/Φ is the mean size of the
+    command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866.
     """
     from fishd.learning import comparison
 

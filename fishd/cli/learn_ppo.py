@@ -40,7 +40,11 @@ INTERRUPTED = 130
     type=click.Path(path_type=Path),
     help="YAML file of the training, such as config/learning.yaml; without it, the defaults.",
 )
-@click.option("--steps", type=click.IntRange(min=1), help="Control steps to learn from, in all.")
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    help="Control steps to learn from, in all; rounded up to whole rollouts of ppo.n_steps.",
+)
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the training.")
 @click.option(
     "--folder",
@@ -51,7 +55,8 @@ INTERRUPTED = 130
     "--resume",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Go on with the run in this folder, from its newest checkpoint and with its settings.",
+    help="Go on with the run in this folder, from its newest checkpoint and with its settings; of "
+    "several seeds, each has a folder of its own: runs/ten/seed-3.",
 )
 @click.option(
     "--from",
