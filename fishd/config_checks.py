@@ -21,15 +21,13 @@ from fishd.hardware.settings import (
     ServoSettings,
 )
 from fishd.schema import Problem
-from fishd.zmq_address import is_address
+from fishd.zmq_address import LONGEST_SOCKET, is_address
 
 PWM_PINS = (12, 13, 18, 19)
 SLOWEST_CONVERSION = 1.25
 """Of the ADC with its tolerance and its transfers, in units of 1 / data rate."""
 I2C_PINS = (2, 3)
 """SDA and SCL of bus 1."""
-LONGEST_SOCKET = 107
-"""Of the path of a Unix socket, by Linux [bytes]."""
 _LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
 

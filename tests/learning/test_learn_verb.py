@@ -58,12 +58,12 @@ def _arguments(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_it_trains_and_says_how_it_went(tmp_path: Path, settings: str) -> None:
     folder = tmp_path / "run"
-    found = learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "512")
+    found = learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "768")
     assert found.exit_code == 0, found.output
-    assert "512 steps in 0:2" in found.output
+    assert "768 steps in 0:3" in found.output
     assert f"fishctl learn export {folder}" in found.output
     assert found.output.count(" in the tank: ") >= 2  # a line for each evaluation
-    assert runs.read(folder)[1].steps == 512
+    assert runs.read(folder)[1].steps == 768
 
 
 def test_it_goes_on_with_more_steps(tmp_path: Path, settings: str) -> None:
