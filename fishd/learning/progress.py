@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 import click
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from fishd.learning.checkpoints import Evaluation
 
 
@@ -93,15 +95,17 @@ class Bar(Lines):
             TimeRemainingColumn(compact=True),
             TextColumn("left"),
         )
-        self._task = self._progress.add_task("", start=False, total=None, figures="", tank="0:00")
+        self._task: TaskID
         self._exploring = ""
         self._evaluation = ""
 
     def begin(self, steps: int, target: int, says: str) -> None:
         """Show the bar."""
         self.say(says)
-        self._progress.update(self._task, completed=steps, total=target)
-        self._progress.start_task(self._task)
+        self._task = self._progress.add_task(
+            "", completed=steps, total=target, figures="", tank="0:00"
+        )
+        self._progress.start()
 
     def step(self, tank_time: float) -> None:
         """Move on by one."""
@@ -131,9 +135,11 @@ class Bar(Lines):
 
     @contextmanager
     def shown(self) -> Iterator["Bar"]:
-        """While the bar is on the terminal."""
-        with self._progress:
+        """While the bar may be on the terminal; it is from `begin` on."""
+        try:
             yield self
+        finally:
+            self._progress.stop()
 
 
 @contextmanager
