@@ -151,7 +151,8 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             ge=0,
             le=100,
             description="In simulation, so many other fish are tried too, at the edges of the "
-            "randomisation and shaken first; the policy counts as the best that does best on its worst fish.",
+            "randomisation and shaken first; the policy counts as the best that does best on its "
+            "worst fish.",
         ),
     ] = 0
 
