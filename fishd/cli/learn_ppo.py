@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from fishd.learning.training import Job, Outcome
 
 INTERRUPTED = 130
+IMPLAUSIBLE = 1.03
+"""No policy does better than the best square wave, but for noise."""
 
 
 @click.command()
@@ -251,6 +253,11 @@ def _report(outcome: "Outcome", job: "Job") -> int:
     click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time")
     if outcome.best_evaluation:
         click.echo(f"best: {described(outcome.best_evaluation).strip()}")
+        if outcome.best_evaluation.efficiency > IMPLAUSIBLE:
+            click.echo(
+                "careful: that is more than the best square wave of the configured plant; the fish "
+                "is another one, or F_x is not calibrated, or it drifts"
+            )
     elif outcome.latest_evaluation:
         click.echo("it stalled in every evaluation; train it for longer, or with another --seed")
         return 0

@@ -140,8 +140,8 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         Meta(
             ge=0,
             le=60,
-            description="On a robot, the tail rests for so long before; F_x of the last third is "
-            "then its zero, whatever the sensor has drifted. 0: the sensor's own zero.",
+            description="On a robot, the tail rests for so long before and after; its zero is then "
+            "between F_x of the last thirds, whatever the sensor drifts. 0: the sensor's own zero.",
             extra_json_schema={"unit": "s"},
         ),
     ] = 3.0

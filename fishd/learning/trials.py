@@ -91,40 +91,50 @@ def on_link(
 ) -> Trial | None:
     """The very fish that learns, by its measured thrust; None where `stop` says so on the way.
 
-    It rests before, so that the thrust can be told from what the sensor has drifted. The fish must
-    not be at pause. Raises `LinkLost`.
+    It rests before and after, so that the thrust can be told from what the sensor drifts meanwhile.
+    The fish must not be at pause. Raises `LinkLost`.
     """
     tick, amplitude = env.link.tick, env.link.amplitude
-    zero = _force_at_rest(env, settings.rest, stop)
+    before = _force_at_rest(env, settings.rest, stop)
     ticks = math.ceil(settings.seconds / tick)
     settled = round(settings.settle / tick)
-    thrusts, angles = [], []
+    times, thrusts, angles = [], [], []
     for index in range(ticks):
         if stop():
             return None
         angle = max(-amplitude, min(amplitude, decide(env.latest)))
         env.advance(angle)
         if index >= settled:
+            times.append(env.latest.time)
             thrusts.append(env.latest.fx)
             angles.append(angle)
+    after = _force_at_rest(env, settings.rest, stop)
+    if stop():
+        return None
+    (began, zero_then), (ended, zero_now) = before, after
+    zero = np.interp(float(np.mean(times)), [began, ended], [zero_then, zero_now])
     shares = np.array(angles) / amplitude
     return Trial(
-        thrust=float(np.mean(thrusts)) - zero,
+        thrust=float(np.mean(thrusts) - zero),
         frequency=beat_frequency(shares, tick),
         fullness=float(np.mean(np.abs(shares))),
         tick=tick,
     )
 
 
-def _force_at_rest(env: SwimEnv, seconds: float, stop: Callable[[], bool]) -> float:
-    """Mean F_x of the last third of a rest [N]; 0 for no rest."""
-    forces = []
+def _force_at_rest(env: SwimEnv, seconds: float, stop: Callable[[], bool]) -> tuple[float, float]:
+    """When it was [s], and the mean F_x of the last third of a rest [N]; 0 for no rest."""
+    times, forces = [], []
     for _ in range(math.ceil(seconds / env.link.tick)):
         if stop():
-            return 0.0
+            break
         env.advance(0.0)
+        times.append(env.latest.time)
         forces.append(env.latest.fx)
-    return float(np.mean(forces[-max(1, len(forces) // 3) :])) if forces else 0.0
+    if not forces:
+        return env.latest.time, 0.0
+    last = max(1, len(forces) // 3)
+    return float(np.mean(times[-last:])), float(np.mean(forces[-last:]))
 
 
 def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from fishd.config import load
 from fishd.errors import ParameterError
@@ -180,3 +181,32 @@ def test_on_a_robot_the_force_at_rest_is_taken_for_zero(
         return trial.thrust
 
     assert thrust(0.02) - thrust(0.0) == pytest.approx(drifted, abs=2e-4)
+
+
+def test_a_steady_drift_during_an_evaluation_is_taken_off(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
+    from fishd.learning.environment import SwimEnv
+    from fishd.learning.in_process import InProcess
+    from fishd.learning.link import Sensed
+    from fishd.learning.settings import EnvironmentSettings
+    from fishd.learning.trials import on_link
+
+    class Drifting(InProcess):
+        slope = 0.0  # N/s
+
+        def step(self, angle: float) -> Sensed:
+            sensed = super().step(angle)
+            seen = sensed.observation
+            return Sensed(replace(seen, fx=seen.fx + self.slope * seen.time))
+
+    def thrust(slope: float, rest: float) -> float:
+        link = Drifting(CONFIG)
+        link.slope = slope
+        env = SwimEnv(link, CONFIG, EnvironmentSettings())
+        env.reset(seed=1)
+        trial = on_link(env, square_of_six_ticks, EvaluationSettings(rest=rest), lambda: False)
+        assert trial
+        return trial.thrust
+
+    assert thrust(1e-3, 3.0) == pytest.approx(thrust(0.0, 3.0), abs=2e-4)
+    assert thrust(1e-3, 0.0) > thrust(0.0, 0.0) + 0.01
