@@ -1,5 +1,6 @@
 """The verb that writes a policy file."""
 
+import shlex
 from pathlib import Path
 
 import click
@@ -40,4 +41,5 @@ def export(run: Path, target: Path | None, newest: bool, force: bool, note: str)
         click.echo(
             "it swims with " + figures(found.trial.thrust, past.efficiency, found.trial.frequency)
         )
-    click.echo(f"to let it swim: fishctl set-controller ppo --policy {found.path}")
+    path = shlex.quote(str(found.path))
+    click.echo(f"to let it swim: fishctl set-controller ppo --policy {path}")
