@@ -226,10 +226,10 @@ def _train(job: "Job") -> int:
             outcome = train(job, show, asked.is_set)
     except ConfigError as error:
         complain("fishctl", str(error), EX_CONFIG)
-    return _report(outcome, job)
+    return report(outcome, job)
 
 
-def _report(outcome: "Outcome", job: "Job") -> int:
+def report(outcome: "Outcome", job: "Job") -> int:
     """Say how it ended; the exit status."""
     from fishd.learning.progress import described, minutes
 

@@ -16,12 +16,15 @@ pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
 
 from click.testing import CliRunner, Result
 from processes import FISHCTL, PATIENCE, Daemon, running
-from swimming import rows
+from swimming import brief_job, rows
 
+from fishd.cli.learn_ppo import report
 from fishd.cli.main import fishctl
 from fishd.client import Fish
 from fishd.console import run
 from fishd.learning import checkpoints, runs
+from fishd.learning.checkpoints import Evaluation
+from fishd.learning.jobs import Outcome
 
 SETTINGS = """\
 steps: 128
@@ -321,3 +324,26 @@ def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
     )
     assert status == 78
     assert "amplitude_limit: 0.3 rad in this configuration, 0.42 rad in the fishd" in line
+
+
+@pytest.mark.parametrize(("efficiency", "careful"), [(1.01, False), (1.1, True)])
+def test_more_thrust_than_is_possible_is_said_to_be_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], efficiency: float, careful: bool
+) -> None:
+    best = Evaluation(128, 32.4, 0.028, efficiency, 1.67, 1.0, stalled=False)
+    outcome = Outcome(
+        folder=tmp_path / "tank",
+        steps=128,
+        dropped=0,
+        tank_time=32.4,
+        ended="finished",
+        message="",
+        checkpoint=None,
+        best=None,
+        latest_evaluation=best,
+        best_evaluation=best,
+    )
+    assert report(outcome, brief_job(tmp_path / "tank")) == 0
+    said = capsys.readouterr().out
+    assert ("careful: that is more than the best square wave" in said) is careful
+    assert "learn export" in said
