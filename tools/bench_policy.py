@@ -56,7 +56,7 @@ class Deaf:
 def random_policy() -> bytes:
     """A 64 × 64 tanh network of random weights, which sees what training shows by default."""
     draw = np.random.default_rng(0)
-    sizes = (4, 64, 64, 1)
+    sizes = (5, 64, 64, 1)
     layers = [
         (draw.normal(0.0, before**-0.5, (after, before)), draw.normal(0.0, 0.1, after))
         for before, after in itertools.pairwise(sizes)
@@ -65,6 +65,7 @@ def random_policy() -> bytes:
         Feature("fy", 0.39),
         Feature("fy_rate", 4.9),
         Feature("instruction_angle", 0.42),
+        Feature("previous_angle", 0.42),
         Feature("fin_velocity", 0.031),
     )
     provenance = Provenance(

@@ -64,5 +64,5 @@ def check_agreement(link: Link, config: Config) -> None:
             raise ConfigError(
                 f"{key}: {here:g} {unit} in this configuration, {there:g} {unit} in the fishd that "
                 "runs; what the network sees is scaled by it, so give the file that fishd was "
-                "started with"
+                "started with, or none"
             )
