@@ -5,17 +5,17 @@ import os
 import socket
 import stat
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
-
-import zmq
 
 from fishd.errors import StartupError
 from fishd.lockfile import Taken, lock_path, locked
+from fishd.zmq_address import Ipc, parse
 
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 _SERVICE = Path("/run/fishd/control")
+_BACKLOG = 128
+"""Connections that may wait to be accepted."""
 
 
 def control_address() -> str:
@@ -130,20 +130,63 @@ def is_deserted(address: str) -> bool:
         return probe.connect_ex(str(socket_path(address))) in nobody
 
 
-def bind(server: "zmq.Socket[Any]", address: str, key: str) -> None:
-    """Bind a socket; raises `StartupError` that names the configuration key of its address."""
+def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
+    """A listening socket; an ipc address must be `claimed` before, what is left there is removed.
+
+    key: that of the address in the configuration, which messages name
+    group: let user and group of this process connect to a Unix socket, and nobody else
+    Raises `StartupError`.
+    """
+    server = None
     try:
-        server.bind(address)
-    except zmq.ZMQError as error:
-        server.close(linger=0)
-        if error.errno == zmq.EADDRINUSE:
-            why = "it is in use, by another fishd perhaps; stop that, or choose another address"
-        elif error.errno in (errno.ENODEV, errno.EADDRNOTAVAIL) and address.startswith("tcp://"):
-            host, _, port = address.removeprefix("tcp://").rpartition(":")
-            why = (
-                f"{host} is no address of this machine; write tcp://127.0.0.1:{port}, or "
-                f"tcp://0.0.0.0:{port} for all"
-            )
+        where = parse(address)
+        if isinstance(where, Ipc):
+            server = socket.socket(socket.AF_UNIX)
+            _bind_path(server, where.path, 0o117 if group else None)
         else:
-            why = f"{zmq.strerror(error.errno or 0)}; choose another address"
-        raise StartupError(f"{key}: cannot listen on {address}: {why}") from None
+            family = socket.AF_INET6 if ":" in where.host else socket.AF_INET
+            host = "" if where.host == "*" else where.host  # "" is every address
+            server = socket.socket(family)
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            server.bind((host, int(where.port)))
+        server.listen(_BACKLOG)
+    except (OSError, ValueError) as error:
+        if server:
+            server.close()
+        raise StartupError(f"{key}: cannot listen on {address}: {_why(address, error)}") from None
+    return server
+
+
+def _bind_path(server: socket.socket, path: str, mask: int | None) -> None:
+    with suppress(FileNotFoundError):
+        Path(path).unlink()  # of a fishd that was killed
+    before = os.umask(mask) if mask is not None else None
+    try:
+        server.bind(path)
+    finally:
+        if before is not None:
+            os.umask(before)
+
+
+def served(address: str, server: socket.socket) -> str:
+    """The address that clients connect to: with the port that was taken where 0 was asked for."""
+    if not address.startswith("tcp://"):
+        return address
+    host = address.removeprefix("tcp://").rpartition(":")[0].replace("*", "0.0.0.0")
+    return f"tcp://{host}:{server.getsockname()[1]}"
+
+
+def _why(address: str, error: Exception) -> str:
+    """Why an address cannot be bound, and what would be right."""
+    if not isinstance(error, OSError):
+        return str(error)
+    if error.errno == errno.EADDRINUSE:
+        return "it is in use, by another fishd perhaps; stop that, or choose another address"
+    unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
+    if unknown and address.startswith("tcp://"):
+        host, _, port = address.removeprefix("tcp://").rpartition(":")
+        return (
+            f"{host} is no address of this machine; write tcp://127.0.0.1:{port}, or "
+            f"tcp://0.0.0.0:{port} for all"
+        )
+    return f"{error.strerror or error}; choose another address"

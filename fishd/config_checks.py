@@ -4,7 +4,6 @@ Each check raises `Problem` with the key to blame and what would be right.
 """
 
 import math
-import os
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -21,14 +20,13 @@ from fishd.hardware.settings import (
     ServoSettings,
 )
 from fishd.schema import Problem
-from fishd.zmq_address import LONGEST_SOCKET, is_address
+from fishd.zmq_address import FORM, check_length, is_local, why_not_served
 
 PWM_PINS = (12, 13, 18, 19)
 SLOWEST_CONVERSION = 1.25
 """Of the ADC with its tolerance and its transfers, in units of 1 / data rate."""
 I2C_PINS = (2, 3)
 """SDA and SCL of bus 1."""
-_LOCAL = re.compile(r"ipc://|tcp://(localhost|127(\.[0-9]+){3}):")
 
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
@@ -50,21 +48,18 @@ def check_start(controller: str | None, parameters: Mapping[str, Any], limits: L
 
 def check_addresses(telemetry: str, control: str | None) -> None:
     """Both are addresses, not the same, and requests come from this machine only."""
-    if not is_address(telemetry):
-        raise Problem(
-            ("telemetry", "address"),
-            f"'{telemetry}' is not valid: tcp://HOST:PORT or ipc://PATH is needed",
-        )
-    _check_length(("telemetry", "address"), telemetry)
+    if complaint := why_not_served(telemetry):
+        raise Problem(("telemetry", "address"), f"'{telemetry}' is not valid: {complaint}")
     if control is None:
         return
-    if not (is_address(control) and _LOCAL.match(control)):
-        raise Problem(
-            ("control", "address"),
-            f"'{control}' is not valid: ipc://PATH or tcp://127.0.0.1:PORT is needed; "
-            "who can send requests can move the fish, so they are taken from this machine only",
+    complaint = why_not_served(control)
+    if complaint.startswith(FORM) or not (complaint or is_local(control)):
+        complaint = (
+            "ipc://PATH or tcp://127.0.0.1:PORT is needed; who can send requests can move the "
+            "fish, so they are taken from this machine only"
         )
-    _check_length(("control", "address"), control)
+    if complaint:
+        raise Problem(("control", "address"), f"'{control}' is not valid: {complaint}")
     if control == telemetry:
         raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
 
@@ -191,23 +186,15 @@ def check_virtual_pi(robot: str, servo: ServoSettings, pi: VirtualPiSettings) ->
     if pi.socket is not None:
         if not pi.socket:
             raise Problem(("virtual_pi", "socket"), "'' is not valid: a path or null is needed")
-        _check_length(("virtual_pi", "socket"), pi.socket)
+        try:
+            check_length(pi.socket)
+        except ValueError as error:
+            raise Problem(
+                ("virtual_pi", "socket"), f"'{pi.socket}' is not valid: {error}"
+            ) from None
     if pi.servo_scale == 0.0:
         raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")
     if pi.channel_x == pi.channel_y:
         raise Problem(
             ("virtual_pi", "channel_y"), f"'{pi.channel_y}' is what channel_x is wired to"
-        )
-
-
-def _check_length(key: tuple[str, ...], address: str) -> None:
-    """A Unix socket can have this path, or ipc address."""
-    if address.startswith("tcp://"):
-        return
-    length = len(os.fsencode(address.removeprefix("ipc://")))
-    if length > LONGEST_SOCKET:
-        raise Problem(
-            key,
-            f"'{address}' is not valid: the path of a Unix socket has at most {LONGEST_SOCKET} "
-            f"bytes, this one has {length}; choose a shorter one, such as in /run or /tmp",
         )

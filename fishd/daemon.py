@@ -7,10 +7,10 @@ import signal
 import sys
 import time
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 
 import click
-import zmq
 
 from fishd import __version__, addresses, build, realtime, robots
 from fishd.clock import SystemClock, Ticker, VirtualClock
@@ -18,6 +18,8 @@ from fishd.config import Config, load
 from fishd.console import complain, run, status_line
 from fishd.controllers import registry
 from fishd.errors import ConfigError, FishdError, ServoError
+from fishd.gateway import link
+from fishd.gateway.process import Gateway
 from fishd.hardware.pulses import REST
 from fishd.lockstep import Lockstep
 from fishd.logs import LogWriter
@@ -26,6 +28,7 @@ from fishd.notify import SystemdNotifier
 from fishd.operations import Operations
 from fishd.policies.runtime import preload
 from fishd.rehearsal import rehearsal
+from fishd.remote import wire
 from fishd.server import ControlServer
 from fishd.telemetry import Telemetry
 from fishd.workbench import Workbench
@@ -65,11 +68,10 @@ class Daemon:
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claimed(address))
             stack.enter_context(addresses.claimed(config.telemetry.address))
-            # That of the whole process, so that its one thread is on time for controllers too.
-            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
-            stack.callback(context.destroy, linger=100)  # with every socket that is still open
-            self._telemetry = Telemetry(context, config.telemetry.address)
-            self._rehearse = None if config.lockstep else rehearsal(config, context)
+            self._open_gateways(address, stack)
+            wire.start_context(stack)
+            self._telemetry = Telemetry(self._gateways[link.TELEMETRY].send)
+            self._rehearse = None if config.lockstep else rehearsal(config)
             controllers = registry.describe_all()  # imports what other packages offer
             preload()  # of what would hold up the ticks later
             robot = robots.open_robot(config, self._clock, stack)
@@ -90,12 +92,50 @@ class Daemon:
                 workbench,
                 config,
                 controllers,
-                self._telemetry.address,
+                self._gateways[link.TELEMETRY].address,
                 fifo,
+                self._gateway_counters,
             )
-            self._server = ControlServer(context, address, self._operations.perform)
+            self._server = ControlServer(self._operations.perform, config.tick)
+            self._connect(self._server)
+            stack.callback(self._server.close)
             self._stack = stack.pop_all()
         return self
+
+    def _open_gateways(self, control: str, stack: ExitStack) -> None:
+        """Begin to listen, so that what is wrong with an address is known at once."""
+        self._gateways = {}
+        for kind, address in (
+            (link.CONTROL, control),
+            (link.TELEMETRY, self._config.telemetry.address),
+        ):
+            listener = addresses.listen(address, f"{kind}.address", group=kind == link.CONTROL)
+            gateway = Gateway(kind, listener, addresses.served(address, listener))
+            self._gateways[kind] = gateway
+            stack.callback(gateway.close)
+        stack.callback(self._gateways[link.CONTROL].end)  # both end at the same time
+
+    def _connect(self, server: ControlServer) -> None:
+        """Let requests come in, and replies go out."""
+        control = self._gateways[link.CONTROL]
+        server.send, server.read = control.send, control.read
+        control.take = server.take
+        control.read(True)
+        for gateway in self._gateways.values():
+            gateway.on_restart = partial(self._tell_restart, gateway.kind)
+
+    def _tell_restart(self, kind: str, why: str) -> None:
+        message = f"the gateway of {kind} was started again: {why}"
+        self._loop.reporter.event("gateway", message, "warning", gateway=kind)
+
+    def _gateway_counters(self) -> dict[str, int]:
+        """What fishd survived at its sockets."""
+        telemetry, control = self._gateways[link.TELEMETRY], self._gateways[link.CONTROL]
+        return {
+            "telemetry_lost": telemetry.lost,
+            "telemetry_restarts": telemetry.restarts,
+            "control_restarts": control.restarts,
+        }
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         """Raises `ServoError` when the servo could not be released."""
@@ -117,18 +157,13 @@ class Daemon:
             self._loop.robot.name,
             self._config.tick * 1e3,
             " of virtual time" if self._config.lockstep else "",
-            self._server.address,
-            self._telemetry.address,
+            self._gateways[link.CONTROL].address,
+            self._gateways[link.TELEMETRY].address,
         )
-        server = asyncio.create_task(self._server.run())
         realtime.quiet_garbage_collector()
-        try:
-            await self._tick_until(stopping, server)
-        finally:
-            server.cancel()
-            self._server.close()
+        await self._tick_until(stopping)
 
-    async def _tick_until(self, stopping: asyncio.Event, server: asyncio.Task[None]) -> None:
+    async def _tick_until(self, stopping: asyncio.Event) -> None:
         clock = self._clock
         lockstep = (
             Lockstep(self._loop, clock, self._config.tick)
@@ -139,7 +174,7 @@ class Daemon:
 
         def glance() -> None:
             self._do_chores()
-            if stopping.is_set() or server.done():
+            if stopping.is_set():
                 self._loop.stop()
 
         try:
@@ -149,8 +184,6 @@ class Daemon:
                 else:
                     self._loop.tick(slot)
                 self._do_chores()
-                if server.done():
-                    server.result()
                 if stopping.is_set():
                     break
             log.info("stopping: fading to neutral")
@@ -166,6 +199,7 @@ class Daemon:
 
     def _do_chores(self) -> None:
         """One at a time, to fit between two ticks of 2 ms."""
+        self._server.ticked()
         now = time.monotonic()
         if now >= self._next_chore:
             self._next_chore = now + HOUSEKEEPING / 2

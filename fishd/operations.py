@@ -41,17 +41,20 @@ class Operations:
         controllers: list[ControllerInfo],
         telemetry: str,
         realtime: bool,
+        counters: Callable[[], dict[str, int]] = dict,
     ) -> None:
         """
         config: what fishd was started with
         controllers: all that can be put in command
         telemetry: the address that clients are told
         realtime: is SCHED_FIFO in force?
+        counters: what was survived outside of the robot, since start
         """
         self._loop = loop
         self._clock = clock
         self._telemetry = telemetry
         self._realtime = realtime
+        self._counters = counters
         self._workbench = workbench
         self._config = config
         self._started = clock.monotonic()
@@ -110,7 +113,7 @@ class Operations:
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
             degraded=loop.robot.degraded(),
-            counters=loop.robot.counters(),
+            counters={**loop.robot.counters(), **self._counters()},
             realtime=self._realtime,
             telemetry=self._telemetry,
             servo_lost=loop.servo_lost,

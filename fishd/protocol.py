@@ -13,7 +13,7 @@ from fishd.hardware.calibration import ForceCalibration, ServoCalibration
 from fishd.signals import Reason
 
 VERSION = 1
-MAX_MESSAGE = 65536
+MAX_MESSAGE = 16384
 """Longer messages are not even received [bytes]."""
 
 LOAN = 5.0
@@ -21,7 +21,7 @@ LOAN = 5.0
 FRESH = 10.0
 """How long after it was taken a force sample is good for a tare [s]."""
 
-RequestId = int | str | None
+RequestId = int | Annotated[str, Meta(max_length=256)] | None
 
 Line = Annotated[str, Meta(max_length=1000, pattern="^[^\x00-\x1f\x7f-\x9f]*$")]
 """Text that goes into logs and terminals: one line without control characters."""
@@ -31,7 +31,7 @@ class Request(Struct, forbid_unknown_fields=True):
     """What a client asks for."""
 
     v: int
-    op: str
+    op: Annotated[str, Meta(max_length=64)]
     id: RequestId = None
     args: dict[str, Any] = {}
 

@@ -1,73 +1,70 @@
-"""The control channel: a ROUTER socket that answers requests, whatever it is sent."""
+"""Answers the requests that the gateway of the control channel lets through."""
 
 import asyncio
 import logging
-import os
+import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-import zmq
-import zmq.asyncio
-
 from fishd import protocol
-from fishd.addresses import bind
 from fishd.errors import Refused
+from fishd.gateway import link
 
 log = logging.getLogger(__name__)
 
 Perform = Callable[[str, dict[str, Any]], Awaitable[Any]]
 
+RATE = 1000.0
+"""Requests per second that are taken from all clients together; others wait in the gateway."""
+
 
 class ControlServer:
-    """Takes `[id, "", json]` from REQ sockets and `[id, json]` from DEALER sockets."""
+    """Performs requests, each in a task of its own, and no more in a tick than it can bear."""
 
-    def __init__(
-        self, context: "zmq.Context[zmq.Socket[bytes]]", address: str, perform: Perform
-    ) -> None:
-        """Raises `StartupError` when the address cannot be bound."""
+    def __init__(self, perform: Perform, tick: float) -> None:
+        """tick: period of the loop [s]"""
         self._perform = perform
+        self._per_tick = max(1, math.floor(RATE * tick))
+        self._left = self._per_tick
         self._tasks: set[asyncio.Task[None]] = set()
-        self._socket = zmq.asyncio.Context.shadow(context.underlying).socket(zmq.ROUTER)
-        self._socket.set(zmq.MAXMSGSIZE, protocol.MAX_MESSAGE)
-        self._socket.set(zmq.LINGER, 100)
-        mask = os.umask(0o117)  # an ipc socket for user and group, nobody else
-        try:
-            bind(self._socket, address, key="control.address")
-        finally:
-            os.umask(mask)
-        self.address = self._socket.get_string(zmq.LAST_ENDPOINT)
+        self.send: Callable[[bytes], object] = lambda message: None
+        """Takes a message for the gateway, without waiting."""
+        self.read: Callable[[bool], object] = lambda wanted: None
+        """Says whether the gateway is to hand over more requests."""
 
-    async def run(self) -> None:
-        """Answer requests until cancelled."""
-        while True:
-            frames = await self._socket.recv_multipart()
-            envelope, payload = frames[:-1], frames[-1]
-            if len(envelope) == 1 or (len(envelope) == 2 and not envelope[1]):
-                task = asyncio.create_task(self._answer(envelope, payload))
-                self._tasks.add(task)
-                task.add_done_callback(self._tasks.discard)
-            # A flood of requests would otherwise keep the ticker from being served.
-            await asyncio.sleep(0)
+    def take(self, message: bytes) -> None:
+        """Begin to answer a request that came over the link."""
+        self._left -= 1
+        if self._left <= 0:
+            self.read(False)
+        task = asyncio.create_task(self._answer(*link.numbered(message)))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def ticked(self) -> None:
+        """A tick is over: the next requests may come."""
+        if self._left <= 0:
+            self.read(True)
+        self._left = self._per_tick
 
     def close(self) -> None:
-        """Close the socket; may be called twice."""
+        """Give up what is not answered yet; may be called twice."""
         for task in self._tasks:
             task.cancel()
-        self._socket.close()
 
-    async def _answer(self, envelope: list[bytes], payload: bytes) -> None:
+    async def _answer(self, number: int, payload: bytes) -> None:
+        for part in link.reply(number, await self._reply(payload)):
+            self.send(part)
+
+    async def _reply(self, payload: bytes) -> bytes:
         identity: protocol.RequestId = None
         try:
             request = protocol.decode_request(payload)
             identity = request.id
-            reply = protocol.success(identity, await self._perform(request.op, request.args))
+            return protocol.success(identity, await self._perform(request.op, request.args))
         except Refused as error:
-            if identity is None:
-                identity = protocol.request_id(payload)
-            reply = protocol.failure(identity, error)
+            return protocol.failure(identity, error)
         except Exception as error:
             log.exception("a request failed")
             internal = Refused("internal", f"fishd failed: {type(error).__name__}: {error}")
-            reply = protocol.failure(identity, internal)
-        # Never blocks: ROUTER drops what a peer does not take.
-        await self._socket.send_multipart([*envelope, reply])
+            return protocol.failure(identity, internal)

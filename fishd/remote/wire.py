@@ -2,6 +2,7 @@
 
 import re
 import select
+from contextlib import ExitStack
 
 import msgspec
 import zmq
@@ -17,6 +18,17 @@ _SHOWN = 200
 """How much of a bad message is shown [bytes]."""
 
 
+def start_context(stack: ExitStack) -> None:
+    """Start ZeroMQ's thread of this process now; leaving `stack` ends it, with every socket.
+
+    So it is there when threads get their priority. To start and end one of its own with each wire
+    would take time, in a tick.
+    """
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+    stack.callback(context.destroy, linger=_FAREWELL)
+    context.socket(zmq.PAIR).close()
+
+
 class _Versioned(msgspec.Struct):
     """Any message, as far as every version will have it."""
 
@@ -29,8 +41,6 @@ class Wire:
     def __init__(self, address: str) -> None:
         """Raises `ParameterError` where ZeroMQ takes the address for none."""
         self._address = address
-        # The context of the whole process: its thread has fishd's priority, and to end one of its
-        # own would take time, in a tick.
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self._socket = context.socket(zmq.DEALER)
         self._socket.set(zmq.IMMEDIATE, 1)  # nothing old waits for an agent that comes late

@@ -5,6 +5,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,6 +40,20 @@ def folders() -> Iterator[tuple[Path, Path]]:
             lock.unlink()
 
 
+def as_nobody() -> tuple[str, ...]:
+    """What starts a fishd of another user, who can start Python once more from it."""
+    version = "python{}.{}".format(*sys.version_info)
+    for python in (sys.executable, f"/usr/bin/{version}", f"/usr/local/bin/{version}"):
+        under = (*NOBODY, "env", f"PYTHONPATH={os.pathsep.join(sys.path[1:])}", python)
+        again = "import subprocess, sys; sys.exit(subprocess.call([sys.executable, '--version']))"
+        for arguments in (["-c", again], [FISHD, "--version"]):
+            if subprocess.run([*under, *arguments], capture_output=True, check=False).returncode:
+                break
+        else:
+            return under
+    pytest.skip("another user cannot start this fishd: its folder, or Python's, is private")
+
+
 def refusal(folder: Path, *arguments: str, under: tuple[str, ...] = ()) -> str:
     """What a fishd that does not start says."""
     status, _, err = Daemon(folder, *arguments, under=under).finish()
@@ -71,15 +86,14 @@ def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
 ) -> None:
     if os.geteuid() != 0:
         pytest.skip("needs root: one fishd runs as another user")
-    if subprocess.run([*NOBODY, FISHD, "--version"], capture_output=True, check=False).returncode:
-        pytest.skip("another user cannot start this fishd: its folder, or Python's, is private")
+    nobody = as_nobody()
     one, other = folders
-    with running(one, *pi_settings(one), under=("sh", "-c", 'umask 077; exec "$@"', "sh", *NOBODY)):
+    with running(one, *pi_settings(one), under=("sh", "-c", 'umask 077; exec "$@"', "sh", *nobody)):
         assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other))
-    with running(one, *pi_settings(one), under=NOBODY) as killed:
+    with running(one, *pi_settings(one), under=nobody) as killed:
         killed.end(signal.SIGKILL)
     with running(other, *pi_settings(other)) as mine:  # whose lock files are somebody else's
-        said = refusal(one, *pi_settings(one), under=NOBODY)
+        said = refusal(one, *pi_settings(one), under=nobody)
         assert f"(pid {mine.process.pid})" in said
 
 

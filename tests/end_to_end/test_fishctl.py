@@ -107,7 +107,7 @@ def test_the_status_says_what_runs_and_how_well(daemon: Daemon) -> None:
         (("stat",), "No such command 'stat'"),
         (("mark",), "Missing argument 'TEXT'"),
         (("mark", "a\nb\x1b[2J"), "a text of up to 1000 printable characters is needed"),
-        (("mark", "x" * 70_000), "mark: the request is longer than 65536 bytes"),
+        (("mark", "x" * 70_000), "mark: the request is longer than 16384 bytes"),
         (("estop", "line\nline"), "a text of up to 1000 printable characters is needed"),
     ],
 )

@@ -1,9 +1,6 @@
 """Checks of the daemon: whether it runs, its addresses, and its systemd unit."""
 
-from contextlib import ExitStack
 from pathlib import Path
-
-import zmq
 
 from fishd import addresses
 from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
@@ -44,7 +41,7 @@ def daemon(context: Context) -> Result:
 
 def telemetry(context: Context) -> Result:
     """Free, or the daemon's."""
-    return _address(context, context.config.telemetry.address, "telemetry.address", zmq.PUB)
+    return _address(context, context.config.telemetry.address, "telemetry.address")
 
 
 def control(context: Context) -> Result:
@@ -54,7 +51,7 @@ def control(context: Context) -> Result:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:
         return fail(str(error), "set control.address, or run this as the user whose folder it is")
-    return _address(context, address, "control.address", zmq.ROUTER)
+    return _address(context, address, "control.address")
 
 
 def unit(context: Context) -> Result:
@@ -72,21 +69,17 @@ def unit(context: Context) -> Result:
     return ok(f"{Path(found[0]) / UNIT}, enabled")
 
 
-def _address(context: Context, address: str, key: str, kind: int) -> Result:
+def _address(context: Context, address: str, key: str) -> Result:
     found = context.daemon
     if isinstance(found, Unreachable):  # to bind could take its socket away
         return skipped("not tried; see daemon")
     if found and address in (found.status.telemetry, found.endpoint):
         return ok(f"{address} is served by the running fishd")
-    context_of_sockets: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    with ExitStack() as stack:
-        stack.callback(context_of_sockets.destroy, linger=0)
-        server = stack.enter_context(context_of_sockets.socket(kind))
-        try:
-            stack.enter_context(addresses.claimed(address))
-            addresses.bind(server, address, key)
-        except StartupError as error:
-            return fail(str(error), f"stop what uses it, or set {key} to another address")
+    try:
+        with addresses.claimed(address), addresses.listen(address, key):
+            pass
+    except StartupError as error:
+        return fail(str(error), f"stop what uses it, or set {key} to another address")
     return ok(f"{address} is free")
 
 

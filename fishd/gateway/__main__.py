@@ -1,0 +1,53 @@
+"""A gateway's process: `python -m fishd.gateway KIND LINK LISTENER ADDRESS`.
+
+KIND: telemetry or control. LINK and LISTENER: file descriptors that fishd has opened, the link to
+it and the socket that clients connect to, which outlives this process. Only fishd starts it.
+"""
+
+import os
+import socket
+import sys
+
+import zmq
+
+from fishd.gateway import link
+from fishd.gateway.limits import Limits
+
+_FAREWELL = 100
+"""How long the last messages may take to leave [ms]."""
+
+
+def main(kind: str, link_number: str, listener_number: str, address: str) -> int:
+    """Serve until fishd ends, or until a limit is exceeded."""
+    connection = socket.socket(fileno=int(link_number))
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    if kind == link.TELEMETRY:
+        from fishd.gateway import publisher
+
+        server = context.socket(zmq.PUB)
+        publisher.configure(server)
+        _serve(server, int(listener_number), address)
+        why = publisher.run(connection, server, Limits(publisher.MEMORY, publisher.CONNECTIONS))
+    else:
+        from fishd.gateway import requests
+
+        server = context.socket(zmq.ROUTER)
+        requests.configure(server)
+        _serve(server, int(listener_number), address)
+        limits = Limits(requests.MEMORY, requests.CONNECTIONS)
+        why = requests.Requests(connection, server, limits).run()
+    if why:
+        connection.send(link.NOTICE + why.encode())
+        os._exit(1)  # ZeroMQ's own end would take as long as there is to free
+    server.close(linger=_FAREWELL)
+    context.term()
+    return 0
+
+
+def _serve(server: "zmq.Socket[bytes]", listener: int, address: str) -> None:
+    server.set(zmq.USE_FD, listener)
+    server.bind(address)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

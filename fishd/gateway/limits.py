@@ -1,0 +1,77 @@
+"""What a gateway may use. It ends when that is not enough: a new one begins with nothing."""
+
+import ctypes
+import os
+import resource
+import signal
+import time
+from contextlib import suppress
+from pathlib import Path
+
+_PAGE = resource.getpagesize()
+_PAUSE = 0.1
+"""Time between two looks at what is used [s]."""
+_MOST_FILES = 4096
+"""File descriptors, where the system permits that many: more than connections can be made between
+two looks."""
+_SPARE_FILES = 32
+"""Kept free: ZeroMQ cannot refuse a connection for which there is no file descriptor."""
+_TRIM = 8 * 2**20
+"""Of memory more than at the start, unused parts are given back [bytes]."""
+_TRIM_PAUSE = 2.0
+
+
+class Limits:
+    """The limits of this process, and how far they are used."""
+
+    def __init__(self, memory: int, connections: int) -> None:
+        """Take them; to be called once everything is loaded.
+
+        memory: what it may take beyond what it has now [bytes]
+        connections: file descriptors beyond those that are open now
+        """
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)  # it ends when fishd does
+        os.nice(5)
+        with suppress(OSError):
+            Path("/proc/self/oom_score_adj").write_text("500")  # rather than fishd
+        highest = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        files = _MOST_FILES if highest == resource.RLIM_INFINITY else min(_MOST_FILES, highest)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (files, highest))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        # The kernel enforces twice of it, also between two looks.
+        most = _data() + 2 * memory
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+        self._memory = _resident() + memory
+        self._trim = _resident() + _TRIM
+        self._files = min(_files() + connections, files - _SPARE_FILES)
+        self._next_look = self._next_trim = 0.0
+
+    def exceeded(self) -> str:
+        """Which limit is exceeded, in words; empty for none. Cheap enough for every message."""
+        now = time.monotonic()
+        if now < self._next_look:
+            return ""
+        self._next_look = now + _PAUSE
+        if (files := _files()) > self._files:
+            return f"it had {files} connections, more than {self._files}"
+        used = _resident()
+        if used > self._trim and now > self._next_trim:
+            self._next_trim = now + _TRIM_PAUSE
+            ctypes.CDLL(None).malloc_trim(0)
+            used = _resident()
+        if used > self._memory:
+            return f"it used {used / 2**20:.0f} MB, more than {self._memory / 2**20:.0f} MB"
+        return ""
+
+
+def _files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def _resident() -> int:
+    return int(Path("/proc/self/statm").read_bytes().split()[1]) * _PAGE
+
+
+def _data() -> int:
+    return int(Path("/proc/self/statm").read_bytes().split()[5]) * _PAGE

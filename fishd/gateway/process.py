@@ -1,0 +1,174 @@
+"""A gateway as fishd sees it: a process that is started again when it ends, and the link to it."""
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from fishd.errors import StartupError
+from fishd.gateway.link import END, LONGEST, NOTICE, TELEMETRY, pair
+
+PAUSES = 0.05, 2.0
+"""Shortest and longest pause before a gateway is started again [s]."""
+HEALTHY = 10.0
+"""One that has lived for so long is started again after the shortest pause [s]."""
+RETURN = 1.0
+"""How long clients may take to connect again [s]."""
+FAREWELL = 0.5
+"""How long it may take to pass on the last messages when fishd ends [s]."""
+
+# What a flood took, malloc gives back to the system.
+_ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "MALLOC_TRIM_THRESHOLD_": "1048576"}
+
+
+class Gateway:
+    """The process of one socket; every method is for the thread of the asyncio loop."""
+
+    def __init__(self, kind: str, listener: socket.socket, address: str) -> None:
+        """Start it; must be made inside a running asyncio loop.
+
+        kind: `link.TELEMETRY` or `link.CONTROL`
+        listener: what clients connect to; it stays open while the process is started again
+        address: the ZeroMQ address of the listener
+        Raises `StartupError`.
+        """
+        self.kind = kind
+        self.address = address
+        self.take: Callable[[bytes], None] = lambda message: None
+        """Called with every message that comes, once `read` wants them."""
+        self.restarts = 0
+        """How often it was started again."""
+        self.lost = 0
+        """Messages to it that were dropped."""
+        self.on_restart: Callable[[str], None] = lambda why: None
+        """Called once it was started again, with what ended the one before."""
+        self._listener = listener
+        self._events = asyncio.get_running_loop()
+        self._link: socket.socket | None = None
+        self._wanted = kind == TELEMETRY  # whose only message is why it ends
+        self._reading = False
+        self._pause = PAUSES[0]
+        self._why = ""
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        try:
+            self._start()
+        except OSError as error:
+            raise StartupError(
+                f"{sys.executable}: cannot be started for the gateway of {kind}: {error.strerror}"
+            ) from None
+
+    def send(self, message: bytes) -> None:
+        """Send without waiting; what there is no room for is dropped."""
+        try:
+            if self._link is None:
+                raise BlockingIOError
+            self._link.send(message)
+        except OSError:  # its end is noticed where it is read from
+            self.lost += 1
+
+    def read(self, wanted: bool) -> None:
+        """Take messages, or let them wait in the link."""
+        self._wanted = wanted
+        self._listen(wanted)
+
+    def end(self) -> None:
+        """Let it pass on what it has, and end; may be called twice."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._timer:
+            self._timer.cancel()
+        if self._link is not None:
+            self.send(END)
+            self._drop_link()
+
+    def close(self) -> None:
+        """Wait until it has ended, and close what clients connect to; may be called twice."""
+        self.end()
+        try:
+            self._process.wait(FAREWELL)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._listener.close()
+
+    def _start(self) -> None:
+        """Raises OSError."""
+        ours, theirs = pair()
+        with theirs, ExitStack() as stack:
+            stack.callback(ours.close)
+            numbers = [theirs.fileno(), self._listener.fileno()]
+            self._process = subprocess.Popen(
+                # -P: not what lies in the working directory.
+                [sys.executable, "-P", "-m", "fishd.gateway", self.kind]
+                + [str(number) for number in numbers]
+                + [self.address],
+                pass_fds=numbers,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env=os.environ | _ENVIRONMENT,
+            )
+            stack.pop_all()
+        self._link = ours
+        self._started = self._events.time()
+        self._listen(self._wanted)
+
+    def _readable(self) -> None:
+        assert self._link
+        try:
+            message = self._link.recv(2 * LONGEST)
+        except BlockingIOError:
+            return
+        except OSError:
+            message = b""
+        if not message:
+            self._ended()
+        elif message.startswith(NOTICE):
+            self._why = message[1:].decode(errors="replace")
+        else:
+            self.take(message)
+
+    def _ended(self) -> None:
+        if self._timer:
+            self._timer.cancel()
+        self._drop_link()
+        lived = self._events.time() - self._started
+        self._pause = PAUSES[0] if lived > HEALTHY else min(2.0 * self._pause, PAUSES[1])
+        self._timer = self._events.call_later(self._pause, self._start_again)
+
+    def _start_again(self) -> None:
+        status = self._process.poll()
+        if status is None:  # its link is gone, so it is of no use
+            self._process.kill()
+            self._timer = self._events.call_later(PAUSES[0], self._start_again)
+            return
+        why = self._why or f"its process ended with status {status}"
+        self._why = ""
+        self.restarts += 1
+        try:
+            self._start()
+        except OSError as error:  # Python was renewed, say, and is not there just now
+            self._why = f"it could not be started: {error.strerror}"
+            self._pause = PAUSES[1]
+            self._timer = self._events.call_later(self._pause, self._start_again)
+            return
+        # Not at once: subscribers are still on their way back, and would miss it.
+        self._timer = self._events.call_later(RETURN, self.on_restart, why)
+
+    def _drop_link(self) -> None:
+        assert self._link
+        self._listen(False)
+        self._link.close()
+        self._link = None
+
+    def _listen(self, wanted: bool) -> None:
+        if self._link is not None and wanted is not self._reading:
+            if wanted:
+                self._events.add_reader(self._link, self._readable)
+            else:
+                self._events.remove_reader(self._link)
+            self._reading = wanted

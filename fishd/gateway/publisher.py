@@ -1,0 +1,43 @@
+"""The gateway of telemetry: a PUB socket that publishes what comes over the link."""
+
+import select
+import socket
+
+import zmq
+
+from fishd.gateway.limits import Limits
+from fishd.gateway.link import END, frames
+
+MEMORY = 16 * 2**20
+CONNECTIONS = 200
+"""Subscribers, and others that connect."""
+
+QUEUE = 100
+"""Messages kept for a slow subscriber, five seconds of ticks; later ones are dropped for it."""
+LONGEST = 512
+"""Of what a subscriber sends: a topic, or the greeting of its connection [bytes]."""
+GREETING = 2000
+"""How long a connection may take for it [ms]."""
+_GLANCE = 100
+"""Longest time between two looks at the limits [ms]."""
+
+
+def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: Limits) -> str:
+    """Publish until fishd ends; returns which limit was exceeded, or nothing."""
+    waiting = select.poll()
+    waiting.register(link, select.POLLIN)
+    while not (why := limits.exceeded()):
+        if not waiting.poll(_GLANCE):
+            continue
+        message = link.recv(2**20)
+        if message in (b"", END):
+            return ""
+        server.send_multipart(frames(message), zmq.DONTWAIT)
+    return why
+
+
+def configure(server: "zmq.Socket[bytes]") -> None:
+    """What holds for every subscriber."""
+    server.set(zmq.SNDHWM, QUEUE)
+    server.set(zmq.MAXMSGSIZE, LONGEST)
+    server.set(zmq.HANDSHAKE_IVL, GREETING)

@@ -1,0 +1,241 @@
+"""The gateways of a real fishd: what happens to them does not happen to fishd."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from processes import PATIENCE, Daemon, Subscriber, running
+
+from fishd.client import Fish, Refused
+from fishd.signals import Status
+
+ATTACKERS = str(Path(__file__).parents[2] / "tools" / "attackers.py")
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    with running(tmp_path, "--set", "start.controller=swing") as daemon:
+        yield daemon
+
+
+def gateways(daemon: Daemon) -> dict[str, int]:
+    """The processes of the gateways, by what they are for."""
+    pid = daemon.process.pid
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    found = {}
+    for child in children:
+        with contextlib.suppress(FileNotFoundError):
+            arguments = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
+            if b"fishd.gateway" in arguments:
+                found[arguments[arguments.index(b"fishd.gateway") + 1].decode()] = int(child)
+    return found
+
+
+def status(daemon: Daemon) -> Status:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        return fish.status()
+
+
+def gone(pid: int) -> bool:
+    """Has a process ended? One that nobody has waited for yet has."""
+    try:
+        return "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry) as subscriber:
+        subscriber.until(mode="running")
+        os.kill(gateways(daemon)["telemetry"], signal.SIGKILL)
+        event = subscriber.until(kind="gateway")
+        tick = subscriber.until(mode="running")
+    assert event["message"] == (
+        "the gateway of telemetry was started again: its process ended with status -9"
+    )
+    assert tick["missed"] == 0
+    assert status(daemon).counters["telemetry_restarts"] == 1
+
+
+def test_while_the_gateway_of_telemetry_is_gone_requests_are_answered(daemon: Daemon) -> None:
+    os.kill(gateways(daemon)["telemetry"], signal.SIGSTOP)
+    with Fish(daemon.endpoint) as fish:
+        assert fish.status().mode == "running"
+        assert fish.estop().mode == "estop"
+
+
+def test_a_client_of_a_gateway_that_died_is_answered_by_the_next_one(daemon: Daemon) -> None:
+    os.kill(gateways(daemon)["control"], signal.SIGKILL)
+    wait_until(lambda: "control" in gateways(daemon))
+    assert status(daemon).counters["control_restarts"] == 1
+
+
+def test_gateways_that_hang_cost_messages_but_no_tick(tmp_path: Path) -> None:
+    with running(tmp_path, "--set", "tick=0.005", "--set", "start.controller=swing") as daemon:
+        before = status(daemon)
+        hung = gateways(daemon)["telemetry"]
+        os.kill(hung, signal.SIGSTOP)
+        wait_until(lambda: status(daemon).counters["telemetry_lost"] > 0)
+        after = status(daemon)
+        assert after.missed - before.missed <= 0.02 * (after.seq - before.seq)
+        assert after.mode == "running"
+        os.kill(gateways(daemon)["control"], signal.SIGSTOP)
+        begun = time.monotonic()
+        assert daemon.end()[0] == 0
+        assert time.monotonic() - begun < 3.0
+        assert gone(hung)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGTERM])
+def test_no_gateway_outlives_fishd(daemon: Daemon, number: int) -> None:
+    pids = gateways(daemon).values()
+    assert len(pids) == 2
+    daemon.end(number)
+    wait_until(lambda: all(gone(pid) for pid in pids))
+
+
+def test_a_signal_for_the_whole_group_leaves_the_gateways_to_fishd(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry) as subscriber:
+        subscriber.until(mode="running")
+        for pid in gateways(daemon).values():
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                os.kill(pid, number)
+        daemon.process.send_signal(signal.SIGTERM)
+        assert subscriber.until(kind="mode")["message"] == "running → idle"
+
+
+def attack(name: str, daemon: Daemon, seconds: float) -> None:
+    subprocess.run(
+        [sys.executable, ATTACKERS, name, daemon.telemetry, daemon.endpoint, str(seconds)],
+        check=True,
+        timeout=3 * PATIENCE,
+    )
+
+
+def memory(daemon: Daemon) -> float:
+    """Of fishd and its gateways, pages that they share counted once [MB]."""
+    total = 0
+    for pid in (daemon.process.pid, *gateways(daemon).values()):
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        total += next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    return total / 1024
+
+
+def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(daemon: Daemon) -> None:
+    before = status(daemon)
+    attack("subscriptions", daemon, 4.0)
+    after = status(daemon)
+    assert (after.mode, after.missed) == ("running", before.missed)
+    assert memory(daemon) < 150.0
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+        assert subscriber.message()["mode"] == "running"
+
+
+def test_a_frame_that_announces_8_gb_ends_its_connection(daemon: Daemon) -> None:
+    host, _, port = daemon.telemetry.removeprefix("tcp://").rpartition(":")
+    with socket.create_connection((host, int(port)), PATIENCE) as connection:
+        greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16) + b"\x00" + bytes(31)
+        connection.sendall(greeting + b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB")
+        connection.sendall(b"\x02" + (8 * 2**30).to_bytes(8, "big"))
+        with contextlib.suppress(ConnectionError):
+            while connection.recv(4096):
+                pass
+    assert status(daemon).mode == "running"
+
+
+def test_a_thousand_idle_connections_end_nothing(tmp_path: Path) -> None:
+    few_files = ("prlimit", "--nofile=1024")
+    with running(tmp_path, "--set", "start.controller=swing", under=few_files) as daemon:
+        before = status(daemon)
+        attack("idle-telemetry", daemon, 3.0)
+        after = status(daemon)
+        assert (after.mode, after.missed) == ("running", before.missed)
+        with Subscriber(daemon.telemetry, b"tick") as subscriber:
+            assert subscriber.message()["mode"] == "running"
+
+
+def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: Daemon) -> None:
+    attacker = subprocess.Popen(
+        [sys.executable, ATTACKERS, "silent-dealers", daemon.telemetry, daemon.endpoint, "5"]
+    )
+    try:
+        time.sleep(2.0)
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+            state = fish.estop()
+        assert attacker.poll() is None
+    finally:
+        attacker.wait(PATIENCE)
+    assert state.mode == "estop"
+    assert memory(daemon) < 150.0
+
+
+def dealer(daemon: Daemon) -> "zmq.Socket[bytes]":
+    socket = zmq.Context.instance().socket(zmq.DEALER)
+    socket.set(zmq.LINGER, 0)
+    socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
+    socket.connect(daemon.endpoint)
+    return socket
+
+
+def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are_not(
+    daemon: Daemon,
+) -> None:
+    with dealer(daemon) as hasty, Fish(daemon.endpoint) as calm:
+        for number in range(700):
+            hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
+        assert calm.status().mode == "running"
+        replies = [json.loads(hasty.recv()) for _ in range(650)]
+    refusals = [reply["error"] for reply in replies if not reply["ok"]]
+    assert refusals
+    assert {refusal["code"] for refusal in refusals} == {"busy"}
+    assert "of your requests wait already; slow down" in refusals[0]["message"]
+
+
+def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
+    daemon: Daemon,
+) -> None:
+    with Fish(daemon.endpoint) as fish:
+        for _ in range(500):
+            assert fish.status().missed == 0
+
+
+def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_one(
+    daemon: Daemon,
+) -> None:
+    with dealer(daemon) as client:
+        client.send(b'{"v":1,"id":1,"op":"%s"}' % (b"x" * 16_000))
+        error = json.loads(client.recv())["error"]
+    assert error["code"] == "bad-request"
+    assert "length <= 64" in error["message"]
+    assert len(error["message"]) < 200
+
+
+def test_a_reply_longer_than_the_link_takes_at_once_arrives_whole(tmp_path: Path) -> None:
+    folder = tmp_path / "policies"
+    folder.mkdir()
+    shipped = Path(__file__).parents[2] / "config" / "policies" / "default-fish.onnx"
+    for number in range(150):
+        (folder / f"copy{number}.onnx").symlink_to(shipped)
+    variables = ("env", f"FISHD_POLICIES={folder}")
+    with running(tmp_path, under=variables) as daemon, Fish(daemon.endpoint, timeout=60) as fish:
+        try:
+            policies = fish.policies()
+        except Refused as error:
+            raise AssertionError(error) from None
+    assert len([policy for policy in policies if policy.name.startswith("copy")]) == 150

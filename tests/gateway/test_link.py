@@ -1,0 +1,39 @@
+"""The messages between fishd and its gateways."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd.gateway import link
+
+
+@given(topic=st.sampled_from([b"tick", b"event", b"status"]), payload=st.binary())
+def test_a_published_message_arrives_as_its_two_frames(topic: bytes, payload: bytes) -> None:
+    assert link.frames(link.published(topic, payload)) == [topic, payload]
+
+
+@given(number=st.integers(0, 2**64 - 1), payload=st.binary())
+def test_a_request_arrives_with_its_number(number: int, payload: bytes) -> None:
+    assert link.numbered(link.request(number, payload)) == (number, payload)
+
+
+@pytest.mark.parametrize("length", [0, 1, link.LONGEST - 10, link.LONGEST, 3 * link.LONGEST])
+def test_replies_of_any_length_travel_in_parts_and_may_be_mixed(length: int) -> None:
+    long, short = bytes(length), b"short"
+    parts = list(link.reply(1, long))
+    assert all(len(part) <= link.LONGEST for part in parts)
+    replies = link.Replies()
+    assert all(replies.take(part) is None for part in parts[:-1])
+    assert [replies.take(part) for part in link.reply(2, short)] == [(2, short)]
+    assert replies.take(parts[-1]) == (1, long)
+
+
+def test_a_link_never_blocks_its_sender() -> None:
+    ours, theirs = link.pair()
+
+    def fill() -> None:
+        for _ in range(10_000):
+            ours.send(bytes(1000))
+
+    with ours, theirs, pytest.raises(BlockingIOError):
+        fill()
