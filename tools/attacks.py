@@ -72,7 +72,7 @@ class Watch:
 
     def look(self) -> None:
         """Take its memory, and ask it something."""
-        pids = [self._fishd.pid, *children(self._fishd.pid)]
+        pids = [self._fishd.pid, *self._fishd.gateways()]
         self._memory = max(self._memory, size(pids[0], "Rss"))
         self._total = max(self._total, sum(size(pid, "Pss") for pid in pids))
 
@@ -109,14 +109,6 @@ class Watch:
             answer=self._answer * 1e3,
             estop=self._estop * 1e3,
         )
-
-
-def children(pid: int) -> list[int]:
-    """The processes that a process has started."""
-    try:
-        return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:
-        return []
 
 
 def size(pid: int, kind: str) -> float:

@@ -185,13 +185,24 @@ class Fishd:
             return fish.status()
 
     def cpu_seconds(self) -> float:
-        """User and system time so far, of all threads [s]."""
-        stat = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii")
-        fields = stat.rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        """User and system time so far, of all threads and of the gateways [s]."""
+        ticks = 0
+        for pid in (self.pid, *self.gateways()):
+            stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii")
+            fields = stat.rpartition(")")[2].split()
+            ticks += int(fields[11]) + int(fields[12])
+        return ticks / os.sysconf("SC_CLK_TCK")
+
+    def gateways(self) -> list[int]:
+        """The processes that fishd has started."""
+        return [
+            int(child)
+            for thread in Path(f"/proc/{self.pid}/task").iterdir()
+            for child in (thread / "children").read_text(encoding="ascii").split()
+        ]
 
     def memory(self, field: str) -> float:
-        """A size from /proc/PID/status, such as VmRSS [MB]."""
+        """A size of fishd's own process, from /proc/PID/status, such as VmRSS [MB]."""
         status = Path(f"/proc/{self._process.pid}/status").read_text(encoding="utf-8")
         return next(
             int(line.split()[1]) * 1024e-6

@@ -1,0 +1,99 @@
+"""What is an address, and where fishd listens: what is written, and nothing else."""
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from fishd.addresses import listen, served
+from fishd.config import load
+from fishd.errors import ConfigError, StartupError
+from fishd.zmq_address import is_local, why_not_bound, why_not_connected, why_not_served
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "tcp://127.0.0.1:19900;0.0.0.0:19901",  # which ZeroMQ takes for a source and a target
+        "tcp://127.0.0.1;0.0.0.0:19901",
+        "tcp://127.999.1.1:9872",
+        "tcp://1.2.3:9872",
+        "tcp://[::1]]:9872",
+        "tcp://[nonsense]:9872",
+        "tcp://::1:9872",
+        "tcp://a b:9872",
+        "tcp://host:١٢",
+        "tcp://host:",
+        "tcp://:9872",
+        "tcp://host:999999999999",
+        "ipc://",
+        "ipc://@hidden",
+        "udp://127.0.0.1:9872",
+        "tcp://127.0.0.1:9872\n",
+    ],
+)
+def test_what_zeromq_would_understand_in_another_way_is_no_address(address: str) -> None:
+    assert why_not_served(address)
+    assert why_not_bound(address)
+    assert why_not_connected(address)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["tcp://127.0.0.1:9872", "tcp://fish.local:1", "tcp://[::1]:9872", "ipc:///tmp/x", "ipc://x"],
+)
+def test_hosts_and_paths_are_addresses(address: str) -> None:
+    assert not why_not_served(address)
+    assert not why_not_connected(address)
+
+
+@pytest.mark.parametrize(
+    ("address", "local"),
+    [
+        ("tcp://127.0.0.1:1", True),
+        ("tcp://127.3.2.1:1", True),
+        ("tcp://localhost:1", True),
+        ("ipc:///run/x", True),
+        ("tcp://0.0.0.0:1", False),
+        ("tcp://*:1", False),
+        ("tcp://localhost.example:1", False),
+        ("tcp://127.0.0.1.example:1", False),
+    ],
+)
+def test_only_the_loopback_is_certain_to_be_this_machine(address: str, local: bool) -> None:
+    assert is_local(address) is local
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:19900;0.0.0.0:19901", "tcp://127.999.1.1:9", "tcp://*:9"]
+)
+def test_requests_from_elsewhere_are_never_advised(address: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(None, [f"control.address={address}"])
+    assert "ipc://PATH or tcp://127.0.0.1:PORT is needed" in str(refusal.value)
+    assert "0.0.0.0:" not in str(refusal.value).replace(address, "")
+
+
+def test_port_0_is_any_that_is_free_and_clients_are_told_which() -> None:
+    with listen("tcp://127.0.0.1:0", "telemetry.address") as server:
+        port = server.getsockname()[1]
+        assert served("tcp://127.0.0.1:0", server) == f"tcp://127.0.0.1:{port}"
+        socket.create_connection(("127.0.0.1", port), 5.0).close()
+
+
+def test_every_address_of_the_machine_is_one_that_clients_here_can_use() -> None:
+    with listen("tcp://*:0", "telemetry.address") as server:
+        assert served("tcp://*:0", server) == f"tcp://0.0.0.0:{server.getsockname()[1]}"
+
+
+def test_a_control_socket_is_for_user_and_group_only(tmp_path: Path) -> None:
+    path = tmp_path / "control"
+    with listen(f"ipc://{path}", "control.address", group=True):
+        assert path.stat().st_mode & 0o777 == 0o660
+
+
+def test_a_port_that_is_taken_is_named_with_its_key() -> None:
+    with listen("tcp://127.0.0.1:0", "telemetry.address") as server:
+        address = served("tcp://127.0.0.1:0", server)
+        with pytest.raises(StartupError, match=f"telemetry.address: cannot listen on {address}"):
+            listen(address, "telemetry.address")
