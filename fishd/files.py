@@ -7,8 +7,10 @@ import os
 import stat
 from pathlib import Path
 
-SETTINGS = 128 * 2**10
+SETTINGS = 64 * 2**10
 """Longest file that people write by hand [bytes]."""
+TABLE = 16 * 2**20
+"""Longest table of numbers [bytes]."""
 
 _KINDS = {
     stat.S_IFDIR: "a folder",

@@ -134,7 +134,7 @@ def test_a_missing_file_is_named() -> None:
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+    with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
         load(tmp_path)
 
 

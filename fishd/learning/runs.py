@@ -6,7 +6,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from fishd import config as configuration
-from fishd import strict_yaml
+from fishd import files, strict_yaml
 from fishd.config import Config
 from fishd.errors import ConfigError
 from fishd.learning import settings as training
@@ -63,8 +63,8 @@ def read(folder: Path) -> tuple[Config, TrainingSettings]:
 def _check_whole(file: Path, kind: type[Struct]) -> None:
     """Nothing in a run is left to defaults, which may not be those that it began with."""
     try:
-        data = strict_yaml.parse(file.read_text(encoding="utf-8")).data
-    except (OSError, UnicodeDecodeError, strict_yaml.YamlProblem):
+        data = strict_yaml.parse(files.read_text(file, files.SETTINGS, "a run")).data
+    except (files.FileProblem, strict_yaml.YamlProblem):
         return  # which `load` says better
     missing = [
         key for key in kind.__struct_fields__ if not isinstance(data, dict) or key not in data
