@@ -254,7 +254,10 @@ def _discard(checkpoint: Path) -> None:
 def _last(folder: Path, *patterns: str) -> Path:
     found = sorted((path for p in patterns for path in folder.glob(p)), key=_steps)
     if not found:
-        raise CheckpointError(f"{folder}: no checkpoint is in there")
+        raise CheckpointError(
+            f"{folder}: no checkpoint is in there: its training ended before the first one; remove "
+            "it, and train again"
+        )
     return found[-1]
 
 

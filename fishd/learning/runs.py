@@ -23,12 +23,20 @@ def default_folder() -> Path:
 
 def create(folder: Path, config: Config, settings: TrainingSettings) -> None:
     """Make a run folder; raises `ConfigError` where something is there already."""
-    make_folder(folder, f", or go on with --resume {folder}")
+    otherwise = f", or go on with --resume {folder}" if has_checkpoint(folder) else ""
+    if not otherwise and (folder / CONFIG).exists():
+        otherwise = ", or remove it: the training in it ended before its first checkpoint"
+    make_folder(folder, otherwise)
     try:
         write_whole(folder / CONFIG, configuration.to_yaml(config))
         keep_settings(folder, settings)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Is there something in a run folder from which --resume could go on?"""
+    return any(path.is_dir() for kind in ("step-*", "best-*") for path in folder.glob(kind))
 
 
 def make_folder(folder: Path, otherwise: str = "") -> None:
