@@ -209,10 +209,12 @@ def _tensors(path: Path) -> dict[str, Any]:
         found = load_from_zip_file(io.BytesIO(content), load_data=False, device="cpu")
         return cast(dict[str, Any], found[1])
     except Exception as error:  # a damaged archive contradicts itself in many ways
-        raise ValueError(_brief(error)) from None
+        raise ValueError(_brief(error.__cause__ or error)) from None
 
 
-def _brief(error: Exception) -> str:
+def _brief(error: BaseException) -> str:
+    if isinstance(error, KeyError):
+        return f"{error} is missing"
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
