@@ -9,7 +9,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from fishd.errors import StartupError
-from fishd.lockfile import Taken, lock_path, locked
+from fishd.lockfile import NotALock, Taken, lock_path, locked
+from fishd.socket_owner import stranger
 from fishd.zmq_address import Ipc, parse
 
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
@@ -53,14 +54,17 @@ def _guarded(path: Path, key: str) -> Path:
 def find_control() -> str:
     """The address at which a client looks for the daemon of this machine.
 
-    $FISHD_ENDPOINT, else a daemon of this user, else the system's service.
+    $FISHD_ENDPOINT, else a daemon of this user, else the system's service. What stands where that
+    of this user would be, but is a stranger's, does not hide the service.
     """
     given = os.environ.get(ENDPOINT_VARIABLE)
     if given:
         return given
-    own = f"ipc://{_private_socket('control')}"
+    path = _private_socket("control")
+    own = f"ipc://{path}"
     # The socket of a daemon that was killed is still there.
-    return f"ipc://{_SERVICE}" if _SERVICE.exists() and is_deserted(own) else own
+    there_is_none = _SERVICE.exists() and (is_deserted(own) or stranger(path))
+    return f"ipc://{_SERVICE}" if there_is_none else own
 
 
 def _private_socket(name: str) -> Path:
@@ -96,10 +100,15 @@ def claimed(
                 raise StartupError(
                     f"{path} is there already and is no socket; choose another address"
                 )
-            stack.enter_context(locked(path, remove=True))
+            stack.enter_context(locked(path.resolve(), remove=True))
         except Taken as taken:
             raise StartupError(
                 f"{rival} (pid {taken.pid}) already serves {address}; {advice}"
+            ) from None
+        except NotALock as error:
+            raise StartupError(
+                f"{error.filename} {error.strerror}; remove it, or choose an address in a folder "
+                "of your own"
             ) from None
         except OSError as error:
             raise StartupError(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from fishd import strict_yaml
+from fishd import files, strict_yaml
 from fishd.config_checks import (
     check_addresses,
     check_data_rate,
@@ -236,17 +236,15 @@ def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
 
 def _read(path: Path) -> strict_yaml.Document:
     try:
-        return strict_yaml.parse(path.read_text(encoding="utf-8"))
+        return strict_yaml.parse(files.read_text(path, files.SETTINGS, "a configuration"))
     except strict_yaml.YamlProblem as problem:
         raise ConfigError(f"{path}:{problem.line}: {problem}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
-    except FileNotFoundError:
+    except files.NoFile as problem:
         raise ConfigError(
-            f"{path}: no such file; give the path of a YAML file, or none for the defaults"
+            f"{path}: {problem}; give the path of a YAML file, or none for the defaults"
         ) from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except files.FileProblem as problem:
+        raise ConfigError(f"{path}: {problem}") from None
 
 
 def _located(problem: Problem, sources: Mapping[tuple[str, ...], str]) -> str:

@@ -12,6 +12,7 @@
     ├── ServoError       (OSError)      the servo cannot be driven
     └── FishError                       raised by the client, `fishd.client`
         ├── NoDaemon     (ConnectionError) nothing answers at the endpoint
+        │   └── Untrusted                  somebody else would, who is not asked
         └── Refused      (RuntimeError)    the daemon answered with an error; see its `code`
 
 Each message is one line that says what is wrong, where, and what would be right.
@@ -75,6 +76,10 @@ class FishError(FishdError):
 
 class NoDaemon(FishError, ConnectionError):
     """Nothing answers at the endpoint."""
+
+
+class Untrusted(NoDaemon):
+    """Another user listens where the fishd of this one would be."""
 
 
 class Refused(FishError, RuntimeError):

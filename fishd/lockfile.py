@@ -1,14 +1,18 @@
 """A lock file beside what only one process may use; it names the process that holds it.
 
-The lock ends with its process, however that ends: unlike a socket file it never lies.
+The lock ends with its process, however that ends: unlike a socket file it never lies. What somebody
+else has put in its place, such as a link to a file that is to be emptied, is left alone.
 """
 
+import errno
 import fcntl
 import os
-from collections.abc import Callable, Iterator
+import stat
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+
+_CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
 class Taken(Exception):
@@ -19,48 +23,109 @@ class Taken(Exception):
         self.pid = pid
 
 
+class NotALock(OSError):
+    """What has the name of the lock file is none; `strerror` says what it is."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__(errno.EPERM, f"is {what}, no lock file of fishd", str(path))
+
+
 def lock_path(path: Path) -> Path:
     """Where the lock file of `path` is."""
     return path.with_name(path.name + ".lock")
 
 
 @contextmanager
-def locked(
-    path: Path, opener: Callable[[str, int], int] | None = None, *, remove: bool = False
-) -> Iterator[None]:
+def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterator[None]:
     """Hold the lock file of `path`, and make it where there is none.
 
-    opener: as for `open`, where the file must not be made in the usual way
+    shared: every user of this machine may lock it, and may have made it
     remove: take the lock file away at the end, where that is permitted
-    Raises `Taken` when somebody holds it, this process included, OSError when it cannot be made.
+    Raises `Taken` when somebody holds it, this process included, OSError when it cannot be made,
+    and `NotALock`, an OSError, where it is something else.
     """
-    with _held(path, opener) as lock:
-        lock.truncate(0)
-        lock.write(f"{os.getpid()}\n")
-        lock.flush()
-        try:
-            yield
-        finally:
-            if remove:
-                with suppress(OSError):
-                    lock_path(path).unlink()
+    lock = _held(path, shared)
+    try:
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+        yield
+    finally:
+        if remove:
+            with suppress(OSError):
+                lock_path(path).unlink()
+        os.close(lock)
 
 
-def _held(path: Path, opener: Callable[[str, int], int] | None) -> TextIO:
-    """The lock file, locked; not one that its holder has removed meanwhile."""
+def holder(path: Path) -> str:
+    """The pid of the process that holds the lock of `path`, or `unknown`; empty where none does.
+
+    Asking takes the lock for a moment.
+    """
+    try:
+        lock = _opened(lock_path(path), os.O_RDONLY, shared=True)
+    except OSError:  # nobody has ever held it, or this user may not know
+        return ""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _pid_in(lock)
+    finally:
+        os.close(lock)
+    return ""
+
+
+def _held(path: Path, shared: bool) -> int:
+    """The lock file, open and locked; not one that its holder has removed meanwhile."""
     while True:
-        lock = open(lock_path(path), "a+", encoding="ascii", opener=opener)  # noqa: SIM115
+        lock = _opened(lock_path(path), os.O_RDWR, shared=shared)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(lock.fileno()), lock_path(path).stat()):
+                if os.path.samestat(os.fstat(lock), lock_path(path).lstat()):
                     return lock
         except BlockingIOError:
-            lock.seek(0)
-            pid = lock.read().strip() or "unknown"
-            lock.close()
+            pid = _pid_in(lock)
+            os.close(lock)
             raise Taken(pid) from None
         except OSError:
-            lock.close()
+            os.close(lock)
             raise
-        lock.close()
+        os.close(lock)
+
+
+def _opened(path: Path, flags: int, *, shared: bool) -> int:
+    flags |= _CAREFULLY
+    try:
+        # First without O_CREAT: there, Linux refuses that for an existing file of another user.
+        lock = os.open(path, flags)
+    except FileNotFoundError:
+        if flags & os.O_ACCMODE == os.O_RDONLY:
+            raise
+        lock = os.open(path, flags | os.O_CREAT, 0o666)
+        if shared and os.fstat(lock).st_uid == os.geteuid():
+            os.fchmod(lock, 0o666)  # whatever the umask
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise NotALock(path, "a symbolic link") from None
+        raise
+    if what := _strange(os.fstat(lock), path.parent, shared):
+        os.close(lock)
+        raise NotALock(path, what)
+    return lock
+
+
+def _strange(found: os.stat_result, folder: Path, shared: bool) -> str:
+    """What an open file is other than a lock file of fishd's; empty where it is one."""
+    if not stat.S_ISREG(found.st_mode):
+        return "no regular file"
+    if found.st_nlink > 1:
+        return "another name of some file"
+    owners = {os.geteuid(), 0, folder.stat().st_uid}
+    if not shared and found.st_uid not in owners:
+        return f"a file of user {found.st_uid}"
+    return ""
+
+
+def _pid_in(lock: int) -> str:
+    text = os.pread(lock, 20, 0).strip()
+    return text.decode() if text.isdigit() else "unknown"

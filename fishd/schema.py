@@ -112,6 +112,18 @@ def names_file(text: str, suffix: str) -> bool:
     return "/" in text or text.endswith(suffix)
 
 
+def nested_too_deeply(data: Any, levels: int = 20) -> bool:
+    """Are there more than so many lists and mappings in one another?
+
+    Whoever walks through them, such as an encoder, would reach the end of Python's stack.
+    """
+    if isinstance(data, Mapping):
+        data = list(data.values())
+    if not isinstance(data, list):
+        return False
+    return levels == 0 or any(nested_too_deeply(part, levels - 1) for part in data)
+
+
 def nearest(word: str, words: list[str]) -> str:
     """A did-you-mean for `word`, or the list of what there is."""
     close = difflib.get_close_matches(word, words, n=1, cutoff=0.6)

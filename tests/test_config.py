@@ -1,5 +1,6 @@
 """The configuration: what is accepted, and what is said about what is not."""
 
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,11 @@ from hypothesis import strategies as st
 from fishd.config import SERVICE_FILE, Config, load, to_yaml
 from fishd.errors import ConfigError
 from fishd.strict_yaml import YamlProblem, parse
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 7)
+)
+"""Each line nine times the one before."""
 
 
 def complaint(text: str, tmp_path: Path) -> str:
@@ -91,6 +97,12 @@ def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
         ("tick: 1:30\n", "fish.yaml:1: tick: '1:30' counts in sixties in YAML"),
         ("a: &a [*a]\n", "nested too deeply"),
         ("a: " + "[" * 3000, "nested too deeply"),
+        ("x: 1\n" + "- " * 500, "fish.yaml:2: "),
+        (BOMB, "fish.yaml:1: more than 2000 values and keys, each alias counted as all that it"),
+        ("a: [" + "x, " * 3000 + "]", "fish.yaml:1: more than 2000 values and keys"),
+        ("# " + "x" * 70_000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
+        ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 letters"),
+        ("a: !!int '" + "1:" * 20_000 + "1'", "fish.yaml:1: a: a number of 40001 letters"),
         ("plant.xi: 2\n", "plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'"),
         ("telemetry: {address: 'tcp://127.0.0.1:99999'}\n", "tcp://HOST:PORT or ipc://PATH"),
         ("control: {address: 'tcp://127.evil.com:99'}\n", "taken from this machine only"),
@@ -134,7 +146,7 @@ def test_a_missing_file_is_named() -> None:
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+    with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
         load(tmp_path)
 
 
@@ -169,6 +181,17 @@ def test_overrides_take_numbers_as_people_write_them() -> None:
     config = load(None, ["simulation.noise=1e-3", "slew_limit=null", "tick=0.1", "tick=0.02"])
     assert config.simulation.noise == 1e-3
     assert config.tick == 0.02
+
+
+def test_a_bomb_of_aliases_costs_milliseconds() -> None:
+    """Six levels of nine: half a million values from 300 letters."""
+    costs = []
+    for _ in range(3):
+        began = time.process_time()
+        with pytest.raises(YamlProblem):
+            parse(BOMB)
+        costs.append(time.process_time() - began)
+    assert min(costs) < 0.2  # some 6 ms; all of it took half a minute
 
 
 @given(st.text(max_size=60))

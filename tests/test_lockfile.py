@@ -3,11 +3,14 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from fishd.lockfile import Taken, lock_path, locked
+from fishd.addresses import claimed
+from fishd.errors import StartupError
+from fishd.lockfile import NotALock, Taken, holder, lock_path, locked
 
 HOLDER = """
 import sys, time
@@ -54,18 +57,109 @@ def test_a_lock_that_is_to_be_removed_is_gone_afterwards_and_held_before(tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_that_its_holder_removed_while_another_opened_it_is_no_lock(tmp_path: Path) -> None:
+def test_a_lock_that_its_holder_removed_while_another_opened_it_is_no_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "agent"
 
-    def late(name: str, flags: int) -> int:
-        found = os.open(name, flags)
+    def late(name: Path, flags: int, mode: int = 0o777) -> int:
+        found = really(name, flags, mode)
         if not removed:
             removed.append(name)
             lock_path(path).unlink()  # as a holder does that ends now
         return found
 
-    removed: list[str] = []
-    with locked(path, late):
+    removed: list[Path] = []
+    really = os.open
+    monkeypatch.setattr(os, "open", late)
+    with locked(path):
+        assert removed
         assert lock_path(path).read_text() == f"{os.getpid()}\n"
         with pytest.raises(Taken), locked(path):
             pass
+
+
+def link(lock: Path, victim: Path) -> None:
+    lock.symlink_to(victim)
+
+
+def second_name(lock: Path, victim: Path) -> None:
+    lock.hardlink_to(victim)
+
+
+def pipe(lock: Path, _: Path) -> None:
+    os.mkfifo(lock)
+
+
+@pytest.mark.parametrize(
+    ("plant", "what"),
+    [
+        (link, "is a symbolic link, no lock file of fishd"),
+        (second_name, "is another name of some file, no lock file of fishd"),
+        (pipe, "is no regular file, no lock file of fishd"),
+    ],
+)
+@pytest.mark.parametrize("shared", [False, True])
+def test_what_was_planted_for_a_lock_is_refused_and_left_as_it_is(
+    tmp_path: Path, plant: Callable[[Path, Path], None], what: str, shared: bool
+) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    plant(lock_path(tmp_path / "control"), victim)
+    with pytest.raises(NotALock, match=what), locked(tmp_path / "control", shared=shared):
+        pass
+    assert holder(tmp_path / "control") == ""  # and without a wait for the pipe's other end
+    with (
+        pytest.raises(StartupError) as caught,
+        claimed(f"ipc://{tmp_path}/control"),
+    ):
+        pass
+    assert str(caught.value) == (
+        f"{tmp_path}/control.lock {what}; remove it, or choose an address in a folder of your own"
+    )
+    assert victim.read_text() == "precious"
+
+
+def test_a_link_to_a_file_that_is_not_there_makes_none(tmp_path: Path) -> None:
+    lock_path(tmp_path / "control").symlink_to(tmp_path / "new")
+    with pytest.raises(NotALock), locked(tmp_path / "control"):
+        pass
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user")
+def test_a_lock_of_another_user_counts_only_where_all_share_them_or_the_folder_is_his(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "control"
+    lock_path(path).write_text("")
+    os.chown(lock_path(path), 60101, 60101)
+    with pytest.raises(NotALock, match="is a file of user 60101, no lock"), locked(path):
+        pass
+    with locked(path, shared=True):
+        assert holder(path) == str(os.getpid())
+    os.chown(tmp_path, 60101, 60101)
+    with locked(path):
+        pass
+
+
+@pytest.mark.parametrize("text", [b"\x1b[31m1", b"\xff\xfe", b"1 2", b"9" * 10_000, b""])
+def test_a_pid_that_is_none_is_unknown(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "control"
+    with locked(path):
+        lock_path(path).write_bytes(text)
+        with pytest.raises(Taken) as caught, locked(path):
+            pass
+        assert caught.value.pid in ("unknown", "9" * 20)
+
+
+def test_two_names_of_one_address_are_one(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    with (
+        claimed(f"ipc://{tmp_path}/real/control"),
+        pytest.raises(StartupError, match=rf"\(pid {os.getpid()}\) already serves"),
+        claimed(f"ipc://{tmp_path}/link/control"),
+    ):
+        pass
+    assert list((tmp_path / "real").iterdir()) == []

@@ -1,6 +1,7 @@
 """CSV files of loads for `fishctl calibrate force`: read as a plan or a measurement, written."""
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import NamedTuple
 
 import click
 
+from fishd import files
 from fishd.hardware.calibration import ForceSample
 
 G0 = 9.80665
@@ -50,16 +52,16 @@ def read(path: Path, unit: str) -> list[Step]:
     Raises `click.ClickException` with one line that names file and line.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            names = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = names
-            columns = _columns(path, names, unit)
-            steps = [_step(f"{path}:{reader.line_num}", row, columns) for row in reader]
-    except OSError as error:
-        raise click.ClickException(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise click.ClickException(f"{path}: not a CSV file in UTF-8: {error}") from None
+        text = files.read_text(path, files.TABLE, "a table of loads", "utf-8-sig")
+        reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+        names = [name.strip() for name in reader.fieldnames or []]
+        reader.fieldnames = names
+        columns = _columns(path, names, unit)
+        steps = [_step(f"{path}:{reader.line_num}", row, columns) for row in reader]
+    except files.FileProblem as problem:
+        raise click.ClickException(f"{path}: {problem}") from None
+    except csv.Error as error:
+        raise click.ClickException(f"{path}: not a CSV file: {error}") from None
     if not steps:
         raise click.ClickException(f"{path}: there is no load in it")
     return steps

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import os
 import time
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -10,8 +11,9 @@ import msgspec
 import zmq
 
 from fishd import protocol
-from fishd.addresses import find_control, is_deserted
-from fishd.errors import NoDaemon, ParameterError, Refused
+from fishd.addresses import ENDPOINT_VARIABLE, find_control, is_deserted, socket_path
+from fishd.errors import NoDaemon, ParameterError, Refused, Untrusted
+from fishd.socket_owner import stranger
 
 T = TypeVar("T")
 
@@ -24,14 +26,23 @@ class Connection:
 
     def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
         self.endpoint = endpoint or find_control()
+        self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.timeout = timeout
         self.telemetry_address = telemetry
         self._ids = itertools.count(1)
 
     def check_endpoint(self) -> None:
-        """Spare the wait where it is certain that nobody listens; raises `NoDaemon`."""
+        """Spare the wait where it is certain that nobody listens; raises `NoDaemon`.
+
+        Raises `Untrusted` where a stranger does. An endpoint that the user named is his own word.
+        """
         if is_deserted(self.endpoint):
             raise self._nobody("nobody listens there")
+        if not self._was_named and (why := stranger(socket_path(self.endpoint))):
+            raise Untrusted(
+                f"what listens at {self.endpoint} is not asked, it may be anybody: {why}; where "
+                "you trust it, name it with --endpoint or $FISHD_ENDPOINT"
+            )
 
     def _nobody(self, why: str) -> NoDaemon:
         return NoDaemon(

@@ -27,7 +27,7 @@ from fishd.emulation.link import (
 )
 from fishd.emulation.virtual_pi import VirtualPi
 from fishd.errors import StartupError
-from fishd.lockfile import Taken, locked
+from fishd.lockfile import NotALock, Taken, locked
 
 
 class LinkServer:
@@ -45,7 +45,7 @@ class LinkServer:
 
         Raises `StartupError` when another one does already, or an address is no good.
         """
-        path = self._path
+        path = self._path.resolve()  # another name of a virtual Pi that runs is no other one
         with ExitStack() as stack:
             try:
                 if path.exists() and not path.is_socket():
@@ -66,6 +66,11 @@ class LinkServer:
                 raise StartupError(
                     f"another virtual Pi (pid {taken.pid}) already listens on {path}; "
                     "stop it, or give this one another virtual_pi.socket"
+                ) from None
+            except NotALock as error:
+                raise StartupError(
+                    f"virtual_pi.socket: {error.filename} {error.strerror}; remove it, or choose a "
+                    "path in a folder of your own"
                 ) from None
             except OSError as error:
                 raise StartupError(

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from fishd import strict_yaml
+from fishd import files, strict_yaml
 from fishd.errors import ConfigError
 from fishd.hardware.calibration import C, ForceCalibration, ServoCalibration
 from fishd.schema import Problem, convert
@@ -46,14 +46,15 @@ class CalibrationFolder:
             return None
         path = self.folder / names[-1]
         try:
-            return _whole(strict_yaml.parse(path.read_text(encoding="utf-8")).data, kind), path
+            text = files.read_text(path, files.SETTINGS, "a calibration")
+            return _whole(strict_yaml.parse(text).data, kind), path
         except strict_yaml.YamlProblem as problem:
             raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
         except Problem as problem:
             where = ".".join(problem.path) + ": " if problem.path else ""
             raise ConfigError(f"{path}: {where}{problem}; {_REMEDY}") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read: {error}") from None
+        except files.FileProblem as problem:
+            raise ConfigError(f"{path}: {problem}; {_REMEDY}") from None
 
     def save(self, calibration: C, now: datetime.datetime) -> tuple[C, Path]:
         """Write a new file, dated `now`; the calibration with its date, and the path.

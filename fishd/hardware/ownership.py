@@ -3,9 +3,7 @@
 Two programs on one bus would take each other's samples, without an error.
 """
 
-import fcntl
 import logging
-import os
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,7 +12,7 @@ from typing import NamedTuple
 
 from fishd.errors import StartupError
 from fishd.hardware.settings import ForceSensorSettings, ServoSettings
-from fishd.lockfile import Taken, lock_path, locked
+from fishd.lockfile import Taken, holder, lock_path, locked
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +50,8 @@ def parts_of_pi(sensor: ForceSensorSettings, servo: ServoSettings) -> tuple[Part
 
 def parts_of_virtual_pi(socket: Path) -> tuple[Part, ...]:
     """What robot virtual-pi drives: the virtual Pi that listens on `socket`."""
-    path = socket.with_name(f"{socket.name}.fishd")
+    real = socket.resolve()  # it may have several names
+    path = real.with_name(f"{real.name}.fishd")
     return (Part(path, f"the virtual Pi on {socket}", "virtual_pi.socket"),)
 
 
@@ -68,7 +67,7 @@ def owned(parts: Iterable[Part]) -> Iterator[None]:
                 _claim(part, stack)
             except OSError as error:
                 log.warning(
-                    "%s: cannot be made: %s; nothing keeps a second fishd from driving %s",
+                    "%s: cannot be used: %s; nothing keeps a second fishd from driving %s",
                     lock_path(part.path),
                     error.strerror,
                     part.what,
@@ -79,7 +78,7 @@ def owned(parts: Iterable[Part]) -> Iterator[None]:
 def owner(parts: Iterable[Part]) -> str:
     """Which fishd drives one of these parts, and which; empty where none is known to."""
     for part in parts:
-        if pid := _holder(part.path):
+        if pid := holder(part.path):
             return f"a fishd (pid {pid}) drives {part.what}"
     return ""
 
@@ -87,7 +86,7 @@ def owner(parts: Iterable[Part]) -> str:
 def _claim(part: Part, stack: ExitStack) -> None:
     for attempt in range(1, TRIES + 1):
         try:
-            stack.enter_context(locked(part.path, _open_for_all))
+            stack.enter_context(locked(part.path, shared=True))
         except Taken as taken:
             if attempt == TRIES:
                 raise StartupError(
@@ -97,35 +96,3 @@ def _claim(part: Part, stack: ExitStack) -> None:
         else:
             return
         time.sleep(PAUSE)
-
-
-def _holder(path: Path) -> str:
-    """The pid of the process that holds the lock of `path`, or `unknown`; empty where none does.
-
-    Asking takes the lock for a moment.
-    """
-    try:
-        lock = open(lock_path(path), encoding="ascii", opener=_open_for_all)  # noqa: SIM115
-    except OSError:  # nobody has ever held it, or this user may not know
-        return ""
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return lock.read().strip() or "unknown"
-    return ""
-
-
-def _open_for_all(path: str, flags: int) -> int:
-    """Open a lock file that every user's fishd may lock, in a folder where all may make files."""
-    flags |= os.O_NOFOLLOW
-    try:
-        # First without O_CREAT: there, Linux refuses that for an existing file of another user.
-        return os.open(path, flags & ~os.O_CREAT)
-    except FileNotFoundError:
-        if not flags & os.O_CREAT:
-            raise
-        file = os.open(path, flags, 0o666)
-    if os.fstat(file).st_uid == os.geteuid():
-        os.fchmod(file, 0o666)  # whatever the umask
-    return file

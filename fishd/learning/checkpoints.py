@@ -8,13 +8,12 @@ renamed: whatever kills the writer, no half a checkpoint is ever taken for a who
 
 import io
 import json
-import pickle
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import msgspec
 import numpy as np
@@ -24,23 +23,20 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from fishd import files
 from fishd.errors import FishdError, PolicyError
 from fishd.learning.ppo import make_policy
 from fishd.learning.settings import TrainingSettings
 from fishd.policies.card import Card, decode, encode
+from fishd.schema import nested_too_deeply
 
 MODEL, CARD, STATE = "model.zip", "card.json", "state.json"
 
+LARGEST_MODEL = 256 * 2**20
+"""Of networks and optimiser [bytes]."""
+LARGEST_TEXT = 2**20
+"""Of a card, or of a state [bytes]."""
 
-_UNREADABLE = (
-    RuntimeError,
-    ValueError,
-    KeyError,
-    OSError,
-    EOFError,
-    BadZipFile,
-    pickle.UnpicklingError,
-)
 _OTHERWISE = "move this checkpoint away to go on from the one before"
 
 
@@ -163,16 +159,21 @@ def read_card(checkpoint: Path) -> Card:
 def read_state(checkpoint: Path) -> State:
     """Raises `CheckpointError`."""
     try:
-        return msgspec.convert(json.loads(_text(checkpoint / STATE)), State)
+        data = json.loads(_text(checkpoint / STATE))  # unlike msgspec, it reads whole numbers whole
+        if nested_too_deeply(data):
+            raise RecursionError
+        return msgspec.convert(data, State)
+    except RecursionError:
+        raise CheckpointError(f"{checkpoint / STATE}: nested too deeply; {_OTHERWISE}") from None
     except ValueError as error:
-        raise CheckpointError(f"{checkpoint / STATE}: {error}") from None
+        raise CheckpointError(f"{checkpoint / STATE}: {error}; {_OTHERWISE}") from None
 
 
 def load_parameters(model: PPO, checkpoint: Path, *, optimiser: bool = True) -> None:
     """Put networks, and optimiser, into a model of the same shape; raises `CheckpointError`."""
     fresh = model.get_parameters()["policy.optimizer"]
-    with _readable(checkpoint / MODEL) as path:
-        model.set_parameters(str(path), exact_match=True, device="cpu")
+    with _readable(checkpoint / MODEL) as parameters:
+        model.set_parameters(parameters, exact_match=True, device="cpu")
     if not optimiser:
         model.policy.optimizer.load_state_dict(fresh)
 
@@ -180,25 +181,41 @@ def load_parameters(model: PPO, checkpoint: Path, *, optimiser: bool = True) -> 
 def load_policy(checkpoint: Path) -> ActorCriticPolicy:
     """The networks of a checkpoint; raises `CheckpointError`."""
     card = read_card(checkpoint)
-    with _readable(checkpoint / MODEL) as path:
+    with _readable(checkpoint / MODEL) as parameters:
         settings = msgspec.convert(card.provenance.settings, TrainingSettings)
         policy = make_policy(settings.ppo, len(card.observation))
-        _, parameters, _ = load_from_zip_file(path, device="cpu", load_data=False)
-        policy.load_state_dict(cast(dict[str, Any], parameters["policy"]))
+        policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
     return policy
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[Path]:
-    """Where a file of the wrong kind or shape is read."""
+def _readable(path: Path) -> Iterator[dict[str, Any]]:
+    """The tensors in a model's file, which may be of the wrong shape for those who use them."""
     try:
-        yield path
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file") from None
-    except _UNREADABLE as error:
-        why = " ".join(str(error).split())[:200] or type(error).__name__
-        raise CheckpointError(f"{path}: cannot be read: {why}; {_OTHERWISE}") from None
+        yield _tensors(path)
+    except files.FileProblem as problem:
+        raise CheckpointError(f"{path}: {problem}; {_OTHERWISE}") from None
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{path}: cannot be read: {_brief(error)}; {_OTHERWISE}") from None
+
+
+def _tensors(path: Path) -> dict[str, Any]:
+    content = files.read(path, LARGEST_MODEL, "a checkpoint")
+    try:
+        with ZipFile(io.BytesIO(content)) as archive:
+            if sum(part.file_size for part in archive.infolist()) > LARGEST_MODEL:
+                raise ValueError("it unpacks to far more than a checkpoint needs")
+        found = load_from_zip_file(io.BytesIO(content), load_data=False, device="cpu")
+        return cast(dict[str, Any], found[1])
+    except Exception as error:  # a damaged archive contradicts itself in many ways
+        raise ValueError(_brief(error.__cause__ or error)) from None
+
+
+def _brief(error: BaseException) -> str:
+    if isinstance(error, KeyError):
+        return f"{error} is missing"
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def random_state(generator: np.random.Generator) -> dict[str, Any]:
@@ -239,22 +256,23 @@ def _discard(checkpoint: Path) -> None:
 def _last(folder: Path, *patterns: str) -> Path:
     found = sorted((path for p in patterns for path in folder.glob(p)), key=_steps)
     if not found:
-        raise CheckpointError(f"{folder}: no checkpoint is in there")
+        raise CheckpointError(
+            f"{folder}: no checkpoint is in there: its training ended before the first one; remove "
+            "it, and train again"
+        )
     return found[-1]
 
 
 def _steps(path: Path) -> tuple[int, bool]:
     number = path.name.partition("-")[2]
-    return int(number) if number.isdigit() else -1, path.name.startswith("step")
+    return int(number) if number.isdecimal() else -1, path.name.startswith("step")
 
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}") from None
+        return files.read_text(path, LARGEST_TEXT, "a checkpoint")
+    except files.FileProblem as problem:
+        raise CheckpointError(f"{path}: {problem}; {_OTHERWISE}") from None
 
 
 def _indented(text: str) -> str:

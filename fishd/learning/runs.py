@@ -6,7 +6,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from fishd import config as configuration
-from fishd import strict_yaml
+from fishd import files, strict_yaml
 from fishd.config import Config
 from fishd.errors import ConfigError
 from fishd.learning import settings as training
@@ -23,12 +23,20 @@ def default_folder() -> Path:
 
 def create(folder: Path, config: Config, settings: TrainingSettings) -> None:
     """Make a run folder; raises `ConfigError` where something is there already."""
-    make_folder(folder, f", or go on with --resume {folder}")
+    otherwise = f", or go on with --resume {folder}" if has_checkpoint(folder) else ""
+    if not otherwise and (folder / CONFIG).exists():
+        otherwise = ", or remove it: the training in it ended before its first checkpoint"
+    make_folder(folder, otherwise)
     try:
         write_whole(folder / CONFIG, configuration.to_yaml(config))
         keep_settings(folder, settings)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Is there something in a run folder from which --resume could go on?"""
+    return any(path.is_dir() for kind in ("step-*", "best-*") for path in folder.glob(kind))
 
 
 def make_folder(folder: Path, otherwise: str = "") -> None:
@@ -63,8 +71,8 @@ def read(folder: Path) -> tuple[Config, TrainingSettings]:
 def _check_whole(file: Path, kind: type[Struct]) -> None:
     """Nothing in a run is left to defaults, which may not be those that it began with."""
     try:
-        data = strict_yaml.parse(file.read_text(encoding="utf-8")).data
-    except (OSError, UnicodeDecodeError, strict_yaml.YamlProblem):
+        data = strict_yaml.parse(files.read_text(file, files.SETTINGS, "a run")).data
+    except (files.FileProblem, strict_yaml.YamlProblem):
         return  # which `load` says better
     missing = [
         key for key in kind.__struct_fields__ if not isinstance(data, dict) or key not in data

@@ -1,11 +1,15 @@
 """What several seeds of a training came to: a row for each evaluation, over all seeds."""
 
 import csv
+import io
 import statistics
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+from fishd import files
+from fishd.errors import ConfigError
 
 COLUMNS = (
     "steps",
@@ -33,19 +37,27 @@ class Point(NamedTuple):
 
 
 def curve(folder: Path) -> list[Point]:
-    """The evaluations in a run folder; none where it has no table of them."""
+    """The evaluations in a run folder; none where it has no table of them.
+
+    Raises `ConfigError` where it is another table.
+    """
     path = folder / "evaluations.csv"
-    if not path.exists():
-        return []
     points = []
     best = 0.0
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
+    try:
+        text = files.read_text(path, files.TABLE, "a table of a training")
+        for row in csv.DictReader(io.StringIO(text)):
             efficiency = float(row["efficiency"])
             if row["best"] == "1":
                 best = efficiency
             frequency, fullness = float(row["frequency"]), float(row["fullness"])
             points.append(Point(int(row["steps"]), efficiency, frequency, fullness, best))
+    except files.NoFile:
+        return []
+    except files.FileProblem as problem:
+        raise ConfigError(f"{path}: {problem}") from None
+    except (csv.Error, KeyError, TypeError, ValueError):
+        raise ConfigError(f"{path}: no table of a training") from None
     return points
 
 

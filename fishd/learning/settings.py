@@ -7,7 +7,7 @@ import msgspec
 import yaml
 from msgspec import Meta, Struct
 
-from fishd import strict_yaml
+from fishd import files, strict_yaml
 from fishd.errors import ConfigError
 from fishd.policies.card import FeatureName
 from fishd.schema import Problem, convert, without_empty_sections
@@ -176,7 +176,7 @@ def load(path: Path | None) -> TrainingSettings:
     if path is None:
         return TrainingSettings()
     try:
-        document = strict_yaml.parse(path.read_text(encoding="utf-8"))
+        document = strict_yaml.parse(files.read_text(path, files.SETTINGS, "a training"))
         data: Any = document.data
         if not isinstance(data, dict):
             raise ConfigError(f"{path}:1: keys and values are needed, such as 'steps: 8000'")
@@ -189,8 +189,8 @@ def load(path: Path | None) -> TrainingSettings:
         line = document.lines.get(problem.path)
         where = f"{path}:{line}" if line else f"{path}"
         raise ConfigError(f"{where}: {'.'.join(problem.path)}: {problem}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    except files.FileProblem as problem:
+        raise ConfigError(f"{path}: {problem}") from None
 
 
 def to_yaml(settings: TrainingSettings) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
 
+from fishd import files
+from fishd.files import FileProblem
 from fishd.learning.checkpoints import CheckpointError
 from fishd.learning.whole import write_whole
 
@@ -53,12 +55,11 @@ class Table:
         Raises `CheckpointError` where it is no such table.
         """
         try:
-            with self._path.open(newline="", encoding="utf-8") as file:
-                head, *rows = csv.reader(file)
+            head, *rows = read_rows(self._path)
             at = head.index("steps")
             whole = [row for row in rows if len(row) == len(head)]  # the last may be cut off
             kept = [row for row in whole if int(row[at]) <= steps]
-        except (ValueError, csv.Error):  # UnicodeDecodeError is one
+        except (ValueError, FileProblem):
             raise CheckpointError(
                 f"{self._path}: no table of a training; move it away, and a new one is begun"
             ) from None
@@ -86,6 +87,15 @@ class Progress(KVWriter):
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """The rows of such a table; raises `FileProblem`."""
+    text = files.read_text(path, files.TABLE, "a table of a training")
+    try:
+        return list(csv.reader(io.StringIO(text)))
+    except csv.Error as error:
+        raise FileProblem(f"not a CSV file: {error}") from None
 
 
 def _lines(rows: list[list[Any]]) -> str:

@@ -6,6 +6,7 @@ evaluate   without exploration: a simulated fish of its own, or the robot itself
 keep       a row in the tables, a checkpoint where one is due, another where it is the best yet
 """
 
+import shlex
 from collections.abc import Callable
 from contextlib import closing
 from typing import cast
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.errors import FishdError
-from fishd.learning import checkpoints
+from fishd.learning import checkpoints, runs
 from fishd.learning.callbacks import Watch
 from fishd.learning.checkpoints import CheckpointError, Evaluation
 from fishd.learning.environment import SwimEnv
@@ -62,10 +63,22 @@ def train(job: Job, show: Show | None = None, stop: Callable[[], bool] = lambda:
             raise
         raise CheckpointError(
             f"{error.filename or job.folder}: cannot be written: {error.strerror}; when that is "
-            f"mended, go on from the newest checkpoint with --resume {job.folder}"
+            f"mended, {_way_on(job)}"
         ) from error
     finally:
         link.close()
+
+
+def _way_on(job: Job) -> str:
+    """What to do after the run folder could not be written."""
+    folder = shlex.quote(str(job.folder))
+    if runs.has_checkpoint(job.folder):
+        return f"go on from the newest checkpoint with --resume {folder}"
+    robot = " --on robot" if job.on == "robot" else ""
+    return (
+        f"remove {job.folder}, which has no checkpoint yet, and start again with 'fishctl learn "
+        f"ppo{robot} --folder {folder}' and what else you gave"
+    )
 
 
 class Training:

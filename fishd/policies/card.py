@@ -13,20 +13,25 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from fishd.errors import PolicyError
-from fishd.schema import Problem, convert
+from fishd.schema import Problem, convert, nested_too_deeply, spelled
 from fishd.signals import Observation
 
 KEY = "fishd.card"
 """Under which the card is in the metadata of an ONNX file."""
 
-FORMAT = 1
+FORMAT = 2
 """Version of the card; a file with another one is refused."""
+
+LONGEST = 64 * 2**10
+"""Of a card as text; that of a training has some two thousand letters."""
 
 SAME_TICK = 1e-9
 """Largest difference between two ticks that are the same [s]."""
 
 FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle"]
 """Fields of `Observation` that a policy may see."""
+
+_TOO_DEEP = "its card is JSON that is nested too deeply"
 
 Positive = Annotated[float, Meta(ge=1e-30, le=1e30)]
 """What a float32 can hold, and its inverse too."""
@@ -121,17 +126,27 @@ def encode(card: Card) -> str:
 
 def decode(text: str) -> Card:
     """The card in `text`; raises `PolicyError` that names what is missing or wrong."""
+    if len(text) > LONGEST:
+        raise PolicyError(f"its card has {len(text)} letters; {LONGEST} are the most")
     try:
         data = msgspec.json.decode(text)
     except RecursionError:
-        raise PolicyError("its card is JSON that is nested too deeply") from None
+        raise PolicyError(_TOO_DEEP) from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise PolicyError(f"its card is no JSON: {error}") from None
     if not isinstance(data, dict):
         raise PolicyError("its card is no JSON object")
+    if nested_too_deeply(data):
+        raise PolicyError(_TOO_DEEP)
     found = data.get("format")
     if found != FORMAT:
-        raise PolicyError(f"its card has format {found!r}; this fishd reads format {FORMAT}")
+        older = isinstance(found, int) and found < FORMAT
+        advice = (
+            ": it is of an older fishd; train and export it again, 'fishctl learn'" if older else ""
+        )
+        raise PolicyError(
+            f"its card has format {spelled(found)[:60]}; this fishd reads format {FORMAT}{advice}"
+        )
     try:
         card = convert(data, Card)
     except Problem as problem:

@@ -1,22 +1,23 @@
-"""Reads a policy file, and refuses what is none or would run code.
+"""Reads a policy file, and refuses what is none, is damaged, or would run code or for ever.
 
 A policy file is an ONNX model with a card (`fishd.policies.card`) in its metadata. Messages are for
 the person who named the file: why it is refused, and what to do.
 """
 
 import os
-import stat
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fishd import files
 from fishd.errors import PolicyError
+from fishd.policies import checksum, operators
 from fishd.policies.card import KEY, Card, decode
+from fishd.policies.operators import shown
 
 if TYPE_CHECKING:
-    from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
+    from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
 
 INPUT, OUTPUT = "observation", "action"
 LARGEST = 16 * 2**20
@@ -52,31 +53,31 @@ def parse(content: bytes) -> Card:
     """The card of a policy whose whole content is good; raises `PolicyError`."""
     _refuse_pickles(content)
     model = _model(content)
-    card = _card(model)
+    try:
+        return _checked(content, model)
+    except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 comes as bytes
+        raise PolicyError(f"this is no whole ONNX model; {_EXPORT}") from None
+
+
+def _checked(content: bytes, model: "ModelProto") -> Card:
+    text = _card(model)
+    if checksum.is_there(model):  # a damaged card would be blamed for what it says
+        checksum.check(content, model)
+    card = decode(text)
+    checksum.check(content, model)
     _check_ends(model.graph, len(card.observation))
-    _check_graph(model.graph)
-    for function in model.functions:
-        _check_nodes(function.node)
+    _check_numbers(model.graph)
+    operators.check(model)
     return card
 
 
 def _content(path: Path) -> bytes:
-    def opener(name: str, flags: int) -> int:
-        return os.open(name, flags | os.O_NONBLOCK)  # a pipe would hold the reader for ever
-
     try:
-        with open(path, "rb", opener=opener) as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                raise PolicyError("is not a regular file")
-            content = file.read(LARGEST + 1) if found.st_size <= LARGEST else None
-    except FileNotFoundError:
-        raise PolicyError(f"no such file{_why_hidden(path)}") from None
-    except OSError as error:
-        raise PolicyError(f"cannot be read: {error.strerror}") from None
-    if content is None or len(content) > LARGEST:
-        raise PolicyError(f"is longer than {LARGEST // 2**20} MB, far more than a policy needs")
-    return content
+        return files.read(path, LARGEST, "a policy")
+    except files.NoFile as problem:
+        raise PolicyError(f"{problem}{_why_hidden(path)}") from None
+    except files.FileProblem as problem:
+        raise PolicyError(str(problem)) from None
 
 
 def _why_hidden(path: Path) -> str:
@@ -114,7 +115,7 @@ def _model(content: bytes) -> "ModelProto":
     return model
 
 
-def _card(model: "ModelProto") -> Card:
+def _card(model: "ModelProto") -> str:
     cards = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if not cards:
         raise PolicyError(
@@ -123,7 +124,7 @@ def _card(model: "ModelProto") -> Card:
         )
     if len(cards) > 1:
         raise PolicyError(f"it has {len(cards)} cards that may contradict one another")
-    return decode(cards[0])
+    return str(cards[0])
 
 
 def _check_ends(graph: "GraphProto", features: int) -> None:
@@ -157,40 +158,38 @@ def _form(value: "ValueInfoProto") -> tuple[str, str, tuple[int | str, ...]]:
 
 def _spelled(value: "ValueInfoProto") -> str:
     name, kind, dims = _form(value)
-    return f"{kind} of shape [{', '.join(map(str, dims))}] named '{name}'"
+    return f"{kind} of shape [{shown(', '.join(map(str, dims)))}] named '{shown(name)}'"
 
 
-def _check_graph(graph: "GraphProto") -> None:
-    """Every number of the model, wherever it hides, is in this file and finite."""
+def _check_numbers(graph: "GraphProto") -> None:
+    """Every number of the model is in this file and finite."""
     for tensor in graph.initializer:
         _check_tensor(tensor)
-    for sparse in graph.sparse_initializer:
-        _check_tensor(sparse.values)
-    _check_nodes(graph.node)
-
-
-def _check_nodes(nodes: "Iterable[NodeProto]") -> None:
-    for node in nodes:
+    if graph.sparse_initializer:
+        raise PolicyError("its weights are sparse; save them as plain ones")
+    for node in graph.node:
         for attribute in node.attribute:
             if not np.isfinite([attribute.f, *attribute.floats]).all():
                 raise PolicyError(
-                    _not_finite(f"'{attribute.name}' of '{node.name or node.op_type}'")
+                    _not_finite(
+                        f"'{shown(attribute.name)}' of '{shown(node.name or node.op_type)}'"
+                    )
                 )
             for tensor in (attribute.t, *attribute.tensors):
                 _check_tensor(tensor)
-            for sparse in (attribute.sparse_tensor, *attribute.sparse_tensors):
-                _check_tensor(sparse.values)
-            for graph in (attribute.g, *attribute.graphs):
-                _check_graph(graph)
+            if attribute.HasField("sparse_tensor") or attribute.sparse_tensors:
+                raise PolicyError("its constants are sparse; save them as plain ones")
 
 
 def _check_tensor(tensor: "TensorProto") -> None:
     from onnx import TensorProto, numpy_helper
 
-    what = f"weights '{tensor.name}'" if tensor.name else "constants"
+    what = f"weights '{shown(tensor.name)}'" if tensor.name else "constants"
     if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
         raise PolicyError(f"its {what} are in another file; save the model as a single file")
-    if tensor.data_type in (TensorProto.UNDEFINED, TensorProto.STRING):
+    if tensor.data_type == TensorProto.STRING:
+        raise PolicyError(f"its {what} are text; a network computes numbers")
+    if tensor.data_type == TensorProto.UNDEFINED:  # an attribute without one
         return
     try:
         array = numpy_helper.to_array(tensor)
@@ -209,4 +208,4 @@ def _not_finite(what: str) -> str:
 
 def one_line(error: Exception) -> str:
     """What a library says, as part of a sentence."""
-    return " ".join(str(error).split())[:300] or type(error).__name__
+    return shown(str(error), 300) or type(error).__name__

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fishd.errors import PolicyError
 from fishd.policies import file
 from fishd.policies.card import KEY, Card, encode
+from fishd.policies.checksum import sealed
 
 Layer = tuple[NDArray[Any], NDArray[Any]]
 """Weights, shape (outputs, inputs), and biases, shape (outputs,)."""
@@ -66,6 +67,6 @@ def to_onnx(layers: Sequence[Layer], activation: Literal["tanh", "relu"], card: 
     )
     helper.set_model_props(model, {KEY: encode(card)})
     onnx.checker.check_model(model)
-    content: bytes = model.SerializeToString()
+    content = sealed(model)
     file.parse(content)
     return content

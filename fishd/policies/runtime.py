@@ -1,7 +1,9 @@
 """Runs the network of a policy file with onnxruntime: one input, one thread, on the spot."""
 
 import contextlib
+import math
 import os
+import time
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,10 @@ _PROBES = 64
 """Inputs on which a network is tried, which warms it up as well."""
 _LARGEST_PROBE = 1e3
 """In units of a feature's scale."""
+_TIMED = 8
+"""After so many probes the fastest must have been fast enough."""
+_SHARE = 0.5
+"""Of the tick, that one run may take."""
 
 
 def load() -> Any:
@@ -52,7 +58,7 @@ class Network:
         try:
             self._session = _session(policy.content)
             self._binding = self._bound(inputs)
-            self._try()
+            self._try(policy.card.tick)
         except PolicyError as error:
             raise PolicyError(f"{policy.path}: {error}") from None
         except Exception as error:  # onnxruntime has a class of its own for each kind of error
@@ -73,16 +79,29 @@ class Network:
         binding.bind_ortvalue_output(OUTPUT, value(self._output))
         return binding
 
-    def _try(self) -> None:
-        """Run on inputs of every size; raises `PolicyError` where the output is not finite."""
+    def _try(self, tick: float) -> None:
+        """Run on inputs of every size; raises `PolicyError` where an output is not finite.
+
+        Or where the fastest of several runs takes too much of a tick [s]. What counts is the
+        processor's time of this thread, in which all is computed: a busy machine adds nothing.
+        """
         probes = np.random.default_rng(0).normal(size=(_PROBES, len(self.row)))
         sizes = np.geomspace(1e-3, _LARGEST_PROBE, _PROBES)
-        for probe, size in zip(probes, sizes, strict=True):
+        fastest = math.inf
+        for number, (probe, size) in enumerate(zip(probes, sizes, strict=True), 1):
             self.row[:] = probe * size
-            if not np.isfinite(self.run()):
+            began = time.thread_time()
+            output = self.run()
+            fastest = min(fastest, time.thread_time() - began)
+            if not np.isfinite(output):
                 raise PolicyError(
                     f"its output is not finite for the input {np.array2string(self.row)}; "
                     "train it again, or export an earlier checkpoint"
+                )
+            if number == _TIMED and fastest > _SHARE * tick:
+                raise PolicyError(
+                    f"this machine takes {fastest * 1e3:.3g} ms for one answer of it, more than "
+                    f"half of its tick of {tick * 1e3:g} ms; train a smaller network"
                 )
 
 

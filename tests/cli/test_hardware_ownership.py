@@ -110,6 +110,16 @@ def test_one_virtual_pi_takes_one_fishd_even_one_that_hangs(pi: Bench, tmp_path:
         pass
 
 
+def test_another_name_of_its_socket_is_no_other_virtual_pi(pi: Bench, tmp_path: Path) -> None:
+    (tmp_path / "second").mkdir()
+    (tmp_path / "folder").symlink_to(pi.folder)
+    (tmp_path / "link").symlink_to(tmp_path / "folder" / "virtual-pi")
+    other = ["--set", f"virtual_pi.socket={tmp_path}/link"]
+    with pi.daemon() as first:
+        said = refusal(tmp_path / "second", *pi.settings, *other)
+    assert f"another fishd (pid {first.process.pid}) drives the virtual Pi on " in said
+
+
 def test_doctor_leaves_the_bus_of_a_fishd_at_another_endpoint_alone(
     pi: Bench, tmp_path: Path
 ) -> None:

@@ -86,7 +86,7 @@ def test_loads_measured_earlier_are_fitted_without_a_question(pi: Bench, daemon:
         ("fx_N,fy_N\n0,0\n0.1,\n", r":3: fy_N: '' is not a number"),
         ("fx_N,fy_N\n0,nan\n", r":2: fy_N: 'nan' is not a number"),
         ("fx_N,fy_N\n", r"there is no load in it"),
-        (None, r"cannot be read: No such file"),
+        (None, r"no such file"),
     ],
 )
 def test_a_file_of_loads_that_is_no_good_is_refused_in_one_line(

@@ -246,3 +246,29 @@ def test_closing_leaves_no_thread_and_no_file(path: Path) -> None:
     for remote in remotes:
         remote.close()
         remote.close()
+
+
+def test_a_second_virtual_pi_under_another_name_of_its_socket_is_refused(
+    pi: VirtualPi, path: Path, tmp_path: Path
+) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(path)
+    with pytest.raises(StartupError, match=f"another virtual Pi \\(pid {os.getpid()}\\)"):
+        LinkServer(virtual_pi(), link).start()
+    assert link.is_symlink()
+    with RemotePi(link) as remote:
+        assert remote.state().faults == {}
+
+
+def test_a_planted_lock_keeps_a_virtual_pi_from_starting_and_stays_as_it_is(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "pi.lock").symlink_to(tmp_path / "precious")
+    with pytest.raises(StartupError) as caught:
+        LinkServer(virtual_pi(), tmp_path / "pi").start()
+    assert str(caught.value) == (
+        f"virtual_pi.socket: {tmp_path}/pi.lock is a symbolic link, no lock file of fishd; remove "
+        "it, or choose a path in a folder of your own"
+    )
+    assert (tmp_path / "precious").read_text() == "precious"

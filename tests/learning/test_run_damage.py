@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -134,28 +136,62 @@ def test_a_damaged_state_of_random_numbers_is_one_line(
         train(replace(job, resume=True, settings=replace(job.settings, steps=128)))
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount")
-def test_a_full_disk_loses_nothing_and_says_how_to_go_on(tmp_path: Path) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    if done.returncode:
+@contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[Callable[[str], None]]:
+    """A disk of its own in this folder; what it yields makes it larger."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can mount")
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
         pytest.skip("nothing can be mounted here")
+
+    def enlarge(size: str) -> None:
+        subprocess.run(["mount", "-o", f"remount,size={size}", str(folder)], check=True)
+
     try:
+        yield enlarge
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_loses_nothing_and_says_how_to_go_on(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", "600k") as enlarge:
         job = brief_job(
-            disk / "run", steps=100_000, checkpoint_every=64, evaluation=EvaluationSettings(every=0)
+            tmp_path / "disk" / "run",
+            steps=100_000,
+            checkpoint_every=64,
+            evaluation=EvaluationSettings(every=0),
         )
-        with pytest.raises(CheckpointError, match="No space left on device; when that is mended"):
+        with pytest.raises(CheckpointError) as caught:
             train(job)
-        subprocess.run(["mount", "-o", "remount,size=50m", str(disk)], check=True)
+        assert "No space left on device; when that is mended, go on from the" in str(caught.value)
+        assert str(caught.value).endswith(f" --resume {job.folder}")
+        enlarge("50m")
         before = checkpoints.read_state(checkpoints.newest(job.folder)).steps
         more = replace(job.settings, steps=before + 64)
         assert train(replace(job, resume=True, settings=more)).ended == "finished"
         steps = [int(row["steps"]) for row in rows(job.folder / "progress.csv")]
         assert steps == list(range(64, before + 65, 64))
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("size", ["16k", "28k", "48k"])
+def test_a_disk_that_is_full_before_the_first_checkpoint_advises_to_start_again(
+    tmp_path: Path, size: str
+) -> None:
+    with small_disk(tmp_path / "disk", size) as enlarge:
+        job = brief_job(tmp_path / "disk" / "run", steps=64)
+        with pytest.raises(CheckpointError) as caught:
+            train(job)
+        assert str(caught.value).endswith(
+            f"No space left on device; when that is mended, remove {job.folder}, which has no "
+            f"checkpoint yet, and start again with 'fishctl learn ppo --folder {job.folder}' and "
+            "what else you gave"
+        )
+        enlarge("50m")
+        with pytest.raises(ConfigError, match="or remove it: the training in it ended before its"):
+            train(job)
+        with pytest.raises(CheckpointError, match="no checkpoint is in there: its training ended"):
+            train(replace(job, resume=True))
+        shutil.rmtree(job.folder)
+        assert train(job).ended == "finished"

@@ -19,6 +19,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
 from fishd.errors import ConfigError, ParameterError
 from fishd.policies.card import KEY, Card, encode
+from fishd.policies.checksum import sealed
 from fishd.policies.network import to_onnx
 from fishd.simulation import simulate
 
@@ -101,8 +102,7 @@ def hand_made(nodes: list[Any], numbers: dict[str, float], about: Card) -> bytes
     opset = [helper.make_opsetid("", 13)]
     model = helper.make_model(graph, ir_version=7, opset_imports=opset)
     helper.set_model_props(model, {KEY: encode(about)})
-    content: bytes = model.SerializeToString()
-    return content
+    return sealed(model)
 
 
 def root_of_what_is_left(largest: float, about: Card) -> bytes:
@@ -140,8 +140,12 @@ def test_a_policy_whose_output_is_not_finite_for_some_input_is_refused(tmp_path:
 
 
 def test_a_model_that_onnxruntime_cannot_run_is_refused(tmp_path: Path) -> None:
-    node = helper.make_node("NoSuchOperator", ["observation"], ["action"])
-    path = write(tmp_path, hand_made([node], {}, card()))
+    nodes = [
+        helper.make_node("Cast", ["observation"], ["short"], to=TensorProto.BFLOAT16),
+        helper.make_node("Tanh", ["short"], ["bent"]),  # there is none for such numbers
+        helper.make_node("Cast", ["bent"], ["action"], to=TensorProto.FLOAT),
+    ]
+    path = write(tmp_path, hand_made(nodes, {}, card()))
     assert refusal(path).startswith(f"ppo: policy: {path}: onnxruntime cannot run it: ")
 
 

@@ -8,7 +8,7 @@ import msgspec
 
 from fishd.addresses import find_control, is_deserted, socket_path
 from fishd.client import Fish
-from fishd.errors import FishError, NoDaemon, Refused
+from fishd.errors import FishError, NoDaemon, Refused, Untrusted
 from fishd.protocol import Calibrations
 from fishd.signals import Status, Tick
 
@@ -40,15 +40,17 @@ def ask(endpoint: str | None) -> Running | Unreachable | None:
 
     A fishd at another control.address cannot be known, even if it owns the same bus.
     """
-    endpoint = endpoint or find_control()
+    named, endpoint = endpoint, endpoint or find_control()
     try:
         if _is_nobody_at(endpoint):
             return None
     except PermissionError:
         return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
     try:
-        with Fish(endpoint, timeout=PATIENCE) as fish:
+        with Fish(named, timeout=PATIENCE) as fish:
             return Running(fish.status(), _latest_tick(fish), _calibrations(fish), endpoint)
+    except Untrusted as error:
+        why = str(error)
     except NoDaemon:
         why = f"no answer from {endpoint} within {PATIENCE:g} s, but a fishd may be there"
     except (FishError, msgspec.MsgspecError) as error:

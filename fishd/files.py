@@ -1,0 +1,74 @@
+"""Reads the files that people name: of the right kind, no longer than they may be, without a wait.
+
+Whatever a name leads to, a pipe, a device or a file without an end, the answer comes at once.
+"""
+
+import os
+import stat
+from pathlib import Path
+
+SETTINGS = 64 * 2**10
+"""Longest file that people write by hand [bytes]."""
+TABLE = 16 * 2**20
+"""Longest table of numbers [bytes]."""
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+class FileProblem(Exception):
+    """Why a file cannot be read, in words that follow its name."""
+
+
+class NoFile(FileProblem):
+    """There is none."""
+
+
+def read(path: Path, longest: int, reader: str) -> bytes:
+    """The content of a regular file; raises `FileProblem`.
+
+    longest: more is not read [bytes]
+    reader: what the file is for, such as `a policy`, for the complaint
+    """
+    try:
+        _check_kind(path.stat())  # first: to open a device may already do something to it
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        with os.fdopen(descriptor, "rb") as file:
+            found = os.fstat(descriptor)
+            _check_kind(found)
+            # What the kernel makes up, as in /proc, has no size until it is read.
+            content = file.read(longest + 1) if found.st_size <= longest else None
+    except (FileNotFoundError, NotADirectoryError):
+        raise NoFile("no such file") from None
+    except OSError as error:
+        raise FileProblem(f"cannot be read: {error.strerror}") from None
+    except ValueError:
+        raise NoFile("no such file: a name has no zero byte") from None
+    if content is None or len(content) > longest:
+        raise FileProblem(f"is longer than {_size(longest)}, far more than {reader} needs")
+    return content
+
+
+def read_text(path: Path, longest: int, reader: str, encoding: str = "utf-8") -> str:
+    """The same as text; line ends are \\n. Raises `FileProblem`."""
+    try:
+        text = read(path, longest, reader).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise FileProblem(f"not a text file in UTF-8 ({error.reason})") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _check_kind(found: os.stat_result) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
+        raise FileProblem(f"is {kind}; a regular file is needed")
+
+
+def _size(longest: int) -> str:
+    megabytes = longest / 2**20
+    return f"{megabytes:g} MB" if megabytes >= 1 else f"{longest // 2**10} kB"

@@ -1,0 +1,54 @@
+"""The checksum of a policy file: a damaged one is refused, whichever of its bytes is another."""
+
+import hashlib
+from typing import TYPE_CHECKING
+
+from fishd.errors import PolicyError
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+
+KEY = "fishd.sha256"
+"""Under which it is in the metadata of an ONNX file."""
+
+_BLANK = "0" * 64
+
+
+def sealed(model: "ModelProto") -> bytes:
+    """The file of a model, with its checksum; one that the model has already is replaced."""
+    kept = [(entry.key, entry.value) for entry in model.metadata_props if entry.key != KEY]
+    del model.metadata_props[:]
+    for key, value in kept:
+        model.metadata_props.add(key=key, value=value)
+    place = hashlib.sha256(model.SerializeToString()).hexdigest()  # a text that is nowhere in it
+    model.metadata_props.add(key=KEY, value=place)
+    content: bytes = model.SerializeToString()
+    return content.replace(place.encode(), _digest(content, place).encode())
+
+
+def check(content: bytes, model: "ModelProto") -> None:
+    """Raises `PolicyError` unless the content of a file is the one that was written."""
+    found = [entry.value for entry in model.metadata_props if entry.key == KEY]
+    if not found:
+        raise PolicyError(
+            f"its metadata lacks {KEY}, the checksum that tells a damaged file; export it again "
+            "with 'fishctl learn export'"
+        )
+    if len(found) > 1 or len(found[0]) != len(_BLANK) or found[0] != _digest(content, found[0]):
+        raise PolicyError(
+            "it is damaged: its content does not fit its checksum; copy it here again, or export "
+            "it again with 'fishctl learn export'"
+        )
+
+
+def is_there(model: "ModelProto") -> bool:
+    """Does the file say what its checksum should be?"""
+    return any(entry.key == KEY for entry in model.metadata_props)
+
+
+def _digest(content: bytes, checksum: str) -> str:
+    """SHA-256, in hexadecimal, of the file with zeros in place of its checksum."""
+    place = checksum.encode()
+    if content.count(place) != 1:
+        return ""
+    return hashlib.sha256(content.replace(place, _BLANK.encode())).hexdigest()

@@ -1,0 +1,162 @@
+"""What the network of a policy may do: a list of operators, none of which can run for ever.
+
+Each answers in a time and a memory that follow from the shapes, and both are bounded before
+onnxruntime sees the model.
+"""
+
+from collections.abc import Mapping
+from math import prod
+from typing import TYPE_CHECKING
+
+from fishd.errors import PolicyError
+
+if TYPE_CHECKING:
+    from onnx import ModelProto, NodeProto, ValueInfoProto
+
+PERMITTED: Mapping[str, tuple[str, ...]] = {
+    "layers": ("Gemm", "MatMul", "Conv", "BatchNormalization", "LayerNormalization"),
+    "activations": (
+        *("Celu", "Clip", "Elu", "Erf", "Gelu", "HardSigmoid", "HardSwish", "LeakyRelu"),
+        *("LogSoftmax", "Mish", "PRelu", "Relu", "Selu", "Sigmoid", "Softmax", "Softplus"),
+        *("Softsign", "Tanh", "ThresholdedRelu"),
+    ),
+    "arithmetic": (
+        *("Abs", "Add", "Ceil", "Cos", "Div", "Exp", "Floor", "Log", "Max", "Mean", "Min"),
+        *("Mul", "Neg", "Pow", "Reciprocal", "Round", "Sign", "Sin", "Sqrt", "Sub", "Sum"),
+    ),
+    "sums": ("ArgMax", "GlobalAveragePool", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum"),
+    "choices": (
+        *("And", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Not", "Or"),
+        "Where",
+    ),
+    "shapes": (
+        *("Cast", "Concat", "Constant", "ConstantOfShape", "Expand", "Flatten", "Gather"),
+        *("Identity", "Reshape", "Shape", "Slice", "Split", "Squeeze", "Transpose", "Unsqueeze"),
+    ),
+}
+"""Those of ONNX itself, by what they are for."""
+
+OPSETS = range(11, 27)
+"""Versions of these operators that are known."""
+LARGEST_NODES = 1000
+LARGEST_VALUES = 4 * 2**20
+"""Numbers that all operators together may give in one run."""
+LARGEST_WORK = 10**8
+"""Multiplications in one run, more or less: 0.1 s on a slow robot."""
+
+_NAMES = frozenset(name for names in PERMITTED.values() for name in names)
+_OWN = ("", "ai.onnx")
+_COUNTS = ("dilations", "group", "kernel_shape", "strides")
+"""Attributes that are divided by somewhere."""
+
+Shapes = Mapping[str, tuple[int, ...] | None]
+"""Of each value in a model; None where it is left open."""
+
+
+def check(model: "ModelProto") -> None:
+    """Raises `PolicyError` for a model that does anything else, or too much."""
+    if model.functions:
+        raise PolicyError(f"it defines an operator of its own, {shown(model.functions[0].name)}")
+    if model.training_info:
+        raise PolicyError("it is a model that trains itself; export it for inference")
+    versions = [entry.version for entry in model.opset_import if entry.domain in _OWN]
+    if len(versions) != 1 or versions[0] not in OPSETS:
+        said = ", ".join(map(str, versions)) or "none"
+        raise PolicyError(
+            f"its version of ONNX's operators: {said}; one from {OPSETS[0]} to {OPSETS[-1]} is "
+            "needed"
+        )
+    nodes = model.graph.node
+    if len(nodes) > LARGEST_NODES:
+        raise PolicyError(f"it has {len(nodes)} operators; {LARGEST_NODES} are the most")
+    for node in nodes:
+        _check_node(node)
+    _check_size(model)
+
+
+def _check_node(node: "NodeProto") -> None:
+    if node.domain not in _OWN or node.op_type not in _NAMES:
+        name = f"{node.domain}.{node.op_type}" if node.domain not in _OWN else node.op_type
+        raise PolicyError(
+            f"its operator {shown(name)} is not permitted; what is: {', '.join(sorted(_NAMES))}"
+        )
+    for attribute in node.attribute:
+        if attribute.HasField("g") or attribute.graphs:
+            raise PolicyError(f"its {node.op_type} holds a graph of its own")
+        counts = [attribute.i] if attribute.type == attribute.INT else attribute.ints
+        if attribute.name in _COUNTS and min(counts, default=0) < 1:
+            raise PolicyError(
+                f"its {node.op_type}: {attribute.name} {list(counts)}: 1 or more is needed"
+            )
+
+
+def _check_size(model: "ModelProto") -> None:
+    """Bound what one run computes and keeps, from the shape of every value."""
+    shapes = _shapes(model)
+    values = work = 0
+    for node in model.graph.node:
+        given = [shapes.get(name) for name in node.output if name]
+        taken = [shapes.get(name) for name in node.input if name]
+        if None in given or None in taken:
+            raise PolicyError(
+                f"how much its {node.op_type} computes cannot be told before it runs; export it "
+                "with fixed shapes"
+            )
+        out = sum(prod(shape) for shape in given if shape is not None)
+        sizes = [shape for shape in taken if shape is not None]
+        values += out
+        work += out * _factor(node, sizes) or max(out, sum(map(prod, sizes)))
+    for what, found, largest in (
+        ("values", values, LARGEST_VALUES),
+        ("multiplications", work, LARGEST_WORK),
+    ):
+        if found > largest:
+            raise PolicyError(
+                f"its network computes {found:.2g} {what} for one answer; {largest:.2g} are the "
+                "most, and a policy needs some ten thousand"
+            )
+
+
+def _factor(node: "NodeProto", taken: list[tuple[int, ...]]) -> int:
+    """Multiplications for each number that a node gives; 0 where all inputs are looked at once."""
+    if node.op_type in ("Gemm", "MatMul"):
+        return max(taken[0], default=1)
+    return prod(taken[1][1:]) if node.op_type == "Conv" else 0
+
+
+def _shapes(model: "ModelProto") -> Shapes:
+    """As they follow from inputs and weights, whatever else the model says about them."""
+    import onnx
+    from onnx import TensorProto
+
+    bare = onnx.ModelProto()
+    bare.CopyFrom(model)
+    del bare.graph.value_info[:]
+    try:
+        graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=True).graph
+    except Exception as error:  # of its own, of protobuf, and ValueError
+        raise PolicyError(f"its network contradicts itself: {shown(str(error), 200)}") from None
+    shapes: dict[str, tuple[int, ...] | None] = {
+        tensor.name: tuple(tensor.dims) for tensor in graph.initializer
+    }
+    given = [name for node in graph.node for name in node.output if name]
+    if len(set(given)) < len(given) or not shapes.keys().isdisjoint(given):
+        raise PolicyError("its network contradicts itself: two values have one name")
+    for value in (*graph.input, *graph.value_info, *graph.output):
+        if value.type.tensor_type.elem_type == TensorProto.STRING:
+            raise PolicyError(f"its {shown(value.name)} is text; a network computes numbers")
+        shapes.setdefault(value.name, _shape(value))
+    return shapes
+
+
+def _shape(value: "ValueInfoProto") -> tuple[int, ...] | None:
+    tensor = value.type.tensor_type
+    if not tensor.HasField("shape") or any(not d.HasField("dim_value") for d in tensor.shape.dim):
+        return None
+    return tuple(int(dim.dim_value) for dim in tensor.shape.dim)
+
+
+def shown(text: str, longest: int = 60) -> str:
+    """What a file says, as part of a sentence on one line."""
+    words = " ".join(text.split())[:longest]
+    return "".join(letter if letter.isprintable() else "?" for letter in words)

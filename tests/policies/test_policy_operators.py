@@ -1,0 +1,254 @@
+"""A policy does what ends in time: other operators, and networks too large, are refused."""
+
+import re
+import time
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from policy_files import card, random_layers, write
+
+from fishd.errors import PolicyError
+from fishd.policies import file, operators
+from fishd.policies.card import KEY, encode
+from fishd.policies.checksum import sealed
+from fishd.policies.network import to_onnx
+from fishd.policies.runtime import Network
+
+make = helper.make_node
+TRUE = numpy_helper.from_array(np.array(True), "true")
+ENDLESS = numpy_helper.from_array(np.array(2**62), "endless")
+
+
+def policy(
+    nodes: Sequence[Any], weights: Sequence[Any] = (), opset: int = 17, tick: float = 0.05
+) -> bytes:
+    """A policy of these nodes, from `observation` to `action`, both of shape [1, 1]."""
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
+        for name in (file.INPUT, file.OUTPUT)
+    ]
+    graph = helper.make_graph(list(nodes), "policy", *ends, list(weights))
+    model = helper.make_model(graph, ir_version=8, opset_imports=[helper.make_opsetid("", opset)])
+    helper.set_model_props(model, {KEY: encode(card(tick=tick))})
+    return sealed(model)
+
+
+def floats(name: str, *shape: int) -> Any:
+    return numpy_helper.from_array(np.zeros(shape, np.float32), name)
+
+
+def integers(name: str, *values: int) -> Any:
+    return numpy_helper.from_array(np.array(values, np.int64), name)
+
+
+def refusal(content: bytes) -> str:
+    with pytest.raises(PolicyError) as caught:
+        file.parse(content)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def body(*names: str) -> Any:
+    """A graph that gives its last input again and says to go on."""
+    flag = helper.make_tensor_value_info("go", TensorProto.BOOL, [])
+    inputs = [helper.make_tensor_value_info("number", TensorProto.INT64, []), flag]
+    value = helper.make_tensor_value_info("value", TensorProto.FLOAT, [1, 1])
+    nodes = [make("Identity", ["go"], ["on"]), make("Identity", ["value"], ["next"])]
+    outputs = [
+        helper.make_tensor_value_info("on", TensorProto.BOOL, []),
+        helper.make_tensor_value_info("next", TensorProto.FLOAT, [1, 1]),
+    ]
+    return helper.make_graph(nodes, "body", [*inputs, value], outputs)
+
+
+def test_an_endless_loop_is_refused_with_what_is_permitted() -> None:
+    loop = make("Loop", ["endless", "true", "observation"], ["action"], body=body())
+    began = time.monotonic()
+    message = refusal(policy([loop], [ENDLESS, TRUE]))
+    assert time.monotonic() - began < 5.0
+    assert message.startswith("its operator Loop is not permitted; what is: Abs, Add, And, ")
+    assert message.endswith(", Tanh, ThresholdedRelu, Transpose, Unsqueeze, Where")
+
+
+@pytest.mark.parametrize(
+    ("node", "named"),
+    [
+        (make("If", ["true"], ["action"], then_branch=body(), else_branch=body()), "If"),
+        (make("Scan", ["observation"], ["action"], body=body(), num_scan_inputs=1), "Scan"),
+        (make("SequenceMap", ["observation"], ["action"], body=body()), "SequenceMap"),
+        (make("LSTM", ["observation", "w", "r"], ["action"]), "LSTM"),
+        (make("RandomNormal", [], ["action"], shape=[1, 1]), "RandomNormal"),
+        (make("Tile", ["observation", "w"], ["action"]), "Tile"),
+        (make("Tanh", ["observation"], ["action"], domain="com.example"), "com.example.Tanh"),
+        (make("\x1b[31mRed\n" * 99, ["observation"], ["action"]), r"\?\[31mRed \S+"),
+    ],
+)
+def test_other_operators_are_refused_by_name(node: Any, named: str) -> None:
+    message = refusal(policy([node], [TRUE]))
+    assert re.match(f"its operator {named}.* is not permitted; what is: Abs, Add", message)
+    assert message.isprintable()
+
+
+def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
+    model = onnx.load_model_from_string(policy([make("Tanh", ["observation"], ["action"])]))
+    own = helper.make_function(
+        "", "Tanh", ["x"], ["y"], [make("Sin", ["x"], ["y"])], [helper.make_opsetid("", 17)]
+    )
+    model.functions.append(own)
+    assert refusal(sealed(model)) == "it defines an operator of its own, Tanh"
+
+
+def test_a_graph_in_an_attribute_is_refused() -> None:
+    node = make("Tanh", ["observation"], ["action"], inner=body())
+    assert refusal(policy([node])) == "its Tanh holds a graph of its own"
+
+
+@pytest.mark.parametrize("opset", [0, 1, 10, 99])
+def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> None:
+    content = policy([make("Tanh", ["observation"], ["action"])], opset=opset)
+    assert refusal(content) == (
+        f"its version of ONNX's operators: {opset}; one from 11 to 26 is needed"
+    )
+
+
+def test_more_operators_than_a_policy_needs_are_refused() -> None:
+    names = ["observation", *(f"v{number}" for number in range(1000)), "action"]
+    chain = [make("Tanh", [a], [b]) for a, b in pairwise(names)]
+    assert refusal(policy(chain)) == "it has 1001 operators; 1000 are the most"
+
+
+@pytest.mark.parametrize(
+    ("nodes", "weights", "message"),
+    [
+        (  # 40 GB from 800 kB
+            [make("Add", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])],
+            [floats("a", 100_000, 1), floats("b", 1, 100_000)],
+            r"its network computes 1e\+10 values for one answer; 4.2e\+06 are the most",
+        ),
+        (
+            [make("Expand", ["observation", "s"], ["c"]), make("ReduceMean", ["c"], ["action"])],
+            [integers("s", 2**20, 2**20)],
+            r"its network computes 1.1e\+12 values",
+        ),
+        (
+            [make("MatMul", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])],
+            [floats("a", 1000, 1000), floats("b", 1000, 1000)],
+            r"its network computes 1e\+09 multiplications for one answer; 1e\+08 are the most",
+        ),
+        (
+            [
+                make("ConstantOfShape", ["s"], ["c"]),
+                make("Conv", ["c", "w"], ["d"]),
+                make("ReduceMean", ["d"], ["action"], axes=[2, 3], keepdims=0),
+            ],
+            [integers("s", 1, 1, 2000, 1000), floats("w", 1, 1, 100, 100)],
+            r"its network computes 1.7e\+10 multiplications",
+        ),
+        (
+            [
+                make("Cast", ["observation"], ["n"], to=TensorProto.INT64),
+                make("Expand", ["observation", "n"], ["c"]),
+                make("ReduceMean", ["c"], ["action"]),
+            ],
+            [],
+            "its network contradicts itself|how much its Expand computes cannot be told",
+        ),
+        (
+            [make("Cast", ["observation"], ["c"], to=TensorProto.STRING)],
+            [],
+            "its c is text; a network computes numbers|its network contradicts itself",
+        ),
+        (
+            [make("Tanh", ["observation"], ["w"]), make("Tanh", ["w"], ["action"])],
+            [floats("w", 1, 1)],
+            "its network contradicts itself",
+        ),
+        (
+            [make("Conv", ["observation", "w"], ["action"], strides=[0])],
+            [floats("w", 1, 1)],
+            r"its Conv: strides \[0\]: 1 or more is needed",
+        ),
+    ],
+)
+def test_a_network_that_would_take_all_memory_or_hours_is_refused_at_once(
+    nodes: list[Any], weights: list[Any], message: str
+) -> None:
+    began = time.monotonic()
+    assert re.match(message, refusal(policy(nodes, weights)))
+    assert time.monotonic() - began < 5.0
+
+
+def test_a_size_that_the_file_only_claims_does_not_count() -> None:
+    """What a file says of values in the middle of it is not believed."""
+    nodes = [make("Add", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])]
+    content = policy(nodes, [floats("a", 100_000, 1), floats("b", 1, 100_000)])
+    model = onnx.load_model_from_string(content)
+    model.graph.value_info.append(helper.make_tensor_value_info("c", TensorProto.FLOAT, [1, 1]))
+    assert "its network computes 1e+10 values" in refusal(sealed(model))
+
+
+def test_a_network_that_takes_more_than_half_a_tick_is_refused_with_its_time(
+    tmp_path: Path,
+) -> None:
+    """80 products with the same weights: some 8 ms on a fast machine, for a tick of 2 ms."""
+    names = ["wide", *(f"v{number}" for number in range(79)), "narrow"]
+    chain = [make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)]
+    nodes = [
+        make("Expand", ["observation", "s"], ["wide"]),
+        *chain,
+        make("ReduceMean", ["narrow"], ["action"]),
+    ]
+    weights = [integers("s", 1, 1100), floats("w", 1100, 1100)]
+    path = write(tmp_path, policy(nodes, weights, tick=0.002))
+    with pytest.raises(PolicyError) as caught:
+        Network(file.read(path))
+    expected = (
+        r": this machine takes [\d.e+]+ ms for one answer of it, more than half of its tick of "
+        r"2 ms; train a smaller network"
+    )
+    assert re.fullmatch(re.escape(str(path)) + expected, str(caught.value))
+
+
+def test_a_usual_network_is_fast_enough_for_the_shortest_tick(tmp_path: Path) -> None:
+    layers = random_layers(6, 64, 64, 1)
+    names = ("fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle")
+    wide = card(*((name, 1.0) for name in names), tick=0.002)
+    Network(file.read(write(tmp_path, to_onnx(layers, "tanh", wide))))
+
+
+@pytest.mark.parametrize("opset", [operators.OPSETS[0], 13, 17, 21])
+def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> None:
+    """Layers as MatMul and Add, constants in nodes, scaling in the network, squashed Gaussians."""
+    one = numpy_helper.from_array(np.array(0.5, np.float32))
+    nodes = [
+        make("Constant", [], ["half"], value=one),
+        make("Flatten", ["observation"], ["flat"]),
+        make("Mul", ["flat", "half"], ["scaled"]),
+        make("MatMul", ["scaled", "w0"], ["p"]),
+        make("Add", ["p", "b0"], ["q"]),
+        make("Elu", ["q"], ["r"]),
+        make("Gemm", ["r", "w1", "b1"], ["mean"], transB=1),
+        make("Tanh", ["mean"], ["squashed"]),
+        make("Reshape", ["squashed", "s"], ["shaped"]),
+        make("Clip", ["shaped", "low", "high"], ["action"]),
+    ]
+    weights = [floats("w0", 1, 8), floats("b0", 8), floats("w1", 1, 8), floats("b1", 1)]
+    weights.append(integers("s", 1, 1))
+    weights += [
+        numpy_helper.from_array(np.array(value, np.float32), name)
+        for name, value in (("low", -1.0), ("high", 1.0))
+    ]
+    network = Network(file.read(write(tmp_path, policy(nodes, weights, opset=opset))))
+    assert network.run() == 0.0
+
+
+def test_every_permitted_operator_is_one_of_onnx() -> None:
+    latest = operators.OPSETS[-1]
+    for names in operators.PERMITTED.values():
+        assert [name for name in names if not onnx.defs.has(name, latest, "")] == []

@@ -1,0 +1,126 @@
+"""Whatever a name leads to, a pipe, a device, a file without an end, the answer comes at once."""
+
+import os
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+
+from fishd import files
+from fishd.cli import load_files
+from fishd.config import load
+from fishd.errors import ConfigError, FishdError, PolicyError
+from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.hardware.calibration_files import CalibrationFolder
+from fishd.policies import file as policy_file
+
+PATIENCE = 20.0
+FORCE = "force-2026-01-01T000000.000000Z.yaml"
+SERVO = "servo-2026-01-01T000000.000000Z.yaml"
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def nothing(path: Path) -> None:
+    path.symlink_to("/dev/null")
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+def listened_at(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as listener:
+        before = Path.cwd()
+        os.chdir(path.parent)  # whose path may be too long for a socket
+        listener.bind(path.name)
+        os.chdir(before)
+
+
+def hole(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 2**40)
+
+
+PLANTS = {
+    pipe: "is a named pipe; a regular file is needed",
+    endless: "is a device; a regular file is needed",
+    nothing: "is a device; a regular file is needed",
+    folder: "is a folder; a regular file is needed",
+    listened_at: "is a socket; a regular file is needed",
+    hole: "is longer than ",
+}
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "fish.yaml": load,
+    FORCE: lambda path: CalibrationFolder(path.parent).newest(ForceCalibration),
+    SERVO: lambda path: CalibrationFolder(path.parent).newest(ServoCalibration),
+    "loads.csv": lambda path: load_files.read(path, "N"),
+    "swim.onnx": policy_file.read,
+}
+
+
+def said(read: Callable[[Path], object], path: Path) -> str:
+    """What a reader complains, in time."""
+    found: list[str] = []
+
+    def run() -> None:
+        try:
+            read(path)
+        except (ConfigError, PolicyError, FishdError, click.ClickException) as error:
+            found.append(str(error))
+
+    reader = threading.Thread(target=run, daemon=True)
+    reader.start()
+    reader.join(PATIENCE)
+    assert found, "it does not end, or accepts it"
+    assert "\n" not in found[0]
+    return found[0]
+
+
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_no_file_or_has_no_end_is_one_line_at_once(
+    tmp_path: Path, name: str, plant: Callable[[Path], None]
+) -> None:
+    plant(tmp_path / name)
+    assert said(READERS[name], tmp_path / name).startswith(f"{tmp_path / name}: {PLANTS[plant]}")
+
+
+def test_a_file_that_the_kernel_makes_up_is_read_no_further_than_is_permitted() -> None:
+    path = Path("/proc/self/status")
+    assert files.read(path, 10**6, "a test").startswith(b"Name:")
+    with pytest.raises(files.FileProblem, match="is longer than 0 kB, far more than a test needs"):
+        files.read(path, 10, "a test")
+
+
+def test_a_file_of_just_the_greatest_length_is_read(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"x" * 1024)
+    assert len(files.read(tmp_path / "file", 1024, "a test")) == 1024
+    with pytest.raises(files.FileProblem):
+        files.read(tmp_path / "file", 1023, "a test")
+
+
+@pytest.mark.parametrize("path", ["none", "none/none", "a\0b"])
+def test_what_is_not_there_is_told_from_what_cannot_be_read(tmp_path: Path, path: str) -> None:
+    with pytest.raises(files.NoFile, match="no such file"):
+        files.read(tmp_path / path, 10, "a test")
+
+
+def test_a_link_to_a_good_file_is_followed_and_lines_end_alike(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes("\ufeffone\r\ntwo\rthrée\n".encode())
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    text = files.read_text(tmp_path / "link", 100, "a test", "utf-8-sig")
+    assert text == "one\ntwo\nthrée\n"
+    (tmp_path / "file").write_bytes(b"\xff")
+    with pytest.raises(files.FileProblem, match="not a text file in UTF-8"):
+        files.read_text(tmp_path / "link", 100, "a test")

@@ -1,0 +1,183 @@
+"""A client asks nobody but the fishd of its user, of root, or the service."""
+
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from processes import FISHCTL, PATIENCE, running
+
+from fishd import addresses
+from fishd.client import Fish, NoDaemon
+from fishd.errors import Untrusted
+from fishd.socket_owner import stranger
+
+USER, OTHER = 60101, 60102
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two other users")
+
+
+@contextmanager
+def user(number: int) -> Iterator[None]:
+    """While this lasts, this process belongs to somebody."""
+    os.setresuid(number, number, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+@pytest.fixture
+def shared() -> Iterator[Path]:
+    """A folder like /tmp."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o1777)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(autouse=True)
+def no_endpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR", addresses.ENDPOINT_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+
+
+class Listener:
+    """Somebody who listens at a socket, and remembers what he is told."""
+
+    def __init__(self, path: Path, number: int) -> None:
+        with user(number):
+            path.parent.mkdir(exist_ok=True)
+            self.socket = socket.socket(socket.AF_UNIX)
+            self.socket.bind(str(path))
+            self.socket.listen()
+        path.chmod(0o777)
+        self.told: list[bytes] = []
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self.socket.accept()
+            except OSError:  # closed
+                return
+            with connection:
+                self.told.append(connection.recv(64))
+
+    def __enter__(self) -> "Listener":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.shutdown(socket.SHUT_RDWR)
+        self.socket.close()
+
+
+@as_root
+@pytest.mark.parametrize("victim", [USER, 0])
+def test_an_estop_is_not_sent_to_a_folder_that_another_user_planted(
+    shared: Path, monkeypatch: pytest.MonkeyPatch, victim: int
+) -> None:
+    with user(OTHER):
+        (shared / "session").mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared / "session"))
+    path = shared / "session" / "fishd" / "control"
+    with Listener(path, OTHER) as planted, user(victim):
+        with Fish(timeout=0.5) as fish, pytest.raises(Untrusted) as caught:
+            fish.estop()
+        assert not any(planted.told)  # a connection that says nothing, at most
+        with Fish(f"ipc://{path}", timeout=0.5) as fish, pytest.raises(NoDaemon, match="no answer"):
+            fish.estop()  # which is the user's own word
+        assert any(planted.told)
+    assert str(caught.value) == (
+        f"what listens at ipc://{path} is not asked, it may be anybody: {path.parent} belongs to "
+        f"user {OTHER}; where you trust it, name it with --endpoint or $FISHD_ENDPOINT"
+    )
+
+
+@as_root
+def test_fishctl_says_in_one_line_that_it_was_not_asked() -> None:
+    path = Path(f"/tmp/fishd-{USER}/control")  # where it would be without a session
+    drop = ["setpriv", f"--reuid={USER}", f"--regid={USER}", "--clear-groups"]
+    if subprocess.run([*drop, FISHCTL, "--help"], capture_output=True, check=False).returncode:
+        pytest.skip("another user cannot start this fishctl: its folder, or Python's, is private")
+    try:
+        with Listener(path, OTHER) as planted:
+            done = subprocess.run(
+                [*drop, FISHCTL, "estop"],
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=PATIENCE,
+            )
+            assert not any(planted.told)
+    finally:
+        shutil.rmtree(path.parent)
+    assert done.returncode != 0
+    assert done.stderr.startswith(f"fishctl: what listens at ipc://{path} is not asked")
+    assert (done.stdout, done.stderr.count("\n")) == ("", 1)
+
+
+@as_root
+def test_a_planted_folder_does_not_hide_the_service(
+    shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, session = shared / "run", shared / "session"
+    (run / "fishd").mkdir(parents=True)
+    run.chmod(0o755)
+    os.chown(run / "fishd", USER, USER)
+    monkeypatch.setattr(addresses, "_SERVICE", run / "fishd" / "control")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
+    with user(OTHER):
+        session.mkdir()
+    with (
+        Listener(run / "fishd" / "control", USER),
+        Listener(session / "fishd" / "control", OTHER),
+    ):
+        assert addresses.find_control() == f"ipc://{run}/fishd/control"
+        with Fish(timeout=0.2) as fish, pytest.raises(NoDaemon, match="no answer within"):
+            fish.status()  # so it was asked
+
+
+@as_root
+def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) -> None:
+    def judged(name: str, owner: int, listener: int, mode: int = 0o755) -> str:
+        folder = shared / name
+        folder.mkdir()
+        os.chown(folder, owner, owner)
+        folder.chmod(0o777)
+        with Listener(folder / "control", listener) if listener else _nothing():
+            folder.chmod(mode)
+            with user(USER):
+                return stranger(folder / "control").replace(str(folder), "FOLDER")
+
+    assert judged("mine", USER, USER) == ""
+    assert judged("deserted", USER, 0) == ""
+    assert judged("roots", 0, USER) == ""
+    assert judged("his", OTHER, OTHER) == f"FOLDER belongs to user {OTHER}"
+    assert judged("his-with-me", OTHER, USER) == f"FOLDER belongs to user {OTHER}"
+    assert judged("open", USER, USER, 0o777) == "others may write to FOLDER"
+    assert judged("group", USER, USER, 0o770) == "others may write to FOLDER"
+    assert judged("slipped-in", USER, OTHER) == f"it is user {OTHER} who listens there"
+    (shared / "link").symlink_to(shared / "mine")
+    with user(USER):
+        assert stranger(shared / "link" / "control") == f"{shared / 'link'} is a symbolic link"
+        assert stranger(shared / "nowhere" / "control") == ""
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield
+
+
+def test_the_fishd_of_the_same_user_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "fishd").mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with running(tmp_path / "fishd"), Fish() as fish:
+        assert fish.status().mode == "idle"
