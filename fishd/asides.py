@@ -1,8 +1,10 @@
 """Calls that must not hold up the ticks: what loads files, and what may never return."""
 
 import asyncio
+import os
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any, TypeVar
 
 from fishd.contained import Attempt
@@ -60,7 +62,7 @@ class Asides:
             with suppress(RuntimeError):  # the loop is closed: nobody waits any more
                 events.call_soon_threadsafe(news.set)
 
-        attempt = Attempt(function, done=done, late=late)
+        attempt = Attempt(partial(_kept_running, function), done=done, late=late)
         self._under_way += 1
         try:
             async with asyncio.timeout(self.patience):
@@ -78,3 +80,17 @@ class Asides:
     def dispose(self, function: Callable[[], Any]) -> None:
         """Call what nobody waits for, such as the `close` of a controller that is not wanted."""
         self._given_up.append(Attempt(function))
+
+
+def _kept_running(function: Callable[[], T]) -> T:
+    """Call it where no ordinary program stops this thread, if none stops the one that ticks.
+
+    That would have to wait for a thread that was stopped while it held the interpreter. On a single
+    core the kernel's limit for real-time threads would hold up both, which is worse.
+    """
+    ticks = os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK
+    if ticks == os.SCHED_FIFO and len(os.sched_getaffinity(0)) > 1:
+        with suppress(OSError):
+            policy, lowest = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1)
+            os.sched_setscheduler(0, policy, lowest)
+    return function()
