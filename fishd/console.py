@@ -5,7 +5,11 @@ from typing import NoReturn
 
 import click
 
+from fishd import text
 from fishd.signals import Status
+
+_LONGEST = 5000
+"""A complaint may list all keys of the configuration, but no more [characters]."""
 
 
 def status_line(status: Status) -> str:
@@ -13,6 +17,7 @@ def status_line(status: Status) -> str:
     what = status.mode if status.mode == "idle" else f"{status.mode} {status.controller}"
     if status.reason:
         what = f"{status.mode} {status.reason.code}"
+    what = text.quoted(what)
     thrust = "     –" if status.sensor_lost else f"{status.thrust * 1e3:6.2f}"
     servo = "  servo not reached" if status.servo_lost else ""
     return (
@@ -41,5 +46,5 @@ def run(command: click.Command, name: str) -> int:
 
 def complain(name: str, message: str, status: int) -> NoReturn:
     """Say one line on standard error and exit."""
-    click.echo(f"{name}: " + " ".join(message.split()), err=True)
+    click.echo(f"{name}: " + text.line(" ".join(message.split()), _LONGEST), err=True)
     sys.exit(status)

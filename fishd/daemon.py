@@ -3,7 +3,7 @@
 import asyncio
 import itertools
 import logging
-import signal
+import math
 import sys
 import time
 from contextlib import ExitStack, suppress
@@ -17,6 +17,7 @@ from fishd.clock import SystemClock, Ticker, VirtualClock
 from fishd.config import Config, load
 from fishd.console import complain, run, status_line
 from fishd.controllers import registry
+from fishd.ending import Ending, leave
 from fishd.errors import ConfigError, FishdError, ServoError
 from fishd.gateway import link
 from fishd.gateway.process import Gateway
@@ -217,6 +218,15 @@ class Daemon:
                 self._loop.robot.servo.write(0.0)
                 self._clock.sleep(REST)
 
+    def release_at_once(self) -> None:
+        """Let go of the servo from another thread, while this one hangs.
+
+        Where a countdown ends the pulses it has done so, and the servo is not woken again.
+        """
+        if self._loop.robot.countdown == math.inf:
+            self._come_to_rest()
+        self._loop.robot.servo.close()
+
     def _on_press(self) -> None:
         """The E-stop button was pressed, says a thread of the driver: do not wait for a tick."""
         message = "the E-stop button was pressed"
@@ -231,12 +241,13 @@ class Daemon:
             console.info("%s", line)
 
 
-async def swim(config: Config, print_status: bool) -> None:
-    """Run a daemon until SIGTERM or SIGINT, which count from before it touches the servo."""
+async def swim(config: Config, print_status: bool, ending: Ending) -> None:
+    """Run a daemon until a signal, which counts from before it touches the servo."""
     stopping = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stopping.set)
+    events = asyncio.get_running_loop()
+    ending.when_asked(partial(events.call_soon_threadsafe, stopping.set))
     with Daemon(config, print_status) as daemon:
+        ending.release = daemon.release_at_once
         await daemon.run(stopping)
 
 
@@ -269,8 +280,8 @@ async def swim(config: Config, print_status: bool) -> None:
 @click.version_option(__version__, prog_name="fishd")
 def fishd(
     path: Path | None, overrides: tuple[str, ...], print_status: bool | None, log_format: str
-) -> None:
-    """Run the robotic fish until SIGINT (Ctrl-C) or SIGTERM.
+) -> int:
+    """Run the robotic fish until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
 
     Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 78 when the
     configuration is wrong.
@@ -280,21 +291,25 @@ def fishd(
     except ConfigError as error:
         complain("fishd", str(error), EX_CONFIG)
     logs = LogWriter(log_format)
+    ending = Ending()
+    ending.last_words = logs.close
+    show = sys.stdout.isatty() if print_status is None else print_status
     try:
-        asyncio.run(swim(config, sys.stdout.isatty() if print_status is None else print_status))
+        asyncio.run(swim(config, show, ending))
     except ConfigError as error:  # in a calibration file
         log.critical("%s", error)
-        sys.exit(EX_CONFIG)
+        return EX_CONFIG
     except FishdError as error:
         log.critical("%s", error)
-        sys.exit(1)
-    except Exception:
+        return 1
+    except BaseException:  # an exit that nobody has asked for is a failure, too
         log.critical("fishd failed; the servo is released", exc_info=True)
-        sys.exit(1)
+        return 1
     finally:
         logs.close()
+    return 0
 
 
 def main() -> None:
     """The `fishd` command."""
-    sys.exit(run(fishd, "fishd"))
+    leave(run(fishd, "fishd"))

@@ -16,6 +16,8 @@
         └── Refused      (RuntimeError)    the daemon answered with an error; see its `code`
 
 Each message is one line that says what is wrong, where, and what would be right.
+
+    Escaped                             a controller raised what is no Exception, such as SystemExit
 """
 
 
@@ -91,3 +93,7 @@ class Refused(FishError, RuntimeError):
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
+
+
+class Escaped(Exception):
+    """Code that is not fishd's raised what is no Exception, such as SystemExit: its cause."""

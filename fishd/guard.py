@@ -1,6 +1,9 @@
 """The last word on what reaches the servo: finite, within its limits, no faster than permitted."""
 
 import math
+from typing import Any
+
+from fishd import text
 
 
 class Guard:
@@ -31,21 +34,35 @@ class Guard:
         self.highest = min(self._amplitude, highest)
         """The highest angle that is permitted [rad]."""
 
-    def apply(self, command: float, previous: float) -> float:
+    def apply(self, command: Any, previous: float) -> float:
         """The instruction angle to send [rad].
 
-        command: what the controller wants [rad]
+        command: what the controller wants [rad]: one real number of any kind, numpy's too
         previous: the angle in force [rad]
-        Raises ValueError when the command is not a finite number.
+        Raises ValueError when the command is no number, or not finite.
         """
-        if not math.isfinite(command):
-            raise ValueError(f"the command is {command}, not an angle")
-        wanted = max(self.lowest, min(self.highest, command))
+        angle = command if type(command) is float else _number(command)
+        if not math.isfinite(angle):
+            raise ValueError(f"the command is {angle}, not an angle")
+        wanted = max(self.lowest, min(self.highest, angle))
         return _towards(wanted, previous, self.step)
 
     def fade(self, previous: float) -> float:
         """The next instruction angle on the way to neutral [rad]."""
         return _towards(0.0, previous, self.fade_step)
+
+
+def _number(command: Any) -> float:
+    """A real number as a float; raises ValueError for what is none, such as a text or True."""
+    try:
+        # An array of one number, whatever its shape, or one of numpy's own kinds of number.
+        value = command.item() if hasattr(command, "item") else command
+        if not isinstance(value, bool | str | bytes | bytearray):
+            return float(value)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    kind = text.quoted(type(command).__name__)
+    raise ValueError(f"the command is of type {kind}, not one real number")
 
 
 def _towards(wanted: float, previous: float, step: float) -> float:

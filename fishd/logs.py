@@ -8,16 +8,41 @@ import logging.handlers
 import os
 import queue
 import sys
+import threading
 import time
+from contextlib import suppress
 
 import msgspec
+
+from fishd import text
+
+log = logging.getLogger(__name__)
 
 _JOURNAL_LEVELS = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
 _QUEUE = 1000
 """Lines kept while standard error is stuck; later ones are dropped."""
+_CLOSING = 0.3
+"""How long the last lines may take to be written [s]."""
+_LONGEST_MESSAGE = 2000
+_LONGEST_TRACEBACK = 10_000
+"""Longer ones are cut [characters]."""
 
 
-class TextFormatter(logging.Formatter):
+class _Formatter(logging.Formatter):
+    """Where all that is logged is made safe, whoever said it."""
+
+    def message(self, record: logging.LogRecord) -> str:
+        """The message, in one line."""
+        return text.line(record.getMessage(), _LONGEST_MESSAGE)
+
+    def traceback(self, record: logging.LogRecord) -> str:
+        """The traceback, where there is one."""
+        if not record.exc_info:
+            return ""
+        return text.block(self.formatException(record.exc_info), _LONGEST_TRACEBACK)
+
+
+class TextFormatter(_Formatter):
     """`12:00:00.123 warning fishd.loop: message`, or with journald's level prefix for a journal."""
 
     def __init__(self, journal: bool) -> None:
@@ -26,20 +51,16 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, and the traceback where there is one."""
-        text = f"{record.levelname.lower()} {record.name}: {record.getMessage()}"
+        what = f"{record.name}: {self.message(record)}"
         if self._journal:  # journald stamps the time itself
-            text = (
-                f"<{_JOURNAL_LEVELS.get(record.levelname, 6)}>{record.name}: {record.getMessage()}"
-            )
+            head = f"<{_JOURNAL_LEVELS.get(record.levelname, 6)}>"
         else:
             clock = time.strftime("%H:%M:%S", time.localtime(record.created))
-            text = f"{clock}.{int(record.msecs):03d} {text}"
-        if record.exc_info:
-            text += "\n" + self.formatException(record.exc_info)
-        return text
+            head = f"{clock}.{int(record.msecs):03d} {record.levelname.lower()} "
+        return "\n".join(part for part in (head + what, self.traceback(record)) if part)
 
 
-class JsonFormatter(logging.Formatter):
+class JsonFormatter(_Formatter):
     """One JSON object a line: t, level, logger, message, and traceback where there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -48,46 +69,72 @@ class JsonFormatter(logging.Formatter):
             "t": record.created,
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage(),
+            "message": self.message(record),
         }
         if record.exc_info:
-            fields["traceback"] = self.formatException(record.exc_info)
+            fields["traceback"] = self.traceback(record)
         return msgspec.json.encode(fields).decode()
 
 
 class _Queued(logging.handlers.QueueHandler):
     def enqueue(self, record: logging.LogRecord) -> None:
         """Drop the line rather than wait."""
-        try:
+        with suppress(queue.Full):
             self.queue.put_nowait(record)
-        except queue.Full:
-            return
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
         """Leave the formatting, tracebacks included, to the writing thread."""
-        record.msg, record.args = record.getMessage(), None
+        record.msg, record.args = record.getMessage()[: 2 * _LONGEST_MESSAGE], None
         return record
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        """Say nothing: it would be said on standard error, which may be stuck."""
 
 
 class LogWriter:
-    """Sends all logs to standard error; lines for `console` go to standard output as they are."""
+    """Sends all logs to standard error; lines for `console` go to standard output as they are.
+
+    Python's own complaints, such as warnings, take the same way.
+    """
 
     def __init__(self, style: str) -> None:
         """style: text or json."""
-        lines: queue.Queue[logging.LogRecord] = queue.Queue(_QUEUE)
-        errors = logging.StreamHandler(sys.stderr)
+        self._lines: queue.Queue[logging.LogRecord | None] = queue.Queue(_QUEUE)
+        self._errors = logging.StreamHandler(sys.stderr)
         journal = bool(os.environ.get("JOURNAL_STREAM")) and not sys.stderr.isatty()
-        errors.setFormatter(JsonFormatter() if style == "json" else TextFormatter(journal))
-        errors.addFilter(lambda record: record.name != "console")
-        console = logging.StreamHandler(sys.stdout)
-        console.addFilter(lambda record: record.name == "console")
-        self._listener = logging.handlers.QueueListener(lines, errors, console)
+        self._errors.setFormatter(JsonFormatter() if style == "json" else TextFormatter(journal))
+        self._console = logging.StreamHandler(sys.stdout)
         root = logging.getLogger()
-        root.handlers = [_Queued(lines)]
+        root.handlers = [_Queued(self._lines)]
         root.setLevel(logging.INFO)
-        self._listener.start()
+        logging.captureWarnings(True)
+        sys.unraisablehook = _log_unraisable
+        threading.excepthook = _log_thread
+        self._thread = threading.Thread(target=self._write, name="logs", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
-        """Write what is left; may be called twice."""
-        if getattr(self._listener, "_thread", None) is not None:
-            self._listener.stop()
+        """Write what is left, as far as that does not take long; may be called twice."""
+        until = time.monotonic() + _CLOSING
+        with suppress(queue.Full):
+            self._lines.put(None, timeout=_CLOSING)
+        self._thread.join(max(0.0, until - time.monotonic()))
+
+    def _write(self) -> None:
+        for record in iter(self._lines.get, None):
+            (self._console if record.name == "console" else self._errors).handle(record)
+
+
+def _log_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
+    """An exception that nobody can catch, such as one of a __del__."""
+    error = unraisable.exc_value
+    if error is not None:
+        log.error("ignored: %s", text.named(error), exc_info=error)
+
+
+def _log_thread(hook: threading.ExceptHookArgs) -> None:
+    """An exception that ended a thread, such as one that a controller has begun."""
+    error = hook.exc_value
+    if error is not None and not isinstance(error, SystemExit):
+        name = text.quoted(hook.thread.name) if hook.thread else "?"
+        log.error("thread %s failed: %s", name, text.named(error), exc_info=error)

@@ -9,10 +9,13 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd import text
 from fishd.clock import Clock, Slot
+from fishd.contained import contained
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.hold import Hold, HoldParameters
 from fishd.drive import Drive
@@ -20,7 +23,7 @@ from fishd.errors import ControllerFault, SensorError
 from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
-from fishd.reporting import Publisher, Reporter, named, why_overrun, why_silent, why_skipped
+from fishd.reporting import Publisher, Reporter, why_overrun, why_silent, why_skipped
 from fishd.signals import Measurement, Observation
 from fishd.statistics import Statistics
 from fishd.supervisor import Mode, Supervisor
@@ -71,6 +74,8 @@ class ControlLoop:
         """What the latest tick observed."""
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
         self.controller_name = "hold"
+        self.parameters = _plain(self.controller)
+        """Those of the controller in command, as JSON has them."""
         self._fresh = False
         self._estimator = estimator
         self.guard = guard
@@ -131,7 +136,7 @@ class ControlLoop:
     def rehearse(self) -> None:
         """Let the controller in command warm up for the next tick, which is imminent."""
         try:
-            self.controller.rehearse()
+            contained(self.controller.rehearse)
         except Exception as error:
             self._fail("controller-error", f"controller {self.controller_name} failed", error)
 
@@ -141,16 +146,18 @@ class ControlLoop:
         Raises `Refused` while a fault or an emergency stop is latched.
         """
         before = self.supervisor.mode
-        self.supervisor.start()
+        self.supervisor.check_startable()
         self._swap(name, controller, fresh=True)
-        self.reporter.controller(name, controller.parameters, "controller", "takes over with")
+        self.supervisor.start()
+        self.reporter.controller(name, self.parameters, "controller", "takes over with")
         self.reporter.mode(before, self.supervisor)
 
     def retune(self, parameters: Struct) -> None:
-        """Give the controller in command new, already checked parameters."""
-        self.controller.retune(parameters)
+        """Give the controller in command new, already checked parameters; raises what it raises."""
+        contained(self.controller.retune, parameters)
+        self.parameters = _plain(self.controller)
         self.reporter.controller(
-            self.controller_name, self.controller.parameters, "parameters", "goes on with"
+            self.controller_name, self.parameters, "parameters", "goes on with"
         )
 
     def stop(self) -> None:
@@ -184,10 +191,10 @@ class ControlLoop:
         self._estimator.rest()
 
     def _swap(self, name: str, controller: Controller[Any], *, fresh: bool) -> None:
-        former = self.controller
+        former, self.parameters = self.controller, _plain(controller)
         self.controller_name, self.controller, self._fresh = name, controller, fresh
         try:
-            former.close()
+            contained(former.close)
         except Exception as error:
             self.reporter.problem(f"the controller before {name} could not be closed", error)
 
@@ -211,7 +218,7 @@ class ControlLoop:
             if self.supervisor.suspect(measurement.suspect):
                 self._fall()
         except Exception as error:
-            problem = f"the force sensor cannot be read: {named(error)}"
+            problem = f"the force sensor cannot be read: {text.named(error)}"
             measurement = self._measurement  # once more, and nothing of it is new
         self._measurement = replace(measurement, samples=0, suspect="", extremes=None)
         age = slot.now - measurement.time
@@ -239,11 +246,12 @@ class ControlLoop:
         started = self._now()
         try:
             if self._fresh:
-                self.controller.activate(observation)
+                contained(self.controller.activate, observation)
                 self._fresh = False
-            applied = self.guard.apply(self.controller.update(observation), self.applied)
+            command = contained(self.controller.update, observation)
+            applied = contained(self.guard.apply, command, self.applied)
         except ControllerFault as error:
-            self._fail(error.code, f"controller {self.controller_name} gave up", error)
+            self._fail(_code(error), f"controller {self.controller_name} gave up", error)
             return self.guard.fade(self.applied)
         except Exception as error:
             self._fail("controller-error", f"controller {self.controller_name} failed", error)
@@ -268,7 +276,7 @@ class ControlLoop:
         except Exception as error:
             self._fail("servo-link", "the servo cannot be driven", error)
             if latched and not lost:  # which the fault or the stop that is latched does not say
-                message = f"it may still have pulses, and cannot be released: {named(error)}"
+                message = f"it may still have pulses, and cannot be released: {text.named(error)}"
                 self.reporter.event("servo", message, "error")
 
     def _publish(
@@ -312,3 +320,19 @@ class ControlLoop:
         """The supervisor has just latched a fault: put `hold` in command and tell everyone."""
         self._rest()
         self.reporter.fault(self.supervisor)
+
+
+def _code(error: ControllerFault) -> str:
+    """Which fault it is, whatever a subclass has made of it."""
+    code = vars(error).get("code")
+    return code if isinstance(code, str) else "controller-error"
+
+
+def _plain(controller: Controller[Any]) -> dict[str, Any]:
+    """The parameters of a controller as JSON has them; raises what it raises, or an Exception."""
+
+    def plain() -> dict[str, Any]:
+        encoded = msgspec.json.encode(msgspec.structs.asdict(controller.parameters))
+        return msgspec.json.decode(encoded, type=dict[str, Any])
+
+    return contained(plain)

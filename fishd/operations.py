@@ -1,17 +1,20 @@
 """What can be asked of a running daemon: each operation of the control protocol, over one loop."""
 
-import asyncio
+import logging
 import os
 from collections.abc import Awaitable, Callable
-from typing import Any, ParamSpec, TypeVar
+from functools import partial
+from typing import Any
 
-import msgspec
 from msgspec import Struct
 
-from fishd import __version__, protocol
+from fishd import __version__, protocol, text
+from fishd.asides import Asides
 from fishd.clock import Clock
 from fishd.config import Config
+from fishd.contained import contained
 from fishd.controllers import registry
+from fishd.controllers.base import Controller
 from fishd.errors import ParameterError, Refused, UnknownController
 from fishd.loop import ControlLoop
 from fishd.policies import library
@@ -22,11 +25,7 @@ from fishd.signals import ControllerInfo, Status
 from fishd.supervisor import Mode
 from fishd.workbench import Workbench
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-MOST_LOADING = 4
-"""Requests that may be reading files at once, each in a thread of its own."""
+log = logging.getLogger(__name__)
 
 
 class Operations:
@@ -42,6 +41,7 @@ class Operations:
         telemetry: str,
         realtime: bool,
         counters: Callable[[], dict[str, int]] = dict,
+        loading: float = protocol.LOADING,
     ) -> None:
         """
         config: what fishd was started with
@@ -49,6 +49,7 @@ class Operations:
         telemetry: the address that clients are told
         realtime: is SCHED_FIFO in force?
         counters: what was survived outside of the robot, since start
+        loading: how long a controller may take to load [s]
         """
         self._loop = loop
         self._clock = clock
@@ -59,7 +60,7 @@ class Operations:
         self._config = config
         self._started = clock.monotonic()
         self._decisions = 0
-        self._loading = 0
+        self._asides = Asides(loading)
         self._controllers = controllers
         self._operations: dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]] = {
             "status": (protocol.NoArguments, self._status),
@@ -78,12 +79,13 @@ class Operations:
     async def perform(self, op: str, args: dict[str, Any]) -> Any:
         """Do what a request asks for and return its result; raises `Refused`."""
         if op not in self._operations:
-            raise Refused("unknown-op", f"no such op '{op}'; {nearest(op, list(self._operations))}")
+            hint = nearest(op, list(self._operations))
+            raise Refused("unknown-op", f"no such op '{text.quoted(op)}'; {hint}")
         expected, operation = self._operations[op]
         try:
             arguments: Any = convert(args, expected)
         except Problem as problem:
-            path = ".".join(problem.path)
+            path = text.quoted(".".join(problem.path))
             raise Refused("bad-arguments", f"{op}: {path}: {problem}") from None
         return await operation(arguments)
 
@@ -99,7 +101,7 @@ class Operations:
             mode=loop.supervisor.mode.value,
             reason=loop.supervisor.reason,
             controller=loop.controller_name,
-            parameters=msgspec.structs.asdict(loop.controller.parameters),
+            parameters=loop.parameters,
             servo_on=loop.servo_on,
             thrust=observation.thrust if observation else 0.0,
             frequency=observation.frequency if observation else 0.0,
@@ -128,9 +130,10 @@ class Operations:
         return self._controllers
 
     async def _list_policies(self, _: protocol.NoArguments) -> list[PolicyInfo]:
-        self._check_busy()
+        self._asides.check_busy()
         limits = self._loop.limits
-        return await self._aside(library.describe_all, limits.tick, limits.amplitude)
+        describe = partial(library.describe_all, limits.tick, limits.amplitude)
+        return await self._asides.call("the policy files have not been read", describe)
 
     async def _tell_config(self, _: protocol.NoArguments) -> Config:
         return self._config
@@ -138,31 +141,28 @@ class Operations:
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
         self._workbench.check_startable(wanted.name)
-        self._check_busy()
+        self._asides.check_busy()
         decision = self._decide()
-        try:
-            controller = await self._aside(
-                registry.create, wanted.name, wanted.parameters, self._loop.limits
-            )
-        except UnknownController as error:
-            raise Refused("unknown-controller", str(error)) from None
-        except ParameterError as error:
-            raise Refused("bad-parameter", str(error)) from None
-        except Exception as error:
-            what = f"controller '{wanted.name}' cannot start: {type(error).__name__}: {error}"
-            raise Refused("controller-error", what) from error
+        controller = await self._load(wanted)
         if decision != self._decisions:
-            controller.close()
+            self._dispose(controller)
             raise Refused(
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
         try:
             self._workbench.check_startable(wanted.name)
             self._loop.set_controller(wanted.name, controller)
-        except Refused:  # a fault since, or a calibration
-            controller.close()
-            raise
+        except Exception as error:  # a fault since, a calibration, or parameters that it has lost
+            self._dispose(controller)
+            raise _refusal(wanted.name, "cannot start", error) from error
         return self._state()
+
+    async def _load(self, wanted: protocol.SetController) -> Controller[Any]:
+        create = partial(registry.create, wanted.name, wanted.parameters, self._loop.limits)
+        try:
+            return await self._asides.call(f"'{wanted.name}' has not loaded", create, late=_close)
+        except Exception as error:
+            raise _refusal(wanted.name, "cannot start", error) from error
 
     async def _set_parameter(self, wanted: protocol.SetParameter) -> State:
         loop = self._loop
@@ -173,17 +173,18 @@ class Operations:
                 f"no controller is running (mode {loop.supervisor.mode}); "
                 "start one with 'fishctl set-controller'",
             )
-        for field in fields_of(type(loop.controller.parameters)):
-            if field.file and field.name in wanted.parameters:  # no tick waits for a file
-                raise Refused("bad-parameter", _why_not_in_flight(loop.controller_name, field.name))
         try:
-            loop.retune(registry.merged(loop.controller, loop.controller_name, wanted.parameters))
-        except ParameterError as error:
-            raise Refused("bad-parameter", str(error)) from None
+            loop.retune(contained(self._retuned, wanted.parameters))
         except Exception as error:
-            what = f"controller '{loop.controller_name}' refused: {type(error).__name__}: {error}"
-            raise Refused("controller-error", what) from error
+            raise _refusal(loop.controller_name, "refused", error) from error
         return self._state()
+
+    def _retuned(self, values: dict[str, Any]) -> Struct:
+        loop = self._loop
+        for field in fields_of(type(loop.controller.parameters)):
+            if field.file and field.name in values:  # no tick waits for a file
+                raise ParameterError(_why_not_in_flight(loop.controller_name, field.name))
+        return registry.merged(loop.controller, loop.controller_name, values)
 
     async def _stop(self, _: protocol.NoArguments) -> State:
         self._decide()
@@ -204,17 +205,9 @@ class Operations:
         self._loop.reporter.event("mark", wanted.text)
         return self._state()
 
-    def _check_busy(self) -> None:
-        if self._loading >= MOST_LOADING:
-            raise Refused("busy", f"{self._loading} requests are reading files; try again")
-
-    async def _aside(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call in a thread what may load files and warm up: the tick must not wait for it."""
-        self._loading += 1
-        try:
-            return await asyncio.to_thread(function, *args, **kwargs)
-        finally:
-            self._loading -= 1
+    def _dispose(self, controller: Controller[Any]) -> None:
+        """Close a controller that was never in command, which may take its time."""
+        self._asides.dispose(partial(_close, controller))
 
     def _decide(self) -> int:
         """Count a decision on who is in command; one that loads slowly must not undo a newer."""
@@ -228,8 +221,26 @@ class Operations:
             mode=loop.supervisor.mode.value,
             reason=loop.supervisor.reason,
             controller=loop.controller_name,
-            parameters=msgspec.structs.asdict(loop.controller.parameters),
+            parameters=loop.parameters,
         )
+
+
+def _close(controller: Controller[Any]) -> None:
+    try:
+        contained(controller.close)
+    except Exception as error:
+        log.error("a controller that was not wanted any more could not be closed", exc_info=error)
+
+
+def _refusal(name: str, what: str, error: Exception) -> Refused:
+    """What a client is told when a controller cannot be had."""
+    if isinstance(error, Refused):
+        return error
+    if isinstance(error, UnknownController):
+        return Refused("unknown-controller", text.said(error))
+    if isinstance(error, ParameterError):
+        return Refused("bad-parameter", text.said(error))
+    return Refused("controller-error", f"controller '{name}' {what}: {text.named(error)}")
 
 
 def _why_not_in_flight(controller: str, parameter: str) -> str:

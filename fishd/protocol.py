@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from fishd import text
 from fishd.errors import Refused
 from fishd.hardware.calibration import ForceCalibration, ServoCalibration
 from fishd.signals import Reason
@@ -20,6 +21,9 @@ LOAN = 5.0
 """How long a servo calibration that is not saved stays in force without being renewed [s]."""
 FRESH = 10.0
 """How long after it was taken a force sample is good for a tare [s]."""
+
+LOADING = 10.0
+"""How long a controller may take to load, and a file to be written [s]."""
 
 RequestId = int | Annotated[str, Meta(max_length=256)] | None
 
@@ -190,4 +194,5 @@ def success(identity: RequestId, result: Any) -> bytes:
 
 def failure(identity: RequestId, error: Refused) -> bytes:
     """A reply with an error."""
-    return encode(Reply(VERSION, identity, ok=False, error=Failure(error.code, str(error))))
+    why = Failure(text.quoted(error.code), text.said(error))
+    return encode(Reply(VERSION, identity, ok=False, error=why))

@@ -1,10 +1,12 @@
 """What the loop tells the world: the record of each tick, events, reasons of overruns."""
 
 import logging
+from collections.abc import Mapping
 from typing import Any, Protocol
 
-from msgspec import UNSET, Struct, structs
+from msgspec import UNSET
 
+from fishd import text
 from fishd.clock import Clock, Slot
 from fishd.errors import FishdError
 from fishd.signals import Event, Measurement, Observation, Tick, Truth
@@ -34,18 +36,18 @@ class Reporter:
 
     def event(self, kind: str, message: str, level: str = "info", **data: Any) -> None:
         """Publish and log an event; never raises, since bad news must not make things worse."""
+        message = text.line(message)
         log.log(logging.getLevelNamesMapping()[level.upper()], "%s: %s", kind, message)
         try:
             self._publisher.event(Event(self._clock.wall(), level, kind, message, data))
         except Exception:
             log.exception("the event could not be published")
 
-    def controller(self, name: str, parameters: Struct, kind: str, does: str) -> None:
+    def controller(self, name: str, parameters: Mapping[str, Any], kind: str, does: str) -> None:
         """Tell who is in command with which parameters; does: such as `takes over with`."""
-        values = structs.asdict(parameters)
-        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in values.items())
+        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in parameters.items())
         message = f"{name} {does} {spelled or 'no parameters'}"
-        self.event(kind, message, controller=name, parameters=values)
+        self.event(kind, message, controller=name, parameters=parameters)
 
     def mode(self, before: Mode, supervisor: Supervisor, level: str = "info") -> None:
         """Tell which mode follows on `before`, if it is another."""
@@ -58,7 +60,7 @@ class Reporter:
 
     def problem(self, what: str, error: Exception) -> str:
         """Log that something failed, with its error, once; gives the two in one line."""
-        line = f"{what}: {named(error)}"
+        line = text.line(f"{what}: {text.named(error)}")
         if line != self._latest_problem:
             log.error("%s", line, exc_info=None if isinstance(error, FishdError) else error)
         self._latest_problem = line
@@ -121,13 +123,6 @@ class Reporter:
                 phi=truth.phi if truth else UNSET,
             )
         )
-
-
-def named(error: Exception) -> str:
-    """An error in one line: one of ours is a sentence by itself, others say their type."""
-    if isinstance(error, FishdError):
-        return str(error)
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None:

@@ -6,12 +6,20 @@ description (`fields_of`) that help texts, command-line options and documentatio
 """
 
 import difflib
+import heapq
 import re
+import reprlib
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 import msgspec
 from msgspec import Struct, inspect
+
+from fishd import text
+
+LONGEST_WORD = 100
+"""For a longer one no suggestion is looked for [characters]."""
+_CANDIDATES = 5
 
 T = TypeVar("T")
 
@@ -126,12 +134,25 @@ def nested_too_deeply(data: Any, levels: int = 20) -> bool:
 
 def nearest(word: str, words: list[str]) -> str:
     """A did-you-mean for `word`, or the list of what there is."""
-    close = difflib.get_close_matches(word, words, n=1, cutoff=0.6)
+    close = _close(word, words)
     if not close:  # 'noise' for 'simulation.noise'
         close = [known for known in words if known.rpartition(".")[2] == word]
     if close:
         return f"did you mean '{close[0]}'?"
     return f"valid: {', '.join(words)}" if words else "none is valid here"
+
+
+def _close(word: str, words: list[str]) -> list[str]:
+    """The nearest, if it is near enough; in microseconds, however long the word is."""
+    if len(word) > LONGEST_WORD:
+        return []
+    letters = set(word)
+
+    def distance(known: str) -> int:
+        return len(letters.symmetric_difference(known)) + abs(len(known) - len(word))
+
+    candidates = heapq.nsmallest(_CANDIDATES, words, distance)  # difflib alone takes milliseconds
+    return difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
 
 
 def leaves(struct: type[Struct], prefix: str = "") -> list[str]:
@@ -245,8 +266,15 @@ def _wanted(target: type[Struct], path: tuple[str, ...]) -> str:
 
 
 def _shown(value: Any) -> str:
-    text = spelled(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    if value is None or isinstance(value, bool):
+        return spelled(value)
+    return text.quoted(_glimpse.repr(value))
+
+
+_glimpse = reprlib.Repr()
+"""Spells only as much of a value as is shown."""
+_glimpse.maxstring = _glimpse.maxother = _glimpse.maxlong = text.LONGEST_WORD
+_glimpse.maxlist = _glimpse.maxtuple = _glimpse.maxdict = 10
 
 
 def spelled(value: Any) -> str:

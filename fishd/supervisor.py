@@ -9,6 +9,7 @@ any   ──estop──▶ estop  ──clear──▶ idle
 from collections import deque
 from enum import StrEnum
 
+from fishd import text
 from fishd.errors import Refused
 from fishd.signals import Reason
 
@@ -66,14 +67,14 @@ class Supervisor:
         if self.reason is not None:
             return False
         self.mode = Mode.FAULT
-        self.reason = Reason(code=code, message=message)
+        self.reason = Reason(code=text.quoted(code), message=text.line(message))
         return True
 
     def estop(self, message: str) -> None:
         """Latch an emergency stop; the reason of an earlier one is kept."""
         if self.mode is not Mode.ESTOP:
             self.mode = Mode.ESTOP
-            self.reason = Reason(code="estop", message=message)
+            self.reason = Reason(code="estop", message=text.line(message))
 
     def clear(self) -> None:
         """Forget the latched reason, if there is one, and go to idle."""

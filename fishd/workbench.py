@@ -4,12 +4,14 @@ import asyncio
 import datetime
 import math
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from msgspec import Struct
 
+from fishd.asides import Asides
 from fishd.clock import Clock
 from fishd.config import Config
 from fishd.errors import ConfigError, Refused
@@ -19,6 +21,7 @@ from fishd.hardware.calibration_files import CalibrationFolder, check
 from fishd.loop import ControlLoop
 from fishd.protocol import (
     FRESH,
+    LOADING,
     CalibrateForce,
     CalibrateServo,
     Calibrations,
@@ -30,6 +33,10 @@ from fishd.protocol import (
 from fishd.schema import Problem
 from fishd.servo_bench import ServoBench, resting_bench
 
+MOST_SAMPLES = 4
+"""Samples of the force that may be taken at once: each adds to every read of the sensor."""
+_LOOK = 0.05
+"""Time between two looks at whether a controller has been started meanwhile [s]."""
 _GLANCE = 0.2
 """How long the present force is looked at before another calibration is put in force [s]."""
 
@@ -52,6 +59,8 @@ class Workbench:
         self._samples: dict[int, tuple[float, ForceSample]] = {}
         """When each fresh sample was taken, and what it says, by its number."""
         self._sampled = 0
+        self._sampling = 0
+        self._asides = Asides(LOADING)
         self._force_file = self._file(ForceCalibration)
         self._servo_file = self._file(ServoCalibration)
         self.operations: Operations = {
@@ -84,12 +93,15 @@ class Workbench:
 
     async def _sample_force(self, wanted: SampleForce) -> ForceSample:
         sensor = resting_bench(self._loop).sensor
+        if self._sampling >= MOST_SAMPLES:
+            raise Refused("busy", f"{self._sampling} samples are being taken; try again")
         watch = sensor.watch()
+        self._sampling += 1
         try:
-            await asyncio.sleep(wanted.seconds)
+            await self._rest_for(wanted.seconds)
         finally:
+            self._sampling -= 1
             sample = watch.close()
-        resting_bench(self._loop)  # a controller may have been started meanwhile
         if sample.pairs == 0:
             raise Refused("no-samples", f"the force sensor gave nothing for {wanted.seconds:g} s")
         self._forget_old_samples()
@@ -97,6 +109,14 @@ class Workbench:
         sample = msgspec.structs.replace(sample, number=self._sampled)
         self._samples[sample.number] = (self._clock.monotonic(), sample)
         return sample
+
+    async def _rest_for(self, seconds: float) -> None:
+        """Wait; raises `Refused` as soon as a controller is in command."""
+        now = asyncio.get_running_loop().time
+        until = now() + seconds
+        while (left := until - now()) > 0.0:
+            await asyncio.sleep(min(left, _LOOK))
+            resting_bench(self._loop)
 
     def _forget_old_samples(self) -> None:
         oldest = self._clock.monotonic() - FRESH
@@ -205,7 +225,11 @@ class Workbench:
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:
-            return await asyncio.to_thread(self._folder.save, calibration, self._date())
+            return await self._asides.call(
+                "the calibration has not been written",
+                partial(self._folder.save, calibration, self._date()),
+                late=_withdraw,
+            )
         except ConfigError as error:
             raise Refused("not-saved", str(error)) from None
         except OSError as error:
@@ -222,6 +246,11 @@ class Workbench:
 
     def _announce(self, what: str, path: Path) -> None:
         self._loop.reporter.event("calibration", f"{what}: {path}", file=str(path))
+
+
+def _withdraw(saved: tuple[C, Path]) -> None:
+    """Remove a file that came too late: it must not be in force from the next start on."""
+    saved[1].unlink()
 
 
 def _sensible(calibration: C) -> C:

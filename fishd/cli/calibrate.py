@@ -5,7 +5,7 @@ import click
 from fishd.cli.calibrate_force import force
 from fishd.cli.calibrate_servo import servo
 from fishd.cli.options import endpoint_option, json_option
-from fishd.cli.output import print_json
+from fishd.cli.output import echo, print_json
 from fishd.client import Fish
 
 
@@ -41,6 +41,6 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
         print_json(after)
         return
     now = after.force
-    click.echo(f"before  x0 {before.x0 * 1e3:+9.2f} mN   y0 {before.y0 * 1e3:+9.2f} mN")
-    click.echo(f"after   x0 {now.x0 * 1e3:+9.2f} mN   y0 {now.y0 * 1e3:+9.2f} mN")
-    click.echo(f"in force, and saved in {after.force_file}")
+    echo(f"before  x0 {before.x0 * 1e3:+9.2f} mN   y0 {before.y0 * 1e3:+9.2f} mN")
+    echo(f"after   x0 {now.x0 * 1e3:+9.2f} mN   y0 {now.y0 * 1e3:+9.2f} mN")
+    echo(f"in force, and saved in {after.force_file}")

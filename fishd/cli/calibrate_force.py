@@ -10,6 +10,7 @@ from fishd.cli import load_files
 from fishd.cli.load_dialogue import Dialogue
 from fishd.cli.load_files import NEWTONS
 from fishd.cli.options import endpoint_option
+from fishd.cli.output import echo
 from fishd.client import Fish
 
 if TYPE_CHECKING:
@@ -86,13 +87,13 @@ def force(
                 fitted = _fitted_with_help(dialogue)
             good = yes or click.confirm("Put this calibration in force, and save it?")
         except (click.Abort, KeyboardInterrupt):
-            click.echo("\nnothing was changed", err=True)
+            echo("\nnothing was changed", err=True)
             raise
         if not good:
-            click.echo("nothing was changed", err=True)
+            echo("nothing was changed", err=True)
             return 1
         saved = fish.calibrate_force(fitted.calibration)
-    click.echo(f"in force, and saved in {saved.force_file}")
+    echo(f"in force, and saved in {saved.force_file}")
     return 0
 
 
@@ -117,21 +118,21 @@ def _fitted_with_help(dialogue: Dialogue) -> "Fit":
         try:
             return _fitted(*dialogue.result())
         except PoorLoads as error:
-            click.echo(f"\n{error}", err=True)
+            echo(f"\n{error}", err=True)
 
 
 def _show(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
     wide = max(len("load"), *map(len, names))
-    click.echo(f"\n{'load':<{wide}}   F_x [mN]   F_y [mN]     V_x [V]     V_y [V]   errors [mN]")
+    echo(f"\n{'load':<{wide}}   F_x [mN]   F_y [mN]     V_x [V]     V_y [V]   errors [mN]")
     for name, load, (ex, ey) in zip(names, loads, fitted.errors, strict=True):
-        click.echo(
+        echo(
             f"{name:<{wide}} {load.fx * 1e3:10.2f} {load.fy * 1e3:10.2f} {load.vx:11.5f} "
             f"{load.vy:11.5f} {ex * 1e3:+8.2f} {ey * 1e3:+8.2f}"
         )
     found = fitted.calibration
-    click.echo(f"\nF_x = {found.xx:+.5g} V_x {found.xy:+.5g} V_y {found.x0:+.5g}   [N, V]")
-    click.echo(f"F_y = {found.yx:+.5g} V_x {found.yy:+.5g} V_y {found.y0:+.5g}")
-    click.echo(
+    echo(f"\nF_x = {found.xx:+.5g} V_x {found.xy:+.5g} V_y {found.x0:+.5g}   [N, V]")
+    echo(f"F_y = {found.yx:+.5g} V_x {found.yy:+.5g} V_y {found.y0:+.5g}")
+    echo(
         f"residual {found.residual * 1e3:.3f} mN rms over {found.loads} loads, "
         f"condition number {found.condition:.3g}"
     )
@@ -143,7 +144,7 @@ def _warn(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
     largest = max(math.hypot(load.fx, load.fy) for load in loads)
     residual = fitted.calibration.residual
     if residual > _POOR_FIT * largest:
-        click.echo(
+        echo(
             f"warning: the residual is {residual / largest:.0%} of the largest load; look at "
             f"{worst(fitted, names)} first",
             err=True,

@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from fishd.cli.options import endpoint_option
+from fishd.cli.output import echo
 from fishd.cli.servo_loan import end, renewed
 from fishd.cli.servo_steps import Tail, orders
 from fishd.client import Fish
@@ -43,9 +44,7 @@ def servo(endpoint: str | None) -> int:
         tail.borrow()
         with _ended_unless_saved(endpoint, tail.loan, before):
             with renewed(endpoint, tail.loan):
-                click.echo(
-                    "Keep hands and cables clear of the tail. Ctrl-C stops it at any prompt."
-                )
+                echo("Keep hands and cables clear of the tail. Ctrl-C stops it at any prompt.")
                 _find_trim(tail)
                 _find_direction(tail)
                 _find_limit(tail, +1)
@@ -54,12 +53,12 @@ def servo(endpoint: str | None) -> int:
                 if not click.confirm("Save it?"):
                     raise click.ClickException("not saved")
             saved = fish.calibrate_servo(tail.calibration, save=True, loan=tail.loan)
-    click.echo(f"in force, and saved in {saved.servo_file}")
+    echo(f"in force, and saved in {saved.servo_file}")
     return 0
 
 
 def _find_trim(tail: Tail) -> None:
-    click.echo(
+    echo(
         f"\nTrim: + and - turn the tail by {TRIM_STEP:g} µs, ++ and -- by {5 * TRIM_STEP:g} µs; "
         "ok when it is straight."
     )
@@ -71,7 +70,7 @@ def _find_trim(tail: Tail) -> None:
 
 
 def _find_direction(tail: Tail) -> None:
-    click.echo(f"\nDirection: the tail moves by {TEST_ANGLE:g} rad, slowly, and stays there.")
+    echo(f"\nDirection: the tail moves by {TEST_ANGLE:g} rad, slowly, and stays there.")
     while True:
         tail.go(TEST_ANGLE)
         answer = click.prompt(
@@ -88,14 +87,14 @@ def _find_direction(tail: Tail) -> None:
             tail.adjust(
                 direction=-was.direction, lowest=0.0 - was.highest, highest=0.0 - was.lowest
             )
-            click.echo("The direction is turned round; once more, to be sure.")
+            echo("The direction is turned round; once more, to be sure.")
 
 
 def _find_limit(tail: Tail, side: int) -> None:
     """Find the limit to the fish's left (1) or right (-1)."""
     key, where = ("highest", "left") if side > 0 else ("lowest", "right")
     was = getattr(tail.calibration, key)
-    click.echo(
+    echo(
         f"\nLimit to the fish's {where}: + goes {LIMIT_STEP:g} rad further and - back, ++ and -- "
         f"{5 * LIMIT_STEP:g} rad; ok where it may go no further, keep for {was:+g} rad as it was."
     )
@@ -106,27 +105,27 @@ def _find_limit(tail: Tail, side: int) -> None:
         if isinstance(order, int):
             wanted = max(0.0, side * tail.angle + LIMIT_STEP * order)
             if not tail.go(side * wanted):
-                click.echo("  no further: the pulses of a servo end here")
+                echo("  no further: the pulses of a servo end here")
             elif wanted > tail.amplitude:
-                click.echo("  no further: this is amplitude_limit")
+                echo("  no further: this is amplitude_limit")
         elif order == "ok" and tail.angle == 0.0:
-            click.echo("  the tail could not go this way at all; go to its limit first, or keep")
+            echo("  the tail could not go this way at all; go to its limit first, or keep")
         elif order == "ok" and side * tail.angle >= tail.amplitude and side * was > tail.amplitude:
             # No stop was found, so a limit that lies beyond is not to be lost.
-            click.echo(f"  free as far as amplitude_limit; {key} stays at {was:+g} rad")
+            echo(f"  free as far as amplitude_limit; {key} stays at {was:+g} rad")
             break
         else:
             limit = round(tail.angle, 4) if order == "ok" else was
             break
     if end < tail.amplitude and abs(limit) > end:
         limit = side * math.floor(end * 1e4) / 1e4
-        click.echo(f"  {key} is {limit:+g} rad now, where the pulses of a servo end")
+        echo(f"  {key} is {limit:+g} rad now, where the pulses of a servo end")
     tail.neutral()
     tail.adjust(**{key: limit})
 
 
 def _show(before: ServoCalibration, now: ServoCalibration) -> None:
-    click.echo(f"\n{'':<16}{'before':>10}{'now':>10}")
+    echo(f"\n{'':<16}{'before':>10}{'now':>10}")
     for name, unit in (
         ("trim", "µs"),
         ("direction", ""),
@@ -134,7 +133,7 @@ def _show(before: ServoCalibration, now: ServoCalibration) -> None:
         ("lowest", "rad"),
         ("highest", "rad"),
     ):
-        click.echo(
+        echo(
             f"{name + ' [' + unit + ']' if unit else name:<16}"
             f"{getattr(before, name):>+10g}{getattr(now, name):>+10g}"
         )
@@ -159,7 +158,7 @@ def _ended_unless_saved(
             signal.signal(number, signal.SIG_IGN)
         outcome = end(endpoint, loan, before)
         with contextlib.suppress(OSError):  # of the lost terminal
-            click.echo(f"\n{outcome}", err=True)
+            echo(f"\n{outcome}", err=True)
         raise
     finally:
         for number, handler in handlers.items():

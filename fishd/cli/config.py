@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from fishd.cli.options import endpoint_option, json_option
-from fishd.cli.output import print_json
+from fishd.cli.output import echo, print_json
 from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file, to_yaml
 from fishd.console import complain
@@ -44,10 +44,10 @@ def config() -> None:
 def check(file: Path, overrides: tuple[str, ...]) -> None:
     """Check a configuration file; exit status 78 when fishd would refuse it."""
     loaded = load_or_exit(file, overrides)
-    click.echo(f"{file}: good")
+    echo(f"{file}: good")
     left = pulses.cut(loaded.servo, loaded.amplitude_limit)
     if left and loaded.robot != "simulated":
-        click.echo(f"servo.lowest and servo.highest permit {left}, amplitude_limit")
+        echo(f"servo.lowest and servo.highest permit {left}, amplitude_limit")
 
 
 @config.command()
@@ -74,7 +74,7 @@ def show(
     if as_json:
         print_json(shown)
     else:
-        click.echo(to_yaml(shown), nl=False)
+        echo(to_yaml(shown), nl=False)
 
 
 @config.command()
@@ -102,5 +102,5 @@ def load_service(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config,
     if file is None:
         file = service_file()
         if file is not None:
-            click.echo(f"fishctl: using {file}; --config names another file", err=True)
+            echo(f"fishctl: using {file}; --config names another file", err=True)
     return load_or_exit(file, overrides), file

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from fishd import text
 from fishd.addresses import ENDPOINT_VARIABLE
 from fishd.cli.options import (
     ControllerGroup,
@@ -14,7 +15,7 @@ from fishd.cli.options import (
     endpoint_option,
     json_option,
 )
-from fishd.cli.output import print_json, spelled
+from fishd.cli.output import echo, made_printable, print_json, spelled
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.errors import NoDaemon
@@ -36,7 +37,7 @@ def status(endpoint: str | None, as_json: bool) -> None:
     if as_json:
         print_json(found)
     else:
-        click.echo(_status_text(found))
+        echo(_status_text(found))
 
 
 @click.command()
@@ -49,15 +50,15 @@ def controllers(endpoint: str | None, as_json: bool) -> None:
     except NoDaemon:
         if endpoint or os.environ.get(ENDPOINT_VARIABLE):
             raise
-        click.echo("fishctl: no fishd is running; these controllers are installed here", err=True)
+        echo("fishctl: no fishd is running; these controllers are installed here", err=True)
         known = registry.describe_all()
     if as_json:
         print_json(known)
         return
-    for info in known:
+    for info in map(made_printable, known):
         click.echo(f"{click.style(info.name, bold=True)}  {info.summary}")
         for field in info.parameters:
-            click.echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
+            echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
 
 
 @click.group(cls=ControllerGroup, options=daemon_options, remote=True)
@@ -123,16 +124,16 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("text")
+@click.argument("words", metavar="TEXT")
 @daemon_options
-def mark(text: str, endpoint: str | None, as_json: bool) -> None:
+def mark(words: str, endpoint: str | None, as_json: bool) -> None:
     """Put a mark in the event stream, such as what you just changed on the rig."""
     with Fish(endpoint) as fish:
-        state = fish.mark(text)
+        state = fish.mark(words)
     if as_json:
         print_json(state)
     else:
-        click.echo(f"marked before tick {state.seq}: {text}")
+        echo(f"marked before tick {state.seq}: {words}")
 
 
 def _print_state(state: State, as_json: bool) -> None:
@@ -140,7 +141,7 @@ def _print_state(state: State, as_json: bool) -> None:
         print_json(state)
         return
     why = f" ({_why(state.reason)})" if state.reason else ""
-    click.echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
+    echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
 
 
 def _status_text(status: Status) -> str:
@@ -167,7 +168,7 @@ def _status_text(status: Status) -> str:
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]
-    return "\n".join(f"{name:<12}{text}" for name, text in rows)
+    return "\n".join(f"{name:<12}{text.line(value)}" for name, value in rows)
 
 
 def _servo(status: Status) -> str:
@@ -188,7 +189,8 @@ def _range(status: Status) -> str:
 
 
 def _why(reason: Reason) -> str:
-    return reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
+    message = reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
+    return text.line(message)
 
 
 def _percentiles(times: Percentiles) -> str:

@@ -6,11 +6,12 @@ from pathlib import Path
 import click
 from msgspec import Struct
 
+from fishd import text
 from fishd.cli.checks import examine
 from fishd.cli.checks.base import Context
 from fishd.cli.config import load_service, service_option, set_option
 from fishd.cli.options import endpoint_option, json_option
-from fishd.cli.output import counted, print_json
+from fishd.cli.output import counted, echo, print_json
 
 _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "bright_black"}
 
@@ -44,7 +45,7 @@ def doctor(
     context = Context(config, found, endpoint or config.control.address)
     findings = []
     for name, (level, message, mend) in examine(context):
-        finding = Finding(name, level, " ".join(message.split()), mend)
+        finding = Finding(name, level, text.line(message), mend)
         findings.append(finding)
         if not as_json:
             _print(finding)
@@ -52,12 +53,12 @@ def doctor(
     if as_json:
         print_json(findings)
     else:
-        click.echo(
+        echo(
             f"robot {config.robot}: {counts['ok']} ok, {counted(counts['warning'], 'warning')}, "
             f"{counts['FAIL']} failed, {counts['skipped']} skipped"
         )
         if config.robot == "simulated":
-            click.echo("a simulated fish needs no hardware, so none was checked")
+            echo("a simulated fish needs no hardware, so none was checked")
     return 1 if counts["FAIL"] else 0
 
 
@@ -65,4 +66,4 @@ def _print(finding: Finding) -> None:
     level = click.style(f"{finding.level:<8}", fg=_COLOURS[finding.level])
     click.echo(f"{level} {finding.check:<14} {finding.message}")
     if finding.mend:
-        click.echo(f"{'':<24}{finding.mend}")
+        echo(f"{'':<24}{finding.mend}")

@@ -10,6 +10,7 @@ import click
 
 from fishd.cli import load_files
 from fishd.cli.load_files import NEWTONS
+from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.errors import Refused
 from fishd.hardware.calibration import ForceSample
@@ -57,16 +58,16 @@ class Dialogue:
 
     def run(self, plan: list[tuple[float, float]]) -> None:
         """Measure a plan [N], or the usual one."""
-        click.echo(f"The loads, each measured for {self._seconds:g} s:")
+        echo(f"The loads, each measured for {self._seconds:g} s:")
         if plan:
             names = [self._spelled(load) for load in plan]
             for n, name in enumerate(names, 1):
-                click.echo(f"  {n}  {name}")
+                echo(f"  {n}  {name}")
             for name, load in zip(names, plan, strict=True):
                 self._add(name, "hang it", partial(_given, load))
         else:
             for n, (name, _, _, what) in enumerate(PLAN, 1):
-                click.echo(f"  {n}  {name:<5} {what}")
+                echo(f"  {n}  {name:<5} {what}")
             for name, x, y, what in PLAN:
                 self._add(name, what, partial(self._ask_size, x, y))
 
@@ -90,7 +91,7 @@ class Dialogue:
                     self._add(self._spelled(extra), "hang it", partial(_given, extra))
             else:
                 names = ", ".join(places)
-                click.echo(f"  two numbers, such as 10 -5, or one of {names} is needed", err=True)
+                echo(f"  two numbers, such as 10 -5, or one of {names} is needed", err=True)
 
     def result(self) -> tuple[list[str], list[tuple[float, ...]]]:
         """Names of the loads, and (F_x, F_y, V_x, V_y) of each."""
@@ -104,19 +105,19 @@ class Dialogue:
 
     def _measure(self, name: str, what: str, ask: Callable[[], tuple[float, float]]) -> _Measured:
         while True:
-            click.echo(f"\n{name}: {what}, and let it come to rest")
+            echo(f"\n{name}: {what}, and let it come to rest")
             load = ask()
             _choice("  Enter when it is still")
             try:
                 sample = self._fish.sample_force(self._seconds)
             except Refused as refusal:  # what was measured so far must not be lost
-                click.echo(f"  not measured: {refusal}", err=True)
+                echo(f"  not measured: {refusal}", err=True)
                 continue
-            click.echo(f"  {_spelled_sample(sample)}")
+            echo(f"  {_spelled_sample(sample)}")
             if sample.suspect:
-                click.echo(f"  warning: not to be believed: {sample.suspect}", err=True)
+                echo(f"  warning: not to be believed: {sample.suspect}", err=True)
             if _restless(sample, [other.sample for other in self._measured]):
-                click.echo("  warning: it was not still, compared with other loads", err=True)
+                echo("  warning: it was not still, compared with other loads", err=True)
             if _choice("  Enter to go on, r to measure it again", "r") != "r":
                 return _Measured(name, what, ask, load, sample)
 
@@ -137,7 +138,7 @@ class Dialogue:
         """Is it a load [N] that the sensor will believe? If not, that is said."""
         if why := load_files.beyond(fx, fy, self._limit):
             hint = "; did you mean --unit g?" if self._unit == "N" else ""
-            click.echo(f"  {why}{hint}", err=True)
+            echo(f"  {why}{hint}", err=True)
         return not why
 
     def _parsed(self, answer: str) -> tuple[float, float] | None:
@@ -158,7 +159,7 @@ class Dialogue:
         for name, *_, sample in self._measured:
             if sample.suspect or _restless(sample, samples):
                 why = sample.suspect or "it was not still, compared with other loads"
-                click.echo(f"warning: {name}: {why}", err=True)
+                echo(f"warning: {name}: {why}", err=True)
 
 
 def _restless(sample: ForceSample, others: list[ForceSample]) -> bool:
@@ -187,7 +188,7 @@ def _choice(prompt: str, *letters: str) -> str:
     """Ask until the answer is one of these letters, or empty for Enter alone."""
     while (answer := _asked(prompt).lower()) and answer not in letters:
         possible = " or ".join(("Enter", *letters))
-        click.echo(f"  only {possible} is possible here; Ctrl-C ends it all", err=True)
+        echo(f"  only {possible} is possible here; Ctrl-C ends it all", err=True)
     return answer
 
 
@@ -197,7 +198,7 @@ def _number(text: str, default: float | None) -> float:
         size: float = click.prompt(text, type=float, default=default)
         if math.isfinite(size) and size > 0.0:
             return size
-        click.echo("  a positive number is needed; the direction is given", err=True)
+        echo("  a positive number is needed; the direction is given", err=True)
 
 
 def _given(load: tuple[float, float]) -> tuple[float, float]:

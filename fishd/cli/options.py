@@ -8,6 +8,7 @@ from typing import Any, TypeVar, cast
 import click
 from click.shell_completion import CompletionItem
 
+from fishd.cli.output import made_printable
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.errors import FishError, UnknownController
@@ -163,7 +164,7 @@ class ControllerGroup(click.Group):
     ) -> ControllerInfo:
         try:
             with Fish(ctx.params.get("endpoint") or ctx.find_root().obj) as fish:
-                known = {info.name: info for info in fish.controllers()}
+                known = {info.name: info for info in map(made_printable, fish.controllers())}
         except FishError:
             raise unknown from None
         if name not in known:

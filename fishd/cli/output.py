@@ -1,21 +1,67 @@
-"""How verbs print values."""
+"""How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
 
-from typing import Any
+import re
+from typing import Any, TypeVar
 
 import click
 import msgspec
 
+from fishd import text
+
+T = TypeVar("T")
+
+_MOST = 1_000_000
+"""Longer output than any verb's [characters]."""
+
+
+def echo(message: Any = "", *, err: bool = False, nl: bool = True) -> None:
+    """Print lines without any control character in them, on standard error where wanted."""
+    click.echo(text.block(str(message), _MOST), err=err, nl=nl)
+
 
 def print_json(value: Any) -> None:
     """Print any struct, or list of them, as one indented JSON document."""
-    click.echo(msgspec.json.format(msgspec.json.encode(value), indent=2))
+    click.echo(_escaped(msgspec.json.format(msgspec.json.encode(value), indent=2)))
+
+
+def print_json_line(value: Any) -> None:
+    """Print any struct as one line of JSON."""
+    click.echo(_escaped(msgspec.json.encode(value)))
+
+
+def made_printable(value: T) -> T:
+    """A struct, or a list of them, with all its texts in one printable line each."""
+    return msgspec.convert(_printable(msgspec.to_builtins(value)), type(value))
 
 
 def spelled(parameters: dict[str, Any]) -> str:
     """Parameters as `C=0.6 amplitude=default`."""
-    return " ".join(f"{k}={'default' if v is None else v}" for k, v in parameters.items())
+    words = (f"{k}={'default' if v is None else v}" for k, v in parameters.items())
+    return text.line(" ".join(words))
 
 
 def counted(number: int, noun: str) -> str:
     """A number of things: `1 warning`, `2 warnings`."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, str):
+        return text.line(value)
+    if isinstance(value, list):
+        return [_printable(part) for part in value]
+    if isinstance(value, dict):
+        return {_printable(key): _printable(part) for key, part in value.items()}
+    return value
+
+
+def _escaped(document: bytes) -> str:
+    """JSON in which what is not printable is escaped; that can only be within its texts."""
+
+    def escape(found: re.Match[str]) -> str:
+        if found[0].isprintable():
+            return found[0]
+        units = found[0].encode("utf-16-be").hex()
+        return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4))
+
+    return re.sub(r"[^\x20-\x7e\n]", escape, document.decode())

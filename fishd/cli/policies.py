@@ -6,9 +6,10 @@ from typing import Any
 
 import click
 
+from fishd import text
 from fishd.addresses import ENDPOINT_VARIABLE
 from fishd.cli.control import daemon_options
-from fishd.cli.output import print_json
+from fishd.cli.output import echo, print_json
 from fishd.client import Fish
 from fishd.errors import NoDaemon, PolicyError
 from fishd.policies import library
@@ -35,9 +36,9 @@ def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
     if as_json:
         print_json(known)
     elif known:
-        click.echo(_table(known))
+        echo(_table(known))
     else:
-        click.echo(f"none; put {library.SUFFIX} files into {library.folders()[0]}", err=True)
+        echo(f"none; put {library.SUFFIX} files into {library.folders()[0]}", err=True)
 
 
 @policies.command()
@@ -58,7 +59,7 @@ def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -
     if as_json or (ctx.parent and ctx.parent.params["as_json"]):
         print_json(found)
     else:
-        click.echo(_as_text(found), nl=False)
+        echo(_as_text(found), nl=False)
 
 
 def _known(endpoint: str | None) -> list[PolicyInfo]:
@@ -69,7 +70,7 @@ def _known(endpoint: str | None) -> list[PolicyInfo]:
     except NoDaemon:
         if endpoint or os.environ.get(ENDPOINT_VARIABLE):
             raise
-        click.echo("fishctl: no fishd is running; these policies are found from here", err=True)
+        echo("fishctl: no fishd is running; these policies are found from here", err=True)
         return library.describe_all()
 
 
@@ -81,14 +82,14 @@ def _table(known: list[PolicyInfo]) -> str:
         cells = (f"{cell:<{width}}" for cell, width in zip(row, (*widths, 0), strict=True))
         lines.append("  ".join(cells).rstrip())
         if info and info.problem:
-            lines.append(f"    not here: {_printable(info.problem)}")
+            lines.append(f"    not here: {text.line(info.problem)}")
     return "\n".join(lines)
 
 
 def _row(info: PolicyInfo) -> tuple[str, ...]:
-    folder = str(Path(info.file).parent)
+    folder = text.line(str(Path(info.file).parent))
     if info.card is None:
-        return (info.name, *["–"] * (len(HEAD) - 2), folder)
+        return (text.line(info.name, WIDEST), *["–"] * (len(HEAD) - 2), folder)
     card: dict[str, Any] = info.card
     past = card["provenance"]
     efficiency = past["efficiency"]
@@ -102,7 +103,7 @@ def _row(info: PolicyInfo) -> tuple[str, ...]:
         past["created"][:10],
         folder,
     )
-    return (*(_short(_printable(cell)) for cell in cells[:-1]), _printable(folder))
+    return (*(text.line(cell, WIDEST) for cell in cells[:-1]), folder)
 
 
 def _as_text(info: PolicyInfo) -> str:
@@ -117,11 +118,3 @@ def _as_text(info: PolicyInfo) -> str:
         allow_unicode=True,
         default_flow_style=False,
     )
-
-
-def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
-def _short(cell: str) -> str:
-    return cell if len(cell) <= WIDEST else cell[: WIDEST - 1] + "…"

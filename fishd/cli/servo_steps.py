@@ -8,6 +8,7 @@ from typing import Any
 import click
 from msgspec.structs import replace
 
+from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.errors import Refused
 from fishd.hardware.calibration import ServoCalibration
@@ -66,7 +67,7 @@ class Tail:
         except Refused as refusal:
             if refusal.code != "bad-arguments":
                 raise
-            click.echo(f"  no: {refusal}")
+            echo(f"  no: {refusal}")
         else:
             self.calibration = changed
 
@@ -113,4 +114,4 @@ def orders(state: Callable[[], str], *others: str) -> Iterator[int | str]:
         if answer in words:
             yield _STEPS.get(answer, answer)
         else:
-            click.echo(f"  one of {' '.join(words)} is needed; Ctrl-C leaves all as it was")
+            echo(f"  one of {' '.join(words)} is needed; Ctrl-C leaves all as it was")

@@ -7,7 +7,7 @@ import click
 
 from fishd.cli.config import load_or_exit, set_option
 from fishd.cli.options import ControllerGroup, json_option
-from fishd.cli.output import print_json, spelled
+from fishd.cli.output import echo, print_json, spelled
 
 if TYPE_CHECKING:
     from fishd.simulation import Report
@@ -62,11 +62,9 @@ def _simulate(
     if as_json:
         print_json(report)
     else:
-        click.echo(_text(report))
+        echo(_text(report))
     if report.reason:
-        click.echo(
-            f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True
-        )
+        echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
     return 0
 

@@ -18,7 +18,7 @@ from fishd import realtime
 from fishd.addresses import virtual_pi_socket
 from fishd.cli.config import load_or_exit, set_option
 from fishd.cli.options import json_option
-from fishd.cli.output import print_json
+from fishd.cli.output import echo, print_json
 from fishd.config import Config
 from fishd.console import complain
 from fishd.emulation.faults import FAULTS
@@ -81,7 +81,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     if config.panel.estop_gpio is not None:
         pi.set_level(config.panel.estop_gpio, _level(config.panel, pressed=False))
     with _signals() as stopped, LinkServer(pi, path):
-        click.echo(
+        echo(
             f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
             f"pigpiod on 127.0.0.1:{pi.pigpiod.port} with the servo on GPIO {settings.servo_gpio}"
         )
@@ -91,7 +91,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
             realtime.collect_garbage()
             state = pi.state()  # also lets the fish swim on while nobody reads the sensor
             if sys.stdout.isatty():
-                click.echo(_line(state))
+                echo(_line(state))
 
 
 @virtual_pi.command()
@@ -142,7 +142,7 @@ def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None
         ("faults", _active(state) or "none"),
         ("pigpiod", f"127.0.0.1:{state.pigpio_port}"),
     ]
-    click.echo("\n".join(f"{label:<12}{text}" for label, text in rows))
+    echo("\n".join(f"{label:<12}{text}" for label, text in rows))
 
 
 @virtual_pi.command()

@@ -13,10 +13,10 @@ from datetime import datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
-import msgspec
 
+from fishd import text
 from fishd.cli.options import endpoint_option, json_option
-from fishd.cli.output import spelled
+from fishd.cli.output import echo, print_json_line, spelled
 from fishd.client import AsyncFish
 from fishd.console import status_line
 from fishd.signals import Event, Status, Tick
@@ -84,13 +84,13 @@ async def _run(
 
 async def _print_ticks(fish: AsyncFish) -> None:
     async for tick in fish.ticks():
-        click.echo(msgspec.json.encode(tick))
+        print_json_line(tick)
 
 
 async def _print_lines(fish: AsyncFish) -> None:
     while True:
         status = await fish.status()
-        click.echo(f"{_clock(status.t)}  {status_line(status)}")
+        echo(f"{_clock(status.t)}  {status_line(status)}")
         await asyncio.sleep(1.0)
 
 
@@ -153,7 +153,8 @@ class View:
         width, height = options.max_width, options.height or console.height
         header = [self._title()]
         if reason := self.status.reason:
-            header += Text(f"{reason.code}: {reason.message}", "red").wrap(console, width)
+            message = text.line(f"{reason.code}: {reason.message}")
+            header += Text(message, "red").wrap(console, width)
         yield from header
         yield self._figures()
         events = max(0, min(3, (height - 14) // 3))
@@ -172,8 +173,8 @@ class View:
 
         tick = self._ticks[-1]
         return Text.assemble(
-            (f" {tick.mode.upper()} ", f"bold reverse {MODES.get(tick.mode, 'none')}"),
-            (f" {tick.controller} ", "bold"),
+            (f" {text.quoted(tick.mode).upper()} ", f"bold reverse {MODES.get(tick.mode, 'none')}"),
+            (f" {text.quoted(tick.controller)} ", "bold"),
             spelled(self.status.parameters),
             "" if tick.servo_on else ("  no pulses", "dim"),
             ("  servo not reached", "red") if self.status.servo_lost else "",
@@ -227,7 +228,7 @@ class View:
 
         return Text.assemble(
             (f"{_clock(event.t)} ", "dim"),
-            (f"{event.kind}: {event.message}", LEVELS.get(event.level, "none")),
+            (text.line(f"{event.kind}: {event.message}"), LEVELS.get(event.level, "none")),
             no_wrap=True,
             overflow="ellipsis",
         )

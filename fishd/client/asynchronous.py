@@ -12,7 +12,7 @@ import zmq.asyncio
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
 from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.policies.info import PolicyInfo
-from fishd.protocol import Calibrations, State
+from fishd.protocol import LOADING, Calibrations, State
 from fishd.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -60,8 +60,13 @@ class AsyncFish(Connection):
         return await self._call(dict[str, Any], "config")
 
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Put another controller in command; parameters left out take their defaults."""
-        return await self._call(State, "set-controller", name=name, parameters=parameters)
+        """Put another controller in command; parameters left out take their defaults.
+
+        It may take `protocol.LOADING` seconds to load, beyond the time-out.
+        """
+        return await self._call(
+            State, "set-controller", patience=LOADING, name=name, parameters=parameters
+        )
 
     async def set_parameters(self, **parameters: Any) -> State:
         """Change parameters of the running controller, all at once or none."""
@@ -153,7 +158,7 @@ class AsyncFish(Connection):
             result = self.result(frames[-1], identity, kind)
             if result is not None:
                 return result
-        raise self.silent()
+        raise self.silent(patience)
 
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
         address = self.telemetry_address or (await self.status()).telemetry

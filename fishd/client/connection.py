@@ -50,9 +50,9 @@ class Connection:
             "--endpoint or $FISHD_ENDPOINT"
         )
 
-    def silent(self) -> NoDaemon:
-        """What to raise when no answer comes in time."""
-        return self._nobody(f"no answer within {self.timeout:g} s")
+    def silent(self, patience: float = 0.0) -> NoDaemon:
+        """What to raise when no answer comes in time; patience: beyond the time-out [s]."""
+        return self._nobody(f"no answer within {self.timeout + patience:g} s")
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
         """A new id, and the request as JSON; raises `ParameterError` for NaN and infinity."""

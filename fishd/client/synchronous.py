@@ -11,7 +11,7 @@ import zmq
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
 from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.policies.info import PolicyInfo
-from fishd.protocol import Calibrations, State
+from fishd.protocol import LOADING, Calibrations, State
 from fishd.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -67,8 +67,13 @@ class Fish(Connection):
         return self._call(dict[str, Any], "config")
 
     def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Put another controller in command; parameters left out take their defaults."""
-        return self._call(State, "set-controller", name=name, parameters=parameters)
+        """Put another controller in command; parameters left out take their defaults.
+
+        It may take `protocol.LOADING` seconds to load, beyond the time-out.
+        """
+        return self._call(
+            State, "set-controller", patience=LOADING, name=name, parameters=parameters
+        )
 
     def set_parameters(self, **parameters: Any) -> State:
         """Change parameters of the running controller, all at once or none."""
@@ -155,7 +160,7 @@ class Fish(Connection):
             result = self.result(self._socket.recv_multipart()[-1], identity, kind)
             if result is not None:
                 return result
-        raise self.silent()
+        raise self.silent(patience)
 
     def _subscribe(self, topic: bytes, kind: type[T]) -> Iterator[T]:
         address = self.telemetry_address or self.status().telemetry

@@ -2,12 +2,14 @@
 
 import contextlib
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec import Struct
 
+from fishd import text
+from fishd.contained import Attempt, contained
 from fishd.controllers.base import Controller, Limits
 from fishd.errors import ParameterError, UnknownController
 from fishd.schema import Problem, convert, fields_of, nearest
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP = "fishd.controllers"
+LONGEST_IMPORT = 10.0
+"""How long a package may take to import before its controllers are left out [s]."""
 
 
 @cache
@@ -38,13 +42,14 @@ def find(name: str) -> type[Controller[Any]]:
     Raises `UnknownController`, also where the package that offers it does not load.
     """
     if name not in _entries():
-        raise UnknownController(f"no controller is named '{name}'; {nearest(name, names())}")
+        hint = nearest(name, names())
+        raise UnknownController(f"no controller is named '{text.quoted(name)}'; {hint}")
     entry = _entries()[name]
     try:
-        found = entry.load()
-    except (Exception, SystemExit) as error:  # a third-party package may fail in any way
+        found = contained(entry.load)
+    except Exception as error:
         raise UnknownController(
-            f"controller '{name}' ({entry.value}) does not load: {type(error).__name__}: {error}"
+            f"controller '{name}' ({entry.value}) does not load: {text.named(error)}"
         ) from error
     if not (isinstance(found, type) and issubclass(found, Controller)):
         raise UnknownController(
@@ -57,11 +62,11 @@ def find(name: str) -> type[Controller[Any]]:
             f"controller '{name}' ({entry.value}) has no Parameters, a msgspec.Struct"
         )
     try:
-        fields_of(parameters)
+        contained(msgspec.json.encode, fields_of(parameters))
     except Exception as error:
         raise UnknownController(
             f"controller '{name}' ({entry.value}) has Parameters that cannot be read: "
-            f"{type(error).__name__}: {error}"
+            f"{text.named(error)}"
         ) from error
     return found
 
@@ -69,16 +74,18 @@ def find(name: str) -> type[Controller[Any]]:
 def describe(name: str) -> ControllerInfo:
     """Name, summary and parameters of one controller; raises `UnknownController`."""
     found = find(name)
-    summary = (found.__doc__ or "").strip().partition("\n")[0]
+    summary = text.line(str(found.__doc__ or "").strip().partition("\n")[0])
     return ControllerInfo(name=name, summary=summary, parameters=fields_of(found.Parameters))
 
 
 def describe_all() -> list[ControllerInfo]:
-    """All controllers that load; the name of one that does not says why when it is used."""
+    """All controllers that load in time; the name of one that does not says why when it is used."""
     found = []
     for name in names():
-        with contextlib.suppress(UnknownController):
-            found.append(describe(name))
+        attempt = Attempt(partial(describe, name))  # of a package that may never come back
+        if attempt.wait(LONGEST_IMPORT) or not attempt.give_up():
+            with contextlib.suppress(UnknownController):
+                found.append(attempt.result())
     return found
 
 
@@ -89,20 +96,20 @@ def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
     """
     found = find(name)
     try:
-        parameters = convert(dict(values), found.Parameters)
+        parameters = contained(convert, dict(values), found.Parameters)
     except Problem as problem:
-        what = ".".join(problem.path) or "parameters"
+        what = text.quoted(".".join(problem.path)) or "parameters"
         raise ParameterError(f"{name}: {what}: {problem}", problem.path) from None
     try:
-        found.check(parameters, limits)
+        contained(found.check, parameters, limits)
     except ParameterError as error:
-        raise ParameterError(f"{name}: {error}", error.path) from None
+        raise ParameterError(f"{name}: {text.said(error)}", error.path) from None
     return parameters
 
 
 def create(name: str, values: Mapping[str, Any], limits: Limits) -> Controller[Any]:
     """A new controller, ready to be swapped in; raises `UnknownController`, `ParameterError`."""
-    return find(name)(check(name, values, limits), limits)
+    return contained(find(name), check(name, values, limits), limits)
 
 
 def merged(controller: Controller[Any], name: str, values: Mapping[str, Any]) -> Struct:

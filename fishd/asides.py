@@ -1,0 +1,96 @@
+"""Calls that must not hold up the ticks: what loads files, and what may never return."""
+
+import asyncio
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any, TypeVar
+
+from fishd.contained import Attempt
+from fishd.errors import Refused
+
+T = TypeVar("T")
+
+MOST_AT_ONCE = 4
+"""Calls that may be under way, each in a thread of its own."""
+MOST_GIVEN_UP = 8
+"""Threads of calls that were given up and would not end; with more, nothing is begun."""
+
+
+class Asides:
+    """Makes calls in threads of their own, and gives up those that take too long.
+
+    The interpreter does not wait for these threads when it ends, as it does for asyncio's own.
+    """
+
+    def __init__(self, patience: float) -> None:
+        """patience: how long a call may take [s]"""
+        self.patience = patience
+        self._under_way = 0
+        self._given_up: list[Attempt[Any]] = []
+
+    def check_busy(self) -> None:
+        """Raises `Refused` while too many calls are under way, or would not end."""
+        if self._under_way >= MOST_AT_ONCE:
+            raise Refused("busy", f"{self._under_way} requests are reading files; try again")
+        self._given_up = [attempt for attempt in self._given_up if attempt.alive]
+        if len(self._given_up) >= MOST_GIVEN_UP:
+            raise Refused(
+                "busy",
+                f"{len(self._given_up)} controllers that were given up while they loaded still "
+                "run; restart fishd",
+            )
+
+    async def call(
+        self,
+        complaint: str,
+        function: Callable[[], T],
+        late: Callable[[T], Any] = lambda result: None,
+    ) -> T:
+        """What the function returns or raises.
+
+        complaint: what to say of it when it takes too long, such as `'chirp' has not loaded`
+        late: takes the result of a call that returns after it was given up
+        Raises `Refused` (too-slow) for a call that takes too long. It is given up then, and
+        likewise where this coroutine is cancelled.
+        """
+        events = asyncio.get_running_loop()
+        news = asyncio.Event()
+
+        def done() -> None:
+            with suppress(RuntimeError):  # the loop is closed: nobody waits any more
+                events.call_soon_threadsafe(news.set)
+
+        attempt = Attempt(partial(_kept_running, function), done=done, late=late)
+        self._under_way += 1
+        try:
+            async with asyncio.timeout(self.patience):
+                await news.wait()
+        except TimeoutError:
+            pass  # unless it is done just now
+        finally:
+            self._under_way -= 1
+            if attempt.give_up():
+                self._given_up.append(attempt)
+        if not attempt.wait(0.0):
+            raise Refused("too-slow", f"{complaint} within {self.patience:g} s; it is given up")
+        return attempt.result()
+
+    def dispose(self, function: Callable[[], Any]) -> None:
+        """Call what nobody waits for, such as the `close` of a controller that is not wanted."""
+        self._given_up.append(Attempt(function))
+
+
+def _kept_running(function: Callable[[], T]) -> T:
+    """Call it where no ordinary program stops this thread, if none stops the one that ticks.
+
+    That would have to wait for a thread that was stopped while it held the interpreter. On a single
+    core the kernel's limit for real-time threads would hold up both, which is worse.
+    """
+    ticks = os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK
+    if ticks == os.SCHED_FIFO and len(os.sched_getaffinity(0)) > 1:
+        with suppress(OSError):
+            policy, lowest = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1)
+            os.sched_setscheduler(0, policy, lowest)
+    return function()

@@ -1,0 +1,123 @@
+"""The one place where code that is not fishd's is called, such as that of a controller.
+
+It may raise anything, and it may never return.
+"""
+
+import ctypes
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Generic, ParamSpec, TypeVar
+
+from fishd import text
+from fishd.errors import Escaped
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def contained(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a function; whatever it raises is an `Exception`, if need be an `Escaped`.
+
+    Only a true Ctrl-C passes: a KeyboardInterrupt where Python raises it for SIGINT, as it does in
+    `fishctl`, not in the daemon.
+    """
+    try:
+        return function(*args, **kwargs)
+    except (StopIteration, StopAsyncIteration) as error:  # which no coroutine may raise
+        raise Escaped(text.named(error)) from error
+    except Exception:
+        raise
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and _ctrl_c_is_raised():
+            raise
+        raise Escaped(text.named(error)) from error
+
+
+def _ctrl_c_is_raised() -> bool:
+    in_main = threading.current_thread() is threading.main_thread()
+    return in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class GivenUp(BaseException):
+    """Raised in the thread of an `Attempt` that nobody waits for any more."""
+
+
+class Attempt(Generic[T]):
+    """A call in a thread of its own, which can be given up. The process does not wait for it."""
+
+    def __init__(
+        self,
+        function: Callable[[], T],
+        *,
+        done: Callable[[], None] = lambda: None,
+        late: Callable[[T], Any] = lambda result: None,
+    ) -> None:
+        """
+        done: called in that thread as soon as there is a result, unless it was given up
+        late: takes the result of one that was given up and returned after all
+        """
+        self._function = function
+        self._done = done
+        self._late = late
+        self._result: list[T] = []
+        self._error: Exception | None = None
+        self._settling = threading.Lock()
+        self._settled = threading.Event()
+        self._given_up = False
+        self._thread = threading.Thread(target=self._run, name="aside", daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """Does the thread still run?"""
+        return self._thread.is_alive()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for the result; False when it has not come in that time."""
+        return self._settled.wait(seconds)
+
+    def result(self) -> T:
+        """What the function returned; raises what it raised. Only once it is `done`."""
+        if self._error:
+            raise self._error
+        return self._result[0]
+
+    def give_up(self) -> bool:
+        """End a loop in Python, and leave alone what cannot be ended; False if it is done."""
+        with self._settling:
+            if self._settled.is_set():
+                return False
+            if not self._given_up:
+                self._given_up = True
+                self._strike(ctypes.py_object(GivenUp))
+        return True
+
+    def _strike(self, error: Any) -> None:
+        """Raise in the thread, as soon as it is in Python; NULL takes back what has not struck."""
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), error)
+
+    def _run(self) -> None:
+        try:
+            in_time = self._attempt()
+        except GivenUp:
+            in_time = False
+        if in_time:
+            self._done()
+        elif self._result:
+            with suppress(Exception):
+                contained(self._late, self._result[0])
+
+    def _attempt(self) -> bool:
+        """Call the function; True unless it was given up meanwhile."""
+        try:
+            self._result.append(contained(self._function))
+        except Exception as error:
+            self._error = error
+        with self._settling:
+            if self._given_up:
+                self._strike(None)
+            else:
+                self._settled.set()
+            return not self._given_up

@@ -1,0 +1,57 @@
+"""Text from outside, such as that of an exception, made safe for logs, replies and terminals."""
+
+from fishd.errors import Escaped, FishdError
+
+LONGEST = 1000
+"""Longer texts are cut, in the middle [characters]."""
+LONGEST_WORD = 60
+"""Of a word that is quoted in a message [characters]."""
+
+
+def line(text: str, longest: int = LONGEST) -> str:
+    """One printable line that can be encoded: line breaks become spaces, what else is odd `?`."""
+    text = block(text, longest)
+    if "\n" not in text:
+        return text.strip()
+    return " ".join(part.strip() for part in text.splitlines() if part.strip())
+
+
+def block(text: str, longest: int = LONGEST) -> str:
+    """The same, but with its line breaks and indentation."""
+    text = _cut(text, longest)
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" else " " if letter.isspace() else "?"
+        for letter in text
+    )
+
+
+def quoted(word: str) -> str:
+    """A word that somebody gave, as short as a message can bear it."""
+    return line(word, LONGEST_WORD)
+
+
+def said(error: BaseException) -> str:
+    """What an exception says, in one line; that may be nothing. Never raises."""
+    try:
+        return line(str(error))
+    except BaseException as worse:  # whoever wrote the exception wrote its __str__, too
+        return f"(its text cannot be had: {quoted(type(worse).__name__)})"
+
+
+def named(error: BaseException) -> str:
+    """An exception in one line: one of fishd's is a sentence by itself, others say their type."""
+    what = said(error)
+    if isinstance(error, FishdError | Escaped):
+        return what
+    kind = quoted(type(error).__name__)
+    return f"{kind}: {what}" if what else kind
+
+
+def _cut(text: str, longest: int) -> str:
+    """The beginning and the end, where the whole is too long."""
+    if len(text) <= longest:
+        return text
+    end = longest // 3
+    return f"{text[: longest - end - 1]}…{text[-end:]}"
