@@ -21,7 +21,7 @@ from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
 from fishd.reporting import Publisher, Reporter, named, why_overrun, why_silent, why_skipped
-from fishd.signals import Measurement, Observation
+from fishd.signals import Measurement, Observation, Reason
 from fishd.statistics import Statistics
 from fishd.supervisor import Mode, Supervisor
 
@@ -71,6 +71,8 @@ class ControlLoop:
         """What the latest tick observed."""
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
         self.controller_name = "hold"
+        self.fallback: Reason | None = None
+        """Why the controller in command took over from the one that was put there, if it did."""
         self._fresh = False
         self._estimator = estimator
         self.guard = guard
@@ -186,6 +188,7 @@ class ControlLoop:
     def _swap(self, name: str, controller: Controller[Any], *, fresh: bool) -> None:
         former = self.controller
         self.controller_name, self.controller, self._fresh = name, controller, fresh
+        self.fallback = None
         try:
             former.close()
         except Exception as error:
@@ -243,6 +246,8 @@ class ControlLoop:
                 self._fresh = False
             applied = self.guard.apply(self.controller.update(observation), self.applied)
         except ControllerFault as error:
+            if error.successor:
+                return self._succeed(error, *error.successor, observation)
             self._fail(error.code, f"controller {self.controller_name} gave up", error)
             return self.guard.fade(self.applied)
         except Exception as error:
@@ -252,6 +257,16 @@ class ControlLoop:
         if self.supervisor.update_time(self._now() - started, budget, self.controller_name):
             self._fall()
         return applied
+
+    def _succeed(
+        self, error: ControllerFault, name: str, controller: Controller[Any], seen: Observation
+    ) -> float:
+        """The controller in command has named who takes over: in this very tick."""
+        before = self.controller_name
+        self._swap(name, controller, fresh=True)
+        self.fallback = Reason(error.code, f"{before} lost command: {error}")
+        self.reporter.fallback(before, name, controller.parameters, self.fallback)
+        return self._update(seen)
 
     def _write(self, neutral: bool) -> None:
         """Send the angle in force, or release the servo, as the mode demands."""

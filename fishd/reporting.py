@@ -7,7 +7,7 @@ from msgspec import UNSET, Struct, structs
 
 from fishd.clock import Clock, Slot
 from fishd.errors import FishdError
-from fishd.signals import Event, Measurement, Observation, Tick, Truth
+from fishd.signals import Event, Measurement, Observation, Reason, Tick, Truth
 from fishd.statistics import PHASES
 from fishd.supervisor import Mode, Supervisor
 
@@ -43,9 +43,21 @@ class Reporter:
     def controller(self, name: str, parameters: Struct, kind: str, does: str) -> None:
         """Tell who is in command with which parameters; does: such as `takes over with`."""
         values = structs.asdict(parameters)
-        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in values.items())
-        message = f"{name} {does} {spelled or 'no parameters'}"
+        message = f"{name} {does} {_spelled(values)}"
         self.event(kind, message, controller=name, parameters=values)
+
+    def fallback(self, before: str, name: str, parameters: Struct, why: Reason) -> None:
+        """Tell that a controller has lost command to another one."""
+        values = structs.asdict(parameters)
+        self.event(
+            "fallback",
+            f"{name} takes over with {_spelled(values)}: {why.message}",
+            "warning",
+            controller=name,
+            parameters=values,
+            before=before,
+            code=why.code,
+        )
 
     def mode(self, before: Mode, supervisor: Supervisor, level: str = "info") -> None:
         """Tell which mode follows on `before`, if it is another."""
@@ -121,6 +133,11 @@ class Reporter:
                 phi=truth.phi if truth else UNSET,
             )
         )
+
+
+def _spelled(parameters: dict[str, Any]) -> str:
+    texts = (f"{k}={'default' if v is None else v}" for k, v in parameters.items())
+    return ", ".join(texts) or "no parameters"
 
 
 def named(error: Exception) -> str:

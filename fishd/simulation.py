@@ -57,6 +57,8 @@ class Report(Struct, frozen=True):
     """Mode at the end."""
     reason: Reason | None
     """Why, when that is fault."""
+    fallback: Reason | None
+    """Why another controller took over, if one did; the figures are those of both."""
     microseconds_per_tick: float
     """What one turn of the loop took on this machine, once settled [µs]."""
     real_time_factor: float
@@ -235,6 +237,7 @@ def judge(
         ticks=ticks,
         mode=loop.supervisor.mode.value,
         reason=loop.supervisor.reason,
+        fallback=loop.fallback,
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )

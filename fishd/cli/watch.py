@@ -154,6 +154,9 @@ class View:
         header = [self._title()]
         if reason := self.status.reason:
             header += Text(f"{reason.code}: {reason.message}", "red").wrap(console, width)
+        elif took_over := self.status.fallback:
+            text = f"took over: {took_over.code}: {took_over.message}"
+            header += Text(text, "yellow").wrap(console, width)
         yield from header
         yield self._figures()
         events = max(0, min(3, (height - 14) // 3))
