@@ -218,6 +218,7 @@ def judge(
             if slot.index >= first:
                 beats.add(angle, window)
         elapsed = time.perf_counter() - begun
+        fallback = loop.fallback
 
     amplitude = amplitude_of(controller.parameters, config.limits)
     best = best_square_wave(config.plant, amplitude)
@@ -237,7 +238,7 @@ def judge(
         ticks=ticks,
         mode=loop.supervisor.mode.value,
         reason=loop.supervisor.reason,
-        fallback=loop.fallback,
+        fallback=fallback,
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )

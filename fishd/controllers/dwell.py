@@ -14,7 +14,7 @@ from fishd.errors import ControllerFault
 RESTING = 0.05
 """An angle below this share of the amplitude is as good as neutral."""
 MOST = 0.5
-"""To be held back in more than this share of the ticks in which that can be is to fight."""
+"""To be held back in this share of the ticks in which that can be is to fight the limit."""
 _ROUNDING = 1e-3  # in ticks; a sum of ticks is not exact
 
 
@@ -81,7 +81,7 @@ class DwellLimit:
         ticks = math.ceil(self.dwell / self._tick - _ROUNDING)
         # Of so many ticks of dwell, who always wants to reverse is held back in all but one.
         most = MOST * self._patience * (ticks - 1) / ticks
-        if len(self._held) == self._patience and self._count > most:
+        if ticks > 1 and len(self._held) == self._patience and self._count >= most:
             raise ControllerFault(
                 "chatter",
                 f"in {self._count} of the last {self._patience} ticks it wanted to reverse sooner "

@@ -256,6 +256,8 @@ class TetheredFish:
         longest = self._fin_panel
         if duration <= _GRADED_FROM * self._servo_time:
             longest = min(longest, self._servo_time)
+        if self.parameters.servo_reaction:
+            longest = min(longest, 5.0 * _REACTION_TIME)
         instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]
         panels: list[Panel] = []
         taken = bisect_left(instants, 0.0)
