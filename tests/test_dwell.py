@@ -111,11 +111,15 @@ def test_who_insists_for_two_seconds_loses_command(tick: float, alternating: boo
     limit = DwellLimit(0.2, limits, 0.3)
     limit.activate(0.3)
     angle, elapsed = 0.3, 0.0
-    with pytest.raises(ControllerFault, match="it wanted to reverse sooner than 0.2 s") as caught:
+
+    def swim() -> None:
+        nonlocal angle, elapsed
         for k in range(round(10.0 / tick)):
             elapsed += tick
-            wanted = 0.3 * (-1) ** k if alternating else -angle
-            angle = limit.apply(wanted, tick)
+            angle = limit.apply(0.3 * (-1) ** k if alternating else -angle, tick)
+
+    with pytest.raises(ControllerFault, match=r"it wanted to reverse sooner than 0\.2 s") as caught:
+        swim()
     assert elapsed == pytest.approx(2.0, abs=1.01 * tick)
     assert caught.value.code == "chatter"
     assert caught.value.successor
@@ -131,9 +135,6 @@ def test_who_is_held_back_now_and_then_stays_in_command() -> None:
 
 def test_nobody_takes_over_where_a_fault_is_configured() -> None:
     limits = replace(LIMITS, chatter=ChatterSettings(fallback="fault"))
-    limit = DwellLimit(0.2, limits, 0.42)
-    limit.activate(0.42)
     with pytest.raises(ControllerFault) as caught:
-        for k in range(100):
-            limit.apply(0.42 * (-1) ** k, 0.05)
+        limited([0.42 * (-1) ** k for k in range(100)], limits=limits)
     assert caught.value.successor is None

@@ -21,8 +21,8 @@ _ROUNDING = 1e-3  # in ticks; a sum of ticks is not exact
 class DwellLimit:
     """Lets a command change its side of neutral no sooner than the dwell after it last did.
 
-    Within a side it may do what it likes. What is held back stays at the angle of before, or goes to
-    neutral where it wants to rest there.
+    Within a side it may do what it likes. What is held back stays at the angle of before, or goes
+    to neutral where it wants to rest there.
     """
 
     def __init__(self, dwell: float, limits: Limits, amplitude: float) -> None:
