@@ -99,7 +99,7 @@ def _half_period(parameters: PlantParameters, amplitude: float, frequency: float
         2.0 * swing / p.servo_lag, half_period * p.servo_speed / p.servo_lag
     )
     fish = TetheredFish(p, PlantState(phi=swing - lag))
-    fish.tail = tail = min(0.0, swing - lag + p.backlash)
+    fish.cables.tail = tail = min(0.0, swing - lag + p.backlash)
     from_rest = fish.advance(amplitude, half_period, samples=1)
     forced = (fish.state.alpha, fish.state.alpha_rate)
     free = np.eye(2)
@@ -107,7 +107,7 @@ def _half_period(parameters: PlantParameters, amplitude: float, frequency: float
         free = panel.free_motion @ free
     alpha, rate = np.linalg.solve(free + np.eye(2), np.negative(forced)).tolist()
     fish.state = PlantState(swing - lag, alpha, rate)
-    fish.tail = tail
+    fish.cables.tail = tail
     return fish.advance(amplitude, half_period, samples=1)
 
 

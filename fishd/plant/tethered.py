@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct
 
+from fishd.plant.cables import Cables
 from fishd.plant.delay import DelayLine
 from fishd.plant.panel import NODES, WEIGHTS, N, Panel, Vector
 from fishd.plant.parameters import PlantParameters
@@ -82,20 +83,19 @@ class TetheredFish:
     Attributes:
         parameters: constants of this fish.
         state: where it is now; assign to it to put the fish elsewhere.
-        tail: the wheel angle that the tail follows; with backlash it may be another than φ, rad.
+        cables: between wheel and tail.
     """
 
     def __init__(self, parameters: PlantParameters, state: PlantState = REST) -> None:
         self.parameters = parameters
         self.state = state
-        self.tail = state.phi
+        self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
         self._servo_time = parameters.servo_lag / parameters.servo_speed
         self._fin_panel = _FIN_REACH / (parameters.omega0 * max(1.0, parameters.xi))
         self._panel = lru_cache(maxsize=512)(lambda *key: Panel(parameters, *key))
         self._equal_panels = lru_cache(maxsize=64)(self._panels)
         self._cause: Vector = np.zeros(N + 3)
         self._line = DelayLine(parameters.servo_delay) if parameters.servo_delay else None
-        self._cables = parameters.cable_slack > 0.0 or parameters.backlash > 0.0
         self._momentum = 0.0
         """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
 
@@ -141,8 +141,6 @@ class TetheredFish:
         phi, alpha, rate = start = self.state
         command = phi if angle is None else self._reached(angle, phi)
         lag = (command - phi) / p.servo_lag
-        if p.backlash:
-            self.tail = max(phi - p.backlash, min(phi + p.backlash, self.tail))
         cuts = self._cuts(command, phi, lag, duration) if lag else ()
         panels = (
             self._panels(whole, samples, part, cuts)
@@ -202,26 +200,21 @@ class TetheredFish:
         if p.servo_reaction:
             self._react(panel, nodes)
         cause[2] = p.coupling * command
-        if self._cables:
+        if not self.cables.taut:
             self._pull(panel, command, lag, later)
         return later
 
     def _pull(self, panel: Panel, command: float, lag: float, later: float) -> None:
         """Take backlash and slack off what the wheel does to the fin during the panel."""
-        p, cause, play = self.parameters, self._cause, self.parameters.backlash
-        phi = tail = command - p.servo_lag * relax(lag, 0.5 * panel.length / self._servo_time)
-        if play:
-            before, end = self.tail, command - p.servo_lag * later
-            tail = max(phi - play, min(phi + play, before))
-            self.tail = max(end - play, min(end + play, before))
-            if tail == before:  # the wheel moves within the play: the tail stays
-                cause[2] = p.coupling * math.copysign(max(0.0, abs(tail) - p.cable_slack), tail)
-                cause[3:] = 0.0
-                return
-        if abs(tail) <= p.cable_slack:
-            cause[2:] = 0.0
+        p, cause = self.parameters, self._cause
+        halfway = relax(lag, 0.5 * panel.length / self._servo_time)
+        moves, angle = self.cables.pull(
+            command - p.servo_lag * halfway, command - p.servo_lag * later
+        )
+        if moves:
+            cause[2] = p.coupling * (command - angle)
         else:
-            cause[2] = p.coupling * (command - (phi - tail) - math.copysign(p.cable_slack, tail))
+            cause[2], cause[3:] = p.coupling * angle, 0.0
 
     def _react(self, panel: Panel, lags: Vector) -> None:
         """Add what the wheel's acceleration passes on during the panel; lags: at its nodes."""
@@ -238,12 +231,8 @@ class TetheredFish:
         if duration > _GRADED_FROM * unit:
             transition = log_sinh(lag)
             cuts = [unit * (transition + time) for time in _TRANSITION]
-        if self._cables:
-            play = math.copysign(p.backlash, lag)
-            edges = [play - p.cable_slack, play + p.cable_slack] if p.cable_slack else []
-            if play:
-                edges.append(self.tail + play)  # from there on the tail follows
-            for edge in edges:
+        if not self.cables.taut:
+            for edge in self.cables.edges(phi, lag):
                 if min(phi, command) < edge < max(phi, command):
                     cuts.append(unit * time_between(lag, (command - edge) / p.servo_lag))
         return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
