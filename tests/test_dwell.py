@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 from harness import LIMITS
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -89,6 +89,7 @@ def test_without_a_dwell_every_command_passes() -> None:
     assert limited(wanted, dwell=0.0) == wanted
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=200),
     st.sampled_from([0.005, 0.02, 0.05, 0.2]),
