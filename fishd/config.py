@@ -23,6 +23,7 @@ from fishd.config_checks import (
     check_virtual_pi,
 )
 from fishd.controllers.base import Limits
+from fishd.controllers.chatter import ChatterSettings
 from fishd.emulation.settings import VirtualPiSettings
 from fishd.errors import ConfigError
 from fishd.estimators.lateral_force import EstimatorSettings
@@ -132,6 +133,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         ),
     ] = 0.4
     start: Annotated[Start, Meta(description="What the fish does at once.")] = Start()
+    chatter: Annotated[
+        ChatterSettings, Meta(description="A policy that would reverse too fast.")
+    ] = ChatterSettings()
     lockstep: Annotated[
         bool,
         Meta(
@@ -180,7 +184,12 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     @property
     def limits(self) -> Limits:
         """What controllers must respect."""
-        return Limits(amplitude=self.amplitude_limit, tick=self.tick, virtual=self.lockstep)
+        return Limits(
+            amplitude=self.amplitude_limit,
+            tick=self.tick,
+            virtual=self.lockstep,
+            chatter=self.chatter,
+        )
 
 
 def service_file() -> Path | None:

@@ -20,6 +20,8 @@ Each message is one line that says what is wrong, where, and what would be right
     Escaped                             a controller raised what is no Exception, such as SystemExit
 """
 
+from typing import Any
+
 
 class FishdError(Exception):
     """Root of the tree."""
@@ -49,11 +51,15 @@ class PolicyError(FishdError, ValueError):
 
 
 class ControllerFault(FishdError, RuntimeError):
-    """A controller cannot go on; raised from `update`, it latches a fault with this `code`."""
+    """A controller cannot go on; raised from `update`, it latches a fault with this `code`.
 
-    def __init__(self, code: str, message: str) -> None:
+    Where there is a `successor`, a name and a ready-made controller, that takes over instead.
+    """
+
+    def __init__(self, code: str, message: str, successor: tuple[str, Any] | None = None) -> None:
         super().__init__(message)
         self.code = code
+        self.successor = successor
 
 
 class StartupError(FishdError, RuntimeError):

@@ -24,7 +24,7 @@ from fishd.estimators.lateral_force import LateralForceEstimator
 from fishd.guard import Guard
 from fishd.hardware.base import Robot
 from fishd.reporting import Publisher, Reporter, why_overrun, why_silent, why_skipped
-from fishd.signals import Measurement, Observation
+from fishd.signals import Measurement, Observation, Reason
 from fishd.statistics import Statistics
 from fishd.supervisor import Mode, Supervisor
 
@@ -76,6 +76,8 @@ class ControlLoop:
         self.controller_name = "hold"
         self.parameters = _plain(self.controller)
         """Those of the controller in command, as JSON has them."""
+        self.fallback: Reason | None = None
+        """Why the controller in command took over from the one that was put there, if it did."""
         self._fresh = False
         self._estimator = estimator
         self.guard = guard
@@ -193,6 +195,7 @@ class ControlLoop:
     def _swap(self, name: str, controller: Controller[Any], *, fresh: bool) -> None:
         former, self.parameters = self.controller, _plain(controller)
         self.controller_name, self.controller, self._fresh = name, controller, fresh
+        self.fallback = None
         try:
             contained(former.close)
         except Exception as error:
@@ -251,6 +254,8 @@ class ControlLoop:
             command = contained(self.controller.update, observation)
             applied = contained(self.guard.apply, command, self.applied)
         except ControllerFault as error:
+            if successor := _successor(error):
+                return self._succeed(error, *successor, observation)
             self._fail(_code(error), f"controller {self.controller_name} gave up", error)
             return self.guard.fade(self.applied)
         except Exception as error:
@@ -260,6 +265,18 @@ class ControlLoop:
         if self.supervisor.update_time(self._now() - started, budget, self.controller_name):
             self._fall()
         return applied
+
+    def _succeed(
+        self, error: ControllerFault, name: str, controller: Controller[Any], seen: Observation
+    ) -> float:
+        """The controller in command has named who takes over: in this very tick."""
+        before = self.controller_name
+        self._swap(name, controller, fresh=True)
+        self.fallback = Reason(
+            _code(error), text.line(f"{before} lost command: {text.said(error)}")
+        )
+        self.reporter.fallback(before, name, self.parameters, self.fallback)
+        return self._update(seen)
 
     def _write(self, neutral: bool) -> None:
         """Send the angle in force, or release the servo, as the mode demands."""
@@ -326,6 +343,14 @@ def _code(error: ControllerFault) -> str:
     """Which fault it is, whatever a subclass has made of it."""
     code = vars(error).get("code")
     return code if isinstance(code, str) else "controller-error"
+
+
+def _successor(error: ControllerFault) -> tuple[str, Controller[Any]] | None:
+    """Who is to take over, if it is a controller."""
+    match vars(error).get("successor"):
+        case (str(name), Controller() as controller):
+            return name, controller
+    return None
 
 
 def _plain(controller: Controller[Any]) -> dict[str, Any]:

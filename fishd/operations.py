@@ -119,6 +119,7 @@ class Operations:
             realtime=self._realtime,
             telemetry=self._telemetry,
             servo_lost=loop.servo_lost,
+            fallback=loop.fallback,
             sensor_lost=loop.supervisor.sensor_lost,
             calibrating=self._workbench.calibrating,
         )

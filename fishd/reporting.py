@@ -9,7 +9,7 @@ from msgspec import UNSET
 from fishd import text
 from fishd.clock import Clock, Slot
 from fishd.errors import FishdError
-from fishd.signals import Event, Measurement, Observation, Tick, Truth
+from fishd.signals import Event, Measurement, Observation, Reason, Tick, Truth
 from fishd.statistics import PHASES
 from fishd.supervisor import Mode, Supervisor
 
@@ -45,9 +45,20 @@ class Reporter:
 
     def controller(self, name: str, parameters: Mapping[str, Any], kind: str, does: str) -> None:
         """Tell who is in command with which parameters; does: such as `takes over with`."""
-        spelled = ", ".join(f"{k}={'default' if v is None else v}" for k, v in parameters.items())
-        message = f"{name} {does} {spelled or 'no parameters'}"
+        message = f"{name} {does} {_spelled(parameters)}"
         self.event(kind, message, controller=name, parameters=parameters)
+
+    def fallback(self, before: str, name: str, parameters: Mapping[str, Any], why: Reason) -> None:
+        """Tell that a controller has lost command to another one."""
+        self.event(
+            "fallback",
+            f"{name} takes over with {_spelled(parameters)}: {why.message}",
+            "warning",
+            controller=name,
+            parameters=parameters,
+            before=before,
+            code=why.code,
+        )
 
     def mode(self, before: Mode, supervisor: Supervisor, level: str = "info") -> None:
         """Tell which mode follows on `before`, if it is another."""
@@ -123,6 +134,11 @@ class Reporter:
                 phi=truth.phi if truth else UNSET,
             )
         )
+
+
+def _spelled(parameters: Mapping[str, Any]) -> str:
+    texts = (f"{k}={'default' if v is None else v}" for k, v in parameters.items())
+    return ", ".join(texts) or "no parameters"
 
 
 def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None:

@@ -131,7 +131,7 @@ class Event(Struct, frozen=True):
     level: str
     """info, warning or error."""
     kind: str
-    """mode, controller, parameters, fault, overrun or mark."""
+    """mode, controller, parameters, fallback, fault, overrun or mark."""
     message: str
     """One line for people."""
     data: dict[str, Any] = {}
@@ -227,5 +227,7 @@ class Status(Struct, frozen=True):
     """True while the servo cannot be reached; with `servo_on`, it may still have pulses."""
     calibrating: bool = False
     """True while a client has the servo on loan, to calibrate it."""
+    fallback: Reason | None = None
+    """Why the controller in command took over from the one that was set; None where it was set."""
     sensor_lost: bool = False
     """True while there is no force to believe; `thrust` is then that of the time before."""

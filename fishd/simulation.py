@@ -57,6 +57,8 @@ class Report(Struct, frozen=True):
     """Mode at the end."""
     reason: Reason | None
     """Why, when that is fault."""
+    fallback: Reason | None
+    """Why another controller took over, if one did; the figures are those of both."""
     microseconds_per_tick: float
     """What one turn of the loop took on this machine, once settled [µs]."""
     real_time_factor: float
@@ -216,6 +218,7 @@ def judge(
             if slot.index >= first:
                 beats.add(angle, window)
         elapsed = time.perf_counter() - begun
+        fallback = loop.fallback
 
     amplitude = amplitude_of(controller.parameters, config.limits)
     best = best_square_wave(config.plant, amplitude)
@@ -235,6 +238,7 @@ def judge(
         ticks=ticks,
         mode=loop.supervisor.mode.value,
         reason=loop.supervisor.reason,
+        fallback=fallback,
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )

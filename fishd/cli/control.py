@@ -154,6 +154,7 @@ def _status_text(status: Status) -> str:
     rows = [
         ("mode", status.mode + reason),
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
+        *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("thrust", f"{thrust} mN at {status.frequency:.2f} Hz"),
         ("servo", f"{_servo(status)}, {_range(status)}"),
         ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling"),

@@ -85,6 +85,9 @@ def evaluate(
 
         # In a file or a pipe nothing is wrapped.
         Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings))
+    for standing in standings:
+        for why in standing.fallbacks:
+            click.echo(f"fishctl: {standing.contestant}: another took over: {why}", err=True)
     faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
     for contestant, fault in faults:
         click.echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)

@@ -63,6 +63,8 @@ def _simulate(
         print_json(report)
     else:
         echo(_text(report))
+    if report.fallback:
+        echo(f"fishctl: another controller took over: {report.fallback.message}", err=True)
     if report.reason:
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1

@@ -155,6 +155,9 @@ class View:
         if reason := self.status.reason:
             message = text.line(f"{reason.code}: {reason.message}")
             header += Text(message, "red").wrap(console, width)
+        elif took_over := self.status.fallback:
+            message = text.line(f"took over: {took_over.code}: {took_over.message}")
+            header += Text(message, "yellow").wrap(console, width)
         yield from header
         yield self._figures()
         events = max(0, min(3, (height - 14) // 3))

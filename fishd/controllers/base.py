@@ -5,6 +5,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from msgspec import Struct
 
+from fishd.controllers.chatter import ChatterSettings
 from fishd.errors import ParameterError
 from fishd.signals import Observation
 
@@ -18,6 +19,8 @@ class Limits(Struct, frozen=True):
     """Period of the loop [s]."""
     virtual: bool = False
     """Time stands still while a controller thinks, so it may wait for others as long as it must."""
+    chatter: ChatterSettings = ChatterSettings()
+    """What becomes of a policy that reverses too fast."""
 
 
 P = TypeVar("P", bound=Struct)

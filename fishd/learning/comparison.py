@@ -61,6 +61,8 @@ class Standing(Struct, frozen=True, kw_only=True):
     """Mean |φ_c| over the rms of φ_c: square 1, sine 0.900, triangle 0.866."""
     faults: list[str]
     """Why runs ended in mode fault, if any did."""
+    fallbacks: list[str]
+    """Why another controller took over in runs, if one did; the figures are those of both."""
     runs: list[Report]
 
 
@@ -160,6 +162,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         fullness=median(report.fullness for report in reports),
         squareness=median(report.squareness for report in reports),
         faults=[report.reason.message for report in reports if report.reason],
+        fallbacks=[report.fallback.message for report in reports if report.fallback],
         runs=reports,
     )
 

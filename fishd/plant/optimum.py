@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from fishd.plant.parameters import PlantParameters
 from fishd.plant.servo import lag_after_reversal
@@ -37,8 +38,8 @@ def fast_servo_thrust(parameters: PlantParameters, amplitude: float, frequency: 
     """Return the mean thrust (N) of a square wave that the wheel follows at once, φ = φ_c.
 
     The closed form of Fu et al., for an amplitude in rad and a frequency in Hz, with numerator and
-    denominator both divided by exp(ξx) so that low frequencies do not overflow. Cable slack is
-    left out.
+    denominator both divided by exp(ξx) so that low frequencies do not overflow. Slack, backlash
+    and dead zone are left out.
     """
     p = parameters
     x = p.omega0 / (4.0 * frequency)
@@ -88,21 +89,25 @@ def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadySta
 def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> Window:
     """Return the half period after a reversal to +amplitude, in the periodic regime.
 
-    Half a period is an affine map of (α, α̇); by antisymmetry the regime is what it negates.
+    Half a period is an affine map of (α, α̇); by antisymmetry the regime is what it negates. The
+    servo's delay shifts it in time, its reaction is no thrust: both are left out.
     """
-    p = parameters
+    p = replace(parameters, servo_delay=0.0, servo_reaction=0.0)
     half_period = 0.5 / frequency
+    swing = max(0.0, amplitude - p.servo_dead_zone)  # as far as the wheel goes
     lag = p.servo_lag * lag_after_reversal(
-        2.0 * amplitude / p.servo_lag, half_period * p.servo_speed / p.servo_lag
+        2.0 * swing / p.servo_lag, half_period * p.servo_speed / p.servo_lag
     )
-    fish = TetheredFish(p, PlantState(phi=amplitude - lag))
+    fish = TetheredFish(p, PlantState(phi=swing - lag))
+    fish.cables.tail = tail = min(0.0, swing - lag + p.backlash)
     from_rest = fish.advance(amplitude, half_period, samples=1)
     forced = (fish.state.alpha, fish.state.alpha_rate)
     free = np.eye(2)
     for panel, _ in from_rest.course:
         free = panel.free_motion @ free
     alpha, rate = np.linalg.solve(free + np.eye(2), np.negative(forced)).tolist()
-    fish.state = PlantState(amplitude - lag, alpha, rate)
+    fish.state = PlantState(swing - lag, alpha, rate)
+    fish.cables.tail = tail
     return fish.advance(amplitude, half_period, samples=1)
 
 

@@ -80,3 +80,41 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             extra_json_schema={"unit": "rad"},
         ),
     ] = 0.0
+    backlash: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1.0,
+            description="Play of the tail against the wheel, either way: after a reversal the "
+            "wheel turns by twice as much before the tail follows.",
+            extra_json_schema={"unit": "rad"},
+        ),
+    ] = 0.0
+    servo_delay: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=0.5,
+            description="Time from an instruction until the servo acts on it.",
+            extra_json_schema={"unit": "s"},
+        ),
+    ] = 0.0
+    servo_dead_zone: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1.0,
+            description="The servo leaves a wheel alone that is this near to its instruction.",
+            extra_json_schema={"unit": "rad"},
+        ),
+    ] = 0.0
+    servo_reaction: Annotated[
+        float,
+        Meta(
+            ge=-0.1,
+            le=0.1,
+            description="Reaction J to the wheel's acceleration that the force sensor feels: "
+            "−J φ̈ is added to F_y, smoothed over 10 ms.",
+            extra_json_schema={"unit": "N s^2/rad"},
+        ),
+    ] = 0.0

@@ -14,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from fishd.plant.panel import N, Panel, Vector
+from fishd.plant.cables import Cables
+from fishd.plant.delay import DelayLine
+from fishd.plant.panel import NODES, WEIGHTS, N, Panel, Vector
 from fishd.plant.parameters import PlantParameters
 from fishd.plant.servo import log_sinh, relax, time_between
 
@@ -25,6 +27,7 @@ _GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer panels gra
 _FIN_REACH = 3.0  # panel length, in units of the fin's shortest time, that N nodes resolve
 _LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all panel long
 _ROUNDING = 1e-9  # a window of exactly one servo time constant stays one panel
+_REACTION_TIME = 0.01  # of the mount that passes the servo's reaction on to the sensor, s
 
 
 class PlantState(NamedTuple):
@@ -80,38 +83,75 @@ class TetheredFish:
     Attributes:
         parameters: constants of this fish.
         state: where it is now; assign to it to put the fish elsewhere.
+        cables: between wheel and tail.
     """
 
     def __init__(self, parameters: PlantParameters, state: PlantState = REST) -> None:
         self.parameters = parameters
         self.state = state
+        self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
         self._servo_time = parameters.servo_lag / parameters.servo_speed
         self._fin_panel = _FIN_REACH / (parameters.omega0 * max(1.0, parameters.xi))
         self._panel = lru_cache(maxsize=512)(lambda *key: Panel(parameters, *key))
         self._equal_panels = lru_cache(maxsize=64)(self._panels)
         self._cause: Vector = np.zeros(N + 3)
+        self._line = DelayLine(parameters.servo_delay) if parameters.servo_delay else None
+        self._momentum = 0.0
+        """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
 
         None means no pulses: the servo then holds the wheel where it is. `samples` instants make
-        the sampled means, as an ADC that is read evenly within the window does.
+        the sampled means, as an ADC that is read evenly within the window does; the reaction of the
+        servo is the same in all of them. The servo acts on an instruction after its delay.
 
         Raises:
             ValueError: `duration` or `samples` is not positive.
         """
+        if not (duration > 0.0 and samples > 0):
+            raise ValueError(f"a window needs time and samples, not {duration} s and {samples}")
+        if self._line is None:
+            return self._swim(instruction_angle, duration, samples, (0.0, duration))
+        parts = self._line.passed(instruction_angle, duration)
+        if len(parts) == 1:
+            return self._swim(parts[0].angle, duration, samples, (0.0, duration))
+        windows = [
+            self._swim(part.angle, duration, samples, (part.begin, part.end)) for part in parts
+        ]
+        return Window(
+            duration,
+            sum(w.thrust * w.duration for w in windows) / duration,
+            sum(w.lateral_force * w.duration for w in windows) / duration,
+            sum(w.sampled_thrust for w in windows),
+            sum(w.sampled_lateral_force for w in windows),
+            [panel for w in windows for panel in w.course],
+        )
+
+    def _swim(
+        self, angle: float | None, whole: float, samples: int, part: tuple[float, float]
+    ) -> Window:
+        """Swim a part of a window in which the servo knows one instruction.
+
+        part: when in the window it begins and ends (s); sampled means are those of the window, as
+            far as the part adds to them
+        """
         p = self.parameters
+        duration = part[1] - part[0]
         phi, alpha, rate = start = self.state
-        command = phi if instruction_angle is None else instruction_angle
+        command = phi if angle is None else self._reached(angle, phi)
         lag = (command - phi) / p.servo_lag
         cuts = self._cuts(command, phi, lag, duration) if lag else ()
         panels = (
-            self._panels(duration, samples, cuts) if cuts else self._equal_panels(duration, samples)
+            self._panels(whole, samples, part, cuts)
+            if cuts
+            else self._equal_panels(whole, samples, part)
         )
 
         cause = self._cause
         course = []
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
+        momentum = self._momentum
         for panel in panels:
             cause[0], cause[1] = alpha, rate
             lag = self._drive(panel, command, lag)
@@ -126,14 +166,23 @@ class TetheredFish:
 
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
         inertia, drag = p.thrust_coefficient, p.lateral_drag
+        reaction = self._momentum - momentum
         return Window(
             duration,
             inertia * thrust / duration,
-            -(inertia * (rate - start.alpha_rate) + drag * (alpha - start.alpha)) / duration,
+            -(inertia * (rate - start.alpha_rate) + drag * (alpha - start.alpha) - reaction)
+            / duration,
             inertia * sampled_thrust / samples,
-            -(inertia * sampled_acceleration + drag * sampled_rate) / samples,
+            -(inertia * sampled_acceleration + drag * sampled_rate) / samples + reaction / whole,
             course,
         )
+
+    def _reached(self, angle: float, phi: float) -> float:
+        """Where the wheel goes: the angle itself, or the edge of its dead zone."""
+        dead = self.parameters.servo_dead_zone
+        if not dead:
+            return angle
+        return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
     def _drive(self, panel: Panel, command: float, lag: float) -> float:
         """Write what drives the fin during the panel into the cause; return the lag at its end."""
@@ -148,40 +197,59 @@ class TetheredFish:
         else:
             np.subtract(lag, math.copysign(1.0, lag) * panel.node_times, out=nodes)
             later = relax(lag, panel.length / self._servo_time)
+        if p.servo_reaction:
+            self._react(panel, nodes)
         cause[2] = p.coupling * command
-        if p.cable_slack:
-            halfway = relax(lag, 0.5 * panel.length / self._servo_time)
-            phi = command - p.servo_lag * halfway
-            if abs(phi) <= p.cable_slack:
-                cause[2:] = 0.0
-            else:
-                cause[2] = p.coupling * (command - math.copysign(p.cable_slack, phi))
+        if not self.cables.taut:
+            self._pull(panel, command, lag, later)
         return later
 
+    def _pull(self, panel: Panel, command: float, lag: float, later: float) -> None:
+        """Take backlash and slack off what the wheel does to the fin during the panel."""
+        p, cause = self.parameters, self._cause
+        halfway = relax(lag, 0.5 * panel.length / self._servo_time)
+        moves, angle = self.cables.pull(
+            command - p.servo_lag * halfway, command - p.servo_lag * later
+        )
+        if moves:
+            cause[2] = p.coupling * (command - angle)
+        else:
+            cause[2], cause[3:] = p.coupling * angle, 0.0
+
+    def _react(self, panel: Panel, lags: Vector) -> None:
+        """Add what the wheel's acceleration passes on during the panel; lags: at its nodes."""
+        p = self.parameters
+        left = np.exp((NODES - 1.0) * (panel.length / _REACTION_TIME))
+        pushed = float((WEIGHTS * left).dot(np.tanh(lags))) * panel.length / _REACTION_TIME
+        self._momentum *= math.exp(-panel.length / _REACTION_TIME)
+        self._momentum -= p.servo_reaction * p.servo_speed * pushed
+
     def _cuts(self, command: float, phi: float, lag: float, duration: float) -> list[float]:
-        """Return the times (s) within the window at which no panel may go on."""
+        """Return the times (s) within the part at which no panel may go on."""
         p, unit = self.parameters, self._servo_time
         cuts = []
         if duration > _GRADED_FROM * unit:
             transition = log_sinh(lag)
             cuts = [unit * (transition + time) for time in _TRANSITION]
-        if p.cable_slack:
-            for edge in (-p.cable_slack, p.cable_slack):
+        if not self.cables.taut:
+            for edge in self.cables.edges(phi, lag):
                 if min(phi, command) < edge < max(phi, command):
                     cuts.append(unit * time_between(lag, (command - edge) / p.servo_lag))
         return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
 
     def _panels(
-        self, duration: float, samples: int, cuts: Sequence[float] = ()
+        self, whole: float, samples: int, part: tuple[float, float], cuts: Sequence[float] = ()
     ) -> tuple[Panel, ...]:
-        """Return the panels that make up the window, each with the sample instants in it."""
-        if not (duration > 0.0 and samples > 0):
-            raise ValueError(f"a window needs time and samples, not {duration} s and {samples}")
+        """Return the panels of a part of a window, each with the sample instants in it."""
+        duration = part[1] - part[0]
         longest = self._fin_panel
         if duration <= _GRADED_FROM * self._servo_time:
             longest = min(longest, self._servo_time)
-        instants = [(i + 0.5) * duration / samples for i in range(samples)]
-        panels, taken = [], 0
+        if self.parameters.servo_reaction:
+            longest = min(longest, 5.0 * _REACTION_TIME)
+        instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]
+        panels: list[Panel] = []
+        taken = bisect_left(instants, 0.0)
         for start, end in pairwise((0.0, *cuts, duration)):
             count = max(1, math.ceil((end - start) / longest - _ROUNDING))
             length = (end - start) / count

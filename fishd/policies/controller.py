@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from msgspec import Meta, Struct
 
 from fishd.controllers.base import Controller, Limits
+from fishd.controllers.dwell import DwellLimit
 from fishd.errors import ParameterError, PolicyError
 from fishd.policies import library
 from fishd.signals import Observation
@@ -36,7 +37,8 @@ class Ppo(Controller[PpoParameters]):
     """Follow a learned policy: a small network chooses each instruction angle.
 
     It is what `fishctl learn export` writes: an ONNX model with the card that says what it must be
-    shown, at which tick, and what its output means.
+    shown, at which tick, and what its output means. Reversals that come sooner than `chatter.dwell`
+    are held back; a policy that insists on them loses command.
     """
 
     Parameters = PpoParameters
@@ -50,12 +52,17 @@ class Ppo(Controller[PpoParameters]):
         card, self._network = _open(parameters, limits)
         self._write = Layout(card.observation).write
         self._amplitude = card.amplitude
+        self._limit = DwellLimit(limits.chatter.dwell, limits, card.amplitude)
         self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
     def check(cls, parameters: PpoParameters, limits: Limits) -> None:
         """Refuse what is no policy, or none for this tick and amplitude."""
         _open(parameters, limits)
+
+    def activate(self, observation: Observation) -> None:
+        """Take over as if the tail had reversed just now."""
+        self._limit.activate(observation.instruction_angle)
 
     def retune(self, parameters: PpoParameters) -> None:
         """Refuse: another policy is loaded and warmed up outside the loop."""
@@ -67,14 +74,19 @@ class Ppo(Controller[PpoParameters]):
     def rehearse(self) -> None:
         """Choose as in the latest tick, a few times: the first brings the network to the caches."""
         for _ in range(_REHEARSALS):
-            self.update(self._latest)
+            self._choose(self._latest)
 
     def update(self, observation: Observation) -> float:
         """Φ times the network's output, which is cut to ±1 [rad].
 
         An output that is not finite stays what it is, and ends in the fault `controller-error`.
+        Raises `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
+        return self._limit.apply(self._choose(observation), observation.dt)
+
+    def _choose(self, observation: Observation) -> float:
+        """What the network wants [rad]."""
         network = self._network
         self._write(observation, network.row)
         action = network.run()

@@ -5,6 +5,7 @@ import time
 from typing import Any
 
 from fishd.controllers.base import Controller, Limits
+from fishd.controllers.dwell import DwellLimit
 from fishd.errors import ControllerFault, ParameterError
 from fishd.remote.messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.remote.parameters import RemoteParameters
@@ -35,6 +36,7 @@ class Remote(Controller[RemoteParameters]):
     def __init__(self, parameters: RemoteParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._wire = Wire(parameters.agent)
+        self._limit = DwellLimit(parameters.dwell, limits, limits.amplitude)
         self._session = secrets.token_hex(8)
         self._observation: Observation | None = None
         """Of the tick that is going on."""
@@ -78,6 +80,10 @@ class Remote(Controller[RemoteParameters]):
                 ("deadline",),
             )
 
+    def activate(self, observation: Observation) -> None:
+        """Take over as if the tail had reversed just now."""
+        self._limit.activate(observation.instruction_angle)
+
     def retune(self, parameters: RemoteParameters) -> None:
         """Take another deadline or limit; another agent has to take over properly."""
         if parameters.agent != self.parameters.agent:
@@ -86,6 +92,7 @@ class Remote(Controller[RemoteParameters]):
                 f"'fishctl set-controller remote --agent {parameters.agent}'"
             )
         super().retune(parameters)
+        self._limit.dwell = parameters.dwell
 
     def fileno(self) -> int:
         """A descriptor that is readable once `ready` may have more to say."""
@@ -108,7 +115,7 @@ class Remote(Controller[RemoteParameters]):
         """The agent's action [rad], or 0 where none came in time.
 
         Raises `ControllerFault`: `remote-silent` where that has lasted too long, `remote-error`
-        where something else came.
+        where something else came, `chatter` where it insists on reversals that are held back.
         """
         begun = time.monotonic()
         while not self.ready(observation):
@@ -118,7 +125,7 @@ class Remote(Controller[RemoteParameters]):
             self._wire.wait(left)
         if self._problem:
             raise self._problem
-        return self._decide(observation)
+        return self._limit.apply(self._decide(observation), observation.dt)
 
     def close(self) -> None:
         """Tell the agent that it is no longer in command."""

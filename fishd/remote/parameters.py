@@ -4,6 +4,8 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
+from fishd.controllers.chatter import LONGEST_DWELL
+
 
 class RemoteParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `remote`."""
@@ -43,3 +45,13 @@ class RemoteParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             extra_json_schema={"unit": "s"},
         ),
     ] = 10.0
+    dwell: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=LONGEST_DWELL,
+            description="Shortest time between two reversals, in whole ticks, rounded up; those "
+            "that would come sooner are held back. 0 holds none back.",
+            extra_json_schema={"unit": "s"},
+        ),
+    ] = 0.0

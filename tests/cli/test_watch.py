@@ -206,7 +206,7 @@ def status(**fields: Any) -> Status:
     return Status(
         **dict.fromkeys(Status.__struct_fields__, 0)
         | {"mode": "running", "reason": None, "controller": "swing", "parameters": {"C": 0.6}}
-        | {"timing": timing, "tick": 0.05}
+        | {"timing": timing, "tick": 0.05, "fallback": None}
         | fields
     )
 
@@ -296,3 +296,9 @@ def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
 def test_traces_are_whole_lines_at_any_period_of_the_loop(period: float) -> None:
     ticks = (tick(seq, t=period * seq) for seq in range(1, round(6.0 / period)))
     assert re.search("[\u2801-\u28ff]{60}", still_trace(shown(view_of(ticks, tick=period))))
+
+
+def test_a_controller_that_took_over_says_why() -> None:
+    message = "ppo lost command: in 30 of the last 40 ticks it wanted to reverse too soon"
+    view = view_of(map(tick, range(1, 101)), fallback=Reason("chatter", message))
+    assert f"took over: chatter: {message}"[:60] in shown(view, width=120)[1]

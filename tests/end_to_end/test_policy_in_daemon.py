@@ -27,8 +27,30 @@ def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def daemon(folder: Path, tmp_path: Path) -> Iterator[Daemon]:
-    with running(tmp_path) as found:
+    with running(tmp_path, "--set", "chatter.dwell=0") as found:
         yield found
+
+
+def test_a_policy_that_shakes_the_servo_loses_command_and_everyone_is_told(
+    folder: Path, tmp_path: Path
+) -> None:
+    with (
+        running(tmp_path) as daemon,
+        Fish(daemon.endpoint) as fish,
+        Subscriber(daemon.telemetry, b"event") as events,
+        Subscriber(daemon.telemetry, b"tick") as ticks,
+    ):
+        fish.set_controller("ppo", policy="flip")
+        told = events.until(kind="fallback")
+        assert (told["data"]["before"], told["data"]["controller"]) == ("ppo", "swing")
+        assert ticks.until(controller="swing")["mode"] == "running"
+        status = fish.status()
+        assert (status.mode, status.controller) == ("running", "swing")
+        assert status.fallback
+        assert (status.fallback.code, status.missed) == ("chatter", 0)
+        assert "took over: chatter: ppo lost command" in daemon.fishctl("status").stdout
+        fish.set_controller("ppo", policy="flip")
+        assert fish.status().fallback is None
 
 
 def test_a_named_policy_swims(daemon: Daemon) -> None:
@@ -137,7 +159,9 @@ def test_a_fishd_without_a_policy_loads_nothing_of_training(daemon: Daemon) -> N
 
 def test_fishd_starts_with_a_policy_of_its_configuration(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "fishd.yaml"
-    file.write_text("start:\n  controller: ppo\n  parameters:\n    policy: flip\n")
+    file.write_text(
+        "start:\n  controller: ppo\n  parameters:\n    policy: flip\nchatter:\n  dwell: 0\n"
+    )
     with running(tmp_path, "--config", str(file)) as daemon, Fish(daemon.endpoint) as fish:
         assert (fish.status().mode, fish.status().parameters) == ("running", {"policy": "flip"})
     (folder / "flip.onnx").unlink()

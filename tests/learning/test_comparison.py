@@ -42,6 +42,23 @@ def test_the_runs_of_a_contestant_differ_in_noise_and_are_summarised_by_the_medi
     ]
 
 
+def test_it_is_said_that_another_controller_took_over_from_a_policy() -> None:
+    config = load(None, ["plant.cable_slack=0.2"])
+    (policy, swing), _ = compare(config, [parse("default-fish"), parse("swing")], 20.0, 5.0)
+    assert "it wanted to reverse sooner than 0.2 s after its last reversal" in policy.fallbacks[0]
+    assert (policy.faults, swing.fallbacks) == ([], [])
+    words = ["--seconds", "20", "--set", "plant.cable_slack=0.2"]
+    done = subprocess.run(
+        [FISHCTL, "learn", "evaluate", "default-fish", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert f"fishctl: default-fish: another took over: {policy.fallbacks[0]}" in done.stderr
+
+
 def test_what_the_fish_starts_with_takes_no_part() -> None:
     config = load(None, ["start.controller=hold"])
     (standing,), _ = compare(config, [parse("swing")], 20.0, 5.0)

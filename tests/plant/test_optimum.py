@@ -73,6 +73,23 @@ def test_no_frequency_beats_the_best_square_wave(xi: float, amplitude: float, sl
         assert square_wave(p, amplitude, frequency).thrust <= best.thrust
 
 
+@pytest.mark.parametrize(
+    "p",
+    [
+        PlantParameters(backlash=0.1),
+        PlantParameters(backlash=0.1, cable_slack=0.1, servo_dead_zone=0.05),
+        PlantParameters(servo_delay=0.03, servo_reaction=0.002),
+        PlantParameters(backlash=0.9),
+        PlantParameters(servo_dead_zone=0.5),
+    ],
+)
+def test_a_rig_with_faults_ends_up_in_the_periodic_state_too(p: PlantParameters) -> None:
+    fish = TetheredFish(p)
+    thrusts = [fish.advance(0.42 * (-1) ** k, 0.3, 1).thrust for k in range(60)]
+    steady = square_wave(p, 0.42, 1.0 / 0.6)
+    assert thrusts[-1] == pytest.approx(steady.thrust, rel=1e-6, abs=1e-12)
+
+
 @pytest.mark.parametrize("xi", [0.0, 0.3, 1.2, 2.0, 8.0])
 def test_a_servo_that_follows_at_once_makes_the_closed_form_thrust(xi: float) -> None:
     p = PlantParameters(xi=xi, servo_speed=1e4, servo_lag=1e-4)

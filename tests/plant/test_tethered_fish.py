@@ -20,12 +20,23 @@ FISHES = {
     "slow servo, very slack cables": PlantParameters(
         servo_speed=2.0, servo_lag=0.02, cable_slack=0.3
     ),
+    "backlash": PlantParameters(backlash=0.1),
+    "backlash and slack cables": PlantParameters(backlash=0.2, cable_slack=0.15),
+    "very fast servo, backlash": PlantParameters(servo_speed=1000.0, servo_lag=0.02, backlash=0.3),
+    "lazy servo": PlantParameters(servo_dead_zone=0.1),
+    "servo that pushes back": PlantParameters(servo_reaction=0.004, cable_slack=0.05),
+    "fast servo that pushes back": PlantParameters(
+        servo_speed=200.0, servo_lag=0.05, servo_reaction=-0.002
+    ),
     "no damping": PlantParameters(xi=0.0),
     "little damping": PlantParameters(xi=0.02),
     "heavy damping": PlantParameters(xi=15.0),
     "stiff fin": PlantParameters(omega0=60.0, xi=4.0),
     "slow fin": PlantParameters(omega0=3.0, servo_speed=30.0, servo_lag=0.3),
 }
+
+REACTION_TIME = 0.01
+"""In which the mount passes the servo's reaction on [s]."""
 
 angles = st.floats(-1.5, 1.5)
 states = st.builds(PlantState, angles, st.floats(-0.5, 0.5), st.floats(-5.0, 5.0))
@@ -43,8 +54,16 @@ def integrate(
 ) -> tuple[PlantState, Window]:
     """The equations as they stand, given to an adaptive solver."""
 
+    if command is not None:  # the wheel stops at the edge of the dead zone
+        command = state.phi + dead_band(command - state.phi, p.servo_dead_zone)
+
+    def turn(phi: float) -> float:
+        return 0.0 if command is None else np.tanh((command - phi) / p.servo_lag) * p.servo_speed
+
     def acceleration(phi: float, alpha: float, rate: float) -> float:
-        drive = p.coupling * dead_band(phi, p.cable_slack)
+        # The wheel turns one way all window long, and the tail was where it is.
+        tail = max(phi - p.backlash, min(phi + p.backlash, state.phi))
+        drive = p.coupling * dead_band(tail, p.cable_slack)
         return -p.xi * p.omega0 * rate - p.omega0**2 * (alpha - drive)
 
     def forces(phi: float, alpha: float, rate: float) -> tuple[float, float]:
@@ -53,24 +72,31 @@ def integrate(
 
     def derivative(_: float, y: np.ndarray) -> list[float]:
         phi, alpha, rate = y[:3]
-        turn = 0.0 if command is None else np.tanh((command - phi) / p.servo_lag) * p.servo_speed
-        return [turn, rate, acceleration(phi, alpha, rate), *forces(phi, alpha, rate)]
+        reaction = (-p.servo_reaction * turn(phi) - y[5]) / REACTION_TIME
+        thrust, lateral_force = forces(phi, alpha, rate)
+        acceleration_now = acceleration(phi, alpha, rate)
+        return [turn(phi), rate, acceleration_now, thrust, lateral_force + reaction, reaction]
 
     solution = solve_ivp(
         derivative,
         (0.0, duration),
-        [*state, 0.0, 0.0],
+        [*state, 0.0, 0.0, 0.0],
         method="DOP853",
         dense_output=True,
         rtol=1e-12,
         atol=1e-13,
         max_step=duration / 60.0,
     )
-    phi, alpha, rate, thrust, lateral_force = solution.y[:, -1]
+    phi, alpha, rate, thrust, lateral_force, reaction = solution.y[:, -1]
     instants = (np.arange(samples) + 0.5) * duration / samples
     sampled = np.mean([forces(*solution.sol(t)[:3]) for t in instants], axis=0).tolist()
     window = Window(
-        duration, thrust / duration, lateral_force / duration, sampled[0], sampled[1], course=()
+        duration,
+        thrust / duration,
+        lateral_force / duration,
+        sampled[0],
+        sampled[1] + reaction / duration,
+        course=(),
     )
     return PlantState(phi, alpha, rate), window
 
@@ -163,6 +189,64 @@ def test_cable_slack_lets_the_wheel_turn_without_moving_the_fin() -> None:
     assert fish.state.alpha == 0.0
     fish.advance(0.3, 5.0, samples=1)
     assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
+
+
+def test_backlash_is_taken_up_after_each_reversal() -> None:
+    fish = TetheredFish(PlantParameters(backlash=0.1))
+    fish.advance(0.3, 5.0, samples=1)
+    assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
+    fish.advance(0.11, 5.0, samples=1)  # back by less than twice the play
+    assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
+    fish.advance(0.0, 5.0, samples=1)
+    assert fish.state.alpha == pytest.approx(0.46 * 0.1, rel=1e-6)
+
+
+def test_a_lazy_servo_stops_at_the_edge_of_its_dead_zone_and_ignores_what_is_within() -> None:
+    fish = TetheredFish(PlantParameters(servo_dead_zone=0.1))
+    fish.advance(0.09, 1.0, samples=1)
+    assert fish.state.phi == 0.0
+    fish.advance(0.4, 5.0, samples=1)
+    assert fish.state.phi == pytest.approx(0.3)
+    fish.advance(0.25, 5.0, samples=1)
+    assert fish.state.phi == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.05, 0.08])
+def test_a_delayed_servo_does_the_same_later(delay: float) -> None:
+    late = TetheredFish(PlantParameters(servo_delay=delay, servo_reaction=0.001))
+    prompt = TetheredFish(PlantParameters(servo_reaction=0.001))
+    commands = [0.42, 0.42, -0.42, 0.1, -0.3, -0.3, 0.42, None, 0.2, 0.0]
+    prompt.advance(None, delay, samples=1)
+    whole = [late.advance(command, 0.05, samples=10) for command in commands]
+    steps = [
+        prompt.advance(commands[int((k * 0.01) / 0.05 + 1e-6)], 0.01, samples=2)
+        for k in range(round((0.5 - delay) / 0.01))
+    ]
+    assert late.state == pytest.approx(prompt.state, abs=1e-9)
+    last, tail = whole[-1], steps[-5:]
+    for name in ("thrust", "lateral_force", "sampled_thrust"):
+        mean = np.mean([getattr(step, name) for step in tail])
+        assert getattr(last, name) == pytest.approx(mean, abs=1e-9)
+    assert last.sampled_lateral_force == pytest.approx(
+        np.mean([step.sampled_lateral_force for step in tail]), abs=1e-6
+    )
+
+
+def test_the_reaction_of_the_servo_is_felt_once_the_wheel_turns_and_once_it_stops() -> None:
+    still, kicked = (
+        TetheredFish(PlantParameters()),
+        TetheredFish(PlantParameters(servo_reaction=1e-3)),
+    )
+    pushes = []
+    for command in [0.42] * 20:
+        pushes.append(
+            kicked.advance(command, 0.05, 10).lateral_force
+            - still.advance(command, 0.05, 10).lateral_force
+        )
+    assert kicked.state == still.state
+    assert pushes[0] < -0.05  # it speeds up
+    assert max(pushes[1:]) > 0.02  # it slows down
+    assert sum(pushes) == pytest.approx(0.0, abs=1e-4)
 
 
 def test_an_instruction_far_beyond_the_servo_lag_does_not_overflow() -> None:

@@ -48,7 +48,7 @@ def test_a_policy_in_the_loop_gives_exactly_the_angles_of_its_network(tmp_path: 
 
 
 def test_a_policy_that_flips_the_tail_swims_a_square_wave(tmp_path: Path) -> None:
-    rig = Rig()
+    rig = Rig("chatter.dwell=0")
     rig.start("ppo", policy=str(write(tmp_path)))
     assert [tick.phi_c for tick in rig.run(5)] == [0.42, -0.42, 0.42, -0.42, 0.42]
 
@@ -56,7 +56,7 @@ def test_a_policy_that_flips_the_tail_swims_a_square_wave(tmp_path: Path) -> Non
 def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) -> None:
     features = (("fy", 0.02), ("fy_rate", 0.3), ("fin_velocity", 0.002), ("fx", 0.026))
     layers = random_layers(4, 16, 1)
-    rig = Rig("simulation.noise=1e-3", "simulation.seed=1")
+    rig = Rig("simulation.noise=1e-3", "simulation.seed=1", "chatter.dwell=0")
     path = write(tmp_path, to_onnx(layers, "tanh", card(*features)))
     rig.start("ppo", policy=str(path))
     for tick in rig.run(200):
@@ -73,7 +73,8 @@ def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> Non
 
 
 def test_a_virtual_fish_can_be_simulated_with_a_policy(tmp_path: Path) -> None:
-    report = simulate(load(), "ppo", {"policy": str(write(tmp_path))}, seconds=5.0, settle=1.0)
+    config = load(None, ["chatter.dwell=0"])
+    report = simulate(config, "ppo", {"policy": str(write(tmp_path))}, seconds=5.0, settle=1.0)
     assert (report.mode, report.reason) == ("running", None)
     assert report.frequency == pytest.approx(10.0)
 
@@ -197,7 +198,7 @@ def test_what_is_run_is_what_was_checked(tmp_path: Path) -> None:
 
 def test_a_configuration_can_start_with_a_policy_or_says_why_not(tmp_path: Path) -> None:
     path = write(tmp_path)
-    rig = Rig("start.controller=ppo", f"start.parameters.policy={path}")
+    rig = Rig("start.controller=ppo", f"start.parameters.policy={path}", "chatter.dwell=0")
     assert (rig.mode, rig.run(2)[-1].phi_c) == ("running", -0.42)
     with pytest.raises(ConfigError, match=r"tick of 50 ms, this robot's is 20 ms"):
         load(None, ("start.controller=ppo", f"start.parameters.policy={path}", "tick=0.02"))

@@ -1,0 +1,172 @@
+"""A policy that would shake the servo: held back, and replaced by `swing` or a fault."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from harness import Rig
+from policy_files import write
+
+from fishd.config import load
+from fishd.controllers.swing import Swing
+from fishd.signals import Tick
+from fishd.simulation import simulate
+
+HARSH = {
+    "servo delay": ("plant.servo_delay=0.05",),
+    "backlash": ("plant.backlash=0.1",),
+    "slack": ("plant.cable_slack=0.2",),
+    "reaction": ("plant.servo_reaction=-0.002",),
+    "all of them": (
+        "plant.servo_delay=0.03",
+        "plant.backlash=0.05",
+        "plant.servo_dead_zone=0.05",
+        "plant.servo_reaction=0.001",
+    ),
+}
+NOISY = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
+
+
+def flipping(tmp_path: Path, *overrides: str) -> Rig:
+    """A loop in which a policy is in command that wants to reverse in every tick."""
+    rig = Rig(*overrides)
+    rig.start("ppo", policy=str(write(tmp_path)))
+    return rig
+
+
+def longest_chatter(ticks: list[Tick]) -> float:
+    """The longest stretch of reversals in consecutive ticks [s]."""
+    run = longest = 0
+    for before, now in pairwise(ticks):
+        run = run + 1 if before.phi_c * now.phi_c < 0.0 else 0
+        longest = max(longest, run)
+    return longest * 0.05
+
+
+def test_a_policy_reverses_no_sooner_than_the_dwell(tmp_path: Path) -> None:
+    angles = [tick.phi_c for tick in flipping(tmp_path).run(12)]
+    assert angles == [0.42] * 4 + [-0.42] * 4 + [0.42] * 4
+
+
+def test_a_policy_that_insists_loses_command_to_swing_within_two_seconds(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = flipping(tmp_path)
+    ticks = rig.run_for(6.0)
+    changed = [tick.controller for tick in ticks].index("swing")
+    assert changed == 39
+    assert {tick.controller for tick in ticks[changed:]} == {"swing"}
+    assert {tick.mode for tick in ticks} == {"running"}
+    assert ticks[changed].phi_c == ticks[changed - 1].phi_c  # without a bump
+    (event,) = (event for event in rig.recorder.events if event.kind == "fallback")
+    assert (event.level, event.data["controller"], event.data["before"], event.data["code"]) == (
+        "warning",
+        "swing",
+        "ppo",
+        "chatter",
+    )
+    assert event.message == (
+        "swing takes over with C=0.6, amplitude=0.42, longest_half_period=1.0: ppo lost command: "
+        "in 30 of the last 40 ticks it wanted to reverse sooner than 0.2 s after its last reversal"
+    )
+    assert event.message in caplog.text
+    assert rig.loop.fallback
+    assert rig.loop.fallback.code == "chatter"
+    assert rig.loop.observation
+    assert rig.loop.observation.frequency == pytest.approx(1.7, abs=0.2)  # and it swims
+
+
+def test_it_is_a_fault_where_that_is_configured(tmp_path: Path) -> None:
+    rig = flipping(tmp_path, "chatter.fallback=fault")
+    rig.run_for(3.0)
+    assert (rig.mode, rig.reason, rig.loop.controller_name) == ("fault", "chatter", "hold")
+    assert rig.loop.supervisor.reason
+    assert rig.loop.supervisor.reason.message.startswith("controller ppo gave up: in 30 of the ")
+
+
+def test_patience_and_dwell_are_those_of_the_configuration(tmp_path: Path) -> None:
+    rig = flipping(tmp_path, "chatter.patience=1", "chatter.dwell=0.1")
+    ticks = rig.run(25)
+    assert [tick.phi_c for tick in ticks[:4]] == [0.42, 0.42, -0.42, -0.42]
+    assert [tick.controller for tick in ticks].index("swing") == 19
+
+
+def test_who_is_put_in_command_again_starts_anew(tmp_path: Path) -> None:
+    rig = flipping(tmp_path)
+    rig.run_for(5.0)
+    assert rig.loop.controller_name == "swing"
+    rig.start("ppo", policy=str(write(tmp_path)))
+    assert {tick.controller for tick in rig.run_for(1.9)} == {"ppo"}
+    assert rig.loop.fallback is None
+    assert rig.run_for(0.2)[-1].controller == "swing"
+    rig.loop.stop()
+    assert rig.loop.fallback is None
+
+
+def test_the_tick_of_the_take_over_builds_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = flipping(tmp_path)
+
+    def never(*args: Any) -> None:
+        raise AssertionError("a controller was built in a tick")
+
+    monkeypatch.setattr(Swing, "__init__", never)
+    rig.run_for(3.0)
+    assert (rig.mode, rig.loop.controller_name) == ("running", "swing")
+
+
+def test_rehearsals_are_no_reversals(tmp_path: Path) -> None:
+    rig = flipping(tmp_path)
+    for _ in range(100):
+        rig.loop.rehearse()
+    assert [tick.phi_c for tick in rig.run(5)] == [0.42] * 4 + [-0.42]
+
+
+def test_a_policy_takes_over_as_if_the_tail_had_reversed_just_then(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.start("hold", angle=0.3)
+    rig.run(10)
+    rig.start("ppo", policy=str(write(tmp_path)))
+    assert [tick.phi_c for tick in rig.run(4)] == [0.3] * 3 + [-0.42]
+
+
+@pytest.mark.parametrize("name", ["swing", "square"])
+def test_controllers_that_know_when_to_reverse_are_not_limited(name: str) -> None:
+    parameters = {"square": {"frequency": 4.0}, "swing": {"C": 1.0}}[name]
+    found = []
+    for dwell in (0.0, 2.0):
+        rig = Rig(*NOISY, f"chatter.dwell={dwell}")
+        rig.start(name, **parameters)
+        found.append([tick.phi_c for tick in rig.run_for(10.0)])
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("fish", HARSH.values(), ids=HARSH)
+def test_the_shipped_policy_does_not_shake_the_servo_of_a_harsh_fish(fish: tuple[str, ...]) -> None:
+    rig = Rig(*NOISY, *fish)
+    rig.start("ppo", policy="default-fish")
+    assert longest_chatter(rig.run_for(30.0)) <= 1.0
+    config = load(None, [*NOISY, *fish])
+    report = simulate(config, "ppo", {"policy": "default-fish"}, seconds=40.0)
+    assert report.efficiency > 0.85
+    unlimited = load(None, [*NOISY, *fish, "chatter.dwell=0"])
+    shaken = simulate(unlimited, "ppo", {"policy": "default-fish"}, seconds=40.0)
+    assert shaken.efficiency < 0.25
+
+
+def test_the_shipped_policy_loses_nothing_on_its_own_fish() -> None:
+    policy = {"policy": "default-fish"}
+    reports = [
+        simulate(load(None, [*NOISY, f"chatter.dwell={dwell}"]), "ppo", policy)
+        for dwell in (0.0, 0.2)
+    ]
+    assert reports[0].mean_thrust == reports[1].mean_thrust
+    assert reports[1].fallback is None
+
+
+def test_a_report_says_that_another_controller_took_over(tmp_path: Path) -> None:
+    report = simulate(load(), "ppo", {"policy": str(write(tmp_path))})
+    assert report.fallback
+    assert report.fallback.message.startswith("ppo lost command: in 30 of the last 40 ticks")

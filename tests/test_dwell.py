@@ -1,0 +1,141 @@
+"""The shortest dwell: what it holds back, what it lets through, and when patience ends."""
+
+from itertools import pairwise
+
+import pytest
+from harness import LIMITS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from fishd.controllers.base import Limits
+from fishd.controllers.chatter import ChatterSettings
+from fishd.controllers.dwell import DwellLimit
+from fishd.errors import ControllerFault
+
+PATIENT = ChatterSettings(patience=600.0)
+
+
+def limited(
+    wanted: list[float], dwell: float = 0.2, tick: float = 0.05, limits: Limits = LIMITS
+) -> list[float]:
+    """What becomes of the angles that a controller wants, tick by tick, from neutral."""
+    limit = DwellLimit(dwell, replace(limits, tick=tick), limits.amplitude)
+    limit.activate(0.0)
+    return [limit.apply(angle, tick) for angle in wanted]
+
+
+def reversals(angles: list[float]) -> list[int]:
+    """The ticks in which a command changes its side of neutral."""
+    sided = [(tick, angle > 0.0) for tick, angle in enumerate(angles) if angle]
+    return [now for (_, before), (now, after) in pairwise(sided) if before != after]
+
+
+def test_a_reversal_waits_at_the_angle_of_before_until_the_dwell_is_over() -> None:
+    wanted = [0.42, -0.42, -0.4, -0.3, -0.2, -0.1]
+    assert limited(wanted) == [0.42, 0.42, 0.42, 0.42, -0.2, -0.1]
+
+
+def test_who_reverses_every_tick_reverses_at_the_dwell() -> None:
+    limits = replace(LIMITS, chatter=PATIENT)
+    limit = DwellLimit(0.2, limits, 0.42)
+    limit.activate(0.0)
+    angles = [0.0]
+    for _ in range(40):
+        angles.append(limit.apply(-0.42 if angles[-1] > 0 else 0.42, 0.05))
+    assert reversals(angles) == list(range(5, 41, 4))
+
+
+@pytest.mark.parametrize(("tick", "ticks"), [(0.005, 40), (0.02, 10), (0.03, 7), (0.2, 1)])
+def test_the_dwell_is_a_time_in_whole_ticks_rounded_up(tick: float, ticks: int) -> None:
+    limits = replace(LIMITS, chatter=PATIENT)
+    angles = limited([0.42] + [-0.42] * 50, tick=tick, limits=limits)
+    assert reversals(angles) == [ticks]
+
+
+def test_a_wave_that_is_slow_enough_passes_untouched() -> None:
+    wanted = [0.42 * (-1) ** (k // 4) * (0.5 + 0.1 * (k % 4)) for k in range(400)]
+    assert limited(wanted) == wanted
+
+
+def test_steps_on_one_side_are_no_reversals() -> None:
+    wanted = [0.42, 0.05, 0.42, 0.0, 0.3, 0.0, 0.42] * 20
+    assert limited(wanted) == wanted
+
+
+def test_who_rests_near_neutral_may_tremble_for_ever_and_the_servo_does_not() -> None:
+    angles = limited([0.01 * (-1) ** k for k in range(1000)])
+    assert max(map(abs, angles)) == 0.01
+    assert min(b - a for a, b in pairwise(reversals(angles))) >= 4
+
+
+def test_who_wants_to_rest_goes_to_neutral_at_once() -> None:
+    assert limited([0.42, -0.01, -0.01]) == [0.42, 0.0, 0.0]
+
+
+def test_neutral_in_between_does_not_hide_a_reversal() -> None:
+    assert reversals(limited([0.42, 0.0, -0.42, 0.0] * 2)) == [6]
+
+
+def test_a_missed_tick_counts_as_time() -> None:
+    limit = DwellLimit(0.2, LIMITS, 0.42)
+    limit.activate(0.42)
+    assert limit.apply(-0.42, 0.15) == 0.42
+    assert limit.apply(-0.42, 0.05) == -0.42
+
+
+def test_without_a_dwell_every_command_passes() -> None:
+    wanted = [0.42 * (-1) ** k for k in range(1000)]
+    assert limited(wanted, dwell=0.0) == wanted
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=200),
+    st.sampled_from([0.005, 0.02, 0.05, 0.2]),
+    st.sampled_from([0.01, 0.1, 0.2, 0.5]),
+)
+def test_whatever_is_wanted_no_reversal_comes_too_soon(
+    wanted: list[float], tick: float, dwell: float
+) -> None:
+    limits = replace(LIMITS, chatter=PATIENT)
+    angles = limited(wanted, dwell, tick, limits)
+    for before, now in pairwise(reversals(angles)):
+        assert (now - before) * tick >= dwell - 1e-3 * tick
+    assert all(abs(angle) <= max(map(abs, wanted)) for angle in angles)
+
+
+@pytest.mark.parametrize("tick", [0.005, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize("alternating", [False, True])
+def test_who_insists_for_two_seconds_loses_command(tick: float, alternating: bool) -> None:
+    limits = replace(LIMITS, tick=tick)
+    limit = DwellLimit(0.2, limits, 0.3)
+    limit.activate(0.3)
+    angle, elapsed = 0.3, 0.0
+
+    def swim() -> None:
+        nonlocal angle, elapsed
+        for k in range(round(10.0 / tick)):
+            elapsed += tick
+            angle = limit.apply(0.3 * (-1) ** k if alternating else -angle, tick)
+
+    with pytest.raises(ControllerFault, match=r"it wanted to reverse sooner than 0\.2 s") as caught:
+        swim()
+    assert elapsed == pytest.approx(2.0, abs=1.01 * tick)
+    assert caught.value.code == "chatter"
+    assert caught.value.successor
+    name, successor = caught.value.successor
+    assert (name, successor.parameters.amplitude) == ("swing", 0.3)
+
+
+def test_who_is_held_back_now_and_then_stays_in_command() -> None:
+    # A half beat of six ticks that is begun again one tick after each reversal.
+    beat = [0.42, -0.42, 0.42, 0.42, 0.42, 0.42, -0.42, 0.42, -0.42, -0.42, -0.42, -0.42]
+    assert reversals(limited(beat * 100)) == list(range(6, 1200, 6))
+
+
+def test_nobody_takes_over_where_a_fault_is_configured() -> None:
+    limits = replace(LIMITS, chatter=ChatterSettings(fallback="fault"))
+    with pytest.raises(ControllerFault) as caught:
+        limited([0.42 * (-1) ** k for k in range(100)], limits=limits)
+    assert caught.value.successor is None

@@ -1,0 +1,189 @@
+"""Measures what the shortest dwell is worth: a policy on fish that make it reverse too fast.
+
+    python tools/bench_chatter.py                            the table of docs/policies.md
+    python tools/bench_chatter.py --write docs/policies.md   put it there
+    python tools/bench_chatter.py --policy NAME|FILE         with this one, not default-fish
+
+Each fish swims a minute from rest in virtual time, with each seed of the noise: with
+`chatter.dwell: 0`, with the defaults, and with `swing` for comparison. About half a minute.
+"""
+
+import argparse
+import statistics
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from reports import put, table
+
+from fishd.config import Config, load
+from fishd.controllers import registry
+from fishd.signals import Event, Tick
+from fishd.simulation import judge
+
+RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
+HARSH = {
+    "servo delay 30 ms": ("servo_delay=0.03",),
+    "servo delay 50 ms": ("servo_delay=0.05",),
+    "servo delay 80 ms": ("servo_delay=0.08",),
+    "backlash ±0.1 rad": ("backlash=0.1",),
+    "slack ±0.1 rad": ("cable_slack=0.1",),
+    "slack ±0.2 rad": ("cable_slack=0.2",),
+    "servo dead zone 0.1 rad": ("servo_dead_zone=0.1",),
+    "servo reaction −2 mN s²/rad": ("servo_reaction=-0.002",),
+    "servo reaction +4 mN s²/rad": ("servo_reaction=0.004",),
+    "30 ms, backlash 0.05, reaction +1": (
+        "servo_delay=0.03",
+        "backlash=0.05",
+        "servo_reaction=0.001",
+    ),
+    "50 ms, slack 0.1, reaction −1": (
+        "servo_delay=0.05",
+        "cable_slack=0.1",
+        "servo_reaction=-0.001",
+    ),
+    "80 ms, backlash 0.05, dead zone 0.05": (
+        "servo_delay=0.08",
+        "backlash=0.05",
+        "servo_dead_zone=0.05",
+    ),
+}
+SECONDS, SETTLE = 60.0, 10.0
+FAST = 0.2
+"""Reversals that follow within less than this are fast ones [s]."""
+
+
+class Swum(NamedTuple):
+    """One run."""
+
+    efficiency: float
+    every_tick: float
+    """Longest stretch of reversals in consecutive ticks [s]."""
+    fast: float
+    """Longest stretch of reversals less than `FAST` apart [s]."""
+    fell_back: bool
+
+
+class Reversals:
+    """A publisher that notes when the instruction angle changed its side."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+        self._side = 0.0
+
+    def tick(self, tick: Tick) -> None:
+        """Note a reversal."""
+        if tick.phi_c * self._side < 0.0:
+            self.times.append(tick.t)
+        self._side = tick.phi_c or self._side
+
+    def event(self, event: Event) -> None:
+        """Drop."""
+
+    def longest(self, apart: float) -> float:
+        """The longest stretch of reversals that follow within less than a time [s]."""
+        longest = begun = 0.0
+        for before, now in pairwise(self.times):
+            begun = begun or before
+            if now - before < apart:
+                longest = max(longest, now - begun)
+            else:
+                begun = 0.0
+        return longest
+
+
+def swim(config: Config, name: str, parameters: dict[str, str]) -> Swum:
+    """Let a controller swim a fish."""
+    reversals = Reversals()
+    controller = registry.create(name, parameters, config.limits)
+    report = judge(config, name, controller, SECONDS, SETTLE, reversals)
+    return Swum(
+        report.efficiency,
+        reversals.longest(1.5 * config.tick),
+        reversals.longest(FAST - 0.5 * config.tick),
+        report.fallback is not None,
+    )
+
+
+def swum(changes: Iterable[str], name: str, parameters: dict[str, str], seeds: int) -> list[Swum]:
+    """The same with several seeds of the noise."""
+    return [
+        swim(load(None, [*RIG, f"simulation.seed={seed}", *changes]), name, parameters)
+        for seed in range(seeds)
+    ]
+
+
+def report(policy: str, seeds: int) -> str:
+    """Markdown."""
+    fish = {"as configured": (), **HARSH}
+    ppo = {"policy": policy}
+    rows, without, limited, swing = [], [], [], []
+    for label, parts in fish.items():
+        changes = [f"plant.{part}" for part in parts]
+        free = swum([*changes, "chatter.dwell=0"], "ppo", ppo, seeds)
+        held = swum(changes, "ppo", ppo, seeds)
+        other = swum(changes, "swing", {}, seeds)
+        if parts:
+            without += free
+            limited += held
+            swing += other
+        rows.append(
+            [
+                label,
+                efficiency(free),
+                f"{max(run.every_tick for run in free):.1f}",
+                f"{max(run.fast for run in free):.1f}",
+                efficiency(held),
+                f"{max(run.every_tick for run in held):.1f}",
+                f"{max(run.fast for run in held):.1f}",
+                f"{sum(run.fell_back for run in held)} of {seeds}",
+                efficiency(other),
+            ]
+        )
+        print(" | ".join(rows[-1]), flush=True)
+    head = [
+        "fish",
+        "no limit [%]",
+        "every tick [s]",
+        f"< {FAST:g} s [s]",
+        "limit [%]",
+        "every tick [s]",
+        f"< {FAST:g} s [s]",
+        "fell back",
+        "`swing` [%]",
+    ]
+    return (
+        f"{table(head, rows)}\n\nThe {len(HARSH)} harsh fish, {len(without)} runs each, median "
+        f"(lowest): without the limit {spread(without)}, with it {spread(limited)}, `swing` "
+        f"{spread(swing)}."
+    )
+
+
+def efficiency(runs: list[Swum]) -> str:
+    """Median in %, for a cell."""
+    return f"{statistics.median(run.efficiency for run in runs) * 100:.1f}"
+
+
+def spread(runs: list[Swum]) -> str:
+    """Median and lowest."""
+    lowest = min(run.efficiency for run in runs)
+    return f"{efficiency(runs)} % ({lowest * 100:.1f} %)"
+
+
+def main() -> None:
+    """Measure, and print or write."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--policy", default="default-fish", help="name or file")
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each")
+    parser.add_argument("--write", type=Path, help="document with the markers of bench_chatter")
+    options = parser.parse_args()
+    text = report(options.policy, options.seeds)
+    if options.write:
+        put(options.write, "bench_chatter", text)
+    else:
+        print(text)
+
+
+if __name__ == "__main__":
+    main()
