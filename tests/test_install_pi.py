@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -77,11 +78,13 @@ def files(disk: Path) -> set[str]:
 
 
 def test_what_is_installed_is_where_the_units_look_for_it(pi: Pi) -> None:
-    unit = (pi.disk / "etc/systemd/system/fishd.service").read_text()
-    for program in ("opt/fishd/bin/fishd", "opt/fishd/bin/fishctl"):
-        assert f"/{program} " in unit
-        assert os.access(pi.disk / program, os.X_OK)
-    assert f"--config /{CONFIG}" in unit
+    for unit in ("fishd.service", "fishd-failure.service"):
+        text = (pi.disk / "etc/systemd/system" / unit).read_text()
+        commands = re.findall(r"^Exec\w+=[-+]*/(opt/\S+) --config /(\S+)$", text, re.MULTILINE)
+        assert commands
+        for program, config in commands:
+            assert os.access(pi.disk / program, os.X_OK), program
+            assert config == CONFIG
     assert (pi.disk / CONFIG).read_text() == (CHECKOUT / "config/pi.yaml").read_text()
     assert (pi.disk / "usr/local/bin/fishctl").readlink() == Path("/opt/fishd/bin/fishctl")
 
