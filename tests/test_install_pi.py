@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -308,6 +309,17 @@ def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> Non
     script = f'source {CHECKOUT}/tools/install_pi.sh; about_python "$@"'
     said = subprocess.check_output(["bash", "-c", script, "bash", python], text=True)
     assert said.startswith("32 linux-")
+
+
+def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:
+    """Adafruit-Blinka before 10 asks for RPi.GPIO and lgpio on a Pi, which exclude rpi-lgpio."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("dist-info/METADATA"))
+        metadata = archive.read(name).decode()
+    pattern = r"^Requires-Dist: ([\w.-]+)(\S*); extra == 'pi'$"
+    wanted = {name.lower(): bounds for name, bounds in re.findall(pattern, metadata, re.MULTILINE)}
+    assert "pigpio" in wanted
+    assert ">=10" in wanted["adafruit-blinka"]
 
 
 def test_an_unknown_gpio_package_is_refused_before_anything_is_done(tmp_path: Path) -> None:

@@ -35,14 +35,6 @@ check_machine() {
   update-binfmts --enable qemu-aarch64
 }
 
-bare_debian() {
-  local suite=$1 folder=$WORK/$1.base
-  [[ -e $folder/etc/os-release && ! -e $folder/debootstrap ]] && return
-  rm -rf "$folder"
-  timeout "$LONGEST" debootstrap --arch=arm64 --variant=minbase --include=ca-certificates \
-    "$suite" "$folder" ${DEBIAN:+"$DEBIAN"}
-}
-
 # What this machine's pip and shell know of the network, as variables.
 network() {
   local name
@@ -57,19 +49,13 @@ network() {
     done
 }
 
-# A new root with the checkout, and with this machine's way to the network.
-make_root() {
-  local suite=$1 root=$2 file
-  rm -rf "$root"
-  cp --archive "$WORK/$suite.base" "$root"
+# This machine's way to the network, for the root.
+connect() {
+  local root=$1 certificate
   cp --dereference /etc/resolv.conf "$root/etc/resolv.conf"
   apt-config dump | grep -E '^Acquire::(https?::|Check-)' >"$root/etc/apt/apt.conf.d/99host" || true
-  file=$(network | sed -n 's/^PIP_CERT=//p' | tail -n 1)
-  if [[ -n $file ]]; then install -D -m 644 "$file" "$root$file"; fi
-  mkdir "$root/root/fishd"
-  git -C "$checkout" ls-files --cached --others --exclude-standard -z |
-    (cd "$checkout" && xargs -0 ls -d -- 2>/dev/null) |
-    tar -C "$checkout" -cf - -T - | tar -C "$root/root/fishd" -xf -
+  certificate=$(network | sed -n 's/^PIP_CERT=//p' | tail -n 1)
+  if [[ -n $certificate ]]; then install -D -m 644 "$certificate" "$root$certificate"; fi
 }
 
 # Runs a command in the root, with nothing of this machine but its way to the network.
@@ -88,6 +74,32 @@ inside() {
 # The packages of the first step in docs/installing.md.
 documented_packages() {
   sed -n 's/^\$ sudo apt install \(.*\)/\1/p' "$checkout/docs/installing.md" | head -n 1
+}
+
+# A Debian with these packages; kept for the next time.
+make_base() {
+  local suite=$1 base=$WORK/$1.base packages
+  shift
+  packages=$base/packages-of-the-trial
+  [[ $(cat "$packages" 2>/dev/null) == "$*" ]] && return
+  rm -rf "$base"
+  timeout "$LONGEST" debootstrap --arch=arm64 --variant=minbase --include=ca-certificates \
+    "$suite" "$base" ${DEBIAN:+"$DEBIAN"}
+  connect "$base"
+  inside "$base" sh -c 'apt-get update && apt-get install --yes --no-install-recommends "$@"' sh "$@"
+  echo "$*" >"$packages"
+}
+
+# A copy of it with the checkout.
+make_root() {
+  local suite=$1 root=$2
+  rm -rf "$root"
+  cp --archive "$WORK/$suite.base" "$root"
+  connect "$root"
+  mkdir "$root/root/fishd"
+  git -C "$checkout" ls-files --cached --others --exclude-standard -z |
+    (cd "$checkout" && xargs -0 ls -d -- 2>/dev/null) |
+    tar -C "$checkout" -cf - -T - | tar -C "$root/root/fishd" -xf -
 }
 
 # Whether two reports of `fishctl simulate` agree; how fast the machines were does not count.
@@ -109,21 +121,22 @@ PYTHON
 }
 
 try_suite() {
-  local suite=$1 root=$WORK/$1 log=$WORK/$1.log status=0 size packages
-  bare_debian "$suite" >"$log" 2>&1 || fail "$suite: no Debian could be made; see $log"
-  make_root "$suite" "$root"
+  local suite=$1 root=$WORK/$1 status=0 size packages
   read -ra packages < <(documented_packages)
-  inside "$root" sh -c 'apt-get update && apt-get install --yes --no-install-recommends "$@"' sh \
-    "${packages[@]}" >>"$log" 2>&1 || fail "$suite: ${packages[*]}: cannot be installed; see $log"
+  make_base "$suite" "${packages[@]}" >"$WORK/$suite.log" 2>&1 ||
+    fail "$suite: no Debian could be made; see $WORK/$suite.log"
+  make_root "$suite" "$root"
   inside "$root" make -C /root/fishd install-pi >"$WORK/$suite.install.log" 2>&1 || status=$?
   size=$(du --summarize --block-size=1MB "$root/opt/fishd" | cut -f 1)
   sed "s/^/$suite: /" "$WORK/$suite.install.log"
   echo "$suite: make install-pi: exit status $status, /opt/fishd: $size MB"
   ((status == 0)) || return 1
   ((size <= MOST_SPACE)) || { echo "$suite: more than $MOST_SPACE MB" && return 1; }
-  inside "$root" fishctl "${SIMULATION[@]}" >"$WORK/$suite.json"
+  inside "$root" /usr/local/bin/fishctl "${SIMULATION[@]}" >"$WORK/$suite.json"
   "$FISHCTL" "${SIMULATION[@]}" >"$WORK/host.json"
-  echo "$suite: fishctl ${SIMULATION[*]}: $(compare "$WORK/host.json" "$WORK/$suite.json")"
+  compare "$WORK/host.json" "$WORK/$suite.json" >"$WORK/$suite.comparison" || status=$?
+  echo "$suite: fishctl ${SIMULATION[*]}: $(cat "$WORK/$suite.comparison")"
+  return "$status"
 }
 
 main() {

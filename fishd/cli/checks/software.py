@@ -10,6 +10,7 @@ from fishd.cli.checks.base import Check, Context, Result, fail, ok, sudo_unless,
 from fishd.hardware.packages import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
+    "adafruit-blinka": "adafruit_blinka",  # not one of its own, such as board, which looks for pins
     "pyyaml": "yaml",
     "pyzmq": "zmq",
 }
