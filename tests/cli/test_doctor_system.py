@@ -112,6 +112,19 @@ def test_where_nobody_answers_for_pigpiod_it_is_told_how_to_get_it_here(
     assert advice in found.mend
 
 
+def test_a_button_that_nothing_can_read_is_not_passed_over(
+    examine: Examine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The installation goes on without its package, and nobody may take that for a working one."""
+    monkeypatch.setattr("fishd.cli.checks.software.metadata.distributions", lambda: iter(()))
+    assert examine("gpio package") is None
+    found = examine("gpio package", "panel.estop_gpio=17")
+    assert level(found) == "FAIL"
+    assert found is not None
+    assert found.message.startswith("neither RPi.GPIO nor rpi-lgpio is installed")
+    assert "make install-pi" in found.mend
+
+
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [

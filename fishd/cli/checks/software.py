@@ -80,6 +80,7 @@ def gpio_package(context: Context) -> Result | None:
     if not installed:
         return fail(
             "neither RPi.GPIO nor rpi-lgpio is installed, but the configuration uses GPIO pins",
+            "sudo make install-pi, which says what it takes; without the service "
             f"{pip} install 'fishd[rpi-lgpio]' (Pi 5, Debian 13) or 'fishd[rpi-gpio]'",
         )
     if "rpi-gpio" in installed and "Raspberry Pi 5" in context.model:
