@@ -51,7 +51,7 @@ $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --no-deps 'rpi-lgpio>=0.6,<1'
 	@touch $@ $(VENV)/installed
 
-.PHONY: install-pi uninstall-pi trial-systemd
+.PHONY: install-pi uninstall-pi trial-systemd trial-arm64 release-check
 
 install-pi:  ## Install fishd on this Raspberry Pi, or renew it; needs sudo
 	tools/install_pi.sh
@@ -61,3 +61,8 @@ uninstall-pi:  ## Remove it; an edited configuration and calibrations stay unles
 
 trial-systemd: $(VENV)/installed-dev  ## Start, hang and kill fishd under a real systemd; needs root
 	$(BIN)/python tools/systemd_trial --write docs/reliability.md
+
+trial-arm64: $(VENV)/installed-dev  ## Install on arm64 Debian 12 and 13 under qemu; needs root, an hour
+	FISHCTL=$(CURDIR)/$(BIN)/fishctl tools/arm64_trial.sh
+
+release-check: lint test trial-systemd trial-arm64  ## All of these, once before each release; needs root

@@ -83,6 +83,12 @@ def check_force_sensor(sensor: ForceSensorSettings) -> None:
             ("force_sensor", "full_scale"),
             f"{sensor.full_scale:g} is not valid: one of {permitted} V is needed",
         )
+    low, high = sensor.saturation_low, sensor.saturation_high
+    if low is not None and high is not None and low >= high:
+        raise Problem(
+            ("force_sensor", "saturation_low"),
+            f"{low:g} is not valid: less than saturation_high, {high:g} V, is needed",
+        )
     if sensor.channel_x == sensor.channel_y:
         raise Problem(
             ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"

@@ -271,10 +271,13 @@ class ControlLoop:
     ) -> float:
         """The controller in command has named who takes over: in this very tick."""
         before = self.controller_name
-        self._swap(name, controller, fresh=True)
-        self.fallback = Reason(
-            _code(error), text.line(f"{before} lost command: {text.said(error)}")
-        )
+        try:
+            self._swap(name, controller, fresh=True)
+        except Exception as problem:
+            self._fail("controller-error", f"{name}, who was to follow {before}, failed", problem)
+            return self.guard.fade(self.applied)
+        why = text.line(f"{before} lost command: {text.said(error)}")
+        self.fallback = Reason(_code(error), why)
         self.reporter.fallback(before, name, self.parameters, self.fallback)
         return self._update(seen)
 

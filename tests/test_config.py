@@ -208,6 +208,11 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
     ("overrides", "key", "words"),
     [
         (["robot=pi", "force_sensor.full_scale=2"], "force_sensor.full_scale", "2.048"),
+        (
+            ["robot=pi", "force_sensor.saturation_low=3.3"],
+            "force_sensor.saturation_low",
+            "less than saturation_high, 3.2 V",
+        ),
         (["robot=pi", "force_sensor.channel_y=A0-A1"], "force_sensor.channel_y", "channel_x"),
         (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
         (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),

@@ -1,9 +1,14 @@
 """make install-pi and uninstall-pi, into a folder: what they put, keep and take away."""
 
+import io
 import os
+import re
 import shutil
+import socket
 import subprocess
 import sys
+import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -32,16 +37,22 @@ class Pi:
         """Run a script without a network; the lines that it says."""
         environment = {**os.environ, "DESTDIR": str(self.disk), "PYTHON": sys.executable}
         environment |= {"FISHD_WHEEL": str(self._wheel), "PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1"}
-        done = subprocess.run(
-            [CHECKOUT / "tools" / script],
-            env=environment | variables,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        environment |= {"FISHD_GPIO": "none"}
+        done = self.attempt(script, environment | variables)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
         return done.stdout.splitlines()
+
+    @staticmethod
+    def attempt(script: str, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [CHECKOUT / "tools" / script],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
 
     def copy(self, folder: Path) -> "Pi":
         shutil.copytree(self.disk, folder, symlinks=True)
@@ -68,11 +79,13 @@ def files(disk: Path) -> set[str]:
 
 
 def test_what_is_installed_is_where_the_units_look_for_it(pi: Pi) -> None:
-    unit = (pi.disk / "etc/systemd/system/fishd.service").read_text()
-    for program in ("opt/fishd/bin/fishd", "opt/fishd/bin/fishctl"):
-        assert f"/{program} " in unit
-        assert os.access(pi.disk / program, os.X_OK)
-    assert f"--config /{CONFIG}" in unit
+    for unit in ("fishd.service", "fishd-failure.service"):
+        text = (pi.disk / "etc/systemd/system" / unit).read_text()
+        commands = re.findall(r"^Exec\w+=[-+]*/(opt/\S+) --config /(\S+)$", text, re.MULTILINE)
+        assert commands
+        for program, config in commands:
+            assert os.access(pi.disk / program, os.X_OK), program
+            assert config == CONFIG
     assert (pi.disk / CONFIG).read_text() == (CHECKOUT / "config/pi.yaml").read_text()
     assert (pi.disk / "usr/local/bin/fishctl").readlink() == Path("/opt/fishd/bin/fishctl")
 
@@ -185,6 +198,130 @@ def test_the_gpio_package_suits_the_pi(model: str, debian: str, kernel: str, ext
     assert chosen.strip() == extra
 
 
+def sdist(folder: Path, name: str, build: str) -> None:
+    """Sources of a package whose build does this."""
+    backend = f"""
+import os, zipfile
+
+def build_wheel(folder, settings=None, metadata=None):
+    {build}
+    name = "{name}-0.6-py3-none-any.whl"
+    with zipfile.ZipFile(folder + "/" + name, "w") as wheel:
+        info = "{name}-0.6.dist-info/"
+        wheel.writestr("RPi/__init__.py", "")
+        wheel.writestr(info + "METADATA", "Metadata-Version: 2.1\\nName: {name}\\nVersion: 0.6\\n")
+        wheel.writestr(info + "WHEEL", "Wheel-Version: 1.0\\nTag: py3-none-any\\n")
+        wheel.writestr(info + "RECORD", "RPi/__init__.py,,\\n")
+    return name
+"""
+    files = {
+        "backend.py": backend,
+        "pyproject.toml": '[build-system]\nrequires = []\nbuild-backend = "backend"\n'
+        'backend-path = ["."]\n',
+        "PKG-INFO": f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.6\n",
+    }
+    folder.mkdir(exist_ok=True)
+    with tarfile.open(folder / f"{name}-0.6.tar.gz", "w:gz") as tar:
+        for path, text in files.items():
+            info = tarfile.TarInfo(f"{name}-0.6/{path}")
+            info.size = len(text.encode())
+            tar.addfile(info, io.BytesIO(text.encode()))
+
+
+def test_a_gpio_package_that_cannot_be_built_does_not_keep_fishd_from_being_installed(
+    pi: Pi, tmp_path: Path
+) -> None:
+    sdist(tmp_path / "sources", "rpi_lgpio", 'raise SystemExit("error: swig failed")')
+    options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
+    said = "\n".join(pi.run("install_pi.sh", **options))
+    assert "E-stop button and status light are NOT available: no rpi-lgpio" in said
+    assert "sudo apt install swig gcc python3-dev; then: sudo make install-pi" in said
+    assert "network" not in said
+    assert "/etc/systemd/system/fishd.service: installed" in said
+
+
+def test_the_gpio_package_is_built_with_what_its_sources_want(pi: Pi, tmp_path: Path) -> None:
+    sdist(tmp_path / "sources", "rpi_lgpio", 'assert os.environ["PYPI"] == "1"')
+    options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
+    built = "rpi-lgpio: installed, for E-stop button and status light"
+    assert built in pi.run("install_pi.sh", **options)
+    # The second time it is there, and is neither fetched nor built.
+    there = "rpi-lgpio: there, for E-stop button and status light"
+    assert there in pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio")
+
+
+def test_the_other_gpio_package_goes_only_once_the_new_one_is_built(pi: Pi, tmp_path: Path) -> None:
+    sources = tmp_path / "sources"
+    sdist(sources, "RPi.GPIO", "pass")
+    sdist(sources, "rpi_lgpio", 'raise SystemExit("error: swig failed")')
+    links = {"PIP_FIND_LINKS": str(sources)}
+    python = pi.disk / "opt/fishd/bin/python"
+    pip = [python, "-m", "pip", "--quiet", "install", "--no-index", f"--find-links={sources}"]
+    subprocess.run([*pip, "--no-deps", "RPi.GPIO"], check=True)
+    pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **links)
+    show = [python, "-m", "pip", "show"]
+    assert subprocess.run([*show, "RPi.GPIO"], capture_output=True, check=False).returncode == 0
+    sdist(sources, "rpi_lgpio", "pass")
+    assert "RPi.GPIO: removed, it excludes rpi-lgpio" in pi.run(
+        "install_pi.sh", FISHD_GPIO="rpi-lgpio", **links
+    )
+    subprocess.run([python, "-I", "-c", "import RPi"], check=True)
+
+
+def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi) -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # bound, but nobody listens: connections are refused
+        index = f"http://127.0.0.1:{nobody.getsockname()[1]}/simple"
+        options = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": index, "PIP_EXTRA_INDEX_URL": ""}
+        options |= {"PIP_FIND_LINKS": "", "PIP_RETRIES": "1", "PIP_CONFIG_FILE": os.devnull}
+        optional = "\n".join(pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **options))
+        environment = {**os.environ, "DESTDIR": str(pi.disk), "PYTHON": sys.executable, **options}
+        environment |= {"PIP_NO_DEPS": "0", "FISHD_GPIO": "none"}
+        needed = pi.attempt("install_pi.sh", environment)
+    assert "NOT available" in optional
+    assert needed.returncode == 1
+    for said in (optional, needed.stderr.splitlines()[-1]):
+        assert "the network failed" in said
+        assert "apt install" not in said
+
+
+@pytest.mark.parametrize(
+    ("bits", "platform", "extras"),
+    [
+        ("64", "linux-aarch64", "pi,policy"),
+        ("64", "linux-x86_64", "pi,policy"),
+        ("32", "linux-aarch64", "pi"),  # 32-bit Raspberry Pi OS on a Pi 4: the kernel has 64
+        ("32", "linux-armv7l", "pi"),
+        ("64", "linux-riscv64", "pi"),
+    ],
+)
+def test_policies_are_for_a_python_of_64_bits(bits: str, platform: str, extras: str) -> None:
+    script = f'source {CHECKOUT}/tools/install_pi.sh; core_extras "$@"'
+    chosen = subprocess.check_output(["bash", "-c", script, "bash", bits, platform], text=True)
+    assert chosen.strip() == extras
+
+
+def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> None:
+    python = tmp_path / "python3"
+    narrow = "import struct, sys; struct.calcsize = lambda form: 4; exec(sys.argv.pop(2))"
+    python.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{narrow}' \"$@\"\n")
+    python.chmod(0o755)
+    script = f'source {CHECKOUT}/tools/install_pi.sh; about_python "$@"'
+    said = subprocess.check_output(["bash", "-c", script, "bash", python], text=True)
+    assert said.startswith("32 linux-")
+
+
+def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:
+    """Adafruit-Blinka before 10 asks for RPi.GPIO and lgpio on a Pi, which exclude rpi-lgpio."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("dist-info/METADATA"))
+        metadata = archive.read(name).decode()
+    pattern = r"^Requires-Dist: ([\w.-]+)(\S*); extra == 'pi'$"
+    wanted = {name.lower(): bounds for name, bounds in re.findall(pattern, metadata, re.MULTILINE)}
+    assert "pigpio" in wanted
+    assert ">=10" in wanted["adafruit-blinka"]
+
+
 def test_an_unknown_gpio_package_is_refused_before_anything_is_done(tmp_path: Path) -> None:
     done = subprocess.run(
         [CHECKOUT / "tools/install_pi.sh"],
@@ -206,7 +343,7 @@ def test_an_unknown_gpio_package_is_refused_before_anything_is_done(tmp_path: Pa
 def test_shellcheck_has_nothing_to_say_against_the_scripts() -> None:
     if shutil.which("shellcheck") is None:
         pytest.skip("shellcheck is not installed: apt install shellcheck")
-    scripts = ["tools/install_pi.sh", "tools/uninstall_pi.sh"]
+    scripts = ["tools/install_pi.sh", "tools/uninstall_pi.sh", "tools/arm64_trial.sh"]
     done = subprocess.run(
         ["shellcheck", "-x", *scripts], cwd=CHECKOUT, capture_output=True, text=True, check=False
     )

@@ -46,7 +46,7 @@ def root(tmp_path: Path) -> Path:
     (tmp_path / "usr/lib/systemd/system/pigpiod.service").write_text(PIGPIOD)
     programs = (
         "opt/fishd/bin/fishd",
-        "opt/fishd/bin/fishctl",
+        "opt/fishd/bin/fishd-release",
         "usr/bin/pigpiod",
         "bin/sh",
         "bin/systemctl",
@@ -130,8 +130,33 @@ def test_a_wrong_config_is_not_tried_again() -> None:
 def test_the_servo_is_released_however_the_daemon_ends() -> None:
     (release,) = setting("fishd.service", "ExecStopPost")
     (start,) = setting("fishd.service", "ExecStart")
-    assert release.startswith("/opt/fishd/bin/fishctl release --config ")
+    assert release.startswith("/opt/fishd/bin/fishd-release --config ")
     assert release.rpartition(" ")[2] == start.rpartition(" ")[2]
+    (last_resort,) = (
+        line for line in setting("fishd-failure.service", "ExecStart") if "opt" in line
+    )
+    assert last_resort == f"-{release}"
+
+
+@pytest.mark.parametrize(
+    ("unit", "limit"),
+    [("fishd.service", "TimeoutStopSec"), ("fishd-failure.service", "TimeoutStartSec")],
+)
+def test_a_release_on_a_slow_pi_has_the_time_that_it_takes(unit: str, limit: str) -> None:
+    """TimeoutStopSec= limits ExecStopPost= as well; 3 s on a Zero 2 W when nothing else runs."""
+    assert float(setting(unit, limit)[0]) >= 20
+
+
+def test_clients_and_controllers_cannot_take_what_the_pi_needs() -> None:
+    (memory,) = setting("fishd.service", "MemoryMax")
+    assert int(memory.removesuffix("M")) <= 300
+    assert int(setting("fishd.service", "LimitNOFILE")[0]) == 4096
+    assert int(setting("fishd.service", "TasksMax")[0]) <= 64
+
+
+def test_only_fishd_itself_is_asked_to_stop() -> None:
+    """Its processes carry telemetry and requests, which it still needs while it fades."""
+    assert setting("fishd.service", "KillMode") == ["mixed"]
 
 
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:

@@ -4,7 +4,7 @@
 # PYTHON       the Python to use, python3 if not set
 # FISHD_WHEEL  a wheel to install instead of building one from this checkout
 # FISHD_GPIO   rpi-gpio or rpi-lgpio, if not what suits this Pi; or none, for a robot without E-stop
-#              button and status light
+#              button and status light. Where it cannot be had, all else is installed, and it says so
 # DESTDIR      a folder to install into, without touching the running system
 # pip's own variables work too: PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER installs without a network.
 set -euo pipefail
@@ -44,6 +44,13 @@ check_python() {
   fi
 }
 
+# A tick takes too long on the one slow core of these.
+check_board() {
+  if real_system && [[ $(about_python "$PYTHON") == *-armv6l ]]; then
+    fail "a Raspberry Pi Zero, Zero W or 1 is too slow for fishd; a Zero 2 W, 3, 4 or 5 is needed"
+  fi
+}
+
 # A Python that was upgraded, or taken away, leaves a folder behind that no longer runs.
 make_venv() {
   local version
@@ -57,32 +64,110 @@ make_venv() {
   step "$HOME_FOLDER: made with Python $version"
 }
 
+# What the controller `ppo` needs has wheels for 64 bits only. The kernel does not tell: 32-bit
+# Raspberry Pi OS boots a 64-bit one on a Pi 4 and 5, and `uname -m` says aarch64 there.
+core_extras() {
+  local bits=$1 platform=$2
+  case $bits-$platform in
+    64-linux-aarch64 | 64-linux-x86_64) echo pi,policy ;;
+    *) echo pi ;;
+  esac
+}
+
+# Bits of a pointer, and platform, of a Python.
+about_python() {
+  "$1" -c 'import struct, sysconfig; print(struct.calcsize("P") * 8, sysconfig.get_platform())'
+}
+
 # -I: not what lies in the folder that this is started from.
 pip() { "$venv/bin/python" -I -m pip --quiet --disable-pip-version-check "$@"; }
 
+# The same, with its complaints in a file, for `why`.
+try_pip() { pip "$@" 2>"$workspace/pip.log"; }
+
+# What pip's complaints amount to: build, network, space or other.
+why() {
+  local log=$1
+  if grep -qE 'Failed (building|to build)|metadata-generation-failed|Building wheel for .* did not run' "$log"; then
+    echo build
+  elif grep -qE 'connection broken|Connection(Pool|Error| refused| reset)|name resolution|timed out|(Proxy|SSL|HTTP)Error|Network is unreachable' "$log"; then
+    echo network
+  elif grep -q 'No space left on device' "$log"; then
+    echo space
+  else
+    echo other
+  fi
+}
+
+# How to mend what pip complained about, where these packages build what has no wheel.
+mend() {
+  case $(why "$workspace/pip.log") in
+    build) echo "a package has no wheel for this Python and could not be built: sudo apt install $1" ;;
+    network) echo "the network failed, not fishd: check it" ;;
+    space) echo "the disk is full: make room" ;;
+    other) echo "see what pip says" ;;
+  esac
+}
+
+give_up() {
+  cat "$workspace/pip.log" >&2
+  fail "$1; $(mend "gcc python3-dev"), then run this again"
+}
+
 install_package() {
-  local extra=$1 extras hint other wheel=${FISHD_WHEEL:-}
+  local extras wheel=${FISHD_WHEEL:-}
+  # shellcheck disable=SC2046
+  extras=$(core_extras $(about_python "$PYTHON"))
   if [[ -z $wheel ]]; then
-    pip wheel --no-deps --wheel-dir "$workspace" "$checkout" || fail "building fishd failed"
+    try_pip wheel --no-deps --wheel-dir "$workspace" "$checkout" || give_up "building fishd failed"
     wheel=$(echo "$workspace"/fishd-*.whl)
   fi
-  # Both packages put their files into the same folder RPi: one at a time.
-  other=$([[ $extra == rpi-gpio ]] && echo rpi-lgpio || echo RPi.GPIO)
-  if pip show "$other" >/dev/null 2>&1; then
-    pip uninstall --yes "$other"
-    step "$other: removed, it excludes $extra"
-  fi
-  extras=pi hint="gcc python3-dev"
-  # For the controller `ppo`; neither of its packages has a wheel for 32 bits.
-  case $(uname -m) in aarch64 | x86_64) extras+=,policy ;; esac
-  if [[ $extra != none ]]; then extras+=,$extra; fi
-  # No ready-made lgpio for Python 3.13; liblgpio-dev is in Raspberry Pi OS, not in Debian.
-  if [[ $extra == rpi-lgpio ]]; then hint+=" swig liblgpio-dev"; fi
-  pip install "${wheel}[$extras]" ||
-    fail "pip failed; to build what it has no wheel of: sudo apt install $hint; or leave $extra out with FISHD_GPIO=none, it is for E-stop button and status light"
+  try_pip install "${wheel}[$extras]" || give_up "installing fishd's packages failed"
   pip install --force-reinstall --no-deps "$wheel" # the same version may have other contents
   step "fishd $("$venv/bin/python" -I -c 'import fishd; print(fishd.__version__)') with the extras $extras"
 }
+
+# What fishd's extra $1 asks for, such as rpi-lgpio<1,>=0.6.
+requirement() {
+  "$venv/bin/python" -I - "$1" <<'PYTHON'
+import importlib.metadata, sys
+
+for line in importlib.metadata.requires("fishd"):
+    package, _, marker = line.partition(";")
+    if f"extra == '{sys.argv[1]}'" in marker.replace('"', "'"):
+        print(package.strip())
+PYTHON
+}
+
+# E-stop button and status light are optional, and so is what drives them: without it fishd is whole.
+install_gpio() {
+  local extra=$1 wanted other packages="gcc python3-dev"
+  [[ $extra != none ]] || return 0
+  wanted=$(requirement "$extra")
+  other=$([[ $extra == rpi-gpio ]] && echo rpi-lgpio || echo RPi.GPIO)
+  if has "$extra" && ! has "$other" && pip install --dry-run --no-index "$wanted" >/dev/null 2>&1; then
+    step "$extra: there, for E-stop button and status light"
+    return
+  fi
+  if [[ $extra == rpi-lgpio ]]; then packages="swig $packages"; fi
+  # PYPI: lgpio has its C library in its sources, and builds that instead of asking for the system's.
+  if ! PYPI=1 try_pip wheel --wheel-dir "$workspace/gpio" "$wanted"; then
+    grep -E '^ERROR|error:' "$workspace/pip.log" | tail -n 3 | sed 's/^ */  pip: /' || true
+    step "E-stop button and status light are NOT available: no $extra. All else is installed."
+    step "To have them: $(mend "$packages"); then: sudo make install-pi${FISHD_GPIO:+ FISHD_GPIO=$extra}"
+    step "A robot without them needs nothing more; FISHD_GPIO=none does not try"
+    return
+  fi
+  # Both packages put their files into the same folder RPi: one at a time.
+  if has "$other"; then
+    pip uninstall --yes "$other"
+    step "$other: removed, it excludes $extra"
+  fi
+  pip install --force-reinstall --no-deps "$workspace"/gpio/*.whl
+  step "$extra: installed, for E-stop button and status light"
+}
+
+has() { pip show "$1" >/dev/null 2>&1; }
 
 # What is in the folder must not know of DESTDIR, it will be gone when the folder is in its place.
 forget_destdir() {
@@ -160,12 +245,14 @@ main() {
   local extra
   need_root
   check_python
+  check_board
   workspace=$(mktemp -d)
   trap 'rm -rf "$workspace"' EXIT
   extra=${FISHD_GPIO:-$(gpio_extra "$(pi_model)" "$(debian_version)" "$(uname -r)")}
   [[ $extra =~ ^(rpi-gpio|rpi-lgpio|none)$ ]] || fail "FISHD_GPIO=$extra: rpi-gpio, rpi-lgpio or none"
   make_venv
-  install_package "$extra"
+  install_package
+  install_gpio "$extra"
   forget_destdir
   install_config
   install_files

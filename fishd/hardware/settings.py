@@ -34,6 +34,22 @@ class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             extra_json_schema={"unit": "V"},
         ),
     ] = 2.048
+    saturation_low: Annotated[
+        Annotated[float, Meta(ge=-6.144, le=6.144)] | None,
+        Meta(
+            description="At or below, an amplifier is at the end of its supply: as if the ADC had "
+            "clipped. Between the pins of the input, so 0.1 for A0 alone; null for none.",
+            extra_json_schema={"unit": "V"},
+        ),
+    ] = -3.2
+    saturation_high: Annotated[
+        Annotated[float, Meta(ge=-6.144, le=6.144)] | None,
+        Meta(
+            description="The same at or above. An amplifier at 3.3 V ends below a full_scale of "
+            "4.096 or 6.144, where the ADC itself does not clip; null for none.",
+            extra_json_schema={"unit": "V"},
+        ),
+    ] = 3.2
     data_rate: Annotated[
         Literal[8, 16, 32, 64, 128, 250, 475, 860],
         Meta(description="Conversions per second.", extra_json_schema={"unit": "1/s"}),

@@ -65,7 +65,10 @@ class _Channel:
 
     def __init__(self, force: str, channel: Channel, settings: ForceSensorSettings) -> None:
         self._name = f"{force} (channel {channel})"
-        self._full_scale = settings.full_scale
+        self._step = settings.full_scale / STEPS
+        low, high = settings.saturation_low, settings.saturation_high
+        self._lowest = -STEPS if low is None else max(-STEPS, math.floor(low / self._step))
+        self._highest = STEPS - 1 if high is None else min(STEPS - 1, math.ceil(high / self._step))
         self._patience = math.inf if settings.frozen_after is None else settings.frozen_after
         self.forget()
 
@@ -80,14 +83,24 @@ class _Channel:
         if not lowest == highest == self._code:
             self._code = codes[-1]
             self._since = newest
-        if highest == STEPS - 1 or lowest == -STEPS:
-            end = self._full_scale if highest == STEPS - 1 else -self._full_scale
-            return f"{self._name} is clipped at {end:+g} V"
+        if highest >= self._highest:
+            return self._at_its_end(highest, "saturation_high")
+        if lowest <= self._lowest:
+            return self._at_its_end(lowest, "saturation_low")
         still = newest - self._since
         if still >= self._patience:
-            volts = lowest * self._full_scale / STEPS
+            volts = lowest * self._step
             return f"{self._name} has been frozen at {volts:+.6g} V for {still:.1f} s"
         return ""
+
+    def _at_its_end(self, code: int, key: str) -> str:
+        """The ADC's own end of the range, or that of the amplifier before it."""
+        if code in (-STEPS, STEPS - 1):
+            return f"{self._name} is clipped at {math.copysign(self._step * STEPS, code):+g} V"
+        volts = code * self._step
+        return (
+            f"{self._name} is at {volts:+.4g} V: the amplifier is at its end (force_sensor.{key})"
+        )
 
 
 class VoltageWatch:

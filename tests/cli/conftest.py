@@ -1,11 +1,14 @@
 """A virtual Pi, a fishd on it, and somebody who talks to fishctl."""
 
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
+from doctor_tree import Examine, examiner
 from operator_rig import Bench, Dialogue, Talk, bench, pi_process
 from processes import Daemon
 
@@ -14,6 +17,21 @@ from processes import Daemon
 def _no_service(monkeypatch: pytest.MonkeyPatch) -> None:
     """The configuration of a service on this machine is none of these tests' business."""
     monkeypatch.setenv("FISHD_CONFIG", "")
+
+
+@pytest.fixture
+def root() -> Iterator[Path]:
+    """A tree of files that every user may enter."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def examine(root: Path) -> Examine:
+    """Make one check of `fishctl doctor` on the tree, for robot pi."""
+    return examiner(root)
 
 
 @pytest.fixture(scope="session")

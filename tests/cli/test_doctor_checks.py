@@ -4,52 +4,12 @@ import contextlib
 import os
 import shutil
 import subprocess
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from doctor_tree import Examine, level, put
 from test_doctor import doctor, free_telemetry
-
-from fishd.cli.checks import CHECKS
-from fishd.cli.checks.base import Context, Result
-from fishd.config import load
-
-Examine = Callable[..., Result | None]
-
-
-@pytest.fixture
-def root() -> Iterator[Path]:
-    """A tree that every user may enter."""
-    folder = Path(tempfile.mkdtemp())
-    folder.chmod(0o755)
-    yield folder
-    shutil.rmtree(folder)
-
-
-@pytest.fixture
-def examine(root: Path) -> Examine:
-    """Make one check on the tree, for robot pi."""
-
-    def make(name: str, *overrides: str) -> Result | None:
-        settings = ["robot=pi", f"state_folder={root}/state", *overrides]
-        context = Context(load(None, settings), None, f"ipc://{root}/nobody", root)
-        return next(check for check in CHECKS if check.name == name).function(context)
-
-    return make
-
-
-def put(root: Path, path: str, content: str | bytes = "") -> Path:
-    file = root / path
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(content.encode() if isinstance(content, str) else content)
-    return file
-
-
-def level(result: Result | None) -> str:
-    assert result is not None
-    assert bool(result.mend) == (result.level in ("warning", "FAIL"))
-    return result.level
 
 
 def test_the_i2c_bus_must_be_there(root: Path, examine: Examine) -> None:
@@ -120,20 +80,6 @@ def unprivileged() -> Iterator[None]:
         os.setresuid(0, 0, 0)
         os.setresgid(0, 0, 0)
         os.setgroups(groups)
-
-
-@pytest.mark.parametrize(("speed", "expected"), [(400_000, "ok"), (100_000, "warning")])
-def test_a_slow_bus_is_a_warning(root: Path, examine: Examine, speed: int, expected: str) -> None:
-    assert level(examine("i2c speed")) == "skipped"
-    place = "sys/class/i2c-adapter/i2c-1/of_node/clock-frequency"
-    put(root, place, speed.to_bytes(4, "big"))
-    assert level(examine("i2c speed")) == expected
-
-
-def test_a_machine_that_is_no_raspberry_pi_is_pointed_out(root: Path, examine: Examine) -> None:
-    assert level(examine("model")) == "warning"
-    put(root, "proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.5\0")
-    assert examine("model") == ("ok", "Raspberry Pi 4 Model B Rev 1.5", "")
 
 
 def test_pigpio_on_a_pi_5_fails_before_anything_is_tried(root: Path, examine: Examine) -> None:

@@ -51,6 +51,19 @@ def test_fishd_on_a_pi_names_the_package(tmp_path: Path, without: dict[str, str]
     assert re.fullmatch(ONE_LINE % "adafruit-circuitpython-ads1x15", ended.stderr)
 
 
+def test_fishd_does_not_start_with_a_button_that_it_cannot_read(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['RPi'] = None\n")
+    bus = 150 + os.getpid() % 50  # that no machine has
+    settings = ("robot=pi", f"force_sensor.bus={bus}", "servo.gpio=8", "panel.estop_gpio=9")
+    pi = [word for setting in settings for word in ("--set", setting)]
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    ended = call(env, FISHD, *pi, "--set", f"state_folder={tmp_path}", *own(tmp_path))
+    for lock in (f"fishd-i2c-{bus}.lock", "fishd-gpio8.lock"):
+        (ownership.FOLDER / lock).unlink(missing_ok=True)
+    assert ended.returncode == 1
+    assert "E-stop button, status light and servo driver rpi-gpio need" in ended.stderr
+
+
 def test_release_names_the_package(tmp_path: Path, without: dict[str, str]) -> None:
     settings = ("--set", "robot=pi", "--set", f"state_folder={tmp_path}")
     ended = call(without, FISHCTL, "release", *settings)

@@ -55,6 +55,43 @@ def test_a_single_clipped_sample_makes_its_window_suspect() -> None:
     assert [bool(suspect) for suspect in suspects] == [False, False, True, False, False, False]
 
 
+@pytest.mark.parametrize(("volts", "key"), [(3.28, "saturation_high"), (-3.28, "saturation_low")])
+def test_an_amplifier_at_its_supply_is_suspected_though_the_adc_does_not_clip(
+    volts: float, key: str
+) -> None:
+    with ForceRig() as rig:
+        rig.volts["A2-A3"] = volts
+        measured = Ticks(rig.sensor(full_scale=4.096)).next()
+    assert measured.suspect.startswith("F_y (channel A2-A3) is at ")
+    assert measured.suspect.endswith(f"the amplifier is at its end (force_sensor.{key})")
+
+
+def test_a_single_saturated_sample_makes_its_window_suspect_and_no_other() -> None:
+    with ForceRig() as rig:
+        rig.volts["A0-A1"] = lambda t: 3.28 if 0.120 < t < 0.126 else 3.1
+        ticks = Ticks(rig.sensor(full_scale=4.096))
+        suspects = [measured.suspect for measured in measurements(ticks.run(0.3))]
+    assert [bool(suspect) for suspect in suspects] == [False, False, True, False, False, False]
+
+
+@pytest.mark.parametrize(("low", "suspected"), [(0.1, True), (-3.2, False)])
+def test_an_amplifier_with_one_output_ends_at_ground_too(low: float, suspected: bool) -> None:
+    with ForceRig() as rig:
+        rig.volts = {"A0": 0.02, "A1": 1.65}
+        sensor = rig.sensor(channel_x="A0", channel_y="A1", full_scale=4.096, saturation_low=low)
+        suspect = Ticks(sensor).next().suspect
+    assert suspect.startswith("F_x (channel A0) is at +0.0") == suspected
+    assert bool(suspect) == suspected
+
+
+def test_where_the_amplifier_has_another_supply_the_whole_range_is_believed() -> None:
+    with ForceRig() as rig:
+        rig.volts["A0-A1"] = 4.0
+        ends = {"saturation_low": None, "saturation_high": None}
+        ticks = Ticks(rig.sensor(full_scale=4.096, force_limit=100.0, **ends))
+        assert not any(measured.suspect for measured in measurements(ticks.run(0.5)))
+
+
 def test_a_force_beyond_the_limit_is_suspected_though_the_mean_is_within() -> None:
     with ForceRig() as rig:
         rig.volts["A2-A3"] = lambda t: -1.2 if 0.020 < t < 0.026 else 0.0

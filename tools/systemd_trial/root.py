@@ -70,10 +70,17 @@ def _wheels(folder: Path) -> None:
     """Everything that installing fishd takes: there is no network inside."""
     _say("collecting wheels")
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    wanted = [f"{CHECKOUT}[pi]", "hatchling"]
+    wanted = [f"{CHECKOUT}[{core_extras()}]", "hatchling"]
     subprocess.run([*pip, "wheel", "--wheel-dir", folder, *wanted], check=True)
     for own in folder.glob("fishd-*.whl"):
         own.unlink()  # the installation builds its own
+
+
+def core_extras() -> str:
+    """What the installation will ask for, in its own words."""
+    script = 'source "$0/tools/install_pi.sh"; core_extras $(about_python "$1")'
+    command = ["bash", "-c", script, str(CHECKOUT), sys.executable]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def _say(line: str) -> None:

@@ -2,15 +2,26 @@
 
 from collections.abc import Iterator
 
-from fishd.cli.checks import computer, sensor, service, servo, software, timing
+from fishd.cli.checks import (
+    computer,
+    i2c,
+    sensor,
+    service,
+    servo,
+    software,
+    system,
+    timing,
+)
 from fishd.cli.checks.base import INSTALL, Check, Context, Result, fail
 from fishd.errors import MissingPackage
 from fishd.hardware.packages import driver_packages
 
 CHECKS: tuple[Check, ...] = (
     *software.CHECKS,
+    *system.CHECKS,
     *computer.CHECKS,
     *timing.CHECKS,
+    *i2c.CHECKS,
     *sensor.CHECKS,
     *servo.CHECKS,
     *service.CHECKS,

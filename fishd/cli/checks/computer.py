@@ -1,4 +1,4 @@
-"""Checks of the computer: model, power, disk, and the folder of calibrations."""
+"""Checks of the computer: power, disk, and the folder of calibrations."""
 
 import errno
 import os
@@ -17,16 +17,6 @@ LITTLE_DISK, NO_DISK = 1e9, 50e6
 _THROTTLED = "/sys/devices/platform/soc/soc:firmware/get_throttled"
 _BEFORE = 16
 """A flag of what happened since start is so many bits above that of what happens now."""
-
-
-def model(context: Context) -> Result:
-    """Robot `pi` is for a Raspberry Pi."""
-    if "Raspberry Pi" in context.model:
-        return ok(context.model)
-    return warning(
-        f"this machine is no Raspberry Pi: {context.model or 'it does not say what it is'}",
-        "run fishd on the Pi, or set robot: simulated or virtual-pi",
-    )
 
 
 def power(context: Context) -> Result:
@@ -169,7 +159,6 @@ def _is_seen(path: Path) -> bool:
 
 
 CHECKS = (
-    Check("model", model, ("pi",)),
     Check("power", power, ("pi",)),
     Check("state folder", state, ("pi", "virtual-pi")),
     Check("disk", disk),

@@ -1,20 +1,16 @@
-"""Checks of the force sensor, from the bus to the force; a running fishd is asked instead."""
+"""Checks of the force sensor, from amplifier to force; a running fishd is asked instead."""
 
-import os
-import stat
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from fishd.cli.checks.base import Check, Context, Result, fail, name_of, ok, skipped, warning
+from fishd.cli.checks.base import Check, Context, Result, fail, ok, warning
 from fishd.clock import SystemClock
 from fishd.errors import MissingPackage, SensorError, StartupError
 from fishd.hardware.calibration import ForceCalibration
 from fishd.hardware.i2c_errors import explain
 
-FAST_BUS = 400_000
-"""[bit/s]"""
 TRIAL = 1.0
 """How long the sensor is tried [s]."""
 FEWEST_PAIRS = 8
@@ -28,47 +24,30 @@ _ADS1115, _ADS1015 = 0x7FFF, 0x7FF0
 
 _START = "fishctl virtual-pi run"
 
-
-def bus(context: Context) -> Result:
-    """The device file, and whether this user may use it."""
-    number = context.config.force_sensor.bus
-    device = context.path(f"/dev/i2c-{number}")
-    if not device.exists():
-        others = sorted(path.name for path in context.path("/dev").glob("i2c-*"))
-        seen = f"; there is {', '.join(others)}: set force_sensor.bus" if others else ""
-        return fail(
-            f"/dev/i2c-{number} does not exist{seen}",
-            "dtparam=i2c_arm=on in /boot/firmware/config.txt, module i2c-dev loaded; restart",
-        )
-    if not os.access(device, os.R_OK | os.W_OK):
-        found = device.stat()
-        if found.st_gid == 0 or not found.st_mode & stat.S_IWGRP:
-            return fail(
-                f"/dev/i2c-{number} may be used by user {name_of(found.st_uid)} only",
-                "sudo make install-pi, then restart: its udev rule gives the bus to group i2c",
-            )
-        group = device.group()
-        return fail(
-            f"/dev/i2c-{number} may be used by group {group} only",
-            f"sudo usermod -aG {group} $USER, then log in again; the systemd service is in it",
-        )
-    return ok(f"/dev/i2c-{number} is there and may be used")
+SUPPLY = 3.3
+"""Of the ADC and of the amplifiers, as docs/wiring.md has them [V]."""
 
 
-def speed(context: Context) -> Result:
-    """As the device tree says; big-endian."""
-    number = context.config.force_sensor.bus
-    place = context.path(f"/sys/class/i2c-adapter/i2c-{number}/of_node/clock-frequency")
-    try:
-        found = int.from_bytes(place.read_bytes(), "big")
-    except OSError:
-        return skipped("the kernel does not tell the speed of this bus")
-    if found < FAST_BUS:
+def amplifier(context: Context) -> Result:
+    """Whether one at the end of its supply can be told from a force."""
+    settings = context.config.force_sensor
+    low, high = settings.saturation_low, settings.saturation_high
+    if settings.full_scale > SUPPLY and high is None:
         return warning(
-            f"{found / 1e3:.0f} kbit/s: fewer samples per tick than at {FAST_BUS / 1e3:.0f}",
-            f"dtparam=i2c_arm_baudrate={FAST_BUS} in /boot/firmware/config.txt, then restart",
+            f"full_scale is {settings.full_scale:g} V: an amplifier of {SUPPLY:g} V is at its end "
+            "before the ADC clips, and that would pass for a force",
+            "set force_sensor.saturation_high to what the amplifier can give, 3.2 V perhaps",
         )
-    return ok(f"{found / 1e3:.0f} kbit/s")
+    single = [c for c in (settings.channel_x, settings.channel_y) if "-" not in c]
+    if single and (low is None or low < 0.0):
+        return warning(
+            f"{' and '.join(single)} against ground: an amplifier at its lower end, near 0 V, "
+            "would pass for a force",
+            "set force_sensor.saturation_low to the least that it can give, 0.1 V perhaps",
+        )
+    ends = [f"{end:+g} V" for end in (low, high) if end is not None]
+    told = f"; at its end at {' and '.join(ends)}" if ends else ""
+    return ok(f"±{settings.full_scale:g} V{told}")
 
 
 def chip(context: Context) -> Result:
@@ -223,8 +202,7 @@ def _registers(number: int, address: int) -> tuple[int, int]:
 
 
 CHECKS = (
-    Check("i2c bus", bus, ("pi",)),
-    Check("i2c speed", speed, ("pi",)),
+    Check("amplifier", amplifier, ("pi", "virtual-pi")),
     Check("adc", chip, ("pi", "virtual-pi")),
     Check("force", force, ("pi", "virtual-pi")),
 )

@@ -38,12 +38,21 @@ def pigpiod(context: Context) -> Result | None:
         elif frozen:
             mend = "sudo systemctl restart pigpiod"
         else:
-            mend = "sudo systemctl enable --now pigpiod (not in Debian 13: servo.driver sysfs-pwm)"
+            mend = _start_pigpiod(context)
         return fail(str(error), mend)
     message = f"version {version} answers in {took * 1e3:.2f} ms"
     if took > SLOW_ANSWER:
         return warning(f"{message}: too slow for a tick", "see what else loads this machine")
     return ok(message)
+
+
+def _start_pigpiod(context: Context) -> str:
+    """What to do where nobody answers: Debian has no package of it, Raspberry Pi OS 12 has."""
+    if any(context.path(f"{folder}/pigpiod").exists() for folder in ("/usr/bin", "/usr/local/bin")):
+        return "sudo systemctl enable --now pigpiod"
+    if context.path("/etc/rpi-issue").exists():
+        return "sudo apt install pigpio; where there is no such package, servo.driver: sysfs-pwm"
+    return "Debian has no pigpiod: set servo.driver: sysfs-pwm, or build it from its sources"
 
 
 def pwm(context: Context) -> Result | None:

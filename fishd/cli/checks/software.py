@@ -10,6 +10,7 @@ from fishd.cli.checks.base import Check, Context, Result, fail, ok, sudo_unless,
 from fishd.hardware.packages import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
+    "adafruit-blinka": "adafruit_blinka",  # not one of its own, such as board, which looks for pins
     "pyyaml": "yaml",
     "pyzmq": "zmq",
 }
@@ -79,6 +80,7 @@ def gpio_package(context: Context) -> Result | None:
     if not installed:
         return fail(
             "neither RPi.GPIO nor rpi-lgpio is installed, but the configuration uses GPIO pins",
+            "sudo make install-pi, which says what it takes; without the service "
             f"{pip} install 'fishd[rpi-lgpio]' (Pi 5, Debian 13) or 'fishd[rpi-gpio]'",
         )
     if "rpi-gpio" in installed and "Raspberry Pi 5" in context.model:

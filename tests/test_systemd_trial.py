@@ -1,0 +1,37 @@
+"""The trial under a real systemd, as far as it can be tried without one: what it takes inside."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+def test_the_trial_collects_what_the_installation_inside_will_ask_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is no network inside."""
+    spec = importlib.util.spec_from_file_location("root", CHECKOUT / "tools/systemd_trial/root.py")
+    assert spec
+    assert spec.loader
+    root = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(root)
+    collected: list[str] = []
+    run = subprocess.run
+
+    def record(command: list[Any], **options: Any) -> Any:
+        if "wheel" not in command:
+            return run(command, check=options.pop("check"), **options)
+        collected.extend(map(str, command))
+        return None
+
+    monkeypatch.setattr(root.subprocess, "run", record)
+    root._wheels(tmp_path)
+    script = f'source {CHECKOUT}/tools/install_pi.sh; core_extras $(about_python "$0")'
+    asked = subprocess.check_output(["bash", "-c", script, sys.executable], text=True).strip()
+    assert asked == "pi,policy"
+    assert f"{CHECKOUT}[{asked}]" in collected

@@ -1,0 +1,153 @@
+#!/usr/bin/env bash
+# Installs fishd as docs/installing.md says on arm64 Debian 12 and 13, in chroots under qemu-user, and
+# compares a simulation there with the same on this machine. Needs root, and an hour.
+#
+#   sudo tools/arm64_trial.sh [SUITE ...]     bookworm and trixie, where none is named
+#
+# WORK   a folder that keeps the bare Debians and the logs; /var/tmp/fishd-arm64-trial if not set
+# DEBIAN what debootstrap takes for a mirror, if not its own
+# How pip and apt reach their packages is inherited from this machine: proxy, index, certificate.
+set -euo pipefail
+checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+WORK=${WORK:-/var/tmp/fishd-arm64-trial}
+FISHCTL=${FISHCTL:-$checkout/.venv/bin/fishctl}
+SIMULATION=(simulate swing --seconds 60 --json)
+MOST_SPACE=250 # MB of /opt/fishd
+LONGEST=2700   # s that a step may take
+
+fail() {
+  printf 'arm64_trial: %s\n' "$*" >&2
+  exit 1
+}
+
+check_machine() {
+  ((EUID == 0)) || fail "needs root"
+  local tool
+  for tool in debootstrap qemu-aarch64-static update-binfmts unshare; do
+    command -v "$tool" >/dev/null ||
+      fail "$tool is missing: apt install debootstrap qemu-user-static binfmt-support util-linux"
+  done
+  [[ -x $FISHCTL ]] || fail "$FISHCTL is missing, to compare with: make test; or name it with FISHCTL"
+  [[ $(uname -m) == aarch64 || -e /proc/sys/fs/binfmt_misc/qemu-aarch64 ]] && return
+  [[ -e /proc/sys/fs/binfmt_misc/register ]] ||
+    mount -t binfmt_misc binfmt_misc /proc/sys/fs/binfmt_misc ||
+    fail "this kernel has no binfmt_misc, so it does not start programs for arm64"
+  update-binfmts --enable qemu-aarch64
+}
+
+# What this machine's pip and shell know of the network, as variables.
+network() {
+  local name
+  for name in http_proxy https_proxy no_proxy; do
+    if [[ -n ${!name:-} ]]; then echo "$name=${!name}"; fi
+  done
+  python3 -m pip config list |
+    sed -nE "s/^[^.]*\.(index-url|proxy|trusted-host|default-timeout|cert)='(.*)'\$/\1 \2/p" |
+    while read -r name value; do
+      name=${name//-/_}
+      echo "PIP_${name^^}=$value"
+    done
+}
+
+# This machine's way to the network, for the root.
+connect() {
+  local root=$1 certificate
+  cp --dereference /etc/resolv.conf "$root/etc/resolv.conf"
+  apt-config dump | grep -E '^Acquire::(https?::|Check-)' >"$root/etc/apt/apt.conf.d/99host" || true
+  certificate=$(network | sed -n 's/^PIP_CERT=//p' | tail -n 1)
+  if [[ -n $certificate ]]; then install -D -m 644 "$certificate" "$root$certificate"; fi
+}
+
+# Runs a command in the root, with nothing of this machine but its way to the network.
+inside() {
+  local root=$1 variables
+  shift
+  mapfile -t variables < <(network)
+  # In namespaces of its own: mounts and processes are gone with it.
+  # shellcheck disable=SC2016
+  timeout "$LONGEST" unshare --mount --pid --fork --kill-child bash -c '
+    mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot "$0" env -i "$@"' \
+    "$root" PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root \
+    LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive "${variables[@]}" "$@"
+}
+
+# The packages of the first step in docs/installing.md.
+documented_packages() {
+  sed -n 's/^\$ sudo apt install \(.*\)/\1/p' "$checkout/docs/installing.md" | head -n 1
+}
+
+# A Debian with these packages; kept for the next time.
+make_base() {
+  local suite=$1 base=$WORK/$1.base packages
+  shift
+  packages=$base/packages-of-the-trial
+  [[ $(cat "$packages" 2>/dev/null) == "$*" ]] && return
+  rm -rf "$base"
+  timeout "$LONGEST" debootstrap --arch=arm64 --variant=minbase --include=ca-certificates \
+    "$suite" "$base" ${DEBIAN:+"$DEBIAN"}
+  connect "$base"
+  inside "$base" sh -c 'apt-get update && apt-get install --yes --no-install-recommends "$@"' sh "$@"
+  echo "$*" >"$packages"
+}
+
+# A copy of it with the checkout.
+make_root() {
+  local suite=$1 root=$2
+  rm -rf "$root"
+  cp --archive "$WORK/$suite.base" "$root"
+  connect "$root"
+  mkdir "$root/root/fishd"
+  git -C "$checkout" ls-files --cached --others --exclude-standard -z |
+    (cd "$checkout" && xargs -0 ls -d -- 2>/dev/null) |
+    tar -C "$checkout" -cf - -T - | tar -C "$root/root/fishd" -xf -
+}
+
+# Whether two reports of `fishctl simulate` agree; how fast the machines were does not count.
+compare() {
+  python3 - "$@" <<'PYTHON'
+import json, math, sys
+
+first, second = (json.load(open(path)) for path in sys.argv[1:])
+for report in (first, second):
+    for name in ("microseconds_per_tick", "real_time_factor"):
+        del report[name]
+assert first.keys() == second.keys()
+numbers = [name for name, value in first.items() if isinstance(value, float)]
+worst = max(abs(first[name] - second[name]) / max(abs(first[name]), 1.0) for name in numbers)
+others = all(first[name] == second[name] for name in first if name not in numbers)
+print(f"{len(numbers)} numbers differ by {worst:.1e} at most")
+sys.exit(not (others and worst <= 1e-9))
+PYTHON
+}
+
+try_suite() {
+  local suite=$1 root=$WORK/$1 status=0 size packages
+  read -ra packages < <(documented_packages)
+  make_base "$suite" "${packages[@]}" >"$WORK/$suite.log" 2>&1 ||
+    fail "$suite: no Debian could be made; see $WORK/$suite.log"
+  make_root "$suite" "$root"
+  inside "$root" make -C /root/fishd install-pi >"$WORK/$suite.install.log" 2>&1 || status=$?
+  size=$(du --summarize --block-size=1MB "$root/opt/fishd" | cut -f 1)
+  sed "s/^/$suite: /" "$WORK/$suite.install.log"
+  echo "$suite: make install-pi: exit status $status, /opt/fishd: $size MB"
+  ((status == 0)) || return 1
+  ((size <= MOST_SPACE)) || { echo "$suite: more than $MOST_SPACE MB" && return 1; }
+  inside "$root" /usr/local/bin/fishctl "${SIMULATION[@]}" >"$WORK/$suite.json"
+  "$FISHCTL" "${SIMULATION[@]}" >"$WORK/host.json"
+  compare "$WORK/host.json" "$WORK/$suite.json" >"$WORK/$suite.comparison" || status=$?
+  echo "$suite: fishctl ${SIMULATION[*]}: $(cat "$WORK/$suite.comparison")"
+  return "$status"
+}
+
+main() {
+  local suite failed=0
+  check_machine
+  mkdir -p "$WORK"
+  if (($# == 0)); then set -- bookworm trixie; fi
+  for suite in "$@"; do
+    try_suite "$suite" || failed=1
+  done
+  return "$failed"
+}
+
+main "$@"
