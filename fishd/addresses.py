@@ -13,6 +13,7 @@ import zmq
 
 from fishd.errors import StartupError
 from fishd.lockfile import Taken, lock_path, locked
+from fishd.runtime_folder import runtime_folder
 
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 _SERVICE = Path("/run/fishd/control")
@@ -64,14 +65,7 @@ def find_control() -> str:
 
 
 def _private_socket(name: str) -> Path:
-    """systemd's folder, else the login session's, else one under /tmp."""
-    runtime = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
-    if runtime:
-        return Path(runtime) / name
-    session = os.environ.get("XDG_RUNTIME_DIR")
-    if session and Path(session).is_dir():
-        return Path(session) / "fishd" / name
-    return Path(f"/tmp/fishd-{os.getuid()}") / name
+    return Path(runtime_folder()) / name
 
 
 @contextmanager

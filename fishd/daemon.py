@@ -48,8 +48,9 @@ class Daemon:
     another step fails.
     """
 
-    def __init__(self, config: Config, print_status: bool) -> None:
+    def __init__(self, config: Config, print_status: bool, file: Path | None = None) -> None:
         self._config = config
+        self._file = file
         self._print_status = print_status
         self._clock = VirtualClock() if config.lockstep else SystemClock()
         self._events = asyncio.get_running_loop()
@@ -72,7 +73,7 @@ class Daemon:
             self._rehearse = None if config.lockstep else rehearsal(config, context)
             controllers = registry.describe_all()  # imports what other packages offer
             preload()  # of what would hold up the ticks later
-            robot = robots.open_robot(config, self._clock, stack)
+            robot = robots.open_robot(config, self._clock, stack, self._file)
             self._loop = build.build_loop(
                 config, robot, self._clock, self._telemetry, self._notifier.ticked
             )
@@ -197,12 +198,15 @@ class Daemon:
             console.info("%s", line)
 
 
-async def swim(config: Config, print_status: bool) -> None:
-    """Run a daemon until SIGTERM or SIGINT, which count from before it touches the servo."""
+async def swim(config: Config, print_status: bool, file: Path | None = None) -> None:
+    """Run a daemon until SIGTERM or SIGINT, which count from before it touches the servo.
+
+    file: where the configuration comes from
+    """
     stopping = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopping.set)
-    with Daemon(config, print_status) as daemon:
+    with Daemon(config, print_status, file) as daemon:
         await daemon.run(stopping)
 
 
@@ -247,7 +251,8 @@ def fishd(
         complain("fishd", str(error), EX_CONFIG)
     logs = LogWriter(log_format)
     try:
-        asyncio.run(swim(config, sys.stdout.isatty() if print_status is None else print_status))
+        status = sys.stdout.isatty() if print_status is None else print_status
+        asyncio.run(swim(config, status, path))
     except ConfigError as error:  # in a calibration file
         log.critical("%s", error)
         sys.exit(EX_CONFIG)

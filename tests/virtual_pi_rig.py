@@ -1,4 +1,4 @@
-"""A virtual Pi in virtual time, with the true driver of its ADS1115 and fishd's client of pigpiod."""
+"""A virtual Pi in virtual time, with the true driver of its ADS1115 and fishd's pigpio client."""
 
 import math
 from typing import Any, Self

@@ -111,9 +111,13 @@ DEEDS = (
 )
 
 
-def die_at(bench: PigpioBench, kill_after: Callable[[int | None], None], deed: object, n: int) -> bool:
+def die_at(
+    n: int,
+    bench: PigpioBench,
+    deed: Callable[[PigpioBench], None],
+    kill_after: Callable[[int | None], None],
+) -> bool:
     """True when it died; False when it had done everything before."""
-    assert callable(deed)
     kill_after(n)
     try:
         deed(bench)
@@ -131,7 +135,7 @@ def test_a_kill_between_any_two_commands_leaves_no_pulses(
     for n in range(100):
         with contextlib.ExitStack() as stack:
             bench = PigpioBench(stack)
-            died = die_at(bench, mortal, deed, n)
+            died = die_at(n, bench, deed, mortal)
             bench.wait(SOON)
             # Pulses of others that nobody has touched yet are theirs.
             others = deed is last_resort_on_pulses_of_others

@@ -1,4 +1,4 @@
-"""An answer of pigpiod that comes late: waited for, but not for ever, and never past the countdown."""
+"""An answer of pigpiod that comes late: waited for, but never past the countdown."""
 
 import contextlib
 import time
@@ -80,7 +80,7 @@ def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: PigpioBen
     servo.write(0.5)
     bench.wait(1.0)  # fishd itself was held up
     bench.faults.clear()
-    with pytest.raises(ServoError, match="the servo may be at rest by now; reconnecting$"):
+    with pytest.raises(ServoError, match=r"the servo may be at rest by now; reconnecting$"):
         servo.write(0.5)
 
 

@@ -193,4 +193,3 @@ def test_close_says_when_pulses_may_still_be_on(bench: PigpioBench) -> None:
         servo.close()
     servo.close()
     bench.faults.clear()
-

@@ -54,7 +54,7 @@ def pwm(context: Context) -> Result | None:
     if occupied := context.occupied("owns the channel; see daemon"):
         return occupied
     from fishd.hardware.pwm_channel import PwmChannel
-    from fishd.hardware.sysfs_pwm import PATIENCE
+    from fishd.hardware.pwm_pulses import PATIENCE
 
     root = str(context.path(settings.sysfs.root))
     channel = PwmChannel(replace(settings, sysfs=replace(settings.sysfs, root=root)), SystemClock())

@@ -1,6 +1,6 @@
 """The GPIOs as pigpiod keeps them on a Pi 4: modes, pulls, levels, and what sends pulses where.
 
-The PWM peripheral is the Pi's, not pigpiod's: its registers, and the mode of a pin, outlive pigpiod.
+The PWM peripheral is the Pi's, not pigpiod's: its registers and the modes of pins outlive pigpiod.
 """
 
 from dataclasses import dataclass, replace
@@ -179,7 +179,8 @@ class Pins:
     def frequency(self, gpio: int) -> int:
         """The frequency of its PWM [Hz]."""
         pin = self._user(gpio)
-        return self._channel(gpio).frequency if pin.use is Use.HARDWARE_PWM else self._frequency(pin)
+        known = pin.use is Use.HARDWARE_PWM
+        return self._channel(gpio).frequency if known else self._frequency(pin)
 
     def hardware_pwm(self, time: float, gpio: int, frequency: int, duty: int) -> int:
         """Hardware PWM: frequency [Hz], 0 for off, and duty in millionths."""
