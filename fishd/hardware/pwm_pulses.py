@@ -27,10 +27,10 @@ def begin(channel: PwmChannel, width: float, period: float) -> None:
     even 0, and a polarity. A kernel that believes a channel to be on does nothing on enable 1, even
     where the hardware is off because the channel was unexported: it is switched off first.
     """
-    if channel.read("duty_cycle"):
-        channel.write("duty_cycle", 0)
     if channel.read("enable"):
         channel.write("enable", 0)
+    if channel.read("duty_cycle"):
+        channel.write("duty_cycle", 0)
     channel.write("period", round(1e9 * period))
     if channel.inverted():
         channel.make_normal()
