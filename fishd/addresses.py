@@ -10,6 +10,7 @@ from pathlib import Path
 
 from fishd.errors import StartupError
 from fishd.lockfile import NotALock, Taken, lock_path, locked
+from fishd.runtime_folder import runtime_folder
 from fishd.socket_owner import stranger
 from fishd.zmq_address import Ipc, parse
 
@@ -68,14 +69,7 @@ def find_control() -> str:
 
 
 def _private_socket(name: str) -> Path:
-    """systemd's folder, else the login session's, else one under /tmp."""
-    runtime = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
-    if runtime:
-        return Path(runtime) / name
-    session = os.environ.get("XDG_RUNTIME_DIR")
-    if session and Path(session).is_dir():
-        return Path(session) / "fishd" / name
-    return Path(f"/tmp/fishd-{os.getuid()}") / name
+    return Path(runtime_folder()) / name
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from fishd.config_checks import (
     check_force_sensor,
     check_lockstep,
     check_pins,
+    check_removed,
     check_servo,
     check_start,
     check_virtual_pi,
@@ -215,6 +216,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     sources = {key: f"{path}:{line}" for key, line in document.lines.items()}
     sources |= apply_overrides(document.data, overrides)
     try:
+        check_removed(document.data)
         config = convert(without_empty_sections(document.data, Config), Config)
         check_start(config.start.controller, config.start.parameters, config.limits)
         check_addresses(config.telemetry.address, config.control.address)

@@ -22,11 +22,26 @@ from fishd.hardware.settings import (
 from fishd.schema import Problem
 from fishd.zmq_address import FORM, check_length, is_local, why_not_served
 
-PWM_PINS = (12, 13, 18, 19)
+REMOVED = {
+    ("servo", "pigpio", "hardware_pwm"): "this key is gone, as such pulses outlive pigpiod and "
+    "nothing ended them; for finer pulses or more than 50 Hz write servo.driver: sysfs-pwm, on the "
+    "same pins, else leave the key out",
+}
+"""Keys that older versions had, and what to write instead."""
 SLOWEST_CONVERSION = 1.25
 """Of the ADC with its tolerance and its transfers, in units of 1 / data rate."""
 I2C_PINS = (2, 3)
 """SDA and SCL of bus 1."""
+
+
+def check_removed(data: Mapping[str, Any]) -> None:
+    """Nothing is asked for that there is no more; data: the file, with overrides."""
+    for path, instead in REMOVED.items():
+        section: Any = data
+        for key in path[:-1]:
+            section = section.get(key) if isinstance(section, Mapping) else None
+        if isinstance(section, Mapping) and path[-1] in section:
+            raise Problem(path, instead)
 
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
@@ -104,18 +119,11 @@ def check_servo(servo: ServoSettings, amplitude: float) -> None:
             ("servo", "pigpio", "host"),
             f"'{servo.pigpio.host}' is not valid: a host is needed, such as 127.0.0.1",
         )
-    if servo.driver != "pigpio":
-        return
-    if servo.frequency != 50.0 and not servo.pigpio.hardware_pwm:
+    if servo.driver == "pigpio" and servo.frequency != 50.0:
         raise Problem(
             ("servo", "frequency"),
             f"{servo.frequency:g} is not valid: pigpiod's servo pulses come at 50 Hz; for others "
-            "set servo.pigpio.hardware_pwm: true",
-        )
-    if servo.pigpio.hardware_pwm and servo.gpio not in PWM_PINS:
-        raise Problem(
-            ("servo", "gpio"),
-            f"{servo.gpio} is not valid: hardware PWM comes out of GPIO 12, 13, 18 or 19 only",
+            "set servo.driver: sysfs-pwm",
         )
 
 

@@ -52,8 +52,9 @@ class Daemon:
     another step fails.
     """
 
-    def __init__(self, config: Config, print_status: bool) -> None:
+    def __init__(self, config: Config, print_status: bool, file: Path | None = None) -> None:
         self._config = config
+        self._file = file
         self._print_status = print_status
         self._clock = VirtualClock() if config.lockstep else SystemClock()
         self._events = asyncio.get_running_loop()
@@ -75,7 +76,7 @@ class Daemon:
             self._rehearse = None if config.lockstep else rehearsal(config)
             controllers = registry.describe_all()  # imports what other packages offer
             preload()  # of what would hold up the ticks later
-            robot = robots.open_robot(config, self._clock, stack)
+            robot = robots.open_robot(config, self._clock, stack, self._file)
             self._loop = build.build_loop(
                 config, robot, self._clock, self._telemetry, self._notifier.ticked
             )
@@ -241,12 +242,17 @@ class Daemon:
             console.info("%s", line)
 
 
-async def swim(config: Config, print_status: bool, ending: Ending) -> None:
-    """Run a daemon until a signal, which counts from before it touches the servo."""
+async def swim(
+    config: Config, print_status: bool, ending: Ending, file: Path | None = None
+) -> None:
+    """Run a daemon until a signal, which counts from before it touches the servo.
+
+    file: where the configuration comes from
+    """
     stopping = asyncio.Event()
     events = asyncio.get_running_loop()
     ending.when_asked(partial(events.call_soon_threadsafe, stopping.set))
-    with Daemon(config, print_status) as daemon:
+    with Daemon(config, print_status, file) as daemon:
         ending.release = daemon.release_at_once
         await daemon.run(stopping)
 
@@ -295,7 +301,7 @@ def fishd(
     ending.last_words = logs.close
     show = sys.stdout.isatty() if print_status is None else print_status
     try:
-        asyncio.run(swim(config, show, ending))
+        asyncio.run(swim(config, show, ending, path))
     except ConfigError as error:  # in a calibration file
         log.critical("%s", error)
         return EX_CONFIG

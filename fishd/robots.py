@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import replace
 
+from fishd import recipe
 from fishd.addresses import virtual_pi_socket
 from fishd.clock import Clock, VirtualClock
 from fishd.config import Config
@@ -36,19 +37,22 @@ START_LIMIT = 1.0
 """How long the force sensor may take for its first sample [s]."""
 
 
-def open_robot(config: Config, clock: Clock, stack: ExitStack) -> Robot:
+def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None = None) -> Robot:
     """The robot, in real time; leaving `stack` releases its servo first, then lets go of the rest.
 
+    file: the configuration file, by which `fishd-release` will ask for this servo
     A sensor or servo that does not answer is no error here: the loop will say so, and recovers
     when it comes back. Raises `StartupError` when a package is missing, no virtual Pi is running or
     another fishd drives this robot, `ConfigError` when a calibration file is broken.
     """
+    if file:
+        recipe.remove(str(file))  # of an earlier configuration
     if config.robot == "simulated":
         return SimulatedFish(config.plant, config.simulation, config.tick).robot()
     stack.enter_context(ownership.owned(parts_of(config)))
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
-    return _assemble(config, clock, stack, threaded=True)
+    return _assemble(config, clock, stack, threaded=True, file=file)
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
@@ -126,13 +130,12 @@ def state_folder(config: Config) -> Path:
 
 
 def open_servo(config: Config, clock: Clock, *, threaded: bool) -> CalibratedServo:
-    """The servo alone; raises `StartupError` when its package is missing."""
+    """The servo alone; raises `StartupError` when the package of rpi-gpio is missing."""
     found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
     calibration = found[0] if found else as_configured(config.servo)
     settings = config.servo
     if settings.driver == "pigpio":
-        with driver_packages():
-            from fishd.hardware.pigpio import PigpioServo
+        from fishd.hardware.pigpio import PigpioServo
 
         return PigpioServo(settings, calibration, clock, threaded=threaded, tick=config.tick)
     if settings.driver == "sysfs-pwm":
@@ -150,6 +153,7 @@ def _assemble(
     stack: ExitStack,
     *,
     threaded: bool,
+    file: Path | None = None,
     truth: Callable[[], Truth] | None = None,
 ) -> Robot:
     from fishd.hardware.ads1115 import Ads1115Sensor
@@ -169,6 +173,8 @@ def _assemble(
     stack.callback(sensor.close)
     servo = open_servo(config, clock, threaded=threaded)
     stack.callback(servo.close)  # last in, first out: whatever fails, this is done first
+    tell_release = partial(_tell_release, config, file)
+    tell_release(servo.calibration)
     if threaded:
         _await_first_sample(sensor.read, clock)
 
@@ -190,11 +196,24 @@ def _assemble(
         servo=servo,
         truth=truth,
         panel=panel,
-        bench=Bench(sensor, servo),
+        bench=Bench(sensor, servo, tell_release),
         degraded=degraded,
         counters=lambda: {**sensor.counters(), **servo.counters()},
         countdown=servo.countdown,
     )
+
+
+def _tell_release(config: Config, file: Path | None, calibration: ServoCalibration) -> None:
+    """Leave what `fishd-release` needs to end these pulses quickly, whatever becomes of fishd."""
+    if file is None or config.servo.driver == "rpi-gpio":  # whose pulses end with fishd
+        return
+    servo = calibrated(config.servo, calibration)
+    where = {"host": servo.pigpio.host, "port": servo.pigpio.port}
+    sysfs = servo.sysfs
+    where |= {"root": sysfs.root, "chip": sysfs.chip, "channel": sysfs.channel}
+    neutral = pulses.pulse_width(servo, 0.0)
+    what = {"driver": servo.driver, "gpio": servo.gpio, "frequency": servo.frequency}
+    recipe.write(str(file), {**what, **where, "neutral": neutral})
 
 
 def _cut_by_calibration(config: Config, calibration: ServoCalibration) -> str:

@@ -171,4 +171,5 @@ class ServoBench:
         bench = self._loop.robot.bench
         assert bench
         bench.servo.recalibrate(calibration)
+        bench.recalibrated(calibration)
         self._loop.guard.restrict(*pulses.reach(calibrated(self._settings, calibration)))

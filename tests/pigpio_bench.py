@@ -2,10 +2,9 @@
 
 import contextlib
 
-import pigpio
-
 from fishd.clock import VirtualClock
 from fishd.emulation.faults import Faults
+from fishd.emulation.pigpiod import errors
 from fishd.emulation.pigpiod.daemon import Pigpiod
 from fishd.errors import ServoError
 from fishd.hardware.calibration import ServoCalibration
@@ -29,9 +28,8 @@ class PigpioBench:
         stack.callback(self.daemon.close)
         self._stack = stack
 
-    def settings(self, *, hardware_pwm: bool = False, frequency: float = 50.0) -> ServoSettings:
-        pigpio = PigpioSettings(port=self.daemon.port, hardware_pwm=hardware_pwm)
-        return ServoSettings(gpio=GPIO, frequency=frequency, pigpio=pigpio)
+    def settings(self) -> ServoSettings:
+        return ServoSettings(gpio=GPIO, pigpio=PigpioSettings(port=self.daemon.port))
 
     def servo(
         self,
@@ -79,7 +77,7 @@ class PigpioBench:
             time: float, number: int, p1: int, p2: int, extension: bytes
         ) -> tuple[int, bytes]:
             if (number, p2) == (command, value):
-                return pigpio.PI_NOT_PERMITTED, b""
+                return errors.NOT_PERMITTED, b""
             return execute(time, number, p1, p2, extension)
 
         commands.execute = refusing  # type: ignore[method-assign]

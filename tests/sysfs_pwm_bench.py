@@ -48,10 +48,10 @@ class Bench:
     def widths(self, channel: int = 2, device: str = PI5) -> list[float]:
         return [width for _, width in self.kernel.pulses(device, channel).history]
 
-    def shell(self, path: str, value: int) -> None:
+    def shell(self, path: str, value: int | str) -> None:
         """`echo value > /sys/class/pwm/path`, by somebody else."""
         fd = self.kernel.open(f"/sys/class/pwm/{path}", os.O_WRONLY)
-        self.kernel.pwrite(fd, b"%d\n" % value, 0)
+        self.kernel.pwrite(fd, f"{value}\n".encode(), 0)
         self.kernel.close(fd)
 
     def exported(self, chip: int = 1) -> list[str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from fishd.clock import Clock
 from fishd.emulation.pulses import PulseTrain
+from fishd.hardware.pwm_channel import PwmChannel
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class _State:
     period: int = 0
     duty_cycle: int = 0
     enable: int = 0
+    polarity: str = "normal"
 
 
 @dataclass
@@ -97,12 +99,15 @@ class SysfsPwm:
         device, channel, name = self._opened(fd)
         if channel is None:
             raise _error(errno.EIO)  # export and unexport can only be written to
-        text = b"%d\n" % getattr(self._chips[device][channel].state, name)
+        text = f"{getattr(self._chips[device][channel].state, name)}\n".encode()
         return text[offset : offset + length]
 
     def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
         """As os.pwrite."""
         device, channel, name = self._opened(fd)
+        if name == "polarity" and channel is not None:
+            self._apply(self._chips[device][channel], name, data.decode().strip())
+            return len(data)
         try:
             value = int(data)
         except ValueError:
@@ -141,7 +146,7 @@ class SysfsPwm:
         if name in ("export", "unexport") and name in self.listdir(folder):
             return self._device(folder), None, name
         chip, _, channel = folder.rpartition("/")
-        if name not in ("period", "duty_cycle", "enable") or channel not in self.listdir(chip):
+        if name not in (*PwmChannel.NAMES, "polarity") or channel not in self.listdir(chip):
             raise _error(errno.ENOENT, path)
         return self._device(chip), int(channel.removeprefix("pwm")), name
 
@@ -176,18 +181,24 @@ class SysfsPwm:
             self._fds[fd] = ("", None, "")
         channel.pulses.cut(self._clock.monotonic())
 
-    def _apply(self, channel: _Channel, name: str, value: int) -> None:
+    def _apply(self, channel: _Channel, name: str, value: int | str) -> None:
         if name == "enable" and value not in (0, 1):
             raise _error(errno.EINVAL)
-        state = replace(channel.state, **{name: value})
+        if name == "polarity" and value not in ("normal", "inversed"):
+            raise _error(errno.EINVAL)
+        state = replace(channel.state, **{name: value})  # type: ignore[arg-type]
         if state.period <= 0 or not 0 <= state.duty_cycle <= state.period:
             raise _error(errno.EINVAL)
         if state == channel.state:
             return
+        if name == "polarity" and state.enable:
+            raise _error(errno.EBUSY)
         channel.state = state
         now = self._clock.monotonic()
         if state.enable:  # from the next period on
-            channel.pulses.set(now, 1e-3 * state.duty_cycle, 1e-9 * state.period)
+            normal = state.polarity == "normal"
+            high = state.duty_cycle if normal else state.period - state.duty_cycle
+            channel.pulses.set(now, 1e-3 * high, 1e-9 * state.period)
         else:  # at once
             channel.pulses.cut(now)
 

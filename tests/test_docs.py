@@ -13,6 +13,7 @@ from documents import DOCS, FENCE, ROOT, code_of, first_cells, prose_of, text_of
 from fishd.cli.checks import CHECKS
 from fishd.cli.main import fishctl
 from fishd.config import Config, load
+from fishd.config_checks import REMOVED
 from fishd.daemon import fishd
 from fishd.emulation.faults import FAULTS
 from fishd.errors import UnknownController
@@ -141,7 +142,7 @@ def test_every_configuration_key_that_is_named_exists(document: Path) -> None:
     if document.name == "configuration.md":
         wrong -= {"plant.omega"}  # an example of a mistake
     if document.name == "troubleshooting.md":
-        wrong -= {"servo.gpoi"}
+        wrong -= {"servo.gpoi", *map(".".join, REMOVED)}
     assert not wrong
 
 

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from functools import cache
 
-import pigpio
 import pytest
 from documents import FENCE, ROOT, text_of
 
@@ -36,9 +35,8 @@ def test_concepts_lists_each_reason() -> None:
 
 @cache
 def phrases() -> frozenset[str]:
-    """What the sources print, cut at the gaps for values; and words of Linux and of pigpio."""
+    """What the sources print, cut at the gaps for values; and words of Linux."""
     found = {os.strerror(number) for number in errno.errorcode}
-    found.add(pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID))
     for source in sources():
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):

@@ -155,7 +155,7 @@ def test_a_pigpiod_that_restarts_is_a_fault_and_gets_its_script_again(rig: Locks
 
 def test_a_pigpiod_that_hangs_is_a_fault_and_is_released_when_it_wakes(rig: LockstepRig) -> None:
     rig.pi.faults.inject("pigpiod-frozen", 1.0)
-    assert rig.run_until_fault(1.0) <= 0.10
+    assert 0.10 < rig.run_until_fault(1.0) <= 0.16  # in the third tick
     assert_one_fault(rig, "servo-link")
     assert rig.pulse != 0.0  # a daemon that hangs cannot be told to stop
     rig.run_for(2.5)

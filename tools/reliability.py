@@ -73,11 +73,19 @@ def injected(fault: str) -> Deed:
     return lambda pi, process: pi.faults.inject(fault)
 
 
+def killed_with_pigpiod(pi: VirtualPi, process: "subprocess.Popen[bytes]") -> None:
+    """Kill fishd, and pigpiod right after; it is started again."""
+    process.kill()
+    time.sleep(0.02)
+    pi.faults.inject("pigpiod-restart")
+
+
 # What is done, how it is called in the table.
 DEATHS: dict[str, tuple[str, Deed]] = {
     "SIGTERM": ("asked to stop", signalled(signal.SIGTERM)),
     "SIGINT": ("Ctrl-C", signalled(signal.SIGINT)),
     "SIGKILL": ("kill -9, or out of memory", signalled(signal.SIGKILL)),
+    "SIGKILL of both": ("fishd, then pigpiod, which is started again", killed_with_pigpiod),
     "SIGSEGV": ("a crash of the interpreter", signalled(signal.SIGSEGV)),
     "SIGSTOP": ("a hang of the whole process", signalled(signal.SIGSTOP)),
     "SIGCONT": ("a hang that ends after 1 s", stopped(1.0)),

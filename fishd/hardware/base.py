@@ -128,3 +128,5 @@ class Bench:
 
     sensor: CalibratedSensor
     servo: CalibratedServo
+    recalibrated: Callable[[ServoCalibration], None] = lambda calibration: None
+    """Called when another calibration of the servo is in force."""

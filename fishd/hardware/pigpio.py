@@ -3,26 +3,14 @@
 A countdown script inside pigpiod ends the pulses when fishd no longer writes, whatever ended it.
 """
 
-from contextlib import suppress
-
-import pigpio
-
 from fishd.clock import Clock
 from fishd.errors import ServoError
+from fishd.hardware import pigpio_client, pigpio_pulses
 from fishd.hardware.calibration import ServoCalibration, calibrated
-from fishd.hardware.pigpio_client import ANSWER, Client, opened
+from fishd.hardware.pigpio_client import Client
 from fishd.hardware.pigpio_link import PigpioLink
-from fishd.hardware.pigpio_pulses import (
-    COUNT,
-    MAGIC,
-    OFF,
-    PARAMETERS,
-    SCRIPTS,
-    HardwarePwm,
-    ServoPulses,
-    counts,
-)
-from fishd.hardware.pulses import REST, pulse_width
+from fishd.hardware.pigpio_pulses import COUNT, OFF, armed
+from fishd.hardware.pulses import pulse_width
 from fishd.hardware.settings import ServoSettings
 
 
@@ -51,13 +39,12 @@ class PigpioServo:
         """
         self._settings = settings
         self._clock = clock
-        self._counts = counts(settings.pigpio.countdown, tick)
+        self._tick = tick
+        self._counts = pigpio_pulses.counts(settings.pigpio.countdown, tick)
         self.countdown = COUNT * self._counts
-        self._pulses = (
-            HardwarePwm(settings) if settings.pigpio.hardware_pwm else ServoPulses(settings)
-        )
         self._script = -1
         self._energised = False
+        self._armed = 0.0  # when the latest countdown that pigpiod has confirmed was sent
         self._closed = False
         self.recalibrate(calibration)
         self._link = PigpioLink(settings.pigpio, clock, self._prepare, threaded=threaded)
@@ -73,16 +60,27 @@ class PigpioServo:
         self.calibration = calibration
 
     def write(self, angle: float) -> None:
-        """Send an instruction angle [rad], and arm the countdown."""
+        """Arm the countdown, and send an instruction angle [rad].
+
+        An answer that comes late is no error: the servo keeps its angle for a tick. Raises
+        `ServoError` at the third in a row, or before the countdown could end.
+        """
         width = pulse_width(self._settings, angle)
-        with self._link.session() as client:
+        with self._link.session(forgives=self._has_time) as client:
+            late = client.owed
+            client.settle()
+            now = self._clock.monotonic()
+            if late and self._energised and now - self._armed > self.countdown:
+                raise ConnectionError("it answered so late that the servo may be at rest by now")
             # First the countdown: whatever happens next, these pulses will have an end.
-            client.update_script(self._script, self._countdown(self._counts, self._neutral))
+            countdown = armed(self._settings.gpio, self._counts, self._neutral)
+            client.update_script(self._script, countdown)
+            self._armed = now
             self._energised = True
-            self._pulses.send(client, width)
+            client.servo(self._settings.gpio, width)
 
     def release(self) -> None:
-        """Disarm the countdown and stop the pulses; may be called twice."""
+        """Stop the pulses and disarm the countdown; may be called twice."""
         with self._link.session() as client:
             self._release(client)
 
@@ -105,77 +103,51 @@ class PigpioServo:
             self._link.close()
 
     def counters(self) -> dict[str, int]:
-        """How often the link was made again since start."""
-        return {"servo_reconnects": self._link.reconnects}
+        """How often the link was made again since start, and how many answers came late."""
+        return {
+            "servo_reconnects": self._link.reconnects,
+            "servo_late_answers": self._link.late_answers,
+        }
 
     def neutralise(self) -> bool:
         """Last resort, from another process than fishd: neutral for 0.3 s, then off.
 
-        False if there are no pulses: then nothing moves. Removes fishd's scripts, so that a fishd
-        that still lives gets a fault. Ends this object's own link. Raises `ServoError` when a step
-        fails; the pulses are stopped all the same, if they can be.
+        Ends this object's own link. The rest is as `pigpio_pulses.neutralise` says.
         """
         self._closed = True
         self._link.close()
-        try:
-            return self._neutralise()
-        except BaseException:
-            # The countdowns may be disarmed by now: nothing else would end the pulses.
-            with suppress(ServoError), opened(self._settings.pigpio) as client:
-                self._pulses.send(client, OFF)
-                self._delete(client, self._disarm_leftovers(client))
-            raise
+        settings, sleep = self._settings, self._clock.sleep
+        return pigpio_pulses.neutralise(settings.pigpio, settings.gpio, self._neutral, sleep)
 
-    def _neutralise(self) -> bool:
-        with opened(self._settings.pigpio) as client:
-            leftovers = self._disarm_leftovers(client)
-            energised = self._pulses.on(client)
-            if energised:
-                self._pulses.send(client, self._neutral)
-                self._clock.sleep(REST)
-                client.within(ANSWER)
-                self._pulses.send(client, OFF)
-            self._delete(client, leftovers)
-        return energised
-
-    def _countdown(self, count: int, width: float) -> list[int]:
-        return [count, self._pulses.gpio, *self._pulses.arguments(width)]
+    def _has_time(self) -> bool:
+        """Whether the countdown leaves time for another tick."""
+        silence = self._clock.monotonic() - self._armed
+        return not self._energised or silence + self._tick < self.countdown
 
     def _release(self, client: Client) -> None:
-        # Without a pulse in it: a count that the script is just writing back cannot energise.
-        client.update_script(self._script, self._countdown(0, OFF))
-        self._pulses.send(client, OFF)
+        gpio = self._settings.gpio
+        # Not disarmed but armed with OFF: if only the first of the two arrives, it ends the pulses.
+        script = pigpio_client.update_script(self._script, armed(gpio, 1, OFF))
+        countdown, off = client.exchange([script, pigpio_client.servo(gpio, OFF)], urgent=True)
+        off.good()
         self._energised = False
-
-    def _disarm_leftovers(self, client: Client) -> list[int]:
-        """The scripts on this pin that an earlier connection or a killed fishd left behind."""
-        leftovers = []
-        for script in range(SCRIPTS):
-            _, parameters = client.script_status(script)
-            if parameters and parameters[1] == self._pulses.gpio and parameters[-1] == MAGIC:
-                client.update_script(script, self._countdown(0, OFF))
-                leftovers.append(script)
-        return leftovers
-
-    @staticmethod
-    def _delete(client: Client, scripts: list[int]) -> None:
-        for script in scripts:
-            client.delete_script(script)
+        countdown.good()
 
     def _prepare(self, client: Client) -> None:
-        """Put a new connection in order: no pulses go on unless the loop writes again."""
-        leftovers = self._disarm_leftovers(client)
-        countdown = self._countdown(0, OFF)
+        """Put a new connection in order: no pulses go on unless the loop writes again.
+
+        The scripts of those before stay armed until that of this connection is. It ends pulses that
+        the bytes of a lost connection, or of a killed fishd, still bring.
+        """
+        gpio, sleep = self._settings.gpio, self._clock.sleep
+        former = pigpio_pulses.countdowns(client, gpio)
+        count, width = self._counts, OFF
+        if not self._energised and pigpio_pulses.pulses_on(client, gpio, sleep):
+            count, width = 1, self._neutral  # of a killed fishd: gently
+        self._script = pigpio_pulses.install(client, gpio, count, width, sleep)
+        for script in former:
+            client.update_script(script, armed(gpio, 0, OFF))
         if self._energised:
-            self._pulses.send(client, OFF)
-            # And once more from the script: the lost connection may still hold a pulse.
-            countdown = self._countdown(self._counts, OFF)
-        elif leftovers and self._pulses.on(client):
-            countdown = self._countdown(1, self._neutral)
-        self._delete(client, leftovers)
-        self._script = client.store_script(self._pulses.script)
-        while client.script_status(self._script)[0] == pigpio.PI_SCRIPT_INITING:
-            self._clock.sleep(0.001)
-        padding = [0] * (PARAMETERS - 1 - len(countdown))
-        client.run_script(self._script, [*countdown, *padding, MAGIC])
+            client.servo(gpio, OFF)
+        pigpio_pulses.remove(client, gpio, former)
         self._energised = False

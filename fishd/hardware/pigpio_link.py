@@ -16,6 +16,9 @@ START = 2.0
 PAUSES = 0.2, 1.0
 """Shortest and longest pause between two attempts to connect [s]."""
 
+LATE_STREAK = 3
+"""Ticks in a row without an answer that end a connection."""
+
 # In virtual time nothing waits for a tick: a busy machine must not pass for a frozen pigpiod.
 VIRTUAL_ANSWER = 0.25
 VIRTUAL_CONNECT = 0.05
@@ -42,6 +45,8 @@ class PigpioLink:
         """
         self.reconnects = 0
         """How often a connection was made again."""
+        self.late_answers = 0
+        """How many sessions ended without an answer in time."""
         self._settings = settings
         self._clock = clock
         self._prepare = prepare
@@ -49,6 +54,7 @@ class PigpioLink:
         self._opening: Client | None = None
         self._reason = "no answer yet"
         self._connections = 0
+        self._late = 0  # sessions in a row
         self._next_attempt = float("-inf")
         self._lock = threading.RLock()
         self._needed = threading.Event()
@@ -64,12 +70,17 @@ class PigpioLink:
             self._connected.wait(START)
 
     @contextlib.contextmanager
-    def session(self, *, last: bool = False) -> Iterator[Client]:
+    def session(
+        self, *, forgives: Callable[[], bool] | None = None, last: bool = False
+    ) -> Iterator[Client]:
         """The client, all of whose commands must be done within the time limit of the settings.
 
+        forgives: asked when an answer is late, whether that is no error: it is then waited for in
+            the next session, and what was to come after that command is left out
         last: nobody will reconnect after it, and no tick waits: it may take 1 s
         Raises `ServoError` where there is no connection, without waiting for one, and where a
-        command fails, which ends the connection.
+        command fails. That ends the connection, unless an answer is merely late, up to twice in a
+        row.
         """
         limit = self._settings.timeout if self._thread else VIRTUAL_ANSWER
         if last:
@@ -83,8 +94,19 @@ class PigpioLink:
             client.within(deadline - time.monotonic() if self._thread else limit)
             try:
                 yield client
+                self._late = 0
+            except TimeoutError as error:
+                self._late += 1
+                self.late_answers += 1
+                why = reason(error, limit)
+                if self._late >= LATE_STREAK or last or not (forgives is None or forgives()):
+                    self._drop(client, why)
+                elif forgives:
+                    return
+                else:
+                    outlook = "; waiting for it"
+                raise ServoError(f"{where(self._settings)}: {why}{outlook}") from None
             except BaseException as error:
-                # An answer may still be under way, and would be taken for that of the next command.
                 self._drop(client, reason(error, limit))
                 if not isinstance(error, FAILURES):
                     raise
@@ -119,7 +141,7 @@ class PigpioLink:
     def _drop(self, client: Client, why: str) -> None:
         self._client = None
         self._reason = why
-        client.dispose()
+        client.close()
         self._needed.set()
 
     def _connect(self, limit: float, preparation: float) -> bool:
@@ -127,22 +149,25 @@ class PigpioLink:
         allowed = limit
         try:
             client = self._opening = Client(self._settings.host, self._settings.port, limit)
-            client.get_pigpio_version()
+            client.version()
             allowed = preparation
             client.within(preparation)
             self._prepare(client)
-        except Exception as error:  # whatever it is, the next attempt may do better
+        except BaseException as error:
             self._reason = reason(error, allowed)
             if client:
-                client.dispose()
-            return False
+                client.close()
+            if isinstance(error, Exception):  # whatever it is, the next attempt may do better
+                return False
+            raise
         finally:
             self._opening = None
         with self._lock:
             if self._closed.is_set():
-                client.dispose()
+                client.close()
                 return False
             self._connections += 1
+            self._late = 0
             self.reconnects = self._connections - 1
             self._client = client
         self._connected.set()

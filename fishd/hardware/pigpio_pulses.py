@@ -1,15 +1,32 @@
-"""The two ways in which pigpiod makes pulses, each with its countdown script.
+"""What keeps pigpiod's pulses from outliving whoever asked for them: a countdown inside of it.
 
-The script runs inside pigpiod and so survives fishd: unless it is armed again in time, it moves the
-servo to neutral, and half a second later it switches the pulses off.
+The script survives the client: unless it is armed again in time, it moves the servo to neutral, and
+half a second later it ends the pulses. The rule of this module and of the servo: whatever instant a
+client dies at, a running script is armed, or there are no pulses. Armed with OFF, it ends them.
 """
 
 import math
+from collections.abc import Callable
+from contextlib import suppress
 
-import pigpio
-
-from fishd.hardware.pigpio_client import Client
-from fishd.hardware.settings import ServoSettings
+from fishd.errors import ServoError
+from fishd.hardware.pigpio_client import (
+    ANSWER,
+    GET_DUTY,
+    GET_MODE,
+    GET_WIDTH,
+    INITIALISING,
+    NOT_PWM,
+    NOT_SERVO,
+    PARAMETERS,
+    READ,
+    SCRIPTS,
+    Client,
+    PigpioError,
+    Place,
+    opened,
+)
+from fishd.hardware.pulses import REST
 
 OFF = 0.0
 """A pulse width that stands for no pulses."""
@@ -17,17 +34,26 @@ OFF = 0.0
 COUNT = 0.01
 """The script counts down once in so long [s]."""
 
-# p0: counts left, 0 is disarmed · p1: GPIO · p2, p3: the pulse to end with · p9: MAGIC.
-# After the hold p0 tells whether the script was armed again meanwhile: then the pulses stay.
+# p0: counts left, 0 is disarmed · p1: GPIO · p2: the pulse to end with, 0 for none · p9: MAGIC.
+# After the hold p0 tells whether the script was armed again meanwhile: then the pulses stay. There
+# is no hold after OFF, so that a servo that is written to again is under guard at once.
 COUNTDOWN = (
-    "tag 0 mils 10 lda p0 cmp 0 jz 0 dcr p0 jnz 0 {neutral} mils 500 lda p0 cmp 0 jnz 0 {off} jmp 0"
+    b"tag 0 mils 10 lda p0 cmp 0 jz 0 dcr p0 jnz 0 "
+    b"s p1 p2 lda p2 cmp 0 jz 0 mils 500 lda p0 cmp 0 jnz 0 s p1 0 jmp 0"
 )
 
 MAGIC = int.from_bytes(b"fish", "big")
 """Tells fishd's scripts from those of others."""
 
-PARAMETERS = 10
-SCRIPTS = 32
+_GUARD = 60
+"""What a last resort arms its own script with: longer than it takes itself [counts]."""
+
+_PWM_MODES = {12: 4, 13: 4, 18: 2, 19: 2}
+"""GPIO → the mode in which the PWM peripheral drives it."""
+_LOOKS, _LOOK = 130, 4e-4
+"""How often a pin's level is looked at, and how long is waited between [s]: two frames, densely."""
+
+Sleep = Callable[[float], None]
 
 
 def counts(countdown: float, tick: float) -> int:
@@ -35,58 +61,92 @@ def counts(countdown: float, tick: float) -> int:
     return math.ceil(round(max(countdown, 3.0 * tick) / COUNT, 6))
 
 
-class ServoPulses:
-    """pigpiod's own servo pulses: 50 Hz on any pin, in steps of 5 µs, or 1 µs as configured."""
+def armed(gpio: int, count: int, width: float) -> list[int]:
+    """The script's first parameters, to end with a pulse `width` [µs] after so many counts."""
+    return [count, gpio, round(width)]
 
-    script = COUNTDOWN.format(neutral="s p1 p2", off="s p1 0").encode()
 
-    def __init__(self, settings: ServoSettings) -> None:
-        self.gpio = settings.gpio
+def countdowns(client: Client, gpio: int) -> list[int]:
+    """The scripts on this pin that an earlier connection or a killed fishd left behind."""
+    statuses = client.script_statuses(range(SCRIPTS))
+    return [
+        script
+        for script, (_, parameters) in enumerate(statuses)
+        if parameters and parameters[1] == gpio and parameters[-1] == MAGIC
+    ]
 
-    def arguments(self, width: float) -> list[int]:
-        """The script's parameters from p2 on, for a pulse `width` [µs]."""
-        return [round(width)]
 
-    def send(self, client: Client, width: float) -> None:
-        """Set the pulse width [µs]; the running pulse ends as it was begun."""
-        client.set_servo_pulsewidth(self.gpio, round(width))
+def install(client: Client, gpio: int, count: int, width: float, sleep: Sleep) -> int:
+    """Store a countdown and run it, armed; the number of the script."""
+    script = client.store_script(COUNTDOWN)
+    parameters = armed(gpio, count, width)
+    parameters += [0] * (PARAMETERS - 1 - len(parameters)) + [MAGIC]
+    client.update_script(script, parameters)  # at once: nobody finds one without its name
+    while client.script_status(script)[0] == INITIALISING:
+        sleep(0.001)
+    client.run_script(script, parameters)
+    return script
 
-    def on(self, client: Client) -> bool:
-        """Whether there are pulses on the pin."""
+
+def remove(client: Client, gpio: int, scripts: list[int]) -> None:
+    """Delete countdowns, which must not be needed any more."""
+    for script in scripts:
+        client.update_script(script, armed(gpio, 0, OFF))
+    for script in scripts:
+        client.within(ANSWER)  # one that holds the servo at neutral ends its hold first
+        client.delete_script(script)
+
+
+def pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
+    """Whether there are pulses on the pin, of this pigpiod or of one before it.
+
+    Those of the PWM peripheral outlive the pigpiod that began them, and the next one knows nothing
+    of them: where the pin is in that mode, its level is watched for two frames.
+    """
+    for command, otherwise in ((GET_WIDTH, NOT_SERVO), (GET_DUTY, NOT_PWM)):
         try:
-            return bool(client.get_servo_pulsewidth(self.gpio) > 0)
-        except pigpio.error as error:
-            if error.value == pigpio.error_text(pigpio.PI_NOT_SERVO_GPIO):
-                return False
-            raise
+            if client.ask(command, gpio):
+                return True
+        except PigpioError as error:
+            if error.number != otherwise:
+                raise
+    if client.ask(GET_MODE, gpio) != _PWM_MODES.get(gpio):
+        return False
+    for _ in range(_LOOKS):
+        if client.ask(READ, gpio):
+            return True
+        sleep(_LOOK)
+    return False
 
 
-class HardwarePwm:
-    """The PWM peripheral: finer steps, up to 333 Hz, on GPIO 12, 13, 18 and 19."""
+def neutralise(place: Place, gpio: int, neutral: float, sleep: Sleep) -> bool:
+    """Last resort, from another process than fishd: neutral [µs] for 0.3 s, then off.
 
-    script = COUNTDOWN.format(neutral="hp p1 p2 p3", off="hp p1 p2 0").encode()
+    False if there are no pulses: then nothing moves. Removes fishd's scripts, so that a fishd that
+    still lives gets a fault. Raises `ServoError` when a step fails; the pulses are stopped all the
+    same, if they can be.
+    """
+    try:
+        with opened(place) as client:
+            return _neutralise(client, gpio, neutral, sleep)
+    except BaseException:
+        with suppress(ServoError), opened(place) as client:
+            client.servo(gpio, OFF)
+            remove(client, gpio, countdowns(client, gpio))
+        raise
 
-    def __init__(self, settings: ServoSettings) -> None:
-        self.gpio = settings.gpio
-        self._frequency = round(settings.frequency)
 
-    def arguments(self, width: float) -> list[int]:
-        """The script's parameters from p2 on: frequency [Hz] and duty [1e-6]."""
-        return [self._frequency, round(width * self._frequency)]
-
-    def send(self, client: Client, width: float) -> None:
-        """Set the pulse width [µs].
-
-        Pulses are ended by a duty of 0 at the same frequency: a frequency of 0 would stop the
-        peripheral in mid-pulse.
-        """
-        client.hardware_PWM(self.gpio, *self.arguments(width))
-
-    def on(self, client: Client) -> bool:
-        """Whether there are pulses on the pin."""
-        try:
-            return bool(client.get_PWM_dutycycle(self.gpio) > 0)
-        except pigpio.error as error:
-            if error.value == pigpio.error_text(pigpio.PI_NOT_PWM_GPIO):
-                return False
-            raise
+def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool:
+    scripts = countdowns(client, gpio)
+    energised = pulses_on(client, gpio, sleep)
+    if energised:
+        # First a script of its own: this process may be killed, too.
+        scripts.append(install(client, gpio, _GUARD, OFF, sleep))
+        for script in scripts[:-1]:
+            client.update_script(script, armed(gpio, 0, OFF))
+        client.servo(gpio, neutral)  # this takes the pin from the PWM peripheral as well
+        sleep(REST)
+        client.within(ANSWER)
+        client.servo(gpio, OFF)
+    remove(client, gpio, scripts)
+    return energised

@@ -1,7 +1,11 @@
 """The one place where an angle becomes a servo pulse."""
 
+from typing import TYPE_CHECKING
+
 from fishd.errors import ServoError
-from fishd.hardware.settings import ServoSettings
+
+if TYPE_CHECKING:  # the last resort has no time to load it
+    from fishd.hardware.settings import ServoSettings
 
 SHORTEST, LONGEST = 500.0, 2500.0
 """No servo is sent a pulse outside of this [µs]."""
@@ -11,7 +15,7 @@ REST = 0.3
 """Time at neutral before the pulses end, for a servo that did not get there slowly [s]."""
 
 
-def pulse_width(servo: ServoSettings, angle: float) -> float:
+def pulse_width(servo: "ServoSettings", angle: float) -> float:
     """The pulse [µs] for an instruction angle [rad].
 
     Raises `ServoError` for an angle that is not finite or beyond the soft limits, and for a pulse
@@ -31,13 +35,13 @@ def pulse_width(servo: ServoSettings, angle: float) -> float:
     return width
 
 
-def reach(servo: ServoSettings) -> tuple[float, float]:
+def reach(servo: "ServoSettings") -> tuple[float, float]:
     """The lowest and highest angle [rad] that soft limits and pulse widths permit."""
     lowest, highest = widest(servo)
     return max(servo.lowest, lowest), min(servo.highest, highest)
 
 
-def widest(servo: ServoSettings) -> tuple[float, float]:
+def widest(servo: "ServoSettings") -> tuple[float, float]:
     """The lowest and highest angle [rad] that pulse widths permit."""
     neutral = servo.centre + servo.trim
     ends = ((end - neutral) / (servo.direction * servo.scale) for end in (SHORTEST, LONGEST))
@@ -45,7 +49,7 @@ def widest(servo: ServoSettings) -> tuple[float, float]:
     return lowest, highest
 
 
-def cut(servo: ServoSettings, amplitude: float) -> str:
+def cut(servo: "ServoSettings", amplitude: float) -> str:
     """What `reach` leaves of ±Φ, such as `-0.3 to +0.42 rad of ±0.42 rad`; empty for all of it.
 
     amplitude: Φ [rad]

@@ -5,9 +5,7 @@ import os
 from contextlib import suppress
 from typing import Protocol
 
-from fishd.clock import Clock
 from fishd.errors import ServoError
-from fishd.hardware.settings import ServoSettings
 
 _BROADCOM = {12: 0, 18: 0, 13: 1, 19: 1}
 
@@ -47,13 +45,51 @@ class Files(Protocol):
         """As os.readlink."""
 
 
+class Sysfs(Protocol):
+    """Where the channel is; `servo.sysfs` of the configuration is one."""
+
+    @property
+    def root(self) -> str:
+        """Folder of the PWM chips."""
+
+    @property
+    def chip(self) -> str | None:
+        """Device of the chip; None for that of the Pi's header."""
+
+    @property
+    def channel(self) -> int | None:
+        """Its channel; None for the one that the pin is wired to."""
+
+
+class Wiring(Protocol):
+    """What a servo is wired to; `servo` of the configuration is one."""
+
+    @property
+    def gpio(self) -> int:
+        """Its pin."""
+
+    @property
+    def sysfs(self) -> Sysfs:
+        """Its channel."""
+
+
+class Clock(Protocol):
+    """The clocks of fishd, and module `time`."""
+
+    def monotonic(self) -> float:
+        """As time.monotonic."""
+
+    def sleep(self, seconds: float, /) -> None:
+        """As time.sleep."""
+
+
 class PwmChannel:
     """One channel; each method raises `ServoError` with a line that says how to mend it."""
 
     NAMES = ("period", "duty_cycle", "enable")
-    """Its files: two times [ns], and 1 for on."""
+    """Its files with a number: two times [ns], and 1 for on."""
 
-    def __init__(self, servo: ServoSettings, clock: Clock, files: Files = os) -> None:
+    def __init__(self, servo: Wiring, clock: Clock, files: Files = os) -> None:
         """Nothing is looked for before `open`."""
         self._servo = servo
         self._files = files
@@ -107,6 +143,30 @@ class PwmChannel:
             self._files.pwrite(self._fds[name], b"%d\n" % value, 0)
         except OSError as error:
             raise _explained(f"{self.path}/{name}", error) from None
+
+    def inverted(self) -> bool:
+        """Whether it is low where it should be high, as others may have left it."""
+        return self._polarity() == b"inversed"
+
+    def make_normal(self) -> None:
+        """Let pulses be high; the channel must be off, and its period known."""
+        self._polarity(b"normal\n")
+
+    def _polarity(self, wanted: bytes = b"") -> bytes:
+        """Read or set it; a chip without one is normal."""
+        path = f"{self.path}/polarity"
+        try:
+            fd = self._files.open(path, os.O_RDWR)
+            try:
+                if wanted:
+                    self._files.pwrite(fd, wanted, 0)
+                return self._files.pread(fd, 32, 0).strip()
+            finally:
+                self._files.close(fd)
+        except FileNotFoundError:
+            return b"normal"
+        except OSError as error:
+            raise _explained(path, error) from None
 
     def close(self) -> None:
         """Close the files; the channel stays as it is."""
@@ -181,7 +241,7 @@ class PwmChannel:
             raise _explained(path, error) from None
 
 
-def _channel_number(servo: ServoSettings, device: str) -> int:
+def _channel_number(servo: Wiring, device: str) -> int:
     if servo.sysfs.channel is not None:
         return servo.sysfs.channel
     if device not in HEADER_CHIPS:

@@ -101,8 +101,8 @@ class PigpioSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         Meta(
             ge=0.001,
             le=0.1,
-            description="Longest that pigpiod may keep a tick waiting; then the link is lost. "
-            "More than 10 ms makes ticks late, but forgives a busy machine.",
+            description="Longest that pigpiod may keep a tick waiting; then the servo keeps its "
+            "angle for a tick. The third time in a row the link is lost.",
             extra_json_schema={"unit": "s"},
         ),
     ] = 0.008
@@ -116,10 +116,6 @@ class PigpioSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             extra_json_schema={"unit": "s"},
         ),
     ] = 0.2
-    hardware_pwm: Annotated[
-        bool,
-        Meta(description="Finer pulses from the PWM peripheral; GPIO 12, 13, 18 or 19 only."),
-    ] = False
 
 
 class SysfsPwmSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -155,7 +151,7 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             ge=40,
             le=333,
             description="Pulses per second; more than 50 for digital servos only, and not with "
-            "pigpiod's own servo pulses.",
+            "pigpio.",
             extra_json_schema={"unit": "Hz"},
         ),
     ] = 50.0

@@ -9,13 +9,12 @@ from contextlib import suppress
 
 from fishd.clock import Clock
 from fishd.errors import ServoError
+from fishd.hardware import pwm_pulses
 from fishd.hardware.calibration import ServoCalibration, calibrated
-from fishd.hardware.pulses import REST, pulse_width
+from fishd.hardware.pulses import pulse_width
 from fishd.hardware.pwm_channel import Files, PwmChannel
+from fishd.hardware.pwm_pulses import PATIENCE
 from fishd.hardware.settings import ServoSettings
-
-PATIENCE = 2.0
-"""How long udev may take to hand over the files of a new channel [s]; ticks do not wait for it."""
 
 
 class SysfsPwmServo:
@@ -57,7 +56,7 @@ class SysfsPwmServo:
         Raises `ServoError`, and keeps the old one, if its neutral is no pulse for a servo.
         """
         servo = calibrated(self._settings, calibration)
-        self._neutral = _nanoseconds(pulse_width(servo, 0.0))
+        self._neutral = pulse_width(servo, 0.0)
         self._servo = servo
         self.calibration = calibration
 
@@ -70,14 +69,14 @@ class SysfsPwmServo:
 
         Raises `ServoError`; after that, each write tries to open the channel again, at once.
         """
-        duty = _nanoseconds(pulse_width(self._servo, angle))
+        width = pulse_width(self._servo, angle)
         try:
             if self._driving:
                 self._check_pulses()
-                self._channel.write("duty_cycle", duty)
+                self._channel.write("duty_cycle", pwm_pulses.nanoseconds(width))
             else:
                 self._channel.open(patience=0.0)
-                self._begin(duty)
+                self._begin(width)
         except ServoError:
             self._lose()
             raise
@@ -89,7 +88,7 @@ class SysfsPwmServo:
         """
         try:
             self._channel.open(patience=0.0)
-            if self._pulses_are_on():
+            if pwm_pulses.on(self._channel):
                 # Not enable 0, which lets the level fall in the middle of a pulse: the servo would
                 # jerk. A new duty cycle takes effect when the present period has ended.
                 self._channel.write("duty_cycle", 0)
@@ -113,7 +112,7 @@ class SysfsPwmServo:
             finally:
                 if self._owned:
                     self._channel.open(patience=0.0)  # a release that fails closes it
-                    self._switch_off()
+                    pwm_pulses.switch_off(self._channel, self._period, self._clock.sleep)
         except ServoError:
             if self._owned:  # else there never were pulses of ours
                 raise
@@ -129,34 +128,11 @@ class SysfsPwmServo:
         its pulses are off. Raises `ServoError` when a step fails; the pulses are stopped all the
         same, if they can be.
         """
-        self._channel.open(PATIENCE)
-        if not self._pulses_are_on():
-            return False
-        try:
-            self._channel.write("duty_cycle", self._neutral)
-            self._clock.sleep(REST)
-        finally:
-            try:
-                self._channel.write("duty_cycle", 0)
-            finally:
-                self._switch_off()
-        return True
+        return pwm_pulses.neutralise(self._channel, self._neutral, self._period, self._clock.sleep)
 
-    def _begin(self, duty: int) -> None:
-        """Start pulses [ns] from whatever state the channel was left in.
-
-        A channel that nobody has used has a period of 0, and older kernels then refuse a duty
-        cycle, even 0. A kernel that believes a channel to be on does nothing on enable 1, even
-        where the hardware is off because the channel was unexported: it is switched off first.
-        """
+    def _begin(self, width: float) -> None:
         self._owned = True
-        if self._channel.read("duty_cycle"):
-            self._channel.write("duty_cycle", 0)
-        if self._channel.read("enable"):
-            self._channel.write("enable", 0)
-        self._channel.write("period", round(1e9 * self._period))
-        self._channel.write("duty_cycle", duty)
-        self._channel.write("enable", 1)
+        pwm_pulses.begin(self._channel, width, self._period)
         self._driving = True
         self._reconnects += self._lost
         self._lost = False
@@ -169,24 +145,8 @@ class SysfsPwmServo:
                 "such as by 'fishctl release'"
             )
 
-    def _pulses_are_on(self) -> bool:
-        return bool(self._channel.read("enable") and self._channel.read("duty_cycle"))
-
-    def _switch_off(self) -> None:
-        """Switch the channel off, once the last pulse before a duty cycle of 0 has ended."""
-        with suppress(ServoError):  # one that cannot be read may be on
-            if not self._channel.read("enable"):
-                return
-        self._clock.sleep(self._period)
-        self._channel.write("enable", 0)
-
     def _lose(self) -> None:
         """Forget a channel that has failed, so that it is opened again."""
         self._driving = False
         self._lost = True
         self._channel.close()
-
-
-def _nanoseconds(width: float) -> int:
-    """A pulse [µs] as the kernel counts it."""
-    return round(1000.0 * width)

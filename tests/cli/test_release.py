@@ -101,6 +101,23 @@ def test_pulses_that_were_left_on_end_at_neutral(pi: Bench, other_program: pigpi
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 
+@pytest.mark.parametrize("restarted", [False, True])
+def test_pulses_of_the_pwm_peripheral_that_pigpiod_may_not_know_of_end_too(
+    pi: Bench, restarted: bool
+) -> None:
+    client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
+    client.hardware_PWM(18, 50, 1740 * 50)
+    client.stop()
+    if restarted:
+        pi.pi.inject("pigpiod-restart")
+    pi.wait_for_pulse(1739, 1741)
+    ended = release(*pi.settings)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout == "pulses were on: neutral, then off\n"
+    assert pi.pi.widths()[-2:] == [1500, 0]
+    assert release(*pi.settings).stdout == "there were no pulses\n"
+
+
 def test_a_servo_without_pulses_is_left_alone(pi: Bench) -> None:
     before = pi.pi.widths()
     ended = release(*pi.settings)

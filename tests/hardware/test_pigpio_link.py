@@ -87,8 +87,8 @@ def test_one_thread_and_one_connection_are_all_it_needs(bench: Bench) -> None:
     assert "pigpio-link" not in [thread.name for thread in threading.enumerate()]
 
 
-@pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_no_write_is_held_up(bench: Bench, fault: str) -> None:
+@pytest.mark.parametrize(("fault", "forgiven"), [("pigpiod-gone", 0), ("pigpiod-frozen", 2)])
+def test_no_write_is_held_up(bench: Bench, fault: str, forgiven: int) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     errors, durations = [], []
@@ -98,8 +98,8 @@ def test_no_write_is_held_up(bench: Bench, fault: str) -> None:
         durations.append(time.monotonic() - begun)
         time.sleep(0.01)
     assert max(durations) < BOUND
-    assert None not in errors
-    for error in errors:
+    assert errors[:forgiven] == [None] * forgiven
+    for error in errors[forgiven:]:
         assert error is not None
         assert error.startswith(f"pigpiod at 127.0.0.1:{bench.daemon.port}: ")
         assert error.endswith("; reconnecting")
@@ -172,7 +172,7 @@ def test_without_a_pigpiod_it_starts_all_the_same_and_connects_later(bench: Benc
 def test_closing_takes_a_bounded_time(bench: Bench, fault: str) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
-    bench.write(0.5)
+    eventually(lambda: bench.write(0.5) is not None)
     begun = time.monotonic()
     with pytest.raises(ServoError):
         bench.servo.close()
@@ -227,13 +227,12 @@ def test_a_late_answer_never_meets_a_later_command() -> None:
         for angle in (0.1, 0.2, 0.3):
             servo.write(angle)
             faults.inject("pigpiod-frozen")
-            with pytest.raises(ServoError, match="no answer within"):
-                servo.write(-angle)
+            servo.write(-angle)
             faults.clear()
-            clock.sleep(0.6)
+            clock.sleep(0.05)
             servo.write(angle)
             assert daemon.width(GPIO, clock.now + 0.02) == 1500 + 600 * angle
-        assert servo.counters() == {"servo_reconnects": 3}
+        assert servo.counters() == {"servo_reconnects": 0, "servo_late_answers": 3}
     finally:
         servo.close()
         daemon.close()

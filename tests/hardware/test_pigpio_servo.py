@@ -193,35 +193,3 @@ def test_close_says_when_pulses_may_still_be_on(bench: PigpioBench) -> None:
         servo.close()
     servo.close()
     bench.faults.clear()
-
-
-def test_hardware_pwm_makes_finer_pulses(bench: PigpioBench) -> None:
-    servo = bench.servo(bench.settings(hardware_pwm=True, frequency=250.0))
-    servo.write(0.50002)
-    assert bench.width == pytest.approx(1800.012, abs=0.005)
-    servo.release()
-    assert bench.width == 0
-
-
-def test_hardware_pwm_counts_down_too(bench: PigpioBench) -> None:
-    servo = bench.servo(bench.settings(hardware_pwm=True, frequency=333.0))
-    servo.write(0.5)
-    bench.wait(0.15)
-    assert bench.width == pytest.approx(1800, abs=0.01)
-    bench.wait(0.15)
-    assert bench.width == pytest.approx(1500, abs=0.01)
-    bench.wait(0.6)
-    assert bench.width == 0
-
-
-def test_hardware_pwm_never_cuts_a_pulse_short(bench: PigpioBench) -> None:
-    servo = bench.servo(bench.settings(hardware_pwm=True))
-    for _ in range(3):
-        servo.write(0.5)
-        bench.clock.now = (bench.clock.now // FRAME + 2) * FRAME + 0.0007  # inside of a pulse
-        servo.release()
-        bench.wait(0.9)
-    servo.write(0.5)
-    bench.wait(2.0)
-    widths = {width for _, width in bench.daemon.history(GPIO)}
-    assert widths == {1800, 1500, 0}

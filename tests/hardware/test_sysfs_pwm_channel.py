@@ -160,3 +160,36 @@ def test_a_channel_that_the_kernel_uses_itself_is_refused(bench: Bench) -> None:
     servo = bench.servo()
     with pytest.raises(ServoError, match=r"channel 2 of .* is in use by a driver of the kernel"):
         servo.write(0.0)
+
+
+def test_a_channel_that_others_have_inverted_gets_its_normal_polarity_back() -> None:
+    bench = Bench()
+    channel = leave_inverted(bench)
+    servo = bench.servo()
+    assert bench.write(servo, 0.5) == 1800
+    assert bench.kernel.pulses(PI5, channel).level(bench.clock.now + 0.0007) == 1
+    servo.release()
+    bench.clock.sleep(0.05)
+    assert bench.width() == 0
+
+
+def test_the_last_resort_brings_an_inverted_servo_to_neutral_too() -> None:
+    bench = Bench()
+    leave_inverted(bench)
+    assert bench.servo().neutralise() is True
+    assert max(bench.widths()) == 18_200  # and never high for good
+    assert bench.widths()[-2:] == [1500, 0]
+    assert bench.servo().neutralise() is False
+
+
+def leave_inverted(bench: Bench) -> int:
+    """Pulses of 18.2 ms, as another program's idea of 1.8 ms."""
+    bench.shell("pwmchip1/export", 2)
+    bench.clock.sleep(0.1)
+    for name, value in (("period", 20_000_000), ("polarity", "inversed")):
+        bench.shell(f"pwmchip1/pwm2/{name}", value)
+    for name, value in (("duty_cycle", 1_800_000), ("enable", 1)):
+        bench.shell(f"pwmchip1/pwm2/{name}", value)
+    bench.clock.sleep(0.05)
+    assert bench.width() == 18_200
+    return 2

@@ -29,7 +29,7 @@ def pigpiod(context: Context) -> Result | None:
     try:
         with opened(settings.pigpio) as client:
             began = time.monotonic()
-            version = client.get_pigpio_version()
+            version = client.version()
             took = time.monotonic() - began
     except ServoError as error:
         frozen = "answer" in str(error)
@@ -63,7 +63,7 @@ def pwm(context: Context) -> Result | None:
     if occupied := context.occupied("owns the channel; see daemon"):
         return occupied
     from fishd.hardware.pwm_channel import PwmChannel
-    from fishd.hardware.sysfs_pwm import PATIENCE
+    from fishd.hardware.pwm_pulses import PATIENCE
 
     root = str(context.path(settings.sysfs.root))
     channel = PwmChannel(replace(settings, sysfs=replace(settings.sysfs, root=root)), SystemClock())

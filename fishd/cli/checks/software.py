@@ -47,9 +47,7 @@ def packages(context: Context) -> Result:
         found = _REQUIREMENT.match(text)
         assert found
         name, extra = found["name"].lower(), found["extra"]
-        if extra is None or (
-            extra == "pi" and real and (name != "pigpio" or _uses_pigpio(context))
-        ):
+        if extra is None or (extra == "pi" and real):
             wanted.append((name, found["bounds"]))
     problems = [problem for name, bounds in wanted if (problem := _problem(name, bounds))]
     if problems:
@@ -92,10 +90,6 @@ def gpio_package(context: Context) -> Result | None:
 
 
 _GPIO = {"rpi-gpio": "RPi.GPIO", "rpi-lgpio": "rpi-lgpio"}
-
-
-def _uses_pigpio(context: Context) -> bool:
-    return context.config.servo.driver == "pigpio"
 
 
 def _problem(name: str, bounds: str) -> str:

@@ -21,7 +21,9 @@ class Use(Enum):
 class Pin:
     """One GPIO."""
 
-    def __init__(self, gpio: int, idle_range: int) -> None:
+    def __init__(self, gpio: int, idle_range: int, peripheral: int | None = None) -> None:
+        """`peripheral`: the mode in which the PWM peripheral drives it; None where it cannot."""
+        self.peripheral = peripheral
         self.use = Use.NOTHING
         self.mode = INPUT
         # At power-on a Pi pulls the low ones up and all others down.
@@ -32,9 +34,14 @@ class Pin:
         self.real_range = idle_range
         self.train = PulseTrain()
 
+    @property
+    def connected(self) -> bool:
+        """Whether the PWM peripheral drives it, whoever wanted that."""
+        return self.mode == self.peripheral
+
     def level(self, time: float) -> int:
         """The level at a time [s]."""
-        if self.use is Use.HARDWARE_PWM:
+        if self.connected:
             return self.train.level(time)
         if self.mode == OUTPUT:
             return self.latch or self.train.level(time)

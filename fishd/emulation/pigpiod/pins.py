@@ -1,4 +1,9 @@
-"""The GPIOs as pigpiod keeps them on a Pi 4: modes, pulls, levels, and what sends pulses where."""
+"""The GPIOs as pigpiod keeps them on a Pi 4: modes, pulls, levels, and what sends pulses where.
+
+The PWM peripheral is the Pi's, not pigpiod's: its registers and the modes of pins outlive pigpiod.
+"""
+
+from dataclasses import dataclass, replace
 
 from fishd.emulation.pigpiod import errors
 from fishd.emulation.pigpiod.errors import PigpioError
@@ -18,6 +23,16 @@ REAL_RANGES = tuple(25 * cycles for cycles in _CYCLES)
 """Steps in a period, for each frequency that software PWM can have."""
 
 
+@dataclass(frozen=True)
+class Channel:
+    """The registers of one channel of the PWM peripheral."""
+
+    frequency: int = 0
+    duty: int = 0
+    steps: int = 1
+    enabled: bool = False
+
+
 class Pins:
     """All GPIOs of a Pi; each method is a command of pigpio and raises `PigpioError`.
 
@@ -31,14 +46,17 @@ class Pins:
             round(1e6 / (steps * step)): steps for steps in sorted(REAL_RANGES, reverse=True)
         }
         idle = self._real_range(800)
-        self.pins = [Pin(gpio, idle) for gpio in range(GPIOS)]
-        self._channels = [(0, 0, 0), (0, 0, 0)]  # frequency, duty, real range
+        self.pins = [self._pin(gpio, idle) for gpio in range(GPIOS)]
+        self._channels = [Channel(), Channel()]
 
     def reset(self, time: float) -> None:
-        """What a new daemon finds: no pulses; modes, pulls and levels as they were."""
+        """What a new daemon finds: no pulses but those of the PWM peripheral, of which it does not
+        know; modes, pulls and levels as they were.
+        """
         for gpio, pin in enumerate(self.pins):
-            pin.train.cut(time)
-            fresh = Pin(gpio, self._real_range(800))
+            if not pin.connected:
+                pin.train.cut(time)
+            fresh = self._pin(gpio, self._real_range(800))
             fresh.mode, fresh.pull, fresh.latch = pin.mode, pin.pull, pin.latch
             fresh.train = pin.train
             self.pins[gpio] = fresh
@@ -63,6 +81,8 @@ class Pins:
         if mode != pin.mode:
             self._use(time, pin, Use.NOTHING)
             pin.mode = mode
+            if pin.connected:
+                self._drive(time, HARDWARE_PWM[gpio][0])
         return 0
 
     def set_pull(self, gpio: int, pull: int) -> int:
@@ -125,7 +145,7 @@ class Pins:
         """The duty of software or hardware PWM."""
         pin = self._user(gpio)
         if pin.use is Use.HARDWARE_PWM:
-            return self._channel(gpio)[1]
+            return self._channel(gpio).duty
         _check(pin.use is Use.PWM, errors.NOT_PWM_GPIO)
         return pin.width
 
@@ -147,7 +167,7 @@ class Pins:
     def real_range(self, gpio: int) -> int:
         """The steps that a period really has."""
         pin = self._user(gpio)
-        return self._channel(gpio)[2] if pin.use is Use.HARDWARE_PWM else pin.real_range
+        return self._channel(gpio).steps if pin.use is Use.HARDWARE_PWM else pin.real_range
 
     def set_frequency(self, time: float, gpio: int, frequency: int) -> int:
         """Take the nearest frequency that there is [Hz], and give it."""
@@ -159,7 +179,8 @@ class Pins:
     def frequency(self, gpio: int) -> int:
         """The frequency of its PWM [Hz]."""
         pin = self._user(gpio)
-        return self._channel(gpio)[0] if pin.use is Use.HARDWARE_PWM else self._frequency(pin)
+        known = pin.use is Use.HARDWARE_PWM
+        return self._channel(gpio).frequency if known else self._frequency(pin)
 
     def hardware_pwm(self, time: float, gpio: int, frequency: int, duty: int) -> int:
         """Hardware PWM: frequency [Hz], 0 for off, and duty in millionths."""
@@ -167,25 +188,45 @@ class Pins:
         _check(gpio in HARDWARE_PWM, errors.NOT_HPWM_GPIO)
         _check(duty <= HARDWARE_DUTY, errors.BAD_HPWM_DUTY)
         _check(frequency <= HARDWARE_FASTEST, errors.BAD_HPWM_FREQ)
-        channel, mode = HARDWARE_PWM[gpio]
+        number, mode = HARDWARE_PWM[gpio]
         if frequency:
             steps = int(HARDWARE_CLOCK / frequency + 0.5)
-            self._channels[channel] = (int(HARDWARE_CLOCK / steps + 0.5), duty, steps)
-            self._use(time, pin, Use.HARDWARE_PWM)
-            pin.mode = mode
-            width = duty * steps // HARDWARE_DUTY / HARDWARE_CLOCK * 1e6
-            for other, (its_channel, _) in HARDWARE_PWM.items():
-                if its_channel == channel and self.pins[other].use is Use.HARDWARE_PWM:
-                    self.pins[other].train.set(time, width, steps / HARDWARE_CLOCK)
-        elif pin.use is Use.HARDWARE_PWM:
-            self._use(time, pin, Use.NOTHING)
+            told = int(HARDWARE_CLOCK / steps + 0.5)
+            self._channels[number] = Channel(told, duty, steps, enabled=True)
+            if pin.use is not Use.HARDWARE_PWM:
+                self._use(time, pin, Use.HARDWARE_PWM)
+                pin.mode = mode
+            self._drive(time, number)
+        elif pin.use is Use.HARDWARE_PWM:  # else it does not know that it is on
+            pin.use = Use.NOTHING
+            self._channels[number] = replace(self._channels[number], enabled=False)
+            self._drive(time, number)
         return 0
 
-    def _use(self, time: float, pin: Pin, use: Use) -> None:
-        if pin.use is not use:
-            if pin.use in (Use.PWM, Use.SERVO, Use.HARDWARE_PWM):
+    def _drive(self, time: float, number: int) -> None:
+        """Let the pins that are connected to a channel of the peripheral send what it makes."""
+        channel = self._channels[number]
+        width = channel.duty * channel.steps // HARDWARE_DUTY / HARDWARE_CLOCK * 1e6
+        for gpio, (its_number, _) in HARDWARE_PWM.items():
+            pin = self.pins[gpio]
+            if its_number != number or not pin.connected:
+                continue
+            if channel.enabled:
+                pin.train.set(time, width, channel.steps / HARDWARE_CLOCK)
+            else:
                 pin.train.cut(time)
-            pin.use, pin.width = use, 0
+
+    def _use(self, time: float, pin: Pin, use: Use) -> None:
+        """Begin another use; what sent pulses until now ends, the peripheral behind the pin too."""
+        if pin.use is use and not pin.connected:
+            return
+        if pin.use in (Use.PWM, Use.SERVO) or pin.connected:
+            pin.train.cut(time)
+        pin.use, pin.width = use, 0
+
+    @staticmethod
+    def _pin(gpio: int, idle_range: int) -> Pin:
+        return Pin(gpio, idle_range, HARDWARE_PWM[gpio][1] if gpio in HARDWARE_PWM else None)
 
     def _send_pwm(self, time: float, pin: Pin) -> None:
         if pin.use is not Use.PWM:
@@ -204,7 +245,7 @@ class Pins:
     def _frequency(self, pin: Pin) -> int:
         return int(1e6 / (pin.real_range * self._step) + 0.5)
 
-    def _channel(self, gpio: int) -> tuple[int, int, int]:
+    def _channel(self, gpio: int) -> Channel:
         return self._channels[HARDWARE_PWM[gpio][0]]
 
     def _any(self, gpio: int, *, change: bool = False) -> Pin:

@@ -1,0 +1,227 @@
+"""`fishd-release`: as `fishctl release`, by the recipe that fishd leaves, and in little time."""
+
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pigpio
+import pytest
+from operator_rig import Bench
+from processes import PATIENCE
+
+from fishd import recipe
+from fishd.client import Fish
+from fishd.hardware.calibration import ServoCalibration
+
+HEAVY = ("click", "msgspec", "numpy", "pathlib", "yaml", "zmq")
+SOURCE = f"""
+import sys
+from fishd.release import main
+try:
+    main()
+finally:
+    print("loaded:", *[name for name in {HEAVY} if name in sys.modules], file=sys.stderr)
+"""
+CPU = 0.15
+"""Of this machine, with the start of Python [s]."""
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The runtime folder of the service, for fishd and for what systemd runs after it."""
+    folder = tmp_path / "runtime"
+    folder.mkdir()
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(folder))
+    return folder
+
+
+@pytest.fixture
+def file(pi: Bench) -> Path:
+    """A configuration file for the virtual Pi."""
+    path = pi.folder / "fishd.yaml"
+    pairs = [word.partition("=") for word in pi.settings if "=" in word]
+    sections: dict[str, object] = {}
+    for key, _, value in pairs:
+        *above, name = key.split(".")
+        section = sections
+        for part in above:
+            section = section.setdefault(part, {})  # type: ignore[assignment]
+        section[name] = json.loads(value) if re.fullmatch(r"[\d.]+", value) else value
+    path.write_text(json.dumps(sections))
+    return path
+
+
+@pytest.fixture
+def killed(pi: Bench, file: Path) -> Iterator[None]:
+    """A fishd that was killed; another program keeps its pulses where they were."""
+    kill_one(pi, file)
+    client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
+    client.set_servo_pulsewidth(18, 1750)
+    pi.wait_for_pulse(1750, 1750)
+    yield
+    client.stop()
+
+
+def kill_one(pi: Bench, file: Path, calibration: ServoCalibration | None = None) -> None:
+    with pi.daemon("--config", str(file)) as daemon:
+        if calibration:
+            with Fish(daemon.endpoint) as fish:
+                fish.calibrate_servo(calibration, save=True)
+        daemon.process.send_signal(signal.SIGKILL)
+        daemon.process.wait(PATIENCE)
+
+
+def release(*words: str, **env: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", SOURCE, *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE,
+        env=os.environ | env,
+    )
+
+
+def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
+    """The lines on standard error but that of the modules."""
+    return [line for line in ended.stderr.splitlines() if not line.startswith("loaded:")]
+
+
+@pytest.mark.usefixtures("killed")
+def test_it_ends_pulses_at_neutral_and_loads_next_to_nothing(pi: Bench, file: Path) -> None:
+    ended = release("--config", str(file), SERVICE_RESULT="signal")
+    assert ended.returncode == 0
+    assert ended.stderr == "loaded:\n"
+    assert ended.stdout == ("the service ended with 'signal': pulses were on: neutral, then off\n")
+    assert pi.pi.widths()[-3:] == [1750, 1500, 0]
+    assert release("--config", str(file)).stdout == "there were no pulses\n"
+
+
+@pytest.mark.usefixtures("killed")
+def test_neutral_is_that_of_a_calibration_made_while_it_ran(pi: Bench, file: Path) -> None:
+    kill_one(pi, file, ServoCalibration(trim=-40.0))
+    client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
+    client.set_servo_pulsewidth(18, 1750)
+    client.stop()
+    ended = release("--config", str(file))
+    assert (ended.returncode, ended.stderr) == (0, "loaded:\n")
+    assert pi.pi.widths()[-2:] == [1460, 0]
+
+
+@pytest.mark.usefixtures("killed")
+def test_without_a_recipe_it_does_what_fishctl_does(pi: Bench, file: Path, runtime: Path) -> None:
+    for path in runtime.glob("release-*"):
+        path.unlink()
+    ended = release("--config", str(file))
+    assert (ended.returncode, said(ended)) == (0, [])
+    assert ended.stdout == "pulses were on: neutral, then off\n"
+    assert "click" in ended.stderr
+
+
+@pytest.mark.usefixtures("killed")
+def test_a_recipe_that_others_may_have_written_is_none(
+    pi: Bench, file: Path, runtime: Path
+) -> None:
+    (path,) = runtime.glob("release-*")
+    path.chmod(0o666)
+    ended = release("--config", str(file))
+    assert ended.returncode == 0
+    assert "click" in ended.stderr
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"config": 3}', "\0", "nul" * 30_000])
+@pytest.mark.usefixtures("killed")
+def test_a_damaged_recipe_is_none(pi: Bench, file: Path, runtime: Path, text: str) -> None:
+    (path,) = runtime.glob("release-*")
+    path.write_text(text)
+    ended = release("--config", str(file))
+    assert (ended.returncode, said(ended)) == (0, [])
+    assert ended.stdout == "pulses were on: neutral, then off\n"
+
+
+@pytest.mark.usefixtures("killed")
+def test_a_file_that_has_changed_since_counts_too(pi: Bench, file: Path) -> None:
+    file.write_text(file.read_text().replace('"robot"', '"tick": 0.04, "robot"'))
+    ended = release("--config", str(file))
+    assert (ended.returncode, said(ended)) == (0, [])
+    assert ended.stdout == "pulses were on: neutral, then off\nthere were no pulses\n"
+
+
+@pytest.mark.usefixtures("killed")
+def test_a_simulated_fish_leaves_no_recipe_of_an_earlier_robot(
+    pi: Bench, file: Path, runtime: Path
+) -> None:
+    assert list(runtime.glob("release-*"))
+    with pi.daemon("--config", str(file), "--set", "robot=simulated"):
+        assert list(runtime.glob("release-*")) == []
+
+
+@pytest.mark.usefixtures("killed")
+def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(
+    pi: Bench, file: Path
+) -> None:
+    pi.pi.inject("pigpiod-gone")
+    ended = release("--config", str(file))
+    assert (ended.returncode, ended.stdout) == (1, "")
+    (line,) = said(ended)
+    assert re.fullmatch(r"fishctl: pigpiod at 127.0.0.1:\d+: Connection refused", line)
+
+
+@pytest.mark.parametrize("words", [(), ("--config", "/nowhere/fishd.yaml"), ("--steam",)])
+def test_whatever_else_is_asked_fishctl_answers(words: tuple[str, ...]) -> None:
+    quick = release(*words, FISHD_CONFIG="")
+    fishctl = Path(sys.executable).with_name("fishctl")
+    slow = subprocess.run(
+        [fishctl, "release", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE,
+        env=os.environ | {"FISHD_CONFIG": ""},
+    )
+    assert slow.returncode != 0
+    assert (quick.returncode, quick.stdout) == (slow.returncode, slow.stdout)
+    assert said(quick) == slow.stderr.splitlines()
+
+
+@pytest.mark.parametrize("enabled", [1, 0])
+def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int) -> None:
+    channel = tmp_path / "pwm" / "pwmchip3" / "pwm2"
+    channel.mkdir(parents=True)
+    device = tmp_path / "devices" / "1f00098000.pwm"
+    device.mkdir(parents=True)
+    (channel.parent / "device").symlink_to(device)
+    for name, value in (("period", 20_000_000), ("duty_cycle", 1_800_000), ("enable", enabled)):
+        (channel / name).write_text(f"{value}\n")
+    file = tmp_path / "fishd.yaml"
+    file.write_text("robot: pi\n")
+    servo = {"driver": "sysfs-pwm", "gpio": 18, "frequency": 50.0, "neutral": 1490.0}
+    where = {"host": "127.0.0.1", "port": 8888, "chip": None, "channel": None}
+    recipe.write(str(file), {**servo, **where, "root": str(tmp_path / "pwm")})
+    ended = release("--config", str(file))
+    assert (ended.returncode, ended.stderr) == (0, "loaded:\n")
+    assert ended.stdout.startswith("pulses were on" if enabled else "there were no pulses")
+    duty, on = ((channel / name).read_text().split()[0] for name in ("duty_cycle", "enable"))
+    assert (int(duty), int(on)) == ((0, 0) if enabled else (1_800_000, 0))
+
+
+@pytest.mark.usefixtures("killed")
+def test_it_costs_little(pi: Bench, file: Path) -> None:
+    used = []
+    for _ in range(5):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(
+            [sys.executable, "-m", "fishd.release", "--config", str(file)],
+            check=True,
+            capture_output=True,
+            timeout=PATIENCE,
+        )
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        used.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    assert min(used) < CPU

@@ -1,0 +1,198 @@
+"""Whatever instant a process dies at, the pulses that it asked pigpiod for end by themselves."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import pytest
+from pigpio_bench import GPIO, PigpioBench, connect
+
+from fishd.hardware.pigpio import PigpioServo
+from fishd.hardware.pigpio_client import Client
+
+SOON = 2.0
+"""Neutral after 0.2 s and off 0.5 s later; longer where a test has lengthened the countdown [s]."""
+
+
+class Killed(BaseException):
+    """Kill -9, as the process itself would see it if it could."""
+
+
+@pytest.fixture
+def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
+    """Call it with n: the process dies instead of sending for the n-th time; None revives it."""
+    send = Client._send
+    left: int | None = None
+
+    def count_down(client: Client, data: bytes) -> None:
+        nonlocal left
+        if left is not None:
+            if left <= 0:
+                raise Killed
+            left -= 1
+        send(client, data)
+
+    def kill_after(count: int | None) -> None:
+        nonlocal left
+        left = count
+
+    monkeypatch.setattr(Client, "_send", count_down)
+    return kill_after
+
+
+def lose_connection(bench: PigpioBench, servo: PigpioServo) -> None:
+    for connection in list(bench.daemon._connections.values()):
+        connection.hang_up()
+    with contextlib.suppress(OSError):
+        servo.write(0.5)
+    bench.wait(0.6)
+
+
+def swim(bench: PigpioBench) -> PigpioServo:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.wait(0.05)
+    assert bench.width == 1800
+    return servo
+
+
+def write(bench: PigpioBench) -> None:
+    swim(bench).write(-0.5)
+
+
+def first_write(bench: PigpioBench) -> None:
+    servo = swim(bench)
+    servo.release()
+    bench.wait(0.05)
+    servo.write(0.5)
+
+
+def release(bench: PigpioBench) -> None:
+    swim(bench).release()
+
+
+def close(bench: PigpioBench) -> None:
+    swim(bench).close()
+
+
+def start_after_a_kill(bench: PigpioBench) -> None:
+    swim(bench)
+    connect(bench.servo())
+
+
+def reconnect(bench: PigpioBench) -> None:
+    servo = swim(bench)
+    with bench.client() as other:  # so that the pulses are still on, and no countdown ends them
+        for script in range(2):
+            other.update_script(script, [100]) if other.script_status(script)[1] else None
+    lose_connection(bench, servo)
+    connect(servo)
+
+
+def last_resort(bench: PigpioBench) -> None:
+    swim(bench)
+    bench.servo().neutralise()
+
+
+def last_resort_on_pulses_of_others(bench: PigpioBench) -> None:
+    with bench.client() as other:
+        other.servo(GPIO, 1800)
+    bench.servo().neutralise()
+
+
+DEEDS = (
+    write,
+    first_write,
+    release,
+    close,
+    start_after_a_kill,
+    reconnect,
+    last_resort,
+    last_resort_on_pulses_of_others,
+)
+
+
+def die_at(
+    n: int,
+    bench: PigpioBench,
+    deed: Callable[[PigpioBench], None],
+    kill_after: Callable[[int | None], None],
+) -> bool:
+    """True when it died; False when it had done everything before."""
+    kill_after(n)
+    try:
+        deed(bench)
+    except Killed:
+        return True
+    finally:
+        kill_after(None)
+    return False
+
+
+@pytest.mark.parametrize("deed", DEEDS)
+def test_a_kill_between_any_two_commands_leaves_no_pulses(
+    deed: Callable[[PigpioBench], None], mortal: Callable[[int | None], None]
+) -> None:
+    for n in range(100):
+        with contextlib.ExitStack() as stack:
+            bench = PigpioBench(stack)
+            died = die_at(n, bench, deed, mortal)
+            bench.wait(SOON)
+            # Pulses of others that nobody has touched yet are theirs.
+            others = deed is last_resort_on_pulses_of_others
+            untouched = others and [width for _, width in bench.daemon.history(GPIO)] == [1800]
+            assert bench.width == 0 or (died and untouched), f"died at command {n}"
+        if not died:
+            return
+    pytest.fail("it never came to its end")
+
+
+@pytest.fixture
+def bench() -> Iterator[PigpioBench]:
+    with contextlib.ExitStack() as stack:
+        yield PigpioBench(stack)
+
+
+def test_bytes_of_a_killed_process_that_pigpiod_reads_late_do_not_stay_in_force(
+    bench: PigpioBench,
+) -> None:
+    swim(bench)
+    successor = bench.servo()
+    connect(successor)  # which has put everything in order
+    with bench.client() as dead:
+        dead.servo(GPIO, 1800)
+    bench.wait(SOON)
+    assert bench.width == 0
+
+
+def test_bytes_of_a_lost_connection_do_not_stay_in_force_after_a_release(
+    bench: PigpioBench,
+) -> None:
+    servo = swim(bench)
+    lose_connection(bench, servo)
+    connect(servo)
+    with bench.client() as lost:
+        lost.servo(GPIO, 1800)
+    bench.wait(SOON)
+    assert bench.width == 0
+
+
+def test_a_release_that_only_reaches_pigpiod_in_half_ends_the_pulses_at_once(
+    bench: PigpioBench, mortal: Callable[[int | None], None]
+) -> None:
+    servo = swim(bench)
+    with bench.client() as client:
+        # The first of its two commands, as after a cable that broke in between.
+        client.update_script(servo._script, [1, GPIO, 0])
+    bench.wait(0.05)
+    assert bench.width == 0
+
+
+def test_a_servo_that_is_written_to_right_after_a_release_is_under_guard_at_once(
+    bench: PigpioBench,
+) -> None:
+    servo = swim(bench)
+    servo.release()
+    bench.wait(0.05)
+    servo.write(0.5)
+    bench.wait(0.25)
+    assert bench.width == 1500

@@ -1,0 +1,145 @@
+"""An answer of pigpiod that comes late: waited for, but never past the countdown."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+import pytest
+from msgspec.structs import replace
+from pigpio_bench import FRAME, GPIO, TICK, PigpioBench
+
+from fishd.clock import SystemClock
+from fishd.emulation.faults import Faults
+from fishd.emulation.pigpiod.daemon import Pigpiod
+from fishd.errors import ServoError
+from fishd.hardware.calibration import ServoCalibration
+from fishd.hardware.pigpio import PigpioServo
+from fishd.hardware.settings import PigpioSettings, ServoSettings
+
+
+@pytest.fixture
+def bench() -> Iterator[PigpioBench]:
+    with contextlib.ExitStack() as stack:
+        yield PigpioBench(stack)
+
+
+def late_tick(bench: PigpioBench, servo: PigpioServo, angle: float) -> None:
+    """A tick whose answer does not come in time, but before the next tick."""
+    bench.faults.inject("pigpiod-frozen")
+    try:
+        servo.write(angle)
+    finally:
+        bench.faults.clear()
+    bench.wait(TICK)
+
+
+def thaw(bench: PigpioBench) -> None:
+    """Pigpiod goes on, and has carried out all that it was sent when this returns."""
+    bench.faults.clear()
+    with bench.client() as client:
+        client.version()
+
+
+def test_a_late_answer_now_and_then_does_not_end_the_link(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    for _ in range(4):
+        servo.write(0.5)
+        bench.wait(TICK)
+        late_tick(bench, servo, -0.5)
+        late_tick(bench, servo, -0.5)
+    servo.write(0.5)
+    assert bench.width == 1800
+    assert servo.counters() == {"servo_reconnects": 0, "servo_late_answers": 8}
+    assert {width for _, width in bench.daemon.history(GPIO)} == {1800}
+
+
+def test_the_third_late_answer_in_a_row_ends_it(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    late_tick(bench, servo, 0.5)
+    late_tick(bench, servo, 0.5)
+    with pytest.raises(ServoError, match=r"no answer within 250 ms; reconnecting$"):
+        late_tick(bench, servo, 0.5)
+
+
+def test_where_the_next_tick_would_come_after_the_countdown_the_first_one_ends_it(
+    bench: PigpioBench,
+) -> None:
+    servo = bench.servo(tick=0.2)  # and so a countdown of 0.6 s
+    servo.write(0.5)
+    bench.wait(0.45)
+    with pytest.raises(ServoError, match="no answer within"):
+        late_tick(bench, servo, 0.5)
+
+
+def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.wait(TICK)
+    bench.faults.inject("pigpiod-frozen")
+    servo.write(0.5)
+    bench.wait(1.0)  # fishd itself was held up
+    bench.faults.clear()
+    with pytest.raises(ServoError, match=r"the servo may be at rest by now; reconnecting$"):
+        servo.write(0.5)
+
+
+def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: PigpioBench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.faults.inject("pigpiod-frozen")
+    servo.write(-0.5)
+    thaw(bench)
+    bench.wait(0.3)
+    assert bench.width == 1500
+    bench.wait(0.6)
+    assert bench.width == 0
+
+
+def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(
+    bench: PigpioBench,
+) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    bench.faults.inject("pigpiod-frozen")
+    servo.write(0.5)
+    with pytest.raises(ServoError, match="no answer within 250 ms; waiting for it"):
+        servo.release()
+    thaw(bench)
+    bench.wait(FRAME)
+    assert bench.width == 0  # at once, without another connection
+    servo.release()
+    assert servo.counters()["servo_reconnects"] == 0
+
+
+def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() -> None:
+    clock = SystemClock()
+    faults = Faults(clock)
+    daemon = Pigpiod(clock, faults)
+    daemon.start()
+    settings = ServoSettings(gpio=GPIO, pigpio=PigpioSettings(port=daemon.port, timeout=0.03))
+    servo = PigpioServo(settings, ServoCalibration(), clock, threaded=True)
+    try:
+        servo.write(0.5)
+        faults.inject("pigpiod-frozen")
+        durations = []
+        for _ in range(3):
+            begun = time.monotonic()
+            with contextlib.suppress(ServoError):
+                servo.write(0.5)
+            durations.append(time.monotonic() - begun)
+        assert max(durations) < 0.06  # twice the limit, for a machine that is busy
+    finally:
+        with contextlib.suppress(ServoError):
+            servo.close()
+        daemon.close()
+
+
+def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: PigpioBench) -> None:
+    settings = bench.settings()
+    servo = bench.servo(replace(settings, pigpio=replace(settings.pigpio, countdown=1.0)))
+    servo.write(0.5)
+    late_tick(bench, servo, 0.5)
+    late_tick(bench, servo, 0.5)
+    servo.write(-0.5)
+    assert bench.width == 1200

@@ -1,0 +1,392 @@
+"""Kills fishd at random microseconds, whatever it is doing, and looks whether its pulses end.
+
+    python tools/random_kills.py --kills 40
+    python tools/random_kills.py --kills 2000 --lanes 8 --write docs/reliability.md
+
+Each lane has a virtual Pi and, one after another, real fishds on it. They are forked from a process
+that has loaded everything, which makes many of them affordable. A kill is stuck when the servo
+still gets pulses 1.5 s later. Ends by itself; exit status 1 when one was stuck.
+"""
+
+import argparse
+import asyncio
+import itertools
+import multiprocessing
+import os
+import random
+import select
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+from reports import put, table
+
+from fishd.client import Fish
+from fishd.clock import SystemClock
+from fishd.config import Config, load
+from fishd.daemon import swim
+from fishd.emulation.link_server import LinkServer
+from fishd.emulation.settings import VirtualPiSettings
+from fishd.emulation.virtual_pi import VirtualPi
+from fishd.errors import FishdError
+from fishd.hardware.imperfections import SimulationSettings
+from fishd.plant.parameters import PlantParameters
+
+GPIO = 18
+PATIENCE = 120.0
+BEGINNING = 5.0
+"""How long a fishd may take until it swims [s]; then another one is started."""
+WATCHED = 1.5
+"""How long after a kill no pulses may be left [s]."""
+STOPPED = 0.15
+"""Share of the kills that are a SIGSTOP instead: a process that hangs, and holds its sockets."""
+POLICY = {"policy": "default-fish"}
+
+
+class Situation(Struct):
+    """What fishd is doing when it is killed."""
+
+    what: str
+    """In words, for the table."""
+    share: int
+    """Of a hundred kills."""
+    window: float
+    """The kill comes at a random moment of so many seconds from the deed on."""
+    deed: Callable[["Lane"], None]
+
+
+class Kill(Struct):
+    """One kill, and what the servo got."""
+
+    situation: str
+    stopped: bool
+    """SIGSTOP instead of SIGKILL."""
+    after: float
+    """From the deed to the kill [s]."""
+    swimming: bool
+    """Whether there were pulses at that moment."""
+    off: float | None
+    """When the last pulse ended, from the kill on [s]; None: they are still on."""
+    width: float
+    """The pulse that is still on [µs]; 0 for none."""
+
+
+class Lane:
+    """A virtual Pi, and the fishd that swims on it."""
+
+    def __init__(self, folder: Path, zygote: Connection, number: random.Random) -> None:
+        self.folder = folder
+        self.random = number
+        self.endpoint = f"ipc://{folder}/control"
+        self._zygote = zygote
+        self._pidfd = -1
+        settings = VirtualPiSettings(pigpio_port=0)
+        self.pi = VirtualPi(settings, PlantParameters(), SimulationSettings(), 0.05, SystemClock())
+
+    def swim(self) -> None:
+        """Start a fishd, and wait until its tail beats; again where a busy machine disturbs it."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            self.start()
+            beats = self._beats()
+            until = time.monotonic() + BEGINNING
+            while time.monotonic() < until:
+                if self._beats() >= beats + 3:
+                    return
+                time.sleep(0.005)
+            self.end()
+        raise SystemExit(f"fishd does not swim: {(self.folder / 'log').read_text()[-2000:]}")
+
+    def start(self) -> None:
+        """Start a fishd."""
+        pairs = {
+            "robot": "virtual-pi",
+            "virtual_pi.socket": self.folder / "virtual-pi",
+            "force_sensor.data_rate": 128,  # light on a busy machine
+            "servo.pigpio.port": self.pi.pigpiod.port,
+            "servo.pigpio.timeout": self.random.choice((0.008, 0.02, 0.1)),
+            "state_folder": self.folder / "state",
+            "control.address": self.endpoint,
+            "telemetry.address": f"ipc://{self.folder}/telemetry",
+            "start.controller": "square",
+            "realtime.priority": 0,
+            "realtime.lock_memory": "false",
+            "realtime.rehearse": "false",
+        }
+        self._zygote.send([f"{key}={value}" for key, value in pairs.items()])
+        self._pidfd = os.pidfd_open(self._zygote.recv())
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send fishd a signal; nothing where it is gone."""
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._pidfd, number)
+
+    def end(self) -> None:
+        """Kill fishd where it still lives, and wait until it is gone."""
+        if self._pidfd >= 0:
+            self.signal(signal.SIGKILL)
+            select.select([self._pidfd], [], [], PATIENCE)
+            os.close(self._pidfd)
+            self._pidfd = -1
+
+    def ask(self, request: Callable[[Fish], object]) -> None:
+        """Send a request, and do not wait for the answer."""
+
+        def call() -> None:
+            with suppress(FishdError), Fish(self.endpoint, timeout=5.0) as fish:
+                request(fish)
+
+        threading.Thread(target=call, daemon=True).start()
+
+    def inject(self, fault: str, seconds: float | None = None) -> None:
+        """Let a fault of the virtual Pi begin."""
+        self.pi.faults.inject(fault, seconds)
+
+    def kill(self, name: str, situation: Situation) -> Kill:
+        """Bring a fishd into a situation, kill it in there, and watch its pulses."""
+        self.swim()
+        time.sleep(self.random.uniform(0.0, 0.2))
+        situation.deed(self)
+        after = self.random.uniform(0.0, situation.window)
+        time.sleep(after)
+        stop = self.random.random() < STOPPED
+        self.signal(signal.SIGSTOP if stop else signal.SIGKILL)
+        dead = time.monotonic()
+        swimming = self._width(dead) > 0.0
+        time.sleep(WATCHED)
+        now = time.monotonic()
+        width = self._width(now)
+        changes = [(when, width) for when, width in self.pi.pigpiod.history(GPIO) if when <= now]
+        off = None if width else max(0.0, changes[-1][0] - dead)
+        self.end()
+        if width:  # the next one is to find a good pigpiod
+            self.inject("pigpiod-restart")
+        return Kill(name, stop, after, swimming, off, width)
+
+    def _beats(self) -> int:
+        history = self.pi.pigpiod.history(GPIO)
+        return sum(abs(width - 1500.0) > 100.0 for _, width in history if width)
+
+    def _width(self, now: float) -> float:
+        return self.pi.pigpiod.width(GPIO, now)
+
+
+def succeed(lane: Lane) -> None:
+    """Kill the fishd that swims, and start the next one at once."""
+    lane.end()
+    lane.start()
+
+
+def clear(fish: Fish) -> None:
+    """An emergency stop and, once it has acted, its end."""
+    fish.estop()
+    time.sleep(0.1)
+    fish.clear_fault()
+
+
+SITUATIONS = {
+    "swims": Situation("it swims", 10, 0.2, lambda lane: None),
+    "starts": Situation("it starts after one that was killed", 16, 0.5, succeed),
+    "frozen": Situation(
+        "pigpiod hangs for 30 ms, and on",
+        22,
+        0.12,
+        lambda lane: lane.inject("pigpiod-frozen", 0.03),
+    ),
+    "frozen long": Situation(
+        "pigpiod hangs for 0.3 s, and it connects again",
+        10,
+        0.5,
+        lambda lane: lane.inject("pigpiod-frozen", 0.3),
+    ),
+    "gone": Situation(
+        "pigpiod is gone for 50 ms, and it connects again",
+        6,
+        0.5,
+        lambda lane: lane.inject("pigpiod-gone", 0.05),
+    ),
+    "restart": Situation(
+        "pigpiod is started again", 6, 0.4, lambda lane: lane.inject("pigpiod-restart")
+    ),
+    "stops": Situation("it stops (SIGTERM)", 10, 0.8, lambda lane: lane.signal(signal.SIGTERM)),
+    "loads": Situation(
+        "it loads a policy",
+        6,
+        0.6,
+        lambda lane: lane.ask(lambda fish: fish.set_controller("ppo", **POLICY)),
+    ),
+    "estop": Situation(
+        "an emergency stop", 10, 0.02, lambda lane: lane.ask(lambda fish: fish.estop())
+    ),
+    "clears": Situation(
+        "a fault is cleared, and it gets pulses again", 4, 0.3, lambda lane: lane.ask(clear)
+    ),
+}
+
+
+def order(kills: int, seed: int, only: str | None) -> list[str]:
+    """The situations of so many kills, in a random order that the seed decides."""
+    if only:
+        return [only] * kills
+    hundred = [name for name, situation in SITUATIONS.items() for _ in range(situation.share)]
+    shuffled = random.Random(seed)
+    names = list(itertools.islice(itertools.cycle(shuffled.sample(hundred, len(hundred))), kills))
+    shuffled.shuffle(names)
+    return names
+
+
+def serve_forks(requests: Connection, log: Path) -> None:
+    """Fork a fishd for each list of settings that comes in; tells its process number."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    while True:
+        try:
+            config = load(None, requests.recv())
+        except EOFError:
+            os._exit(0)
+        pid = os.fork()
+        if pid == 0:
+            requests.close()
+            be_fishd(config)
+        requests.send(pid)
+
+
+def be_fishd(config: Config) -> None:
+    """Never returns."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    try:
+        asyncio.run(swim(config, False))
+    except BaseException as error:
+        print(f"fishd: {error!r}", file=sys.stderr, flush=True)
+        os._exit(1)
+    os._exit(0)
+
+
+@contextmanager
+def lane(folder: Path, seed: int) -> Iterator[Lane]:
+    """A lane; must be called while its process has one thread, as it forks."""
+    ours, theirs = multiprocessing.Pipe()
+    if os.fork() == 0:
+        ours.close()
+        serve_forks(theirs, folder / "log")
+    theirs.close()
+    made = Lane(folder, ours, random.Random(seed))
+    try:
+        with LinkServer(made.pi, folder / "virtual-pi"):
+            yield made
+    finally:
+        made.end()
+        ours.close()
+        os.wait()
+
+
+def work(names: list[str], seed: int, deadline: float, results: Connection) -> None:
+    """Do these kills, one after another, and send what was seen."""
+    with (
+        tempfile.TemporaryDirectory(prefix="fishd-") as folder,
+        lane(Path(folder), seed) as made,
+    ):
+        for name in names:
+            if time.monotonic() > deadline:
+                break
+            results.send(made.kill(name, SITUATIONS[name]))
+    results.close()
+
+
+def run(names: list[str], lanes: int, seed: int, limit: float) -> Iterator[Kill]:
+    """The kills as they come in; those that do not fit into `limit` [s] are left out."""
+    deadline = time.monotonic() + limit
+    waiting: dict[Connection, int] = {}
+    for number in range(lanes):
+        ours, theirs = multiprocessing.Pipe(duplex=False)
+        pid = os.fork()
+        if pid == 0:
+            status = 1
+            try:
+                work(names[number::lanes], seed * 1000 + number, deadline, theirs)
+                status = 0
+            except BaseException as error:
+                print(f"lane {number}: {error!r}", file=sys.stderr, flush=True)
+            os._exit(status)
+        theirs.close()
+        waiting[ours] = pid
+    while waiting:
+        for ours in multiprocessing.connection.wait(list(waiting)):
+            try:
+                yield ours.recv()
+            except EOFError:
+                pid = waiting.pop(ours)
+                if os.waitpid(pid, 0)[1]:
+                    raise SystemExit("a lane has failed, see above") from None
+
+
+def report(kills: list[Kill], seed: int) -> str:
+    """What is put into the document."""
+    rows = []
+    for name, situation in SITUATIONS.items():
+        of_it = [kill for kill in kills if kill.situation == name]
+        times = [kill.off for kill in of_it if kill.off is not None]
+        if not of_it:
+            continue
+        stuck = len(of_it) - len(times)
+        late = f"{max(times) * 1e3:.0f}" if times else "–"
+        swimming = sum(kill.swimming for kill in of_it)
+        rows.append([situation.what, *map(str, (len(of_it), swimming, late, stuck))])
+    stuck = sum(kill.off is None for kill in kills)
+    stopped = sum(kill.stopped for kill in kills)
+    rows.append(["all", str(len(kills)), str(sum(kill.swimming for kill in kills)), "", str(stuck)])
+    head = ["fishd is killed while", "kills", "with pulses on", "off after, at most [ms]", "stuck"]
+    return f"{table(head, rows)}\n\nSeed {seed}; {stopped} of them by SIGSTOP."
+
+
+def main() -> int:
+    """Kill, and print or write what was seen."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--lanes", type=int, default=4, help="how many at a time")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--situation", choices=[*SITUATIONS], help="only this one")
+    parser.add_argument("--limit", type=float, default=3600.0, help="longest time [s]")
+    parser.add_argument("--json", action="store_true", help="print each kill as JSON")
+    parser.add_argument("--write", type=Path, help="put the table into this file")
+    options = parser.parse_args()
+    warm_up()
+    kills = []
+    names = order(options.kills, options.seed, options.situation)
+    for kill in run(names, options.lanes, options.seed, options.limit):
+        kills.append(kill)
+        if options.json:
+            print(msgspec.json.encode(kill).decode(), flush=True)
+        elif kill.off is None:
+            print(f"stuck: {kill}", flush=True)
+    text = report(kills, options.seed)
+    if not options.json:
+        print(text)
+    if options.write:
+        put(options.write, "random kills", text)
+    return 1 if any(kill.off is None for kill in kills) else 0
+
+
+def warm_up() -> None:
+    """Load what a fishd loads, without a thread: it is forked afterwards."""
+    import fishd.hardware.ads1115
+    import fishd.hardware.pigpio  # noqa: F401
+    from fishd.controllers import registry
+    from fishd.policies.runtime import preload
+
+    registry.describe_all()
+    preload()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
