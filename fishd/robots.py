@@ -130,12 +130,13 @@ def state_folder(config: Config) -> Path:
 
 
 def open_servo(config: Config, clock: Clock, *, threaded: bool) -> CalibratedServo:
-    """The servo alone; raises `StartupError` when the package of rpi-gpio is missing."""
+    """The servo alone; raises `StartupError` when its package is missing."""
     found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
     calibration = found[0] if found else as_configured(config.servo)
     settings = config.servo
     if settings.driver == "pigpio":
-        from fishd.hardware.pigpio import PigpioServo
+        with driver_packages():
+            from fishd.hardware.pigpio import PigpioServo
 
         return PigpioServo(settings, calibration, clock, threaded=threaded, tick=config.tick)
     if settings.driver == "sysfs-pwm":

@@ -1,4 +1,4 @@
-"""A virtual Pi in virtual time, with the true driver of its ADS1115 and fishd's pigpio client."""
+"""A virtual Pi in virtual time, with the true driver of its ADS1115 and the true pigpio client."""
 
 import math
 from typing import Any, Self
@@ -50,7 +50,7 @@ class VirtualPiRig:
 
     def steer(self, angle: float) -> None:
         self.pigpio.within(PATIENCE)
-        self.pigpio.servo(GPIO, 1500 + 600 * angle)
+        self.pigpio.set_servo_pulsewidth(GPIO, 1500 + 600 * angle)
 
     def forces_until(self, time: float) -> tuple[float, float]:
         """Mean voltages at x and y from now to a time [s]."""

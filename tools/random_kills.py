@@ -36,6 +36,7 @@ from fishd.daemon import swim
 from fishd.emulation.link_server import LinkServer
 from fishd.emulation.settings import VirtualPiSettings
 from fishd.emulation.virtual_pi import VirtualPi
+from fishd.ending import Ending
 from fishd.errors import FishdError
 from fishd.hardware.imperfections import SimulationSettings
 from fishd.plant.parameters import PlantParameters
@@ -265,7 +266,7 @@ def be_fishd(config: Config) -> None:
     """Never returns."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     try:
-        asyncio.run(swim(config, False))
+        asyncio.run(swim(config, False, Ending()))
     except BaseException as error:
         print(f"fishd: {error!r}", file=sys.stderr, flush=True)
         os._exit(1)

@@ -3,9 +3,11 @@
 A countdown script inside pigpiod ends the pulses when fishd no longer writes, whatever ended it.
 """
 
+import pigpio
+
 from fishd.clock import Clock
 from fishd.errors import ServoError
-from fishd.hardware import pigpio_client, pigpio_pulses
+from fishd.hardware import pigpio_pulses
 from fishd.hardware.calibration import ServoCalibration, calibrated
 from fishd.hardware.pigpio_client import Client
 from fishd.hardware.pigpio_link import PigpioLink
@@ -77,7 +79,7 @@ class PigpioServo:
             client.update_script(self._script, countdown)
             self._armed = now
             self._energised = True
-            client.servo(self._settings.gpio, width)
+            client.set_servo_pulsewidth(self._settings.gpio, round(width))
 
     def release(self) -> None:
         """Stop the pulses and disarm the countdown; may be called twice."""
@@ -126,12 +128,16 @@ class PigpioServo:
 
     def _release(self, client: Client) -> None:
         gpio = self._settings.gpio
-        # Not disarmed but armed with OFF: if only the first of the two arrives, it ends the pulses.
-        script = pigpio_client.update_script(self._script, armed(gpio, 1, OFF))
-        countdown, off = client.exchange([script, pigpio_client.servo(gpio, OFF)], urgent=True)
-        off.good()
+        taken_away = None
+        try:
+            # Not disarmed but armed with OFF: if this alone arrives, it ends the pulses.
+            client.update_script(self._script, armed(gpio, 1, OFF))
+        except pigpio.error as error:
+            taken_away = error
+        client.set_servo_pulsewidth(gpio, OFF)
         self._energised = False
-        countdown.good()
+        if taken_away:
+            raise taken_away
 
     def _prepare(self, client: Client) -> None:
         """Put a new connection in order: no pulses go on unless the loop writes again.
@@ -141,13 +147,13 @@ class PigpioServo:
         """
         gpio, sleep = self._settings.gpio, self._clock.sleep
         former = pigpio_pulses.countdowns(client, gpio)
-        count, width = self._counts, OFF
+        count, width = self._counts, float(OFF)
         if not self._energised and pigpio_pulses.pulses_on(client, gpio, sleep):
             count, width = 1, self._neutral  # of a killed fishd: gently
         self._script = pigpio_pulses.install(client, gpio, count, width, sleep)
         for script in former:
             client.update_script(script, armed(gpio, 0, OFF))
         if self._energised:
-            client.servo(gpio, OFF)
+            client.set_servo_pulsewidth(gpio, OFF)
         pigpio_pulses.remove(client, gpio, former)
         self._energised = False

@@ -149,7 +149,7 @@ class PigpioLink:
         allowed = limit
         try:
             client = self._opening = Client(self._settings.host, self._settings.port, limit)
-            client.version()
+            client.get_pigpio_version()
             allowed = preparation
             client.within(preparation)
             self._prepare(client)

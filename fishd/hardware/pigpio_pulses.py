@@ -9,26 +9,13 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 
+import pigpio
+
 from fishd.errors import ServoError
-from fishd.hardware.pigpio_client import (
-    ANSWER,
-    GET_DUTY,
-    GET_MODE,
-    GET_WIDTH,
-    INITIALISING,
-    NOT_PWM,
-    NOT_SERVO,
-    PARAMETERS,
-    READ,
-    SCRIPTS,
-    Client,
-    PigpioError,
-    Place,
-    opened,
-)
+from fishd.hardware.pigpio_client import ANSWER, PARAMETERS, SCRIPTS, Client, Place, opened
 from fishd.hardware.pulses import REST
 
-OFF = 0.0
+OFF = 0
 """A pulse width that stands for no pulses."""
 
 COUNT = 0.01
@@ -68,21 +55,21 @@ def armed(gpio: int, count: int, width: float) -> list[int]:
 
 def countdowns(client: Client, gpio: int) -> list[int]:
     """The scripts on this pin that an earlier connection or a killed fishd left behind."""
-    statuses = client.script_statuses(range(SCRIPTS))
-    return [
-        script
-        for script, (_, parameters) in enumerate(statuses)
-        if parameters and parameters[1] == gpio and parameters[-1] == MAGIC
-    ]
+    found = []
+    for script in range(SCRIPTS):
+        _, parameters = client.script_status(script)
+        if parameters and parameters[1] == gpio and parameters[-1] == MAGIC:
+            found.append(script)
+    return found
 
 
 def install(client: Client, gpio: int, count: int, width: float, sleep: Sleep) -> int:
     """Store a countdown and run it, armed; the number of the script."""
-    script = client.store_script(COUNTDOWN)
+    script: int = client.store_script(COUNTDOWN)
     parameters = armed(gpio, count, width)
     parameters += [0] * (PARAMETERS - 1 - len(parameters)) + [MAGIC]
     client.update_script(script, parameters)  # at once: nobody finds one without its name
-    while client.script_status(script)[0] == INITIALISING:
+    while client.script_status(script)[0] == pigpio.PI_SCRIPT_INITING:
         sleep(0.001)
     client.run_script(script, parameters)
     return script
@@ -103,17 +90,20 @@ def pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
     Those of the PWM peripheral outlive the pigpiod that began them, and the next one knows nothing
     of them: where the pin is in that mode, its level is watched for two frames.
     """
-    for command, otherwise in ((GET_WIDTH, NOT_SERVO), (GET_DUTY, NOT_PWM)):
+    for asked, otherwise in (
+        (client.get_servo_pulsewidth, pigpio.PI_NOT_SERVO_GPIO),
+        (client.get_PWM_dutycycle, pigpio.PI_NOT_PWM_GPIO),
+    ):
         try:
-            if client.ask(command, gpio):
+            if asked(gpio):
                 return True
-        except PigpioError as error:
-            if error.number != otherwise:
+        except pigpio.error as error:
+            if error.value != pigpio.error_text(otherwise):
                 raise
-    if client.ask(GET_MODE, gpio) != _PWM_MODES.get(gpio):
+    if client.get_mode(gpio) != _PWM_MODES.get(gpio):
         return False
     for _ in range(_LOOKS):
-        if client.ask(READ, gpio):
+        if client.read(gpio):
             return True
         sleep(_LOOK)
     return False
@@ -131,7 +121,7 @@ def neutralise(place: Place, gpio: int, neutral: float, sleep: Sleep) -> bool:
             return _neutralise(client, gpio, neutral, sleep)
     except BaseException:
         with suppress(ServoError), opened(place) as client:
-            client.servo(gpio, OFF)
+            client.set_servo_pulsewidth(gpio, OFF)
             remove(client, gpio, countdowns(client, gpio))
         raise
 
@@ -144,9 +134,10 @@ def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool
         scripts.append(install(client, gpio, _GUARD, OFF, sleep))
         for script in scripts[:-1]:
             client.update_script(script, armed(gpio, 0, OFF))
-        client.servo(gpio, neutral)  # this takes the pin from the PWM peripheral as well
+        # This takes the pin from the PWM peripheral as well.
+        client.set_servo_pulsewidth(gpio, round(neutral))
         sleep(REST)
         client.within(ANSWER)
-        client.servo(gpio, OFF)
+        client.set_servo_pulsewidth(gpio, OFF)
     remove(client, gpio, scripts)
     return energised

@@ -12,7 +12,7 @@ from processes import FISHCTL, FISHD, PATIENCE
 
 from fishd.hardware import ownership, packages
 
-MODULES = ("adafruit_extended_bus", "adafruit_ads1x15", "Adafruit_PureIO")
+MODULES = ("pigpio", "adafruit_extended_bus", "adafruit_ads1x15", "Adafruit_PureIO")
 ONE_LINE = r"[^\n]*the package %s is missing; install fishd\[pi\]\n"
 
 
@@ -64,9 +64,11 @@ def test_fishd_does_not_start_with_a_button_that_it_cannot_read(tmp_path: Path) 
     assert "E-stop button, status light and servo driver rpi-gpio need" in ended.stderr
 
 
-def test_release_needs_no_package(pi: Bench, without: dict[str, str]) -> None:
-    ended = call(without, FISHCTL, "release", *pi.settings)
-    assert (ended.returncode, ended.stdout) == (0, "there were no pulses\n")
+def test_release_names_the_package(tmp_path: Path, without: dict[str, str]) -> None:
+    settings = ("--set", "robot=pi", "--set", f"state_folder={tmp_path}")
+    ended = call(without, FISHCTL, "release", *settings)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert re.fullmatch(ONE_LINE % "pigpio", ended.stderr)
 
 
 def test_a_simulation_of_the_virtual_pi_names_the_package(without: dict[str, str]) -> None:
@@ -80,7 +82,7 @@ def test_no_check_of_doctor_breaks_off(pi: Bench, without: dict[str, str]) -> No
     ended = call(without, *doctor)
     assert (ended.returncode, ended.stderr) == (1, "")
     found = {line["check"]: line for line in json.loads(ended.stdout)}
-    for name in ("adc", "force"):
+    for name in ("adc", "force", "pigpiod"):
         assert found[name]["level"] == "FAIL"
         assert found[name]["message"].endswith(" is missing; install fishd[pi]")
         assert found[name]["mend"].endswith("-m pip install 'fishd[pi]'")

@@ -95,7 +95,7 @@ def test_it_says_where_it_listens_and_answers_there(pi: Process) -> None:
 def test_a_pulse_moves_the_fish(pi: Process) -> None:
     client = Client("127.0.0.1", pi.port, PATIENCE)
     with contextlib.closing(client):
-        client.servo(18, 1740)
+        client.set_servo_pulsewidth(18, 1740)
     deadline = time.monotonic() + PATIENCE
     with RemotePi(pi.path) as remote:  # nobody reads the sensor, and still the fish swims
         while remote.state().truth.alpha < 0.15 and time.monotonic() < deadline:

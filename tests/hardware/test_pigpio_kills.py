@@ -7,7 +7,7 @@ import pytest
 from pigpio_bench import GPIO, PigpioBench, connect
 
 from fishd.hardware.pigpio import PigpioServo
-from fishd.hardware.pigpio_client import Client
+from fishd.hardware.pigpio_client import TimedSocket
 
 SOON = 2.0
 """Neutral after 0.2 s and off 0.5 s later; longer where a test has lengthened the countdown [s]."""
@@ -20,10 +20,10 @@ class Killed(BaseException):
 @pytest.fixture
 def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     """Call it with n: the process dies instead of sending for the n-th time; None revives it."""
-    send = Client._send
+    send = TimedSocket.sendall
     left: int | None = None
 
-    def count_down(client: Client, data: bytes) -> None:
+    def count_down(client: TimedSocket, data: bytes) -> None:
         nonlocal left
         if left is not None:
             if left <= 0:
@@ -35,7 +35,7 @@ def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
         nonlocal left
         left = count
 
-    monkeypatch.setattr(Client, "_send", count_down)
+    monkeypatch.setattr(TimedSocket, "sendall", count_down)
     return kill_after
 
 
@@ -95,7 +95,7 @@ def last_resort(bench: PigpioBench) -> None:
 
 def last_resort_on_pulses_of_others(bench: PigpioBench) -> None:
     with bench.client() as other:
-        other.servo(GPIO, 1800)
+        other.set_servo_pulsewidth(GPIO, 1800)
     bench.servo().neutralise()
 
 
@@ -159,7 +159,7 @@ def test_bytes_of_a_killed_process_that_pigpiod_reads_late_do_not_stay_in_force(
     successor = bench.servo()
     connect(successor)  # which has put everything in order
     with bench.client() as dead:
-        dead.servo(GPIO, 1800)
+        dead.set_servo_pulsewidth(GPIO, 1800)
     bench.wait(SOON)
     assert bench.width == 0
 
@@ -171,7 +171,7 @@ def test_bytes_of_a_lost_connection_do_not_stay_in_force_after_a_release(
     lose_connection(bench, servo)
     connect(servo)
     with bench.client() as lost:
-        lost.servo(GPIO, 1800)
+        lost.set_servo_pulsewidth(GPIO, 1800)
     bench.wait(SOON)
     assert bench.width == 0
 

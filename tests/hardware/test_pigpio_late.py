@@ -37,7 +37,7 @@ def thaw(bench: PigpioBench) -> None:
     """Pigpiod goes on, and has carried out all that it was sent when this returns."""
     bench.faults.clear()
     with bench.client() as client:
-        client.version()
+        client.get_pigpio_version()
 
 
 def test_a_late_answer_now_and_then_does_not_end_the_link(bench: PigpioBench) -> None:

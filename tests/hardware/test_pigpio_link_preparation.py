@@ -35,7 +35,7 @@ def test_the_thread_outlives_an_error_that_nobody_thought_of(settings: PigpioSet
     with contextlib.closing(link), link.session(last=True) as client:
         assert client is attempts[1]
         with pytest.raises(OSError, match="Bad file descriptor"):
-            attempts[0].version()
+            attempts[0].get_pigpio_version()
 
 
 def test_an_unforeseen_error_is_the_reason_why_there_is_no_connection(

@@ -1,13 +1,11 @@
 """Pulses of the PWM peripheral, which outlive pigpiod: the last resort and a fishd end them."""
 
 import contextlib
-import struct
 from collections.abc import Iterator
 
+import pigpio
 import pytest
 from pigpio_bench import GPIO, PigpioBench, connect
-
-from fishd.hardware.pigpio_client import GET_DUTY, NOT_PWM, PigpioError
 
 HARDWARE_PWM = 86
 SET_MODE = 0
@@ -23,7 +21,7 @@ def bench() -> Iterator[PigpioBench]:
 def leave_pulses(bench: PigpioBench, width: float = 1740.0) -> None:
     """As a fishd of old with hardware PWM, or another program, when it was killed."""
     with bench.client() as client:
-        client.ask(HARDWARE_PWM, GPIO, 50, struct.pack("<I", round(width * 50)))
+        client.hardware_PWM(GPIO, 50, round(width * 50))
     bench.wait(0.1)
     assert bench.width == pytest.approx(width, abs=0.1)
 
@@ -35,10 +33,10 @@ def test_they_go_on_when_pigpiod_is_started_again_which_knows_nothing_of_them(
     bench.faults.inject("pigpiod-restart")
     bench.wait(1.0)
     assert bench.width == pytest.approx(1740, abs=0.1)
-    with bench.client() as client, pytest.raises(OSError, match=str(NOT_PWM)):
-        client.ask(GET_DUTY, GPIO)
+    with bench.client() as client, pytest.raises(pigpio.error, match="not in use for PWM"):
+        client.get_PWM_dutycycle(GPIO)
     with bench.client() as client:
-        client.ask(HARDWARE_PWM, GPIO, 0, bytes(4))  # of no use, as on a Pi
+        client.hardware_PWM(GPIO, 0, 0)  # of no use, as on a Pi
     bench.wait(0.1)
     assert bench.width == pytest.approx(1740, abs=0.1)
 
@@ -72,24 +70,17 @@ def test_a_fishd_that_starts_ends_them_at_neutral(bench: PigpioBench, restarted:
 
 def test_a_pin_that_is_the_peripherals_but_has_no_pulses_is_left_alone(bench: PigpioBench) -> None:
     with bench.client() as client:
-        client.ask(SET_MODE, GPIO, ALT5)  # as the overlay of the kernel's PWM leaves it
+        client.set_mode(GPIO, ALT5)  # as the overlay of the kernel's PWM leaves it
     assert bench.servo().neutralise() is False
     assert bench.daemon.history(GPIO) == []
     with bench.client() as client:
-        assert client.ask(1, GPIO) == ALT5
+        assert client.get_mode(GPIO) == ALT5
 
 
 def test_software_pwm_of_another_program_counts_as_pulses_too(bench: PigpioBench) -> None:
     with bench.client() as client:
-        client.ask(5, GPIO, 128)
+        client.set_PWM_dutycycle(GPIO, 128)
     bench.wait(0.1)
     assert bench.servo().neutralise() is True
     bench.wait(0.1)
     assert bench.width == 0
-
-
-def test_an_error_of_pigpiod_is_told_by_its_number(bench: PigpioBench) -> None:
-    with bench.client() as client:
-        with pytest.raises(OSError, match="pigpiod's error -7"):
-            client.servo(GPIO, 400)
-        assert PigpioError(-48).number == -48

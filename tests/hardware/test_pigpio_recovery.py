@@ -3,13 +3,13 @@
 import contextlib
 from collections.abc import Iterator
 
+import pigpio
 import pytest
 from msgspec.structs import replace
 from pigpio_bench import FRAME, GPIO, PigpioBench, connect
 
 from fishd.errors import ServoError
 from fishd.hardware.calibration import ServoCalibration
-from fishd.hardware.pigpio_client import SERVO
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: PigpioBench)
 def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: PigpioBench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.1)
-    bench.refuse(SERVO, 1500)
+    bench.refuse(pigpio._PI_CMD_SERVO, 1500)
     with pytest.raises(ServoError, match="no permission"):
         bench.servo().neutralise()
     assert bench.width == 0

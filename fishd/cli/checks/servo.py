@@ -29,7 +29,7 @@ def pigpiod(context: Context) -> Result | None:
     try:
         with opened(settings.pigpio) as client:
             began = time.monotonic()
-            version = client.version()
+            version = client.get_pigpio_version()
             took = time.monotonic() - began
     except ServoError as error:
         frozen = "answer" in str(error)

@@ -47,7 +47,8 @@ def packages(context: Context) -> Result:
         found = _REQUIREMENT.match(text)
         assert found
         name, extra = found["name"].lower(), found["extra"]
-        if extra is None or (extra == "pi" and real):
+        pigpio = servo.driver == "pigpio"
+        if extra is None or (extra == "pi" and real and (name != "pigpio" or pigpio)):
             wanted.append((name, found["bounds"]))
     problems = [problem for name, bounds in wanted if (problem := _problem(name, bounds))]
     if problems:
