@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 import zmq
 
-from fishd import protocol
+from fishd import protocol, text
 from fishd.addresses import find_control, is_deserted
 from fishd.errors import NoDaemon, ParameterError, Refused
 
@@ -62,7 +62,7 @@ class Connection:
         if reply.id != identity:
             return None
         if reply.error:
-            raise Refused(reply.error.code, reply.error.message)
+            raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
         assert reply.result
         return msgspec.json.decode(reply.result, type=kind)
 
