@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from fishd_zoo import BAD, GOOD
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -73,3 +74,18 @@ def test_a_restricted_guard_permits_neither_more_than_the_servo_reaches_nor_more
     for command in commands:
         angle = guard.apply(command, angle)
         assert max(-0.42, lowest) <= angle <= min(0.42, highest)
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_any_finite_real_number_is_an_angle(name: str) -> None:
+    guard = Guard(0.42, 0.05, None, 0.4)
+    angle = guard.apply(GOOD[name], 0.0)
+    assert type(angle) is float
+    expected = {"int": 0.0, "int64": 0.0, "beyond": 0.42}.get(name, 0.1)
+    assert angle == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_finite_real_number_is_refused_with_its_type(name: str) -> None:
+    with pytest.raises(ValueError, match=r"the command is (of type \w+, not one real|nan|inf)"):
+        Guard(0.42, 0.05, None, 0.4).apply(BAD[name], 0.0)

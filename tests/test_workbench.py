@@ -13,7 +13,7 @@ from fishd.errors import Refused
 from fishd.hardware.calibration import ForceCalibration, ServoCalibration
 from fishd.protocol import FRESH, CalibrateForce, CalibrateServo, NoArguments, SampleForce, Tare
 from fishd.robots import state_folder
-from fishd.workbench import Workbench
+from fishd.workbench import MOST_SAMPLES, Workbench
 
 ANOTHER_BUS = ("force_sensor.bus=2", "virtual_pi.bus=2")
 BRIEFLY = SampleForce(seconds=0.2)
@@ -88,6 +88,47 @@ def test_a_sample_alone_changes_nothing(rig: LockstepRig) -> None:
     perform(rig, bench, ("sample-force", BRIEFLY))
     (found,) = perform(rig, bench, ("calibrations", NoArguments()))
     assert (found.force.x0, found.force_file) == (0.0, None)
+
+
+def test_four_samples_at_once_are_all(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+
+    async def ask(request: SampleForce) -> Any:
+        try:
+            return await bench.operations["sample-force"][1](request)
+        except Refused as refusal:
+            return refusal.code
+
+    async def run() -> list[Any]:
+        answers = asyncio.gather(*(ask(BRIEFLY) for _ in range(MOST_SAMPLES + 3)))
+        while not answers.done():
+            rig.run_for(rig.config.tick)
+            await asyncio.sleep(0)
+        return await answers
+
+    answers = asyncio.run(run())
+    assert answers.count("busy") == 3
+    assert all(answer.pairs for answer in answers if answer != "busy")
+    (again,) = perform(rig, bench, ("sample-force", BRIEFLY))
+    assert again.pairs
+
+
+def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: LockstepRig) -> None:
+    bench = workbench(rig)
+
+    async def run() -> list[Any]:
+        long = SampleForce(seconds=60.0)
+        request = bench.operations["sample-force"][1]
+        answers = asyncio.gather(
+            *(request(long) for _ in range(MOST_SAMPLES)), return_exceptions=True
+        )
+        await asyncio.sleep(0.1)
+        rig.start("square")
+        return await asyncio.wait_for(answers, 2.0)
+
+    refusals = asyncio.run(run())
+    assert [refusal.code for refusal in refusals] == ["running"] * MOST_SAMPLES
+    assert str(refusals[0]) == "square is in command; stop it with 'fishctl stop'"
 
 
 def test_a_sample_is_good_for_a_tare_only_while_it_is_fresh(rig: LockstepRig) -> None:

@@ -2,6 +2,7 @@
 
 import click
 
+from fishd import text
 from fishd.cli.calibrate_force import force
 from fishd.cli.calibrate_servo import servo
 from fishd.cli.options import endpoint_option, json_option
@@ -43,4 +44,4 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     now = after.force
     echo(f"before  x0 {before.x0 * 1e3:+9.2f} mN   y0 {before.y0 * 1e3:+9.2f} mN")
     echo(f"after   x0 {now.x0 * 1e3:+9.2f} mN   y0 {now.y0 * 1e3:+9.2f} mN")
-    echo(f"in force, and saved in {after.force_file}")
+    echo(text.line(f"in force, and saved in {after.force_file}"))

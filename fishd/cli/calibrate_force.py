@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fishd import text
 from fishd.cli import load_files
 from fishd.cli.load_dialogue import Dialogue
 from fishd.cli.load_files import NEWTONS
@@ -93,7 +94,7 @@ def force(
             echo("nothing was changed", err=True)
             return 1
         saved = fish.calibrate_force(fitted.calibration)
-    echo(f"in force, and saved in {saved.force_file}")
+    echo(text.line(f"in force, and saved in {saved.force_file}"))
     return 0
 
 

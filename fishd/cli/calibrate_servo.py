@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from fishd import text
 from fishd.cli.options import endpoint_option
 from fishd.cli.output import echo
 from fishd.cli.servo_loan import end, renewed
@@ -53,7 +54,7 @@ def servo(endpoint: str | None) -> int:
                 if not click.confirm("Save it?"):
                     raise click.ClickException("not saved")
             saved = fish.calibrate_servo(tail.calibration, save=True, loan=tail.loan)
-    echo(f"in force, and saved in {saved.servo_file}")
+    echo(text.line(f"in force, and saved in {saved.servo_file}"))
     return 0
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import click
 
-from fishd import text
 from fishd.addresses import ENDPOINT_VARIABLE
 from fishd.cli.options import (
     ControllerGroup,
@@ -37,7 +36,7 @@ def status(endpoint: str | None, as_json: bool) -> None:
     if as_json:
         print_json(found)
     else:
-        echo(_status_text(found))
+        echo(_status_text(made_printable(found)))
 
 
 @click.command()
@@ -140,6 +139,7 @@ def _print_state(state: State, as_json: bool) -> None:
     if as_json:
         print_json(state)
         return
+    state = made_printable(state)
     why = f" ({_why(state.reason)})" if state.reason else ""
     echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
 
@@ -169,7 +169,7 @@ def _status_text(status: Status) -> str:
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]
-    return "\n".join(f"{name:<12}{text.line(value)}" for name, value in rows)
+    return "\n".join(f"{name:<12}{value}" for name, value in rows)
 
 
 def _servo(status: Status) -> str:
@@ -190,8 +190,7 @@ def _range(status: Status) -> str:
 
 
 def _why(reason: Reason) -> str:
-    message = reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
-    return text.line(message)
+    return reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
 
 
 def _percentiles(times: Percentiles) -> str:

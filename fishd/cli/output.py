@@ -48,7 +48,7 @@ def counted(number: int, noun: str) -> str:
 def _printable(value: Any) -> Any:
     if isinstance(value, str):
         return text.line(value)
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [_printable(part) for part in value]
     if isinstance(value, dict):
         return {_printable(key): _printable(part) for key, part in value.items()}

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import zmq
 
-from fishd import protocol
+from fishd import protocol, text
 from fishd.addresses import ENDPOINT_VARIABLE, find_control, is_deserted, socket_path
 from fishd.errors import NoDaemon, ParameterError, Refused, Untrusted
 from fishd.socket_owner import stranger
@@ -73,7 +73,7 @@ class Connection:
         if reply.id != identity:
             return None
         if reply.error:
-            raise Refused(reply.error.code, reply.error.message)
+            raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
         assert reply.result
         return msgspec.json.decode(reply.result, type=kind)
 

@@ -1,0 +1,117 @@
+"""Code that is not fishd's: it may raise anything and never return, and is no trouble."""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+import pytest
+from fishd_zoo import RAISED
+
+from fishd.contained import Attempt, contained
+from fishd.errors import Escaped
+
+PATIENCE = 10.0
+
+
+@pytest.fixture
+def _as_in_the_daemon() -> Iterator[None]:
+    """There a SIGINT raises nothing."""
+
+    def ignore(number: int, frame: FrameType | None) -> None:
+        pass
+
+    before = signal.signal(signal.SIGINT, ignore)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_as_in_the_daemon")
+@pytest.mark.parametrize("deed", RAISED)
+def test_whatever_is_raised_is_an_exception_outside(deed: str) -> None:
+    def misbehave() -> None:
+        raise RAISED[deed]
+
+    with pytest.raises(Exception) as caught:  # noqa: PT011  (that is what it is about)
+        contained(misbehave)
+    error = caught.value
+    assert error is RAISED[deed] or error.__cause__ is RAISED[deed]
+
+
+def test_a_true_ctrl_c_passes() -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with pytest.raises(KeyboardInterrupt):
+        contained(interrupt)
+
+
+def test_an_attempt_gives_what_is_returned_or_raises_what_is_raised() -> None:
+    good, bad = Attempt(lambda: 42), Attempt(lambda: sys.exit(3))
+    assert good.wait(PATIENCE)
+    assert good.result() == 42
+    assert bad.wait(PATIENCE)
+    with pytest.raises(Escaped, match="SystemExit: 3"):
+        bad.result()
+    assert not good.give_up()
+
+
+def test_a_loop_in_python_ends_when_it_is_given_up() -> None:
+    begun = threading.Event()
+
+    def loop() -> None:
+        begun.set()
+        while True:
+            pass
+
+    attempt = Attempt(loop)
+    assert begun.wait(PATIENCE)
+    assert attempt.give_up()
+    deadline = time.monotonic() + PATIENCE
+    while attempt.alive and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not attempt.alive
+    assert not attempt.wait(0.0)
+
+
+def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
+    go, taken = threading.Event(), threading.Event()
+    results: list[str] = []
+
+    def deliver() -> str:
+        while True:
+            try:
+                go.wait(PATIENCE)
+            except BaseException:  # what gives it up
+                continue
+            return "late"
+
+    def take(result: str) -> None:
+        results.append(result)
+        taken.set()
+
+    attempt = Attempt(deliver, late=take)
+    assert attempt.give_up()
+    go.set()
+    assert taken.wait(PATIENCE)
+    assert results == ["late"]
+    assert not attempt.wait(0.0)
+
+
+def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thrown_away() -> None:
+    """Given up at every moment of a short life, a result is never lost and never there twice."""
+    for number in range(400):
+        late: list[int] = []
+        attempt = Attempt(lambda: 1, late=late.append)
+        for _ in range(number):
+            pass
+        done = not attempt.give_up()
+        deadline = time.monotonic() + PATIENCE
+        while attempt.alive and time.monotonic() < deadline:
+            time.sleep(0)
+        # One that was ended before it returned has no result at all.
+        assert attempt.wait(0.0) == done
+        assert len(late) <= (0 if done else 1)

@@ -1,0 +1,106 @@
+"""The end of the process: it comes when it is asked for, however the process hangs."""
+
+import asyncio
+import dataclasses
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from harness import Rig, Wrapped
+from processes import PATIENCE, Daemon
+
+from fishd.config import Config
+from fishd.daemon import Daemon as Inside
+from fishd.hardware.base import Robot
+
+PROGRAM = """
+import sys, threading, time
+from fishd.ending import Ending, leave
+
+ending = Ending()
+asked = threading.Event()
+ending.when_asked(asked.set)
+ending.release = lambda: (print("released", flush=True), {release})
+ending.last_words = lambda: print("last words", flush=True)
+print("up", flush=True)
+{hang}
+asked.wait()
+leave(7)
+"""
+LIMIT = 3.0
+
+
+def end(hang: str = "", release: str = "None", number: int = signal.SIGTERM) -> tuple[int, str]:
+    """Exit status and output of a process that hangs, and is asked to end."""
+    program = PROGRAM.format(hang=hang, release=release)
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout
+        assert process.stdout.readline() == "up\n"
+        time.sleep(0.1)
+        begun = time.monotonic()
+        process.send_signal(number)
+        output = process.communicate(timeout=PATIENCE)[0]
+        assert time.monotonic() - begun <= LIMIT
+    return process.returncode, output
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_an_orderly_end_is_nobodys_business(number: int) -> None:
+    assert end(number=number) == (7, "")
+
+
+@pytest.mark.parametrize(
+    "hang",
+    [
+        "while True: pass",
+        "time.sleep(60)",
+        "threading.Lock().acquire(); import os; os.read(os.pipe()[0], 1)",
+        "signal = __import__('signal'); signal.signal(15, lambda *_: None); time.sleep(60)",
+    ],
+    ids=["loop", "sleep", "block", "handler taken"],
+)
+def test_a_process_that_hangs_lets_go_of_the_servo_and_ends(hang: str) -> None:
+    assert end(hang) == (1, "released\nlast words\n")
+
+
+def test_a_servo_that_hangs_as_well_keeps_nobody() -> None:
+    assert end("time.sleep(60)", "time.sleep(60)") == (1, "released\nlast words\n")
+
+
+def test_a_thread_that_a_controller_left_behind_keeps_nobody() -> None:
+    assert end("threading.Thread(target=time.sleep, args=(60,)).start()") == (7, "")
+
+
+def test_below_nohup_a_terminal_that_closes_is_nothing(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, under=["nohup"]).wait_until_up()
+    daemon.process.send_signal(signal.SIGHUP)
+    with pytest.raises(subprocess.TimeoutExpired):
+        daemon.process.wait(0.5)
+    assert daemon.end()[0] == 0
+
+
+@pytest.mark.parametrize("countdown", [0.2, float("inf")])
+def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdown: float) -> None:
+    made: list[Wrapped] = []
+
+    def wrap(robot: Robot) -> Robot:
+        made.append(Wrapped(robot))
+        return dataclasses.replace(made[0].robot(), countdown=countdown)
+
+    rig = Rig(wrap=wrap)
+    rig.start("hold", angle=0.3)
+    rig.run(10)
+    made[0].log.clear()
+
+    async def release() -> None:
+        daemon = Inside(Config(lockstep=True), print_status=False)
+        daemon._loop = rig.loop
+        daemon.release_at_once()
+
+    asyncio.run(release())
+    assert made[0].log == ([None] if countdown == 0.2 else [0.0, None])

@@ -1,0 +1,115 @@
+"""Logs: whatever is logged is safe to read, and nobody waits for a reader who is gone."""
+
+import io
+import logging
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import msgspec
+import pytest
+
+from fishd.logs import JsonFormatter, LogWriter, TextFormatter
+
+
+def record(message: str, error: BaseException | None = None) -> logging.LogRecord:
+    info = (type(error), error, error.__traceback__) if error else None
+    return logging.LogRecord("zoo", logging.ERROR, "", 0, message, None, info)
+
+
+def raised(error: BaseException) -> BaseException:
+    try:
+        raise error
+    except BaseException as caught:
+        return caught
+
+
+@pytest.mark.parametrize("formatter", [TextFormatter(False), TextFormatter(True), JsonFormatter()])
+def test_a_text_of_5_mb_is_cut_and_its_traceback_too(formatter: logging.Formatter) -> None:
+    line = formatter.format(record("x" * 5_000_000, raised(RuntimeError("y" * 5_000_000))))
+    assert len(line) < 15_000
+    assert "Traceback" in line
+    assert "in raised" in line
+
+
+@pytest.mark.parametrize("formatter", [TextFormatter(False), TextFormatter(True), JsonFormatter()])
+def test_what_is_logged_can_be_encoded_and_says_nothing_to_a_terminal(
+    formatter: logging.Formatter,
+) -> None:
+    odd = "\x1b[2J\udcff\x9b31m\r\nforged"
+    line = formatter.format(record(odd, raised(RuntimeError(odd))))
+    line.encode()
+    assert all(part.isprintable() for part in line.split("\n"))
+
+
+def test_a_json_line_is_one_line_of_json() -> None:
+    line = JsonFormatter().format(record("two\nlines", raised(RuntimeError("\udcff"))))
+    found = msgspec.json.decode(line)
+    assert found["message"] == "two lines"
+    assert found["traceback"].endswith("RuntimeError: ?")
+
+
+@contextmanager
+def writer(monkeypatch: pytest.MonkeyPatch, stderr: io.TextIOBase) -> Iterator[LogWriter]:
+    """A log writer, and after it everything as it was."""
+    root = logging.getLogger()
+    monkeypatch.setattr(sys, "stderr", stderr)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr("threading.excepthook", sys.excepthook)
+    handlers, level = root.handlers, root.level
+    logs = LogWriter("text")
+    try:
+        yield logs
+    finally:
+        logs.close()
+        logging.captureWarnings(False)
+        root.handlers = handlers
+        root.setLevel(level)
+
+
+def test_what_was_logged_is_written_before_it_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = io.StringIO()
+    with writer(monkeypatch, said):
+        for number in range(200):
+            logging.error("line %d", number)
+    assert said.getvalue().count("error root: line ") == 200
+
+
+class Stuck(io.StringIO):
+    """Standard error that nobody reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.let_go = threading.Event()
+
+    def write(self, text: str) -> int:
+        self.let_go.wait(10.0)
+        return len(text)
+
+
+def test_it_closes_soon_where_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    stuck = Stuck()
+    with writer(monkeypatch, stuck) as logs:
+        begun = time.monotonic()
+        for _ in range(2000):
+            logging.error("a line")
+        logs.close()
+        assert time.monotonic() - begun < 1.5
+        stuck.let_go.set()
+
+
+class Odd:
+    def __str__(self) -> str:
+        raise RuntimeError("no text")
+
+
+def test_what_cannot_be_logged_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = io.StringIO()
+    with writer(monkeypatch, said):
+        logging.error("%s", Odd())
+        logging.error("%d apples", "three")
+        logging.error("on")
+    assert said.getvalue().endswith("error root: on\n")
+    assert said.getvalue().count("\n") == 1

@@ -1,0 +1,60 @@
+"""Suggestions for a wrong word: made on the ticking thread, so they cost next to nothing."""
+
+import time
+from collections.abc import Callable
+
+import pytest
+
+from fishd.config import Config
+from fishd.schema import LONGEST_WORD, Problem, convert, leaves, nearest
+
+POLICIES = [f"policy-{number:04d}-swim" for number in range(500)]
+KEYS = leaves(Config)
+
+
+def fastest(function: Callable[[], object]) -> float:
+    """What it takes on a machine that is not disturbed [s]."""
+    times = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+@pytest.mark.parametrize(
+    ("word", "words", "limit"),
+    [
+        ("x" * 65536, ["status", "controllers"], 1e-4),
+        ("status" * 10_000, ["status", "controllers"], 1e-4),
+        ("servo.gpoi" * 10, KEYS, 1e-3),
+        ("policy-0123-swum", POLICIES, 3e-3),
+    ],
+    ids=["64 kB", "64 kB of letters", "100 letters", "500 names"],
+)
+def test_a_suggestion_is_quick(word: str, words: list[str], limit: float) -> None:
+    assert fastest(lambda: nearest(word, words)) < limit
+
+
+def test_the_nearest_of_many_is_found() -> None:
+    assert nearest("policy-0123-swum", POLICIES) == "did you mean 'policy-0123-swim'?"
+    assert nearest("servo.gpoi", KEYS) == "did you mean 'servo.gpio'?"
+    for known in KEYS:
+        swapped = known[:-2] + known[-1] + known[-2]
+        assert nearest(swapped, KEYS).startswith("did you mean"), swapped
+
+
+def test_a_word_that_is_too_long_to_be_meant_gets_no_suggestion() -> None:
+    known = "x" * (LONGEST_WORD + 1)
+    assert nearest(known + "y", [known]).startswith("valid: ")
+
+
+@pytest.mark.parametrize("value", ["x" * 60_000, [[1] * 20_000], {"a": ["b"] * 20_000}, 10**4000])
+def test_a_long_value_is_quoted_briefly_and_quickly(value: object) -> None:
+    def refuse() -> str:
+        with pytest.raises(Problem) as problem:
+            convert({"tick": value}, Config)
+        return str(problem.value)
+
+    assert len(refuse()) < 150
+    assert fastest(refuse) < 5e-3
