@@ -198,8 +198,8 @@ def test_the_gpio_package_suits_the_pi(model: str, debian: str, kernel: str, ext
     assert chosen.strip() == extra
 
 
-def sdist(folder: Path, name: str, build: str) -> None:
-    """Sources of a package whose build does this."""
+def sdist(folder: Path, name: str, build: str, requires: str = "") -> None:
+    """Sources of a package whose build does this, and needs that, a quoted name."""
     backend = f"""
 import os, zipfile
 
@@ -216,7 +216,7 @@ def build_wheel(folder, settings=None, metadata=None):
 """
     files = {
         "backend.py": backend,
-        "pyproject.toml": '[build-system]\nrequires = []\nbuild-backend = "backend"\n'
+        "pyproject.toml": f'[build-system]\nrequires = [{requires}]\nbuild-backend = "backend"\n'
         'backend-path = ["."]\n',
         "PKG-INFO": f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.6\n",
     }
@@ -268,19 +268,23 @@ def test_the_other_gpio_package_goes_only_once_the_new_one_is_built(pi: Pi, tmp_
     subprocess.run([python, "-I", "-c", "import RPi"], check=True)
 
 
-def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi) -> None:
+def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_path: Path) -> None:
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # bound, but nobody listens: connections are refused
         index = f"http://127.0.0.1:{nobody.getsockname()[1]}/simple"
         options = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": index, "PIP_EXTRA_INDEX_URL": ""}
         options |= {"PIP_FIND_LINKS": "", "PIP_RETRIES": "1", "PIP_CONFIG_FILE": os.devnull}
         optional = "\n".join(pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **options))
+        sdist(tmp_path / "sources", "rpi_lgpio", "pass", requires='"setuptools"')
+        links = {"PIP_FIND_LINKS": str(tmp_path / "sources")}
+        half = "\n".join(pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **options | links))
         environment = {**os.environ, "DESTDIR": str(pi.disk), "PYTHON": sys.executable, **options}
         environment |= {"PIP_NO_DEPS": "0", "FISHD_GPIO": "none"}
         needed = pi.attempt("install_pi.sh", environment)
     assert "NOT available" in optional
+    assert "NOT available" in half
     assert needed.returncode == 1
-    for said in (optional, needed.stderr.splitlines()[-1]):
+    for said in (optional, half, needed.stderr.splitlines()[-1]):
         assert "the network failed" in said
         assert "apt install" not in said
 

@@ -88,10 +88,12 @@ try_pip() { pip "$@" 2>"$workspace/pip.log"; }
 # What pip's complaints amount to: build, network, space or other.
 why() {
   local log=$1
-  if grep -qE 'Failed (building|to build)|metadata-generation-failed|Building wheel for .* did not run' "$log"; then
+  if grep -qE 'Failed building wheel|Building wheel for .* did not run|metadata-generation-failed' "$log"; then
     echo build
   elif grep -qE 'connection broken|Connection(Pool|Error| refused| reset)|name resolution|timed out|(Proxy|SSL|HTTP)Error|Network is unreachable' "$log"; then
     echo network
+  elif grep -q 'Failed to build' "$log"; then
+    echo build
   elif grep -q 'No space left on device' "$log"; then
     echo space
   else
