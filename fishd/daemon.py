@@ -196,6 +196,7 @@ class Daemon:
                 if self._loop.neutral_for > SETTLING or slot.now > deadline:
                     break
                 self._loop.tick(slot)
+                self._server.ticked()
         finally:
             ticker.close()
 

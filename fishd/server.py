@@ -6,7 +6,7 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from fishd import protocol
+from fishd import protocol, text
 from fishd.errors import Refused
 from fishd.gateway import link
 
@@ -66,5 +66,5 @@ class ControlServer:
             return protocol.failure(identity, error)
         except Exception as error:
             log.exception("a request failed")
-            internal = Refused("internal", f"fishd failed: {type(error).__name__}: {error}")
+            internal = Refused("internal", f"fishd failed: {text.named(error)}")
             return protocol.failure(identity, internal)
