@@ -40,6 +40,12 @@ class Request(Struct, forbid_unknown_fields=True):
     args: dict[str, Any] = {}
 
 
+class OnlyId(Struct):
+    """A request of which nothing but its id matters."""
+
+    id: RequestId = None
+
+
 class Failure(Struct, frozen=True):
     """Why a request was refused."""
 
@@ -148,6 +154,7 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _request_decoder = msgspec.json.Decoder(Request)
+_id_decoder = msgspec.json.Decoder(OnlyId)
 _reply_decoder = msgspec.json.Decoder(Reply)
 _encoder = msgspec.json.Encoder()
 
@@ -172,12 +179,8 @@ def decode_request(payload: bytes) -> Request:
 
 def request_id(payload: bytes) -> RequestId:
     """The id of a request that may be broken otherwise; None where it cannot be told."""
-
-    class OnlyId(Struct):
-        id: RequestId = None
-
     try:
-        return msgspec.json.decode(payload, type=OnlyId).id
+        return _id_decoder.decode(payload).id
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 
