@@ -14,7 +14,7 @@ from fishd import files
 from fishd.errors import PolicyError
 from fishd.policies import checksum, operators
 from fishd.policies.card import KEY, Card, decode
-from fishd.policies.operators import shown
+from fishd.text import named, quoted
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
@@ -158,7 +158,7 @@ def _form(value: "ValueInfoProto") -> tuple[str, str, tuple[int | str, ...]]:
 
 def _spelled(value: "ValueInfoProto") -> str:
     name, kind, dims = _form(value)
-    return f"{kind} of shape [{shown(', '.join(map(str, dims)))}] named '{shown(name)}'"
+    return f"{kind} of shape [{quoted(', '.join(map(str, dims)))}] named '{quoted(name)}'"
 
 
 def _check_numbers(graph: "GraphProto") -> None:
@@ -172,7 +172,7 @@ def _check_numbers(graph: "GraphProto") -> None:
             if not np.isfinite([attribute.f, *attribute.floats]).all():
                 raise PolicyError(
                     _not_finite(
-                        f"'{shown(attribute.name)}' of '{shown(node.name or node.op_type)}'"
+                        f"'{quoted(attribute.name)}' of '{quoted(node.name or node.op_type)}'"
                     )
                 )
             for tensor in (attribute.t, *attribute.tensors):
@@ -184,7 +184,7 @@ def _check_numbers(graph: "GraphProto") -> None:
 def _check_tensor(tensor: "TensorProto") -> None:
     from onnx import TensorProto, numpy_helper
 
-    what = f"weights '{shown(tensor.name)}'" if tensor.name else "constants"
+    what = f"weights '{quoted(tensor.name)}'" if tensor.name else "constants"
     if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
         raise PolicyError(f"its {what} are in another file; save the model as a single file")
     if tensor.data_type == TensorProto.STRING:
@@ -194,7 +194,7 @@ def _check_tensor(tensor: "TensorProto") -> None:
     try:
         array = numpy_helper.to_array(tensor)
     except Exception as error:  # a tensor may contradict itself in many ways
-        raise PolicyError(f"its {what} cannot be read: {one_line(error)}") from None
+        raise PolicyError(f"its {what} cannot be read: {named(error)}") from None
     numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
     if not np.isfinite(numbers).all():
         raise PolicyError(_not_finite(what))
@@ -204,8 +204,3 @@ def _not_finite(what: str) -> str:
     return (
         f"its {what} are not all finite numbers: the training blew up; export an earlier checkpoint"
     )
-
-
-def one_line(error: Exception) -> str:
-    """What a library says, as part of a sentence."""
-    return shown(str(error), 300) or type(error).__name__

@@ -9,6 +9,7 @@ from math import prod
 from typing import TYPE_CHECKING
 
 from fishd.errors import PolicyError
+from fishd.text import quoted, said
 
 if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto, ValueInfoProto
@@ -56,7 +57,7 @@ Shapes = Mapping[str, tuple[int, ...] | None]
 def check(model: "ModelProto") -> None:
     """Raises `PolicyError` for a model that does anything else, or too much."""
     if model.functions:
-        raise PolicyError(f"it defines an operator of its own, {shown(model.functions[0].name)}")
+        raise PolicyError(f"it defines an operator of its own, {quoted(model.functions[0].name)}")
     if model.training_info:
         raise PolicyError("it is a model that trains itself; export it for inference")
     versions = [entry.version for entry in model.opset_import if entry.domain in _OWN]
@@ -78,7 +79,7 @@ def _check_node(node: "NodeProto") -> None:
     if node.domain not in _OWN or node.op_type not in _NAMES:
         name = f"{node.domain}.{node.op_type}" if node.domain not in _OWN else node.op_type
         raise PolicyError(
-            f"its operator {shown(name)} is not permitted; what is: {', '.join(sorted(_NAMES))}"
+            f"its operator {quoted(name)} is not permitted; what is: {', '.join(sorted(_NAMES))}"
         )
     for attribute in node.attribute:
         if attribute.HasField("g") or attribute.graphs:
@@ -135,7 +136,7 @@ def _shapes(model: "ModelProto") -> Shapes:
     try:
         graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=True).graph
     except Exception as error:  # of its own, of protobuf, and ValueError
-        raise PolicyError(f"its network contradicts itself: {shown(str(error), 200)}") from None
+        raise PolicyError(f"its network contradicts itself: {said(error)}") from None
     shapes: dict[str, tuple[int, ...] | None] = {
         tensor.name: tuple(tensor.dims) for tensor in graph.initializer
     }
@@ -144,7 +145,7 @@ def _shapes(model: "ModelProto") -> Shapes:
         raise PolicyError("its network contradicts itself: two values have one name")
     for value in (*graph.input, *graph.value_info, *graph.output):
         if value.type.tensor_type.elem_type == TensorProto.STRING:
-            raise PolicyError(f"its {shown(value.name)} is text; a network computes numbers")
+            raise PolicyError(f"its {quoted(value.name)} is text; a network computes numbers")
         shapes.setdefault(value.name, _shape(value))
     return shapes
 
@@ -154,9 +155,3 @@ def _shape(value: "ValueInfoProto") -> tuple[int, ...] | None:
     if not tensor.HasField("shape") or any(not d.HasField("dim_value") for d in tensor.shape.dim):
         return None
     return tuple(int(dim.dim_value) for dim in tensor.shape.dim)
-
-
-def shown(text: str, longest: int = 60) -> str:
-    """What a file says, as part of a sentence on one line."""
-    words = " ".join(text.split())[:longest]
-    return "".join(letter if letter.isprintable() else "?" for letter in words)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.errors import PolicyError
-from fishd.policies.file import INPUT, MISSING, OUTPUT, PolicyFile, one_line
+from fishd.policies.file import INPUT, MISSING, OUTPUT, PolicyFile
+from fishd.text import named
 
 _PROBES = 64
 """Inputs on which a network is tried, which warms it up as well."""
@@ -62,9 +63,7 @@ class Network:
         except PolicyError as error:
             raise PolicyError(f"{policy.path}: {error}") from None
         except Exception as error:  # onnxruntime has a class of its own for each kind of error
-            raise PolicyError(
-                f"{policy.path}: onnxruntime cannot run it: {one_line(error)}"
-            ) from None
+            raise PolicyError(f"{policy.path}: onnxruntime cannot run it: {named(error)}") from None
 
     def run(self) -> float:
         """The output for what is in `row`."""
