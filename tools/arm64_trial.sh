@@ -84,10 +84,11 @@ make_base() {
   [[ $(cat "$packages" 2>/dev/null) == "$*" ]] && return
   rm -rf "$base"
   timeout "$LONGEST" debootstrap --arch=arm64 --variant=minbase --include=ca-certificates \
-    "$suite" "$base" ${DEBIAN:+"$DEBIAN"}
-  connect "$base"
-  inside "$base" sh -c 'apt-get update && apt-get install --yes --no-install-recommends "$@"' sh "$@"
-  echo "$*" >"$packages"
+    "$suite" "$base" ${DEBIAN:+"$DEBIAN"} &&
+    connect "$base" &&
+    inside "$base" sh -c 'apt-get update && apt-get install --yes --no-install-recommends "$@"' \
+      sh "$@" &&
+    echo "$*" >"$packages"
 }
 
 # A copy of it with the checkout.
@@ -144,8 +145,12 @@ main() {
   check_machine
   mkdir -p "$WORK"
   if (($# == 0)); then set -- bookworm trixie; fi
+  if (($# == 1)); then
+    try_suite "$1"
+    return
+  fi
   for suite in "$@"; do
-    try_suite "$suite" || failed=1
+    "${BASH_SOURCE[0]}" "$suite" || failed=1 # a process of its own, which its first error ends
   done
   return "$failed"
 }
