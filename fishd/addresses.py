@@ -64,8 +64,19 @@ def find_control() -> str:
     path = _private_socket("control")
     own = f"ipc://{path}"
     # The socket of a daemon that was killed is still there.
-    there_is_none = _SERVICE.exists() and (is_deserted(own) or stranger(path))
+    there_is_none = _is_there(_SERVICE) and (is_deserted(own) or stranger(path))
     return f"ipc://{_SERVICE}" if there_is_none else own
+
+
+def _is_there(path: Path) -> bool:
+    """Is it, as far as this user may know?"""
+    try:
+        path.stat()
+    except PermissionError:  # of its folder
+        return True
+    except OSError:
+        return False
+    return True
 
 
 def _private_socket(name: str) -> Path:
@@ -130,7 +141,10 @@ def is_deserted(address: str) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
         nobody = (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED)
-        return probe.connect_ex(str(socket_path(address))) in nobody
+        try:
+            return probe.connect_ex(str(socket_path(address))) in nobody
+        except OSError:  # no socket has a path that long
+            return True
 
 
 def listen(address: str, key: str, *, group: bool = False) -> socket.socket:

@@ -38,7 +38,7 @@ class Asides:
         if len(self._given_up) >= MOST_GIVEN_UP:
             raise Refused(
                 "busy",
-                f"{len(self._given_up)} controllers that were given up while they loaded still "
+                f"{len(self._given_up)} calls that were given up, of controllers mostly, still "
                 "run; restart fishd",
             )
 
@@ -47,14 +47,18 @@ class Asides:
         complaint: str,
         function: Callable[[], T],
         late: Callable[[T], Any] = lambda result: None,
+        *,
+        interrupt: bool = True,
     ) -> T:
         """What the function returns or raises.
 
         complaint: what to say of it when it takes too long, such as `'chirp' has not loaded`
         late: takes the result of a call that returns after it was given up
-        Raises `Refused` (too-slow) for a call that takes too long. It is given up then, and
-        likewise where this coroutine is cancelled.
+        interrupt: as for `Attempt`
+        Raises `Refused`: busy as `check_busy` says, too-slow for a call that takes too long. It is
+        given up then, and likewise where this coroutine is cancelled.
         """
+        self.check_busy()
         events = asyncio.get_running_loop()
         news = asyncio.Event()
 
@@ -62,7 +66,8 @@ class Asides:
             with suppress(RuntimeError):  # the loop is closed: nobody waits any more
                 events.call_soon_threadsafe(news.set)
 
-        attempt = Attempt(partial(_kept_running, function), done=done, late=late)
+        work = partial(_kept_running, function)
+        attempt = Attempt(work, done=done, late=late, interrupt=interrupt)
         self._under_way += 1
         try:
             async with asyncio.timeout(self.patience):
@@ -83,10 +88,11 @@ class Asides:
 
 
 def _kept_running(function: Callable[[], T]) -> T:
-    """Call it where no ordinary program stops this thread, if none stops the one that ticks.
+    """Call it at the lowest FIFO priority, where the thread that ticks has a FIFO priority.
 
-    That would have to wait for a thread that was stopped while it held the interpreter. On a single
-    core the kernel's limit for real-time threads would hold up both, which is worse.
+    A thread that holds the interpreter must not be preempted by ordinary programs: the tick would
+    have to wait for it. On a single core the kernel's limit for real-time threads would hold up
+    both, which is worse.
     """
     ticks = os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK
     if ticks == os.SCHED_FIFO and len(os.sched_getaffinity(0)) > 1:

@@ -53,14 +53,17 @@ class Attempt(Generic[T]):
         *,
         done: Callable[[], None] = lambda: None,
         late: Callable[[T], Any] = lambda result: None,
+        interrupt: bool = True,
     ) -> None:
         """
         done: called in that thread as soon as there is a result, unless it was given up
         late: takes the result of one that was given up and returned after all
+        interrupt: end a loop in Python when it is given up; not where half of the work would harm
         """
         self._function = function
         self._done = done
         self._late = late
+        self._interrupt = interrupt
         self._result: list[T] = []
         self._error: Exception | None = None
         self._settling = threading.Lock()
@@ -91,11 +94,13 @@ class Attempt(Generic[T]):
                 return False
             if not self._given_up:
                 self._given_up = True
-                self._strike(ctypes.py_object(GivenUp))
+                self._raise_in_thread(ctypes.py_object(GivenUp))
         return True
 
-    def _strike(self, error: Any) -> None:
-        """Raise in the thread, as soon as it is in Python; NULL takes back what has not struck."""
+    def _raise_in_thread(self, error: Any) -> None:
+        """Raise there, as soon as it is in Python; None takes back what was not raised yet."""
+        if not self._interrupt:
+            return
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), error)
 
     def _run(self) -> None:
@@ -117,7 +122,7 @@ class Attempt(Generic[T]):
             self._error = error
         with self._settling:
             if self._given_up:
-                self._strike(None)
+                self._raise_in_thread(None)
             else:
                 self._settled.set()
             return not self._given_up

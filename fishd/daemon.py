@@ -19,8 +19,7 @@ from fishd.console import complain, run, status_line
 from fishd.controllers import registry
 from fishd.ending import Ending, leave
 from fishd.errors import ConfigError, FishdError, ServoError
-from fishd.gateway import link
-from fishd.gateway.process import Gateway
+from fishd.gateway.gateways import Gateways
 from fishd.hardware.pulses import REST
 from fishd.lockstep import Lockstep
 from fishd.logs import LogWriter
@@ -70,9 +69,9 @@ class Daemon:
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claimed(address))
             stack.enter_context(addresses.claimed(config.telemetry.address))
-            self._open_gateways(address, stack)
+            self._gateways = Gateways(address, config.telemetry.address, stack)
             wire.start_context(stack)
-            self._telemetry = Telemetry(self._gateways[link.TELEMETRY].send)
+            self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._rehearse = None if config.lockstep else rehearsal(config)
             controllers = registry.describe_all()  # imports what other packages offer
             preload()  # of what would hold up the ticks later
@@ -94,50 +93,15 @@ class Daemon:
                 workbench,
                 config,
                 controllers,
-                self._gateways[link.TELEMETRY].address,
+                self._gateways.telemetry.address,
                 fifo,
-                self._gateway_counters,
+                self._gateways.counters,
             )
             self._server = ControlServer(self._operations.perform, config.tick)
-            self._connect(self._server)
+            self._gateways.serve(self._server, self._loop.reporter)
             stack.callback(self._server.close)
             self._stack = stack.pop_all()
         return self
-
-    def _open_gateways(self, control: str, stack: ExitStack) -> None:
-        """Begin to listen, so that what is wrong with an address is known at once."""
-        self._gateways = {}
-        for kind, address in (
-            (link.CONTROL, control),
-            (link.TELEMETRY, self._config.telemetry.address),
-        ):
-            listener = addresses.listen(address, f"{kind}.address", group=kind == link.CONTROL)
-            gateway = Gateway(kind, listener, addresses.served(address, listener))
-            self._gateways[kind] = gateway
-            stack.callback(gateway.close)
-        stack.callback(self._gateways[link.CONTROL].end)  # both end at the same time
-
-    def _connect(self, server: ControlServer) -> None:
-        """Let requests come in, and replies go out."""
-        control = self._gateways[link.CONTROL]
-        server.send, server.read = control.send, control.read
-        control.take = server.take
-        control.read(True)
-        for gateway in self._gateways.values():
-            gateway.on_restart = partial(self._tell_restart, gateway.kind)
-
-    def _tell_restart(self, kind: str, why: str) -> None:
-        message = f"the gateway of {kind} was started again: {why}"
-        self._loop.reporter.event("gateway", message, "warning", gateway=kind)
-
-    def _gateway_counters(self) -> dict[str, int]:
-        """What fishd survived at its sockets."""
-        telemetry, control = self._gateways[link.TELEMETRY], self._gateways[link.CONTROL]
-        return {
-            "telemetry_lost": telemetry.lost,
-            "telemetry_restarts": telemetry.restarts,
-            "control_restarts": control.restarts,
-        }
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         """Raises `ServoError` when the servo could not be released."""
@@ -159,8 +123,8 @@ class Daemon:
             self._loop.robot.name,
             self._config.tick * 1e3,
             " of virtual time" if self._config.lockstep else "",
-            self._gateways[link.CONTROL].address,
-            self._gateways[link.TELEMETRY].address,
+            self._gateways.control.address,
+            self._gateways.telemetry.address,
         )
         realtime.quiet_garbage_collector()
         await self._tick_until(stopping)
@@ -255,7 +219,9 @@ async def swim(
     ending.when_asked(partial(events.call_soon_threadsafe, stopping.set))
     with Daemon(config, print_status, file) as daemon:
         ending.release = daemon.release_at_once
-        await daemon.run(stopping)
+        await asyncio.sleep(0)  # what was asked meanwhile counts before the first tick
+        if not stopping.is_set():
+            await daemon.run(stopping)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

@@ -35,8 +35,8 @@ class Ending:
         """Call it from the main thread. SIGHUP stays ignored where it is, as below `nohup`."""
         self._asked = threading.Event()
         self._tell: Callable[[], object] = lambda: None
-        self.release: Callable[[], None] = lambda: None
-        """Lets go of the servo, from any thread: called where fishd hangs."""
+        self.release: Callable[[], None] | None = None
+        """Lets go of the servo, from any thread: called where fishd hangs; None while it starts."""
         self.last_words: Callable[[], None] = lambda: None
         """Writes what is left of the log, as far as that is possible at once."""
         self._main = threading.get_ident()
@@ -64,13 +64,17 @@ class Ending:
         self._end_at_once(signal.Signals(number).name)
 
     def _end_at_once(self, name: str) -> NoReturn:
+        place = _place(sys._current_frames().get(self._main))
+        release = self.release
         log.critical(
-            "%s came %g s ago, and fishd hangs %s: the servo is released and the process ended",
+            "%s came %g s ago, and fishd hangs %s: %s the process is ended",
             name,
             PATIENCE,
-            _place(sys._current_frames().get(self._main)),
+            place,
+            "the servo is released and" if release else "it has not begun to drive the servo;",
         )
-        _within(_RELEASE, self.release)
+        if release:
+            _within(_RELEASE, release)
         self.last_words()
         os._exit(1)
 

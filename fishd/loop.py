@@ -239,8 +239,11 @@ class ControlLoop:
             fx, fy, angle = measurement.fx, measurement.fy, self.applied
             return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
 
-    def _update(self, observation: Observation) -> float:
-        """The angle to apply: the controller's after the guard, or the next step to neutral."""
+    def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
+        """The angle to apply: the controller's after the guard, or the next step to neutral.
+
+        may_succeed: may a controller that gives up name another one? Once in a tick.
+        """
         mode = self.supervisor.mode
         if mode is Mode.ESTOP:
             return self.applied
@@ -254,9 +257,10 @@ class ControlLoop:
             command = contained(self.controller.update, observation)
             applied = contained(self.guard.apply, command, self.applied)
         except ControllerFault as error:
-            if successor := _successor(error):
+            code, successor = _told(error)
+            if successor and may_succeed:
                 return self._succeed(error, *successor, observation)
-            self._fail(_code(error), f"controller {self.controller_name} gave up", error)
+            self._fail(code, f"controller {self.controller_name} gave up", error)
             return self.guard.fade(self.applied)
         except Exception as error:
             self._fail("controller-error", f"controller {self.controller_name} failed", error)
@@ -277,9 +281,9 @@ class ControlLoop:
             self._fail("controller-error", f"{name}, who was to follow {before}, failed", problem)
             return self.guard.fade(self.applied)
         why = text.line(f"{before} lost command: {text.said(error)}")
-        self.fallback = Reason(_code(error), why)
+        self.fallback = Reason(_told(error)[0], why)
         self.reporter.fallback(before, name, self.parameters, self.fallback)
-        return self._update(seen)
+        return self._update(seen, may_succeed=False)
 
     def _write(self, neutral: bool) -> None:
         """Send the angle in force, or release the servo, as the mode demands."""
@@ -342,18 +346,23 @@ class ControlLoop:
         self.reporter.fault(self.supervisor)
 
 
-def _code(error: ControllerFault) -> str:
-    """Which fault it is, whatever a subclass has made of it."""
-    code = vars(error).get("code")
-    return code if isinstance(code, str) else "controller-error"
+def _told(error: ControllerFault) -> tuple[str, tuple[str, Controller[Any]] | None]:
+    """Code and successor of a fault, whatever a subclass has made of them."""
 
+    def told() -> tuple[str, tuple[str, Controller[Any]] | None]:
+        code, successor = error.code, error.successor
+        if type(code) is not str:
+            code = "controller-error"
+        if type(successor) is tuple and type(successor[0]) is str:
+            name, controller = successor
+            if isinstance(controller, Controller):
+                return code, (name, controller)
+        return code, None
 
-def _successor(error: ControllerFault) -> tuple[str, Controller[Any]] | None:
-    """Who is to take over, if it is a controller."""
-    match vars(error).get("successor"):
-        case (str(name), Controller() as controller):
-            return name, controller
-    return None
+    try:
+        return contained(told)
+    except Exception:
+        return "controller-error", None
 
 
 def _plain(controller: Controller[Any]) -> dict[str, Any]:

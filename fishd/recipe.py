@@ -13,6 +13,9 @@ from typing import Any
 
 from fishd.runtime_folder import runtime_folder
 
+NOT_RELEASED = "the servo was not released and may still have pulses: cut its power"
+"""What to say where a release has failed."""
+
 _LARGEST = 65_536
 _NUMBERS = (("gpio", 0, 27), ("neutral", 500, 2500), ("frequency", 40, 333), ("port", 1, 65_535))
 _TEXTS = ("driver", "host", "root", "config")

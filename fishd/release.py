@@ -17,14 +17,18 @@ def main() -> None:
     """Release the servo as the recipe says; without one, or with other options, as fishctl does."""
     words = sys.argv[1:]
     found = recipe.read(words[1]) if len(words) == 2 and words[0] == "--config" else None
-    status = _release(found) if found else None
+    status = _release(found) if found else 0
     if found and found["fresh"]:
         sys.exit(status)
     # The file has changed since that fishd began, and may mean another servo: that one as well.
     from fishd.cli.main import main as fishctl
 
     sys.argv[:] = ["fishctl", "release", *words]
-    fishctl()
+    try:
+        fishctl()
+    except SystemExit as end:
+        sys.exit(end.code or status)
+    sys.exit(status)
 
 
 def _release(servo: dict[str, Any]) -> int:
@@ -34,7 +38,7 @@ def _release(servo: dict[str, Any]) -> int:
     try:
         done = _neutralise(servo)
     except ServoError as error:
-        print(f"fishctl: {error}", file=sys.stderr)
+        print(f"fishctl: {error}; {recipe.NOT_RELEASED}", file=sys.stderr)
         return 1
     print(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
     return 0

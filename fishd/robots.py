@@ -45,11 +45,13 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
     when it comes back. Raises `StartupError` when a package is missing, no virtual Pi is running or
     another fishd drives this robot, `ConfigError` when a calibration file is broken.
     """
-    if file:
-        recipe.remove(str(file))  # of an earlier configuration
     if config.robot == "simulated":
+        if file and not (recipe.read(str(file)) or {}).get("fresh"):
+            recipe.remove(str(file))  # of what the file said before
         return SimulatedFish(config.plant, config.simulation, config.tick).robot()
     stack.enter_context(ownership.owned(parts_of(config)))
+    if file:
+        recipe.remove(str(file))  # of an earlier fishd
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
     return _assemble(config, clock, stack, threaded=True, file=file)

@@ -16,6 +16,8 @@ Perform = Callable[[str, dict[str, Any]], Awaitable[Any]]
 
 RATE = 1000.0
 """Requests per second that are taken from all clients together; others wait in the gateway."""
+_NO_ROOM = 0.01
+"""Time until a reply is tried again for which the link to the gateway had no room [s]."""
 
 
 class ControlServer:
@@ -27,8 +29,8 @@ class ControlServer:
         self._per_tick = max(1, math.floor(RATE * tick))
         self._left = self._per_tick
         self._tasks: set[asyncio.Task[None]] = set()
-        self.send: Callable[[bytes], object] = lambda message: None
-        """Takes a message for the gateway, without waiting."""
+        self.send: Callable[[bytes], bool] = lambda message: True
+        """Takes a message for the gateway, without waiting; False where there is no room for it."""
         self.read: Callable[[bool], object] = lambda wanted: None
         """Says whether the gateway is to hand over more requests."""
 
@@ -54,7 +56,8 @@ class ControlServer:
 
     async def _answer(self, number: int, payload: bytes) -> None:
         for part in link.reply(number, await self._reply(payload)):
-            self.send(part)
+            while not self.send(part):  # a reply that is not whole would never make room for more
+                await asyncio.sleep(_NO_ROOM)
 
     async def _reply(self, payload: bytes) -> bytes:
         identity: protocol.RequestId = None

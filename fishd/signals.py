@@ -131,7 +131,7 @@ class Event(Struct, frozen=True):
     level: str
     """info, warning or error."""
     kind: str
-    """mode, controller, parameters, fallback, fault, overrun or mark."""
+    """mode, controller, parameters, fallback, fault, overrun, servo, calibration, gateway, mark."""
     message: str
     """One line for people."""
     data: dict[str, Any] = {}

@@ -1,13 +1,16 @@
-"""Whose a Unix socket is: a client must not take orders, or comfort, from a stranger's.
+"""Whose a Unix socket is: a client must not believe the replies of a stranger.
 
 In /tmp anybody can make the folder in which fishd's socket would be, and answer there.
 """
 
+import errno
 import os
 import socket
 import stat
 import struct
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _ROOT = 0
@@ -35,9 +38,10 @@ def stranger(path: Path) -> str:
         return f"{folder} belongs to user {found.st_uid}"
     if found.st_mode & _OTHERS:
         return f"others may write to {folder}"
-    listener = _listener(path)
-    if listener is not None and listener not in trusted:
-        return f"it is user {listener} who listens there"
+    with suppress(PermissionError):
+        found_there = listener(path)
+        if found_there and found_there.user not in trusted:
+            return f"it is user {found_there.user} who listens there"
     return ""
 
 
@@ -45,12 +49,28 @@ def _is_roots_alone(folder: os.stat_result) -> bool:
     return folder.st_uid == _ROOT and not folder.st_mode & _OTHERS
 
 
-def _listener(path: Path) -> int | None:
-    """The user who listens at a socket; None where nobody does, or none can be asked now."""
+class Listener(NamedTuple):
+    """Who listens at a socket."""
+
+    pid: int
+    user: int
+
+
+def listener(path: Path) -> Listener | None:
+    """Who listens at a socket; None where nobody does, or none can be asked now.
+
+    Raises PermissionError where this user may not connect.
+    """
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
-        if probe.connect_ex(os.fspath(path)):
+        try:
+            failure = probe.connect_ex(os.fspath(path))
+        except OSError:  # no socket has a path that long
+            return None
+        if failure == errno.EACCES:
+            raise PermissionError(failure, os.strerror(failure), os.fspath(path))
+        if failure:
             return None
         peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    _, user, _ = struct.unpack("3i", peer)
-    return int(user)
+    pid, user, _ = struct.unpack("3i", peer)
+    return Listener(pid, user)

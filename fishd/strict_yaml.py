@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from fishd.files import SETTINGS
+
 Path = tuple[str, ...]
 
 
@@ -31,7 +33,7 @@ _WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false
 _BARE_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?")
 _DEEPEST = 20
-_LONGEST = 64 * 2**10
+_LONGEST = SETTINGS
 """Longest text [characters]."""
 _MOST = 2000
 """Values and keys in one document; an alias counts as all that it stands for."""

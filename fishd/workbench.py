@@ -229,6 +229,7 @@ class Workbench:
                 "the calibration has not been written",
                 partial(self._folder.save, calibration, self._date()),
                 late=_withdraw,
+                interrupt=False,  # between the file's coming into being and its name in the result
             )
         except ConfigError as error:
             raise Refused("not-saved", str(error)) from None

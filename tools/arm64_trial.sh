@@ -140,10 +140,11 @@ try_suite() {
     fail "$suite: no Debian could be made; see $WORK/$suite.log"
   make_root "$suite" "$root"
   inside "$root" make -C /root/fishd install-pi >"$WORK/$suite.install.log" 2>&1 || status=$?
-  size=$(du --summarize --block-size=1MB "$root/opt/fishd" | cut -f 1)
   sed "s/^/$suite: /" "$WORK/$suite.install.log"
-  echo "$suite: make install-pi: exit status $status, /opt/fishd: $size MB"
+  echo "$suite: make install-pi: exit status $status"
   ((status == 0)) || return 1
+  size=$(du --summarize --block-size=1MB "$root/opt/fishd" | cut -f 1)
+  echo "$suite: /opt/fishd: $size MB"
   ((size <= MOST_SPACE)) || { echo "$suite: more than $MOST_SPACE MB" && return 1; }
   inside "$root" /usr/local/bin/fishctl "${SIMULATION[@]}" >"$WORK/$suite.json"
   "$FISHCTL" "${SIMULATION[@]}" >"$WORK/host.json"

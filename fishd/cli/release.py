@@ -10,6 +10,7 @@ from fishd.cli.config import load_service, service_option, set_option
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config
 from fishd.errors import ConfigError, ServoError
 from fishd.hardware.base import CalibratedServo
+from fishd.recipe import NOT_RELEASED
 
 _NO_FOLDER = "/proc/self/no-calibrations"
 """Nobody can make it: as on a machine where nothing was ever calibrated."""
@@ -30,7 +31,10 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
     if config.robot != "simulated":
-        done = _open(config).neutralise()
+        try:
+            done = _open(config).neutralise()
+        except ServoError as error:
+            raise ServoError(f"{error}; {NOT_RELEASED}") from None
         click.echo(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
         return 0
     if found is None:

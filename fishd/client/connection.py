@@ -13,7 +13,7 @@ import zmq
 from fishd import protocol, text
 from fishd.addresses import ENDPOINT_VARIABLE, find_control, is_deserted, socket_path
 from fishd.errors import NoDaemon, ParameterError, Refused, Untrusted
-from fishd.socket_owner import stranger
+from fishd.socket_owner import Listener, listener, stranger
 
 T = TypeVar("T")
 
@@ -32,12 +32,19 @@ class Connection:
         self._ids = itertools.count(1)
 
     def check_endpoint(self) -> None:
-        """Spare the wait where it is certain that nobody listens; raises `NoDaemon`.
+        """Spare the wait where it is certain that nobody will answer; raises `NoDaemon`.
 
-        Raises `Untrusted` where a stranger does. An endpoint that the user named is his own word.
+        Raises `Untrusted` where a stranger would. An endpoint that the user named is trusted.
         """
         if is_deserted(self.endpoint):
             raise self._nobody("nobody listens there")
+        try:
+            self._listener()
+        except PermissionError:
+            raise NoDaemon(
+                f"this user may not ask the fishd at {self.endpoint}: join the group of its socket "
+                "('sudo usermod -aG fishd USER' for the service), log in again, then try again"
+            ) from None
         if not self._was_named and (why := stranger(socket_path(self.endpoint))):
             raise Untrusted(
                 f"what listens at {self.endpoint} is not asked, it may be anybody: {why}; where "
@@ -52,7 +59,23 @@ class Connection:
 
     def silent(self, patience: float = 0.0) -> NoDaemon:
         """What to raise when no answer comes in time; patience: beyond the time-out [s]."""
-        return self._nobody(f"no answer within {self.timeout + patience:g} s")
+        why = f"no answer within {self.timeout + patience:g} s"
+        try:
+            found = self._listener()
+        except PermissionError:
+            found = None
+        if found is None:
+            return self._nobody(why)
+        return NoDaemon(
+            f"{why} from process {found.pid}, which serves {self.endpoint}: it hangs, is stopped "
+            "or is overloaded; 'fishctl release --config FILE' stops the servo without it"
+        )
+
+    def _listener(self) -> Listener | None:
+        """Who listens, where that can be told; raises PermissionError."""
+        if not self.endpoint.startswith("ipc://"):
+            return None
+        return listener(socket_path(self.endpoint))
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
         """A new id, and the request as JSON; raises `ParameterError` for NaN and infinity."""

@@ -7,11 +7,12 @@ it and the socket that clients connect to, which outlives this process. Only fis
 import os
 import socket
 import sys
+from contextlib import suppress
 
 import zmq
 
 from fishd.gateway import link
-from fishd.gateway.limits import Limits
+from fishd.gateway.limits import ResourceLimits
 
 _FAREWELL = 100
 """How long the last messages may take to leave [ms]."""
@@ -27,17 +28,20 @@ def main(kind: str, link_number: str, listener_number: str, address: str) -> int
         server = context.socket(zmq.PUB)
         publisher.configure(server)
         _serve(server, int(listener_number), address)
-        why = publisher.run(connection, server, Limits(publisher.MEMORY, publisher.CONNECTIONS))
+        why = publisher.run(
+            connection, server, ResourceLimits(publisher.MEMORY, publisher.CONNECTIONS)
+        )
     else:
         from fishd.gateway import requests
 
         server = context.socket(zmq.ROUTER)
         requests.configure(server)
         _serve(server, int(listener_number), address)
-        limits = Limits(requests.MEMORY, requests.CONNECTIONS)
+        limits = ResourceLimits(requests.MEMORY, requests.CONNECTIONS)
         why = requests.Requests(connection, server, limits).run()
     if why:
-        connection.send(link.NOTICE + why.encode())
+        with suppress(OSError):  # fishd has ended, or takes nothing just now
+            connection.send(link.NOTICE + why.encode())
         os._exit(1)  # ZeroMQ's own end would take as long as there is to free
     server.close(linger=_FAREWELL)
     context.term()

@@ -19,9 +19,10 @@ _SPARE_FILES = 32
 _TRIM = 8 * 2**20
 """Of memory more than at the start, unused parts are given back [bytes]."""
 _TRIM_PAUSE = 2.0
+"""Shortest time between two times of that [s]."""
 
 
-class Limits:
+class ResourceLimits:
     """The limits of this process, and how far they are used."""
 
     def __init__(self, memory: int, connections: int) -> None:

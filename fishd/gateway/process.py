@@ -61,14 +61,21 @@ class Gateway:
                 f"{sys.executable}: cannot be started for the gateway of {kind}: {error.strerror}"
             ) from None
 
-    def send(self, message: bytes) -> None:
-        """Send without waiting; what there is no room for is dropped."""
+    def send(self, message: bytes) -> bool:
+        """Send without waiting; False where there is no room for it, which counts as lost.
+
+        What is sent while there is no process is lost as well: nobody waits for it there.
+        """
         try:
             if self._link is None:
-                raise BlockingIOError
+                raise ConnectionError
             self._link.send(message)
+        except BlockingIOError:
+            self.lost += 1
+            return False
         except OSError:  # its end is noticed where it is read from
             self.lost += 1
+        return True
 
     def read(self, wanted: bool) -> None:
         """Take messages, or let them wait in the link."""
@@ -87,14 +94,13 @@ class Gateway:
             self._drop_link()
 
     def close(self) -> None:
-        """Wait until it has ended, and close what clients connect to; may be called twice."""
+        """Wait until it has ended; may be called twice."""
         self.end()
         try:
             self._process.wait(FAREWELL)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._listener.close()
 
     def _start(self) -> None:
         """Raises OSError."""
@@ -111,6 +117,7 @@ class Gateway:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 env=os.environ | _ENVIRONMENT,
+                start_new_session=True,  # a Ctrl-C in the terminal is for fishd alone
             )
             stack.pop_all()
         self._link = ours

@@ -5,10 +5,11 @@ import socket
 
 import zmq
 
-from fishd.gateway.limits import Limits
+from fishd.gateway.limits import ResourceLimits
 from fishd.gateway.link import END, frames
 
 MEMORY = 16 * 2**20
+"""Beyond what it starts with [bytes]."""
 CONNECTIONS = 200
 """Subscribers, and others that connect."""
 
@@ -22,14 +23,17 @@ _GLANCE = 100
 """Longest time between two looks at the limits [ms]."""
 
 
-def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: Limits) -> str:
+def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits) -> str:
     """Publish until fishd ends; returns which limit was exceeded, or nothing."""
     waiting = select.poll()
     waiting.register(link, select.POLLIN)
     while not (why := limits.exceeded()):
         if not waiting.poll(_GLANCE):
             continue
-        message = link.recv(2**20)
+        try:
+            message = link.recv(2**20)
+        except ConnectionResetError:  # fishd was killed
+            return ""
         if message in (b"", END):
             return ""
         server.send_multipart(frames(message), zmq.DONTWAIT)

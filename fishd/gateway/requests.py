@@ -8,11 +8,13 @@ import zmq
 
 from fishd import protocol
 from fishd.errors import Refused
-from fishd.gateway.limits import Limits
+from fishd.gateway.limits import ResourceLimits
 from fishd.gateway.link import END, LONGEST, Replies, request
 
 MEMORY = 48 * 2**20
+"""Beyond what it starts with [bytes]."""
 CONNECTIONS = 1500
+"""Clients, and others that connect."""
 
 QUEUE_IN, QUEUE_OUT = 8, 128
 """Requests and replies in ZeroMQ's hands for one client; further replies are dropped."""
@@ -22,6 +24,8 @@ MOST_WAITING = 600
 """Requests that wait, of all clients together; each has its share, which is one at least."""
 URGENT = {"estop", "stop"}
 """Operations that wait for no other."""
+SPARE = 2
+"""Requests beyond MOST_OPEN that may be open, if they are urgent."""
 REFUSALS, REFUSALS_AT_ONCE = 100.0, 100.0
 """Requests of one client per second, and at once, that are refused; others get no reply."""
 GREETING = 2000
@@ -58,7 +62,9 @@ class Client:
 class Requests:
     """Between a ROUTER socket and the link to fishd: clients take turns."""
 
-    def __init__(self, link: socket.socket, server: "zmq.Socket[bytes]", limits: Limits) -> None:
+    def __init__(
+        self, link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
+    ) -> None:
         self._link = link
         self._server = server
         self._limits = limits
@@ -70,7 +76,7 @@ class Requests:
         """What the reply to a request needs, by its number."""
         self._open = 0
         self._replies = Replies()
-        self._number = 0
+        self._number = time.monotonic_ns()  # a gateway before this one had other numbers
         self._next_purge = 0.0
         self._ended = False
 
@@ -95,14 +101,18 @@ class Requests:
                 message = self._link.recv(2 * LONGEST)
             except BlockingIOError:
                 return
+            except ConnectionResetError:  # fishd was killed
+                message = b""
             if message in (b"", END):
                 self._ended = True
                 return
             found = self._replies.take(message)
             if found:
                 number, payload = found
-                self._open -= 1
-                self._answer(self._envelopes.pop(number), payload)
+                envelope = self._envelopes.pop(number, None)
+                if envelope:  # else the gateway before this one was asked
+                    self._open -= 1
+                    self._answer(envelope, payload)
 
     def _take_requests(self) -> None:
         for _ in range(_AT_ONCE):
@@ -141,7 +151,9 @@ class Requests:
         client.waiting.append(message)
 
     def _pass_on(self) -> None:
-        while self._open < MOST_OPEN and (self._urgent or self._turns):
+        while self._urgent or self._turns:
+            if self._open >= MOST_OPEN + SPARE * bool(self._urgent):
+                return
             waiting = self._urgent or self._turns[0].waiting
             try:
                 self._link.send(waiting[0])

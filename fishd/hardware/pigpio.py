@@ -128,16 +128,16 @@ class PigpioServo:
 
     def _release(self, client: Client) -> None:
         gpio = self._settings.gpio
-        taken_away = None
+        failure = None
         try:
             # Not disarmed but armed with OFF: if this alone arrives, it ends the pulses.
             client.update_script(self._script, armed(gpio, 1, OFF))
         except pigpio.error as error:
-            taken_away = error
+            failure = error
         client.set_servo_pulsewidth(gpio, OFF)
         self._energised = False
-        if taken_away:
-            raise taken_away
+        if failure:
+            raise failure
 
     def _prepare(self, client: Client) -> None:
         """Put a new connection in order: no pulses go on unless the loop writes again.

@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from fishd.errors import PolicyError
+from fishd.files import SETTINGS
 from fishd.schema import Problem, convert, nested_too_deeply, spelled
 from fishd.signals import Observation
 
@@ -22,7 +23,7 @@ KEY = "fishd.card"
 FORMAT = 2
 """Version of the card; a file with another one is refused."""
 
-LONGEST = 64 * 2**10
+LONGEST = SETTINGS
 """Of a card as text; that of a training has some two thousand letters."""
 
 SAME_TICK = 1e-9

@@ -154,10 +154,13 @@ def test_a_file_that_has_changed_since_counts_too(pi: Bench, file: Path) -> None
 
 
 @pytest.mark.usefixtures("killed")
-def test_a_simulated_fish_leaves_no_recipe_of_an_earlier_robot(
+def test_a_simulated_fish_leaves_the_recipe_of_a_robot_alone_unless_the_file_has_changed(
     pi: Bench, file: Path, runtime: Path
 ) -> None:
     assert list(runtime.glob("release-*"))
+    with pi.daemon("--config", str(file), "--set", "robot=simulated"):
+        assert list(runtime.glob("release-*"))
+    file.write_text(file.read_text() + "\n")
     with pi.daemon("--config", str(file), "--set", "robot=simulated"):
         assert list(runtime.glob("release-*")) == []
 
@@ -170,7 +173,10 @@ def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(
     ended = release("--config", str(file))
     assert (ended.returncode, ended.stdout) == (1, "")
     (line,) = said(ended)
-    assert re.fullmatch(r"fishctl: pigpiod at 127.0.0.1:\d+: Connection refused", line)
+    assert re.fullmatch(
+        r"fishctl: pigpiod at 127.0.0.1:\d+: Connection refused; the servo was not released .*",
+        line,
+    )
 
 
 @pytest.mark.parametrize("words", [(), ("--config", "/nowhere/fishd.yaml"), ("--steam",)])

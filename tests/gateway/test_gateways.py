@@ -15,7 +15,7 @@ import pytest
 import zmq
 from processes import PATIENCE, Daemon, Subscriber, running
 
-from fishd.client import Fish, Refused
+from fishd.client import Fish
 from fishd.signals import Status
 
 ATTACKERS = str(Path(__file__).parents[2] / "tools" / "attackers.py")
@@ -196,11 +196,13 @@ def dealer(daemon: Daemon) -> "zmq.Socket[bytes]":
 def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are_not(
     daemon: Daemon,
 ) -> None:
-    with dealer(daemon) as hasty, Fish(daemon.endpoint) as calm:
-        for number in range(700):
+    with dealer(daemon) as hasty, Fish(daemon.endpoint, timeout=PATIENCE) as calm:
+        for number in range(1500):
             hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
         assert calm.status().mode == "running"
-        replies = [json.loads(hasty.recv()) for _ in range(650)]
+        replies = [json.loads(hasty.recv())]
+        while hasty.poll(2000):
+            replies.append(json.loads(hasty.recv()))
     refusals = [reply["error"] for reply in replies if not reply["ok"]]
     assert refusals
     assert {refusal["code"] for refusal in refusals} == {"busy"}
@@ -226,16 +228,30 @@ def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_
     assert len(error["message"]) < 200
 
 
-def test_a_reply_longer_than_the_link_takes_at_once_arrives_whole(tmp_path: Path) -> None:
+def test_replies_longer_than_the_link_has_room_for_arrive_whole_and_hold_up_no_estop(
+    tmp_path: Path,
+) -> None:
     folder = tmp_path / "policies"
     folder.mkdir()
     shipped = Path(__file__).parents[2] / "config" / "policies" / "default-fish.onnx"
-    for number in range(150):
+    for number in range(300):
         (folder / f"copy{number}.onnx").symlink_to(shipped)
     variables = ("env", f"FISHD_POLICIES={folder}")
     with running(tmp_path, under=variables) as daemon, Fish(daemon.endpoint, timeout=60) as fish:
-        try:
-            policies = fish.policies()
-        except Refused as error:
-            raise AssertionError(error) from None
-    assert len([policy for policy in policies if policy.name.startswith("copy")]) == 150
+        for _ in range(3):
+            found = [policy.name for policy in fish.policies()]
+            assert len([name for name in found if name.startswith("copy")]) == 300
+        assert fish.estop().mode == "estop"
+
+
+def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon, dealer(daemon) as before:
+        for _ in range(4):
+            before.send(b'{"v":1,"id":"before","op":"policies"}')
+        os.kill(gateways(daemon)["control"], signal.SIGKILL)
+        wait_until(lambda: "control" in gateways(daemon))
+        with dealer(daemon) as after:
+            for number in range(50):
+                after.send(b'{"v":1,"id":%d,"op":"status"}' % number)
+                assert json.loads(after.recv())["id"] == number
+        assert status(daemon).counters["control_restarts"] == 1
