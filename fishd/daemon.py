@@ -266,7 +266,7 @@ def fishd(
     logs = LogWriter(log_format)
     ending = Ending()
     ending.last_words = logs.close
-    show = sys.stdout.isatty() if print_status is None else print_status
+    show = bool(sys.stdout and sys.stdout.isatty()) if print_status is None else print_status
     try:
         asyncio.run(swim(config, show, ending, path))
     except ConfigError as error:  # in a calibration file

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from types import FrameType
 from typing import NoReturn
 
@@ -64,25 +65,24 @@ class Ending:
         self._end_at_once(signal.Signals(number).name)
 
     def _end_at_once(self, name: str) -> NoReturn:
-        place = _place(sys._current_frames().get(self._main))
+        """Nothing here may wait: what hangs may hold any lock, that of logging too."""
         release = self.release
-        log.critical(
-            "%s came %g s ago, and fishd hangs %s: %s the process is ended",
-            name,
-            PATIENCE,
-            place,
-            "the servo is released and" if release else "it has not begun to drive the servo;",
-        )
         if release:
             _within(_RELEASE, release)
-        self.last_words()
+        what = "the servo is released and" if release else "it has not begun to drive the servo;"
+        place = _place(sys._current_frames().get(self._main))
+        line = f"{name} came {PATIENCE:g} s ago, and fishd hangs {place}: "
+        line += f"{what} the process is ended"
+        _within(_FLUSH, partial(log.critical, "%s", line))
+        _within(_FLUSH, self.last_words)
         os._exit(1)
 
 
 def leave(status: int) -> NoReturn:
     """End the process without waiting for threads, or for somebody to read the output."""
-    _within(_FLUSH, sys.stdout.flush)
-    _within(_FLUSH, sys.stderr.flush)
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # as where it was closed before the start
+            _within(_FLUSH, stream.flush)
     os._exit(status)
 
 

@@ -76,7 +76,27 @@ class JsonFormatter(_Formatter):
         return msgspec.json.encode(fields).decode()
 
 
+class _NoLock:
+    """A lock that nobody can hold, in the place of one that a controller may never let go of."""
+
+    def acquire(self) -> bool:
+        """Succeeds."""
+        return True
+
+    def release(self) -> None:
+        """Does nothing."""
+
+    __enter__ = acquire
+
+    def __exit__(self, *_: object) -> None:
+        """Does nothing."""
+
+
 class _Queued(logging.handlers.QueueHandler):
+    def createLock(self) -> None:  # noqa: N802  (logging's name)
+        """A queue needs no lock: whoever hangs while it formats its line must stop nobody else."""
+        self.lock = _NoLock()  # type: ignore[assignment]
+
     def enqueue(self, record: logging.LogRecord) -> None:
         """Drop the line rather than wait."""
         with suppress(queue.Full):

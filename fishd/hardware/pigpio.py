@@ -151,9 +151,7 @@ class PigpioServo:
         if not self._energised and pigpio_pulses.pulses_on(client, gpio, sleep):
             count, width = 1, self._neutral  # of a killed fishd: gently
         self._script = pigpio_pulses.install(client, gpio, count, width, sleep)
-        for script in former:
-            client.update_script(script, armed(gpio, 0, OFF))
         if self._energised:
             client.set_servo_pulsewidth(gpio, OFF)
-        pigpio_pulses.remove(client, gpio, former)
+        pigpio_pulses.remove(client, former)
         self._energised = False

@@ -23,17 +23,19 @@ COUNT = 0.01
 
 # p0: counts left, 0 is disarmed · p1: GPIO · p2: the pulse to end with, 0 for none · p9: MAGIC.
 # After the hold p0 tells whether the script was armed again meanwhile: then the pulses stay. There
-# is no hold after OFF, so that a servo that is written to again is under guard at once.
+# is no hold after OFF, so that a servo that is written to again is under guard at once. While it is
+# disarmed it ends pulses again and again: a command that was under way when its sender died, and
+# arrives after the countdown, has no effect for longer than a count.
 COUNTDOWN = (
-    b"tag 0 mils 10 lda p0 cmp 0 jz 0 dcr p0 jnz 0 "
-    b"s p1 p2 lda p2 cmp 0 jz 0 mils 500 lda p0 cmp 0 jnz 0 s p1 0 jmp 0"
+    b"tag 0 mils 10 lda p0 cmp 0 jz 1 dcr p0 jnz 0 "
+    b"s p1 p2 lda p2 cmp 0 jz 0 mils 500 lda p0 cmp 0 jnz 0 tag 1 s p1 0 jmp 0"
 )
 
 MAGIC = int.from_bytes(b"fish", "big")
 """Tells fishd's scripts from those of others."""
 
 _GUARD = 60
-"""What a last resort arms its own script with: longer than it takes itself [counts]."""
+"""What a last resort arms its own script with: longer than the pulses take [counts]."""
 
 _PWM_MODES = {12: 4, 13: 4, 18: 2, 19: 2}
 """GPIO → the mode in which the PWM peripheral drives it."""
@@ -75,10 +77,8 @@ def install(client: Client, gpio: int, count: int, width: float, sleep: Sleep) -
     return script
 
 
-def remove(client: Client, gpio: int, scripts: list[int]) -> None:
+def remove(client: Client, scripts: list[int]) -> None:
     """Delete countdowns, which must not be needed any more."""
-    for script in scripts:
-        client.update_script(script, armed(gpio, 0, OFF))
     for script in scripts:
         client.within(ANSWER)  # one that holds the servo at neutral ends its hold first
         client.delete_script(script)
@@ -122,7 +122,7 @@ def neutralise(place: Place, gpio: int, neutral: float, sleep: Sleep) -> bool:
     except BaseException:
         with suppress(ServoError), opened(place) as client:
             client.set_servo_pulsewidth(gpio, OFF)
-            remove(client, gpio, countdowns(client, gpio))
+            remove(client, countdowns(client, gpio))
         raise
 
 
@@ -131,13 +131,15 @@ def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool
     energised = pulses_on(client, gpio, sleep)
     if energised:
         # First a script of its own: this process may be killed, too.
-        scripts.append(install(client, gpio, _GUARD, OFF, sleep))
-        for script in scripts[:-1]:
-            client.update_script(script, armed(gpio, 0, OFF))
+        guard = install(client, gpio, _GUARD, OFF, sleep)
+        remove(client, scripts)
+        scripts = [guard]
+        client.within(ANSWER)
+        client.update_script(guard, armed(gpio, _GUARD, OFF))
         # This takes the pin from the PWM peripheral as well.
         client.set_servo_pulsewidth(gpio, round(neutral))
         sleep(REST)
         client.within(ANSWER)
         client.set_servo_pulsewidth(gpio, OFF)
-    remove(client, gpio, scripts)
+    remove(client, scripts)
     return energised

@@ -12,7 +12,7 @@ import numpy as np
 
 from fishd import files
 from fishd.errors import PolicyError
-from fishd.policies import checksum, operators
+from fishd.policies import bulk, checksum, operators
 from fishd.policies.card import KEY, Card, decode
 from fishd.text import named, quoted
 
@@ -52,6 +52,15 @@ def read(path: Path) -> PolicyFile:
 def parse(content: bytes) -> Card:
     """The card of a policy whose whole content is good; raises `PolicyError`."""
     _refuse_pickles(content)
+    try:
+        bulk.check(content)
+    except bulk.TooMuch:
+        raise PolicyError(
+            f"more than {bulk.MOST // 2**10} kB of it are no raw weights, far more than a policy "
+            "needs; save weights as raw data"
+        ) from None
+    except bulk.Broken:
+        raise PolicyError(f"this is no ONNX model; {_EXPORT}") from None
     model = _model(content)
     try:
         return _checked(content, model)

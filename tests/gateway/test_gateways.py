@@ -248,8 +248,9 @@ def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path
     with running(tmp_path) as daemon, dealer(daemon) as before:
         for _ in range(4):
             before.send(b'{"v":1,"id":"before","op":"policies"}')
-        os.kill(gateways(daemon)["control"], signal.SIGKILL)
-        wait_until(lambda: "control" in gateways(daemon))
+        killed = gateways(daemon)["control"]
+        os.kill(killed, signal.SIGKILL)
+        wait_until(lambda: gateways(daemon).get("control", killed) != killed)
         with dealer(daemon) as after:
             for number in range(50):
                 after.send(b'{"v":1,"id":%d,"op":"status"}' % number)

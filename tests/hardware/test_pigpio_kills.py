@@ -196,3 +196,15 @@ def test_a_servo_that_is_written_to_right_after_a_release_is_under_guard_at_once
     servo.write(0.5)
     bench.wait(0.25)
     assert bench.width == 1500
+
+
+def test_a_pulse_that_arrives_after_its_countdown_has_ended_is_ended_at_once(
+    bench: PigpioBench,
+) -> None:
+    swim(bench).write(-0.5)
+    bench.wait(2.0)
+    assert bench.width == 0
+    with bench.client() as late:
+        late.set_servo_pulsewidth(GPIO, 1750)
+    bench.wait(0.1)
+    assert bench.width == 0

@@ -21,6 +21,7 @@ from swimming import NOISY, brief_job
 from fishd.cli.main import fishctl
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
+from fishd.controllers.chatter import ChatterSettings
 from fishd.errors import ParameterError, PolicyError
 from fishd.learning import checkpoints
 from fishd.learning.checkpoints import CheckpointError
@@ -54,7 +55,7 @@ def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
     assert trained.best
     found = export(trained.best, tmp_path / "policy.onnx")
     controller = registry.create(
-        "ppo", {"policy": str(found.path)}, Limits(amplitude=0.42, tick=0.05)
+        "ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, chatter=ChatterSettings(dwell=0.0))
     )
     policy = checkpoints.load_policy(trained.best)
     decide = Deterministic(policy, found.card.observation, 0.42)

@@ -4,6 +4,7 @@ tools/misbehaviour.py installs it as a package of its own and lets the true fish
 """
 
 import asyncio
+import logging
 import os
 import time
 from fractions import Fraction
@@ -103,7 +104,20 @@ def block() -> None:
     os.read(reader, 1)
 
 
-HANGS = {"loop": loop, "stubborn": stubborn, "sleep": sleep, "block": block}
+class Endless:
+    """Whoever writes this in a log never comes back."""
+
+    def __str__(self) -> str:
+        sleep()
+        return ""
+
+
+def log_for_ever() -> None:
+    """For ever, in the midst of a log record."""
+    logging.getLogger("zoo").error("%s", Endless())
+
+
+HANGS = {"loop": loop, "stubborn": stubborn, "sleep": sleep, "block": block, "log": log_for_ever}
 
 
 class ZooParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
