@@ -7,6 +7,7 @@ it and the socket that clients connect to, which outlives this process. Only fis
 import os
 import socket
 import sys
+import time
 from contextlib import suppress
 
 import zmq
@@ -14,12 +15,14 @@ import zmq
 from fishd.gateway import link
 from fishd.gateway.limits import ResourceLimits
 
+_PAUSE = 0.3
+"""How long a crowd at the door waits before it is let in again [s]."""
 _FAREWELL = 100
 """How long the last messages may take to leave [ms]."""
 
 
 def main(kind: str, link_number: str, listener_number: str, address: str) -> int:
-    """Serve until fishd ends, or until a limit is exceeded."""
+    """Serve until fishd ends; begin anew, with nothing, when a limit is exceeded."""
     connection = socket.socket(fileno=int(link_number))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     if kind == link.TELEMETRY:
@@ -42,14 +45,17 @@ def main(kind: str, link_number: str, listener_number: str, address: str) -> int
     if why:
         with suppress(OSError):  # fishd has ended, or takes nothing just now
             connection.send(link.NOTICE + why.encode())
-        os._exit(1)  # ZeroMQ's own end would take as long as there is to free
+        time.sleep(_PAUSE)
+        # From here, as fishd must not wait for a process to be made; and at once, as ZeroMQ's own
+        # end would take as long as there is to free.
+        os.execv(sys.executable, [sys.executable, "-P", "-m", "fishd.gateway", *sys.argv[1:]])
     server.close(linger=_FAREWELL)
     context.term()
     return 0
 
 
 def _serve(server: "zmq.Socket[bytes]", listener: int, address: str) -> None:
-    server.set(zmq.USE_FD, listener)
+    server.set(zmq.USE_FD, os.dup(listener))  # which is closed when this begins anew
     server.bind(address)
 
 

@@ -14,7 +14,7 @@ _PAUSE = 0.1
 _MOST_FILES = 4096
 """File descriptors, where the system permits that many: more than connections can be made between
 two looks."""
-_SPARE_FILES = 32
+_SPARE_FILES = 16
 """Kept free: ZeroMQ cannot refuse a connection for which there is no file descriptor."""
 _TRIM = 8 * 2**20
 """Of memory more than at the start, unused parts are given back [bytes]."""
@@ -33,7 +33,7 @@ class ResourceLimits:
         """
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)  # it ends when fishd does
-        os.nice(5)
+        os.setpriority(os.PRIO_PROCESS, 0, max(5, os.getpriority(os.PRIO_PROCESS, 0)))
         with suppress(OSError):
             Path("/proc/self/oom_score_adj").write_text("500")  # rather than fishd
         highest = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -41,11 +41,14 @@ class ResourceLimits:
         resource.setrlimit(resource.RLIMIT_NOFILE, (files, highest))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         # The kernel enforces twice of it, also between two looks.
+        highest = resource.getrlimit(resource.RLIMIT_DATA)[1]
         most = _data() + 2 * memory
+        if highest != resource.RLIM_INFINITY:
+            most = min(most, highest)
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         self._memory = _resident() + memory
         self._trim = _resident() + _TRIM
-        self._files = min(_files() + connections, files - _SPARE_FILES)
+        self._files = min(_files() + connections, max(_files(), files - _SPARE_FILES))
         self._next_look = self._next_trim = 0.0
 
     def exceeded(self) -> str:

@@ -44,7 +44,7 @@ class Gateway:
         self.lost = 0
         """Messages to it that were dropped."""
         self.on_restart: Callable[[str], None] = lambda why: None
-        """Called once it was started again, with what ended the one before."""
+        """Called once it was started again, or should have been, with the latest reason."""
         self._listener = listener
         self._events = asyncio.get_running_loop()
         self._link: socket.socket | None = None
@@ -52,6 +52,7 @@ class Gateway:
         self._reading = False
         self._pause = PAUSES[0]
         self._why = ""
+        self._telling: asyncio.TimerHandle | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
         try:
@@ -87,8 +88,9 @@ class Gateway:
         if self._closed:
             return
         self._closed = True
-        if self._timer:
-            self._timer.cancel()
+        for timer in (self._timer, self._telling):
+            if timer:
+                timer.cancel()
         if self._link is not None:
             self.send(END)
             self._drop_link()
@@ -135,13 +137,11 @@ class Gateway:
         if not message:
             self._ended()
         elif message.startswith(NOTICE):
-            self._why = message[1:].decode(errors="replace")
+            self._tell(message[1:].decode(errors="replace"))
         else:
             self.take(message)
 
     def _ended(self) -> None:
-        if self._timer:
-            self._timer.cancel()
         self._drop_link()
         lived = self._events.time() - self._started
         self._pause = PAUSES[0] if lived > HEALTHY else min(2.0 * self._pause, PAUSES[1])
@@ -153,18 +153,24 @@ class Gateway:
             self._process.kill()
             self._timer = self._events.call_later(PAUSES[0], self._start_again)
             return
-        why = self._why or f"its process ended with status {status}"
-        self._why = ""
-        self.restarts += 1
         try:
             self._start()
+            self._tell(f"its process ended with status {status}")
         except OSError as error:  # Python was renewed, say, and is not there just now
-            self._why = f"it could not be started: {error.strerror}"
+            self._tell(f"it cannot be started: {error.strerror}")
             self._pause = PAUSES[1]
             self._timer = self._events.call_later(self._pause, self._start_again)
-            return
-        # Not at once: subscribers are still on their way back, and would miss it.
-        self._timer = self._events.call_later(RETURN, self.on_restart, why)
+
+    def _tell(self, why: str) -> None:
+        """Count a restart, and report it soon: subscribers are still on their way back."""
+        self.restarts += 1
+        self._why = why
+        if self._telling is None:
+            self._telling = self._events.call_later(RETURN, self._told)
+
+    def _told(self) -> None:
+        self._telling = None
+        self.on_restart(self._why)
 
     def _drop_link(self) -> None:
         assert self._link

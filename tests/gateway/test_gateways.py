@@ -256,3 +256,34 @@ def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path
                 after.send(b'{"v":1,"id":%d,"op":"status"}' % number)
                 assert json.loads(after.recv())["id"] == number
         assert status(daemon).counters["control_restarts"] == 1
+
+
+def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(
+    daemon: Daemon,
+) -> None:
+    pid = gateways(daemon)["telemetry"]
+    open_files = []
+    for count in (1, 2):
+        attack("idle-telemetry", daemon, 2.0)
+        wait_until(lambda count=count: status(daemon).counters["telemetry_restarts"] >= count)
+        with Subscriber(daemon.telemetry, b"tick") as subscriber:
+            assert subscriber.message()["missed"] == 0
+        wait_until(lambda: len(list(Path(f"/proc/{pid}/fd").iterdir())) < 30)
+        open_files.append(len(list(Path(f"/proc/{pid}/fd").iterdir())))
+    assert gateways(daemon)["telemetry"] == pid
+    assert open_files[1] <= open_files[0] + 1
+
+
+def test_a_gateway_that_dies_again_and_again_is_reported_all_the_same(daemon: Daemon) -> None:
+    killed = set()
+    end = time.monotonic() + 2.5
+    while time.monotonic() < end:
+        pid = gateways(daemon).get("telemetry")
+        if pid is not None and pid not in killed:
+            os.kill(pid, signal.SIGKILL)
+            killed.add(pid)
+        time.sleep(0.01)
+    assert len(killed) >= 3
+    wait_until(lambda: status(daemon).counters["telemetry_restarts"] >= len(killed))
+    _, _, errors = daemon.end()
+    assert "the gateway of telemetry was started again: its process ended with status -9" in errors
