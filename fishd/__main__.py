@@ -1,5 +1,5 @@
 """`python -m fishd` is `fishd`."""
 
-from fishd.daemon import main
+from fishd.entry import fishd
 
-main()
+fishd()

@@ -158,7 +158,7 @@ def _status_text(status: Status) -> str:
         ("thrust", f"{thrust} mN at {status.frequency:.2f} Hz"),
         ("servo", f"{_servo(status)}, {_range(status)}"),
         ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling"),
-        ("", f"{status.missed} slots missed, {status.overruns} overruns"),
+        ("", f"slots missed: {status.missed}, overruns: {status.overruns}"),
         ("late", _percentiles(timing.lateness)),
         ("busy", _percentiles(timing.busy)),
         *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),

@@ -4,12 +4,13 @@ import json
 import os
 import signal
 import subprocess
+import time
 from itertools import pairwise
 from pathlib import Path
 
 import msgspec
 import pytest
-from processes import FISHCTL, Daemon, Subscriber, running
+from processes import FISHCTL, FISHD, PATIENCE, Daemon, Subscriber, running
 
 SHIPPED = str(Path(__file__).parents[2] / "config" / "simulated.yaml")
 
@@ -227,3 +228,19 @@ def test_fishctl_says_when_no_daemon_is_there(tmp_path: Path) -> None:
         f"fishctl: no fishd at {endpoint}: nobody listens there; start one with 'fishd', "
         "or name another with --endpoint or $FISHD_ENDPOINT\n"
     )
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.15, 0.3, 0.45, 0.6])
+def test_a_ctrl_c_at_any_moment_of_the_start_ends_it_without_a_traceback_or_a_beat(
+    tmp_path: Path, delay: float
+) -> None:
+    command = [FISHD, "--config", SHIPPED, "--set", f"control.address=ipc://{tmp_path}/control"]
+    command += ["--set", "telemetry.address=tcp://127.0.0.1:0"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    time.sleep(delay)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode in (0, -signal.SIGINT)
+    assert "Traceback" not in errors

@@ -1,0 +1,29 @@
+"""Where the commands begin: a Ctrl-C while they are still being loaded ends them without a word."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+def fishd() -> None:
+    """The `fishd` command."""
+    with _quiet():
+        from fishd.daemon import main
+    main()
+
+
+def fishctl() -> None:
+    """The `fishctl` command."""
+    with _quiet():
+        from fishd.cli.main import main
+    main()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Let a Ctrl-C meanwhile be the end of the process, unless it is ignored as below `nohup`."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGINT, before)
