@@ -195,11 +195,8 @@ class Fishd:
 
     def gateways(self) -> list[int]:
         """The processes that fishd has started."""
-        return [
-            int(child)
-            for thread in Path(f"/proc/{self.pid}/task").iterdir()
-            for child in (thread / "children").read_text(encoding="ascii").split()
-        ]
+        children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text(encoding="ascii")
+        return [int(child) for child in children.split()]
 
     def memory(self, field: str) -> float:
         """A size of fishd's own process, from /proc/PID/status, such as VmRSS [MB]."""

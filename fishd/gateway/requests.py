@@ -16,7 +16,7 @@ MEMORY = 48 * 2**20
 CONNECTIONS = 1500
 """Clients, and others that connect."""
 
-QUEUE_IN, QUEUE_OUT = 8, 128
+QUEUE_IN, QUEUE_OUT = 8, 64
 """Requests and replies in ZeroMQ's hands for one client; further replies are dropped."""
 MOST_OPEN = 16
 """Requests that fishd has and has not answered yet; more wait here."""
@@ -26,7 +26,7 @@ URGENT = {"estop", "stop"}
 """Operations that wait for no other."""
 SPARE = 2
 """Requests beyond MOST_OPEN that may be open, if they are urgent."""
-REFUSALS, REFUSALS_AT_ONCE = 100.0, 100.0
+REFUSALS, REFUSALS_AT_ONCE = 20.0, 50.0
 """Requests of one client per second, and at once, that are refused; others get no reply."""
 GREETING = 2000
 """How long a connection may take until it speaks ZeroMQ [ms]."""
