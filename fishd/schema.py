@@ -10,6 +10,7 @@ import heapq
 import re
 import reprlib
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -78,8 +79,17 @@ def without_empty_sections(data: Mapping[str, Any], target: type[Struct]) -> dic
 
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """The fields of a parameter struct, in the order in which they are declared."""
-    info = cast(inspect.StructType, inspect.type_info(struct))
-    return tuple(_describe(field) for field in info.fields)
+    return _fields_of(struct)
+
+
+@lru_cache(maxsize=256)  # controllers are asked for theirs in every request
+def _fields_of(struct: type[Struct]) -> tuple[Field, ...]:
+    return tuple(_describe(field) for field in _info(struct).fields)
+
+
+@lru_cache(maxsize=256)
+def _info(struct: type[Struct]) -> inspect.StructType:
+    return cast(inspect.StructType, inspect.type_info(struct))
 
 
 def convert(data: Any, target: type[T], *, prefix: tuple[str, ...] = ()) -> T:
@@ -249,7 +259,7 @@ def _sections(
     target: type[Struct], *, in_lists: bool = False
 ) -> Iterator[tuple[str, type[Struct]]]:
     """The fields of a struct that are structs themselves, or lists of them where wanted."""
-    for field in cast(inspect.StructType, inspect.type_info(target)).fields:
+    for field in _info(target).fields:
         kind = field.type.type if isinstance(field.type, inspect.Metadata) else field.type
         if in_lists and isinstance(kind, inspect.VarTupleType):
             kind = kind.item_type

@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 Perform = Callable[[str, dict[str, Any]], Awaitable[Any]]
 
-RATE = 1000.0
+RATE = 600.0
 """Requests per second that are taken from all clients together; others wait in the gateway."""
 _NO_ROOM = 0.01
 """Time until a reply is tried again for which the link to the gateway had no room [s]."""
