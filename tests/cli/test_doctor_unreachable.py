@@ -2,10 +2,8 @@
 
 import contextlib
 import os
-import shutil
 import signal
 import socket
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,15 +17,6 @@ from fishd.config import load
 
 HARDWARE = ("adc", "force", "pwm", "gpio pins")
 AS_FISHD = "sudo -u fishd fishctl doctor"
-
-
-@pytest.fixture
-def root() -> Iterator[Path]:
-    """A folder that every user may enter."""
-    folder = Path(tempfile.mkdtemp())
-    folder.chmod(0o755)
-    yield folder
-    shutil.rmtree(folder)
 
 
 @contextlib.contextmanager
