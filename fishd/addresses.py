@@ -4,6 +4,7 @@ import errno
 import os
 import socket
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -16,6 +17,8 @@ from fishd.zmq_address import Ipc, parse
 
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 _SERVICE = Path("/run/fishd/control")
+_LEAVING, _AGAIN = 1.0, 0.02
+"""How long the gateways of a fishd that was killed may take to leave, and a pause meanwhile [s]."""
 _BACKLOG = 128
 """Connections that may wait to be accepted."""
 
@@ -120,8 +123,11 @@ def claimed(
                 f"{lock_path(path)}: cannot be made: {error.strerror}; "
                 "choose an address in a folder that exists"
             ) from None
-        if path.is_socket() and not is_deserted(address):  # of a program that locks nothing
-            raise StartupError(f"another program already serves {address}; {advice}")
+        given_up = time.monotonic() + _LEAVING
+        while path.is_socket() and not is_deserted(address):
+            if time.monotonic() > given_up:  # a program that locks nothing
+                raise StartupError(f"another program already serves {address}; {advice}")
+            time.sleep(_AGAIN)
         try:
             yield
         finally:
@@ -165,13 +171,24 @@ def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
             host = "" if where.host == "*" else where.host  # "" is every address
             server = socket.socket(family)
             server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            server.bind((host, int(where.port)))
+            _bind_port(server, host, int(where.port))
         server.listen(_BACKLOG)
     except (OSError, ValueError) as error:
         if server:
             server.close()
         raise StartupError(f"{key}: cannot listen on {address}: {_why(address, error)}") from None
     return server
+
+
+def _bind_port(server: socket.socket, host: str, port: int) -> None:
+    given_up = time.monotonic() + _LEAVING
+    while True:
+        try:
+            return server.bind((host, port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or time.monotonic() > given_up:
+                raise
+        time.sleep(_AGAIN)
 
 
 def _bind_path(server: socket.socket, path: str, mask: int | None) -> None:

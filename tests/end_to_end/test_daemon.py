@@ -244,3 +244,15 @@ def test_a_ctrl_c_at_any_moment_of_the_start_ends_it_without_a_traceback_or_a_be
     _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode in (0, -signal.SIGINT)
     assert "Traceback" not in errors
+
+
+def test_a_fishd_that_was_killed_is_followed_by_the_next_one_without_a_pause(
+    tmp_path: Path,
+) -> None:
+    for _ in range(3):
+        with running(tmp_path, "--set", "telemetry.address=tcp://127.0.0.1:0") as first:
+            port = first.telemetry
+            first.process.kill()
+            first.process.wait()
+            with running(tmp_path, "--set", f"telemetry.address={port}") as second:
+                assert second.fishctl("status").returncode == 0
