@@ -9,6 +9,7 @@ import difflib
 import heapq
 import re
 import reprlib
+import threading
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, TypeVar, cast
@@ -98,11 +99,25 @@ def convert(data: Any, target: type[T], *, prefix: tuple[str, ...] = ()) -> T:
     Raises `Problem`, whose message names the permitted values or the nearest valid key and whose
     path begins with `prefix`.
     """
+    _prepare(target)
     try:
         return msgspec.convert(data, target)
     except msgspec.ValidationError as error:
         path, message = _explain(error, data, cast(type[Struct], target))
         raise Problem(prefix + path, message) from None
+
+
+_prepared: set[Any] = set()
+_preparing = threading.Lock()
+
+
+def _prepare(target: Any) -> None:
+    """Let msgspec look at a type for the first time in one thread only: in two, it crashes."""
+    if target in _prepared:
+        return
+    with _preparing:
+        msgspec.json.Decoder(target)
+        _prepared.add(target)
 
 
 def wanted(field: Field) -> str:

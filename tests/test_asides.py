@@ -80,7 +80,7 @@ def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
         for _ in range(MOST_GIVEN_UP):
             asides.check_busy()
             await refusal(asides, stuck)
-        with pytest.raises(Refused, match="given up while they loaded still run; restart fishd"):
+        with pytest.raises(Refused, match="of controllers mostly, still run; restart fishd"):
             asides.check_busy()
         stuck.let_go()
         asides.check_busy()
