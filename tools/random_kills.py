@@ -123,12 +123,15 @@ class Lane:
             "realtime.rehearse": "false",
         }
         self._zygote.send([f"{key}={value}" for key, value in pairs.items()])
-        self._pidfd = os.pidfd_open(self._zygote.recv())
+        pid = self._zygote.recv()
+        with suppress(ProcessLookupError):  # a busy machine: what it was to follow is still there
+            self._pidfd = os.pidfd_open(pid)
 
     def signal(self, number: signal.Signals) -> None:
         """Send fishd a signal; nothing where it is gone."""
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._pidfd, number)
+        if self._pidfd >= 0:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pidfd, number)
 
     def end(self) -> None:
         """Kill fishd where it still lives, and wait until it is gone."""
