@@ -2,10 +2,12 @@
 PYTHON ?= python3
 # What `make test` and `make lint` install; without `learn`, its tests are skipped.
 EXTRAS ?= dev,learn,cluster
+# How many tests run at a time: some only wait.
+JOBS ?= $(shell expr $$(nproc) + 1)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint docs bench clean
+.PHONY: help run test test-fast lint docs bench clean
 
 help:  ## List what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
@@ -13,8 +15,14 @@ help:  ## List what there is to make
 run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
 	$(BIN)/fishd --config config/simulated.yaml --print-status
 
+# First what shares the cores, then, alone, what judges real time: also after failures.
 test: $(VENV)/installed-dev  ## Run the whole test suite
-	$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not realtime"; shared=$$?; \
+	$(BIN)/python -m pytest -m realtime $$(grep -rl --include='test_*.py' 'mark\.realtime' tests); \
+	alone=$$?; exit $$((shared || alone))
+
+test-fast: $(VENV)/installed-dev  ## Run what is on the virtual clock: no processes, no torch
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --fast
 
 lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 	$(BIN)/ruff check .
@@ -23,11 +31,12 @@ lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 	$(BIN)/lint-imports
 
 docs: $(VENV)/installed-dev  ## Write the generated parts of docs/ again
-	$(BIN)/python tools/config_reference.py
-	$(BIN)/python tools/efficiency_map.py
+	$(BIN)/python tools/config_reference.py --write
+	$(BIN)/python tools/protocol_reference.py --write
+	$(BIN)/python tools/bench swing --write
 
 bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine
-	$(BIN)/python tools/bench_tick.py
+	$(BIN)/python tools/bench tick
 
 clean:  ## Remove the virtual environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
@@ -60,7 +69,7 @@ uninstall-pi:  ## Remove it; an edited configuration and calibrations stay unles
 	tools/uninstall_pi.sh
 
 trial-systemd: $(VENV)/installed-dev  ## Start, hang and kill fishd under a real systemd; needs root
-	$(BIN)/python tools/systemd_trial --write docs/reliability.md
+	$(BIN)/python tools/reliability systemd --write
 
 trial-arm64: $(VENV)/installed-dev  ## Install on arm64 Debian 12 and 13 under qemu; needs root, an hour
 	FISHCTL=$(CURDIR)/$(BIN)/fishctl tools/arm64_trial.sh

@@ -1,5 +1,33 @@
-"""`python -m fishd` is `fishd`."""
+"""Where the commands begin: a Ctrl-C while they are still being loaded ends them quietly."""
 
-from fishd.entry import fishd
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-fishd()
+
+def fishd() -> None:
+    """The `fishd` command."""
+    with _quiet():
+        from fishd.daemon.main import main
+    main()
+
+
+def fishctl() -> None:
+    """The `fishctl` command."""
+    with _quiet():
+        from fishd.cli.main import main
+    main()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Let a Ctrl-C meanwhile be the end of the process, unless it is ignored as below `nohup`."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+if __name__ == "__main__":
+    fishd()

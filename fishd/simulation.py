@@ -1,7 +1,8 @@
-"""A whole run in virtual time: the loop of the robot, on a simulated fish, for its figures."""
+"""A whole run in virtual time: the robot's own loop on a simulated fish, and a report."""
 
 import itertools
 import math
+import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -11,26 +12,25 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.build import build_loop
-from fishd.clock import VirtualClock, VirtualTicker
 from fishd.config import Config
+from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, amplitude_of
-from fishd.errors import ParameterError
+from fishd.core.clock import VirtualClock, VirtualTicker
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Event, Reason, Tick
 from fishd.hardware.base import Robot
-from fishd.hardware.simulated import SimulatedFish
-from fishd.plant.optimum import best_square_wave
-from fishd.plant.tethered import TrueWindow
-from fishd.reporting import Publisher
-from fishd.robots import open_in_virtual_time
-from fishd.signals import Event, Reason, Tick
+from fishd.virtual.fish import SimulatedFish
+from fishd.virtual.plant.optimum import best_square_wave
+from fishd.virtual.plant.tethered import TrueWindow
+from fishd.wiring import build_loop, open_in_virtual_time
 
 LONGEST = 1e8
 """Runs are shorter than this [s]: three years."""
 
 
 class Report(Struct, frozen=True):
-    """What a run came to. Forces are the plant's true ones, over whole beats once settled."""
+    """The result of a run. Forces are the plant's true ones, over whole beats once settled."""
 
     controller: str
     parameters: dict[str, Any]
@@ -40,6 +40,8 @@ class Report(Struct, frozen=True):
     """[N]"""
     frequency: float
     """Tail beats per second; 0 when the tail does not beat [Hz]."""
+    half_beats: tuple[int, int]
+    """The shortest and the longest half beat, in ticks; 0 when the tail does not beat."""
     fin_amplitude: float
     """Largest fin angle of each half beat, mean over half beats [rad]."""
     fullness: float
@@ -58,7 +60,11 @@ class Report(Struct, frozen=True):
     reason: Reason | None
     """Why, when that is fault."""
     fallback: Reason | None
-    """Why another controller took over, if one did; the figures are those of both."""
+    """Why another controller took over, if one did."""
+    successor: str | None
+    """Which one that was."""
+    took_over: float | None
+    """When it took over [s]; the figures are its own where that was before the end of settling."""
     microseconds_per_tick: float
     """What one turn of the loop took on this machine, once settled [µs]."""
     real_time_factor: float
@@ -78,7 +84,7 @@ class Beats:
         self._side = 0.0
 
     def add(self, angle: float, window: TrueWindow) -> None:
-        """Add a window in which the instruction angle `angle` [rad] was in force."""
+        """Add a window; angle: the instruction angle during it [rad]."""
         side = math.copysign(1.0, angle) if angle else self._side
         if side != self._side and self._side:
             self._open.close_half()
@@ -90,8 +96,8 @@ class Beats:
         self._side = side
         self._open.add(angle, window)
 
-    def figures(self) -> "Figures":
-        """What the beats came to."""
+    def means(self) -> "BeatMeans":
+        """Means over the whole beats."""
         sums = self._whole
         frequency = 0.5 * sums.halves / sums.duration if sums.halves else 0.0
         if not sums.halves:
@@ -99,16 +105,17 @@ class Beats:
             sums.close_half()
         mean = sums.angle / sums.duration
         rms = math.sqrt(sums.angle_squared / sums.duration)
-        return Figures(
+        return BeatMeans(
             thrust=sums.impulse / sums.duration,
             frequency=frequency,
             fin_amplitude=sums.peaks / sums.halves,
             mean_angle=mean,
             squareness=mean / rms if rms else 0.0,
+            half_beats=(sums.shortest, sums.longest) if frequency else (0, 0),
         )
 
 
-class Figures(NamedTuple):
+class BeatMeans(NamedTuple):
     """Means over beats."""
 
     thrust: float  # N
@@ -116,13 +123,16 @@ class Figures(NamedTuple):
     fin_amplitude: float  # rad
     mean_angle: float  # of |φ_c|, rad
     squareness: float  # mean |φ_c| over rms φ_c
+    half_beats: tuple[int, int]  # shortest and longest, ticks
 
 
 class _Sums:
     def __init__(self) -> None:
         self.duration = self.impulse = self.peaks = self.angle = self.angle_squared = 0.0
         self.halves = 0
+        self.shortest, self.longest = sys.maxsize, 0
         self._peak = 0.0
+        self._ticks = 0
 
     def add(self, angle: float, window: TrueWindow) -> None:
         self.duration += window.duration
@@ -130,19 +140,21 @@ class _Sums:
         self.angle += abs(angle) * window.duration
         self.angle_squared += angle**2 * window.duration
         self._peak = max(self._peak, window.fin_peak)
+        self._ticks += 1
 
     def close_half(self) -> None:
         self.halves += 1
         self.peaks += self._peak
+        self.shortest = min(self.shortest, self._ticks)
+        self.longest = max(self.longest, self._ticks)
         self._peak = 0.0
+        self._ticks = 0
 
     def __iadd__(self, other: "_Sums") -> "_Sums":
-        self.duration += other.duration
-        self.impulse += other.impulse
-        self.peaks += other.peaks
-        self.angle += other.angle
-        self.angle_squared += other.angle_squared
-        self.halves += other.halves
+        for name in ("duration", "impulse", "peaks", "angle", "angle_squared", "halves"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.shortest = min(self.shortest, other.shortest)
+        self.longest = max(self.longest, other.longest)
         return self
 
 
@@ -184,16 +196,17 @@ def judge(
     settle: float,
     publisher: Publisher,
 ) -> Report:
-    """As `simulate`, with a controller that is ready made, or is no part of fishd.
+    """As `simulate`, with a controller that is ready-made.
 
     publisher: gets the record of every tick
     Raises `ParameterError` where the lengths do not fit one another.
     """
-    if not (0.0 <= settle < LONGEST and 0.0 < seconds < LONGEST):  # neither is NaN, say
-        raise ParameterError(
-            f"a run of {seconds:g} s with {settle:g} s to settle: numbers from 0 to {LONGEST:g} s "
-            "are needed"
-        )
+    for what, length in (("run", seconds), ("time to settle", settle)):
+        if not 0.0 <= length < LONGEST:  # NaN is not
+            raise ParameterError(
+                f"a {what} of {length:g} s is not possible: a number from 0 to {LONGEST:g} s is "
+                "needed"
+            )
     ticks = round(seconds / config.tick)
     first = math.ceil(settle / config.tick - 1e-9) + 1
     if first >= ticks:
@@ -204,6 +217,7 @@ def judge(
     clock = VirtualClock()
     beats = Beats()
     begun = 0.0
+    took_over: float | None = None
     with ExitStack() as stack:
         robot, take_window = _swimmer(config, stack)
         loop = build_loop(config, robot, clock, publisher)
@@ -215,30 +229,36 @@ def judge(
             angle = loop.applied
             loop.tick(slot)
             window = take_window()
+            if loop.active.fallback and took_over is None:
+                took_over = slot.index * config.tick
             if slot.index >= first:
                 beats.add(angle, window)
         elapsed = time.perf_counter() - begun
-        fallback = loop.fallback
+        fallback = loop.active.fallback
+        successor = loop.active.name if fallback else None
 
     amplitude = amplitude_of(controller.parameters, config.limits)
     best = best_square_wave(config.plant, amplitude)
-    figures = beats.figures()
+    means = beats.means()
     return Report(
         controller=name,
         parameters=msgspec.structs.asdict(controller.parameters),
         amplitude=amplitude,
-        mean_thrust=figures.thrust,
-        frequency=figures.frequency,
-        fin_amplitude=figures.fin_amplitude,
-        fullness=figures.mean_angle / amplitude,
-        squareness=figures.squareness,
-        efficiency=figures.thrust / best.thrust if best.thrust > 0.0 else 0.0,
+        mean_thrust=means.thrust,
+        frequency=means.frequency,
+        half_beats=means.half_beats,
+        fin_amplitude=means.fin_amplitude,
+        fullness=means.mean_angle / amplitude,
+        squareness=means.squareness,
+        efficiency=means.thrust / best.thrust if best.thrust > 0.0 else 0.0,
         best_square_thrust=best.thrust,
         best_square_frequency=best.frequency,
         ticks=ticks,
         mode=loop.supervisor.mode.value,
         reason=loop.supervisor.reason,
         fallback=fallback,
+        successor=successor,
+        took_over=took_over,
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )

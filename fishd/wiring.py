@@ -1,4 +1,4 @@
-"""Opens the robot that the configuration describes: its sensor, servo and panel, ready to use."""
+"""Builds a robot as the configuration describes it, and the loop that ticks on it."""
 
 import logging
 import os
@@ -6,30 +6,36 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec.structs import replace
 
-from fishd import recipe
-from fishd.addresses import virtual_pi_socket
-from fishd.clock import Clock, VirtualClock
 from fishd.config import Config
-from fishd.errors import SensorError
-from fishd.hardware import ownership, pulses
-from fishd.hardware.base import Bench, CalibratedServo, Panel, Robot
-from fishd.hardware.calibration import (
-    ForceCalibration,
-    ServoCalibration,
-    as_configured,
-    calibrated,
-)
+from fishd.config.drivers import claims_of
+from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.guard import Guard
+from fishd.control.loop import ControlLoop
+from fishd.control.reporting import Publisher
+from fishd.controllers import registry
+from fishd.core.addresses import virtual_pi_socket
+from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.clock import Clock, SystemClock, VirtualClock
+from fishd.core.errors import SensorError
+from fishd.core.signals import Truth
+from fishd.hardware import ownership, release_recipe
+from fishd.hardware.base import CalibratedParts, Panel, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
+from fishd.hardware.driver import ServoDriver
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.packages import driver_packages
-from fishd.hardware.simulated import SimulatedFish
-from fishd.signals import Truth
+from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.servo import pulses
+from fishd.hardware.servo.calibrated_servo import CalibratedServo
+from fishd.hardware.servo.pigpio import Pigpio
+from fishd.virtual.fish import SimulatedFish
 
 if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
-    from fishd.emulation.virtual_pi import VirtualPi
+    from fishd.virtual.pi.virtual_pi import VirtualPi
 
 log = logging.getLogger(__name__)
 
@@ -46,21 +52,21 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
     another fishd drives this robot, `ConfigError` when a calibration file is broken.
     """
     if config.robot == "simulated":
-        if file and not (recipe.read(str(file)) or {}).get("fresh"):
-            recipe.remove(str(file))  # of what the file said before
+        if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
+            release_recipe.remove(str(file))  # of what the file said before
         return SimulatedFish(config.plant, config.simulation, config.tick).robot()
     stack.enter_context(ownership.owned(parts_of(config)))
     if file:
-        recipe.remove(str(file))  # of an earlier fishd
+        release_recipe.remove(str(file))  # of an earlier fishd
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
-    return _assemble(config, clock, stack, threaded=True, file=file)
+    return assemble(config, clock, stack, threaded=True, file=file)
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
     """What no other fishd may drive meanwhile; `fishctl release`, the last resort, does not ask."""
     if config.robot == "pi":
-        return ownership.parts_of_pi(config.force_sensor, config.servo)
+        return ownership.parts_of_pi(claims_of(config.force_sensor, config.servo))
     if config.robot == "virtual-pi":
         return ownership.parts_of_virtual_pi(virtual_pi_socket(config.virtual_pi.socket))
     return ()
@@ -78,9 +84,9 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
 
     Its own clock runs ahead of the loop's by the rest of a conversion.
     """
-    from fishd.emulation.lgpio import EmulatedLgpio
-    from fishd.emulation.linux_i2c import LinuxI2c
-    from fishd.emulation.virtual_pi import VirtualPi
+    from fishd.virtual.pi.lgpio import EmulatedLgpio
+    from fishd.virtual.pi.linux_i2c import LinuxI2c
+    from fishd.virtual.pi.virtual_pi import VirtualPi
 
     clock = VirtualClock()
     clock.now = -config.tick  # so that the first read, at 0, finds a window
@@ -93,8 +99,14 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
         stack.enter_context(LinuxI2c(pi.bus.transfer, {settings.bus}, set_timeout))
     if _has_panel(config):
         stack.enter_context(EmulatedLgpio(pi.pins))
-    robot = _assemble(
-        with_pigpio_port(config, pi.pigpiod.port), clock, stack, threaded=False, truth=pi.tank.truth
+    servo = replace(config.servo, host="127.0.0.1", port=pi.pigpiod.port)
+    robot = assemble(
+        replace(config, servo=servo),
+        clock,
+        stack,
+        threaded=False,
+        truth=pi.tank.truth,
+        servo_driver=partial(Pigpio, standstill=pi.pigpiod.stands_still),
     )
     return InVirtualTime(robot, pi)
 
@@ -104,11 +116,11 @@ def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
 
     Raises `StartupError` where there is none, or a package is missing.
     """
-    from fishd.emulation.lgpio import EmulatedLgpio
-    from fishd.emulation.link import RemotePi
-    from fishd.emulation.linux_i2c import LinuxI2c
-    from fishd.emulation.pins import Pins
-    from fishd.emulation.wires import Wires
+    from fishd.virtual.pi.lgpio import EmulatedLgpio
+    from fishd.virtual.pi.link import RemotePi
+    from fishd.virtual.pi.linux_i2c import LinuxI2c
+    from fishd.virtual.pi.pins import Pins
+    from fishd.virtual.pi.wires import Wires
 
     path = virtual_pi_socket(config.virtual_pi.socket)
     remote = RemotePi(path)
@@ -131,26 +143,32 @@ def state_folder(config: Config) -> Path:
     return Path(state).expanduser() / "fishd" / config.robot
 
 
-def open_servo(config: Config, clock: Clock, *, threaded: bool) -> CalibratedServo:
-    """The servo alone; raises `StartupError` when its package is missing."""
-    found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
-    calibration = found[0] if found else as_configured(config.servo)
+def end_pulses(config: Config) -> bool:
+    """The last resort, when fishd is dead: neutral, then no pulses; False where there were none.
+
+    Raises `ServoError`, `StartupError` when a package is missing, and `ConfigError` when the
+    calibration cannot be read.
+    """
     settings = config.servo
-    if settings.driver == "pigpio":
-        with driver_packages():
-            from fishd.hardware.pigpio import PigpioServo
+    kind = SERVOS.find(settings.driver)
+    neutral = pulses.pulse_width(settings.calibrated(_servo_calibration(config)), 0.0)
+    with driver_packages(settings.driver):
+        if resort := kind.last_resort(settings):
+            return release_recipe.carry_out(resort.function, neutral, resort.arguments)
+        servo = kind(settings, neutral, SystemClock(), tick=config.tick, threaded=False)
+        try:
+            servo.off()
+        finally:
+            servo.close()
+    return False
 
-        return PigpioServo(settings, calibration, clock, threaded=threaded, tick=config.tick)
-    if settings.driver == "sysfs-pwm":
-        from fishd.hardware.sysfs_pwm import SysfsPwmServo
 
-        return SysfsPwmServo(settings, calibration, clock)
-    from fishd.hardware.rpi_gpio import RpiGpioServo
-
-    return RpiGpioServo(settings, calibration, clock)
+def _servo_calibration(config: Config) -> ServoCalibration:
+    found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
+    return found[0] if found else config.servo.calibration
 
 
-def _assemble(
+def assemble(
     config: Config,
     clock: Clock,
     stack: ExitStack,
@@ -158,39 +176,53 @@ def _assemble(
     threaded: bool,
     file: Path | None = None,
     truth: Callable[[], Truth] | None = None,
+    servo_driver: Callable[..., ServoDriver[Any]] | None = None,
 ) -> Robot:
-    from fishd.hardware.ads1115 import Ads1115Sensor
+    """The robot on the buses and pins that this process has now; as `open_robot` without claims.
 
+    threaded: False for a clock in virtual time
+    servo_driver: what opens the servo; by default the class that the configuration names
+    """
     panel = _open_panel(config, clock, stack)
     folder = CalibrationFolder(state_folder(config))
     found = folder.newest(ForceCalibration)
     for line in folder.ignored():
         log.warning("%s", line)
-    sensor = Ads1115Sensor(
-        config.force_sensor,
-        found[0] if found else ForceCalibration(),
-        clock,
-        threaded=threaded,
-        tick=config.tick,
+    sensor = open_sensor(
+        config, found[0] if found else ForceCalibration(), clock, threaded=threaded
     )
     stack.callback(sensor.close)
-    servo = open_servo(config, clock, threaded=threaded)
+    settings = config.servo
+    with driver_packages(settings.driver):
+        servo = CalibratedServo(
+            servo_driver or SERVOS.find(settings.driver),
+            settings,
+            _servo_calibration(config),
+            clock,
+            threaded=threaded,
+            tick=config.tick,
+        )
     stack.callback(servo.close)  # last in, first out: whatever fails, this is done first
-    tell_release = partial(_tell_release, config, file)
+
+    def tell_release(calibration: ServoCalibration) -> None:
+        """Leave what `fishd-release` needs to end these pulses quickly, whatever happens."""
+        if file and (resort := servo.driver.last_resort(settings)):
+            release_recipe.write(str(file), resort.function, servo.driver.neutral, resort.arguments)
+
     tell_release(servo.calibration)
     if threaded:
         _await_first_sample(sensor.read, clock)
 
-    if left := pulses.cut(config.servo, config.amplitude_limit):
+    if left := pulses.cut(settings, config.amplitude_limit):
         log.info("servo.lowest and servo.highest permit %s, amplitude_limit", left)
-    if line := _cut_by_calibration(config, servo.calibration):
+    if line := _cut_by_calibration(config, servo):
         log.warning("%s", line)
 
     def degraded() -> tuple[str, ...]:
-        lines = servo.degraded
+        lines = servo.driver.degraded
         if sensor.calibration.untouched:
             lines += ("the force is not calibrated: fishctl calibrate force",)
-        cut = _cut_by_calibration(config, servo.calibration)
+        cut = _cut_by_calibration(config, servo)
         return (*lines, cut) if cut else lines
 
     return Robot(
@@ -199,33 +231,30 @@ def _assemble(
         servo=servo,
         truth=truth,
         panel=panel,
-        bench=Bench(sensor, servo, tell_release),
+        calibrated=CalibratedParts(sensor, servo, tell_release),
         degraded=degraded,
-        counters=lambda: {**sensor.counters(), **servo.counters()},
-        countdown=servo.countdown,
+        counters=lambda: {**sensor.counters(), **servo.driver.counters()},
+        countdown=servo.driver.countdown,
     )
 
 
-def _tell_release(config: Config, file: Path | None, calibration: ServoCalibration) -> None:
-    """Leave what `fishd-release` needs to end these pulses quickly, whatever becomes of fishd."""
-    if file is None or config.servo.driver == "rpi-gpio":  # whose pulses end with fishd
-        return
-    servo = calibrated(config.servo, calibration)
-    where = {"host": servo.pigpio.host, "port": servo.pigpio.port}
-    sysfs = servo.sysfs
-    where |= {"root": sysfs.root, "chip": sysfs.chip, "channel": sysfs.channel}
-    neutral = pulses.pulse_width(servo, 0.0)
-    what = {"driver": servo.driver, "gpio": servo.gpio, "frequency": servo.frequency}
-    recipe.write(str(file), {**what, **where, "neutral": neutral})
+def open_sensor(
+    config: Config, calibration: ForceCalibration, clock: Clock, *, threaded: bool
+) -> SampledSensor:
+    """The force sensor alone; raises `StartupError` when a package is missing."""
+    settings = config.force_sensor
+    with driver_packages(settings.driver):
+        driver = FORCE_SENSORS.find(settings.driver)(settings, clock)
+    return SampledSensor(driver, calibration, clock, threaded=threaded, tick=config.tick)
 
 
-def _cut_by_calibration(config: Config, calibration: ServoCalibration) -> str:
+def _cut_by_calibration(config: Config, servo: CalibratedServo) -> str:
     """A line about a calibration of the servo with which it cannot go to ±Φ; empty if it can."""
-    left = pulses.cut(calibrated(config.servo, calibration), config.amplitude_limit)
-    if not left or calibration == as_configured(config.servo):
+    left = servo.cut(config.amplitude_limit)
+    if not left or servo.calibration == config.servo.calibration:
         return ""
     return (
-        f"the servo's calibration of {calibration.date or 'no date'} permits {left}, "
+        f"the servo's calibration of {servo.calibration.date or 'no date'} permits {left}, "
         "amplitude_limit: fishctl calibrate servo"
     )
 
@@ -256,7 +285,32 @@ def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
             return
 
 
-def with_pigpio_port(config: Config, port: int) -> Config:
-    """The configuration with the TCP port of pigpiod that was really taken."""
-    pigpio = replace(config.servo.pigpio, host="127.0.0.1", port=port)
-    return replace(config, servo=replace(config.servo, pigpio=pigpio))
+def build_loop(
+    config: Config,
+    robot: Robot,
+    clock: Clock,
+    publisher: Publisher,
+    notify: Callable[[float], None] = lambda now: None,
+) -> ControlLoop:
+    """A loop in which `config.start.controller` is in command, if there is one.
+
+    notify: called at the end of every tick with the time of its start [s, monotonic]
+    Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
+    """
+    guard = Guard(config.amplitude_limit, config.tick, config.slew_limit, config.fade_time)
+    if robot.calibrated:
+        guard.restrict(*robot.calibrated.servo.reach)
+    loop = ControlLoop(
+        robot=robot,
+        estimator=LateralForceEstimator(config.estimator),
+        guard=guard,
+        limits=config.limits,
+        clock=clock,
+        publisher=publisher,
+        notify=notify,
+    )
+    start = config.start
+    if start.controller is not None:
+        controller = registry.create(start.controller, start.parameters, config.limits)
+        loop.set_controller(start.controller, controller)
+    return loop

@@ -2,41 +2,28 @@
 
 from typing import Annotated, Any
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from fishd.controllers.base import Controller, Limits, amplitude_of
-from fishd.errors import ParameterError
-from fishd.signals import Observation
-
-Frequency = Annotated[float, Meta(gt=0, le=10)]
+from fishd.controllers import (
+    Amplitude,
+    Controller,
+    Limits,
+    Observation,
+    ParameterError,
+    amplitude_of,
+    unit,
+)
 
 
 class ChirpParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `chirp`."""
 
-    lowest: Annotated[
-        Frequency,
-        Meta(description="Frequency at which the sweep begins.", extra_json_schema={"unit": "Hz"}),
-    ] = 0.5
-    highest: Annotated[
-        Frequency,
-        Meta(description="Frequency at which it turns back.", extra_json_schema={"unit": "Hz"}),
-    ] = 3.0
-    sweep_time: Annotated[
-        float,
-        Meta(
-            ge=1,
-            le=3600,
-            description="Time from lowest to highest.",
-            extra_json_schema={"unit": "s"},
-        ),
-    ] = 60.0
+    lowest: Annotated[float, unit("Hz", "Frequency at which the sweep begins.", gt=0, le=10)] = 0.5
+    highest: Annotated[float, unit("Hz", "Frequency at which it turns back.", gt=0, le=10)] = 3.0
+    sweep_time: Annotated[float, unit("s", "Time from lowest to highest.", ge=1, le=3600)] = 60.0
     amplitude: Annotated[
-        Annotated[float, Meta(gt=0, le=3.1416)] | None,
-        Meta(
-            description="Instruction angle on either side; null: the robot's amplitude_limit.",
-            extra_json_schema={"unit": "rad"},
-        ),
+        Amplitude,
+        unit("rad", "Instruction angle on either side; null: the robot's amplitude_limit."),
     ] = None
 
 

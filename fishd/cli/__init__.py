@@ -1,1 +1,1 @@
-"""`fishctl`, the command line of fishd: one module per family of verbs."""
+"""The command line: `fishctl`, with a module for each family of verbs, and `fishd-release`."""

@@ -1,25 +1,45 @@
-"""Verbs about the configuration: check a file, show what is in force, print the schema."""
+"""Verbs about the configuration: check a file, show it, print its schema."""
 
 from pathlib import Path
 from typing import Any
 
 import click
 
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.completion import complete_key
+from fishd.cli.options import F, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.client import Fish
-from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file, to_yaml
-from fishd.console import complain
-from fishd.errors import ConfigError
-from fishd.hardware import pulses
+from fishd.config import (
+    FILE_VARIABLE,
+    SERVICE_FILE,
+    Config,
+    json_schema,
+    load,
+    service_file,
+    to_yaml,
+)
+from fishd.hardware.servo import pulses
 
 set_option = click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="KEY=VALUE",
+    shell_complete=complete_key,
     help="Override one key of the configuration, such as plant.omega0=10. Repeatable.",
 )
+
+
+def fish_options(function: F) -> F:
+    """`--config` and `--set` of verbs that are about a fish of one's own choice."""
+    option = click.option(
+        "--config",
+        "file",
+        type=click.Path(path_type=Path),
+        help="YAML file, as for fishd; without it, the defaults.",
+    )
+    return option(set_option(function))
+
 
 service_option = click.option(
     "--config",
@@ -30,20 +50,21 @@ service_option = click.option(
 )
 """`--config` of verbs that are about the fishd of this machine; goes with `load_service`."""
 
-EX_CONFIG = 78
-
 
 @click.group()
 def config() -> None:
-    """Check, show and explain the configuration."""
+    """Check and show the configuration, print its schema."""
 
 
 @config.command()
 @click.argument("file", type=click.Path(path_type=Path))
 @set_option
 def check(file: Path, overrides: tuple[str, ...]) -> None:
-    """Check a configuration file; exit status 78 when fishd would refuse it."""
-    loaded = load_or_exit(file, overrides)
+    """Check a configuration file.
+
+    Exit status 78 when fishd would refuse it.
+    """
+    loaded = load(file, overrides)
     echo(f"{file}: good")
     left = pulses.cut(loaded.servo, loaded.amplitude_limit)
     if left and loaded.robot != "simulated":
@@ -70,7 +91,7 @@ def show(
         with Fish(endpoint) as fish:
             shown: Config | dict[str, Any] = fish.config()
     else:
-        shown = load_or_exit(file, overrides)
+        shown = load(file, overrides)
     if as_json:
         print_json(shown)
     else:
@@ -79,19 +100,11 @@ def show(
 
 @config.command()
 def schema() -> None:
-    """Print the JSON Schema of the configuration, for editors and other programs."""
-    import msgspec
+    """Print the JSON Schema of the configuration.
 
-    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    print_json(dialect | msgspec.json.schema(Config))
-
-
-def load_or_exit(file: Path | None, overrides: tuple[str, ...]) -> Config:
-    """The configuration; one line and exit status 78 where it is wrong."""
-    try:
-        return load(file, overrides)
-    except ConfigError as error:
-        complain("fishctl", str(error), EX_CONFIG)
+    Editors and other programs read it.
+    """
+    print_json({"$schema": "https://json-schema.org/draft/2020-12/schema"} | json_schema())
 
 
 def load_service(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path | None]:
@@ -103,4 +116,4 @@ def load_service(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config,
         file = service_file()
         if file is not None:
             echo(f"fishctl: using {file}; --config names another file", err=True)
-    return load_or_exit(file, overrides), file
+    return load(file, overrides), file

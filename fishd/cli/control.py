@@ -2,55 +2,65 @@
 
 import datetime
 import os
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 import click
 
-from fishd.addresses import ENDPOINT_VARIABLE
+from fishd.cli.completion import active_parameters, complete_pair
 from fishd.cli.options import (
     ControllerGroup,
     ParameterType,
+    daemon_options,
     describe,
-    endpoint_option,
-    json_option,
 )
-from fishd.cli.output import echo, made_printable, print_json, spelled
+from fishd.cli.output import echo, echo_rows, made_printable, print_json, spelled
 from fishd.client import Fish
 from fishd.controllers import registry
-from fishd.errors import NoDaemon
-from fishd.protocol import State
-from fishd.signals import Percentiles, Reason, Status
+from fishd.core.addresses import ENDPOINT_VARIABLE
+from fishd.core.errors import NoDaemon
+from fishd.core.protocol import State
+from fishd.core.signals import Percentiles, Reason, Status
 
-
-def daemon_options(function: Any) -> Any:
-    """`--endpoint` and `--json`."""
-    return endpoint_option(json_option(function))
+T = TypeVar("T")
+_HELP = "docs/troubleshooting.md"
 
 
 @click.command()
+@click.option("--timing", is_flag=True, help="Show how well the loop keeps its time, too.")
 @daemon_options
-def status(endpoint: str | None, as_json: bool) -> None:
-    """Show what the daemon is doing, and how well."""
+def status(timing: bool, endpoint: str | None, as_json: bool) -> None:
+    """Show what the fish and its daemon are doing."""
     with Fish(endpoint) as fish:
         found = fish.status()
     if as_json:
         print_json(found)
-    else:
-        echo(_status_text(made_printable(found)))
+        return
+    rows = _status_rows(found := made_printable(found))
+    if timing:
+        rows += _timing_rows(found)
+    echo_rows(rows)
+
+
+def asked(
+    endpoint: str | None, ask: Callable[[Fish], list[T]], look: Callable[[], list[T]], what: str
+) -> list[T]:
+    """What the daemon knows; where none runs and none was named, what is found without it."""
+    try:
+        with Fish(endpoint) as fish:
+            return ask(fish)
+    except NoDaemon:
+        if endpoint or os.environ.get(ENDPOINT_VARIABLE):
+            raise
+        echo(f"fishctl: no fishd is running; these {what} are found from here", err=True)
+        return look()
 
 
 @click.command()
 @daemon_options
 def controllers(endpoint: str | None, as_json: bool) -> None:
     """List the controllers that the daemon knows, and their parameters."""
-    try:
-        with Fish(endpoint) as fish:
-            known = fish.controllers()
-    except NoDaemon:
-        if endpoint or os.environ.get(ENDPOINT_VARIABLE):
-            raise
-        echo("fishctl: no fishd is running; these controllers are installed here", err=True)
-        known = registry.describe_all()
+    known = asked(endpoint, Fish.controllers, registry.describe_all, "controllers")
     if as_json:
         print_json(known)
         return
@@ -62,47 +72,57 @@ def controllers(endpoint: str | None, as_json: bool) -> None:
 
 @click.group(cls=ControllerGroup, options=daemon_options, remote=True)
 def set_controller() -> None:
-    """Put another controller in command; parameters left out take their defaults."""
+    """Let another controller swim; parameters left out take their defaults."""
 
 
 @set_controller.action
 def _set_controller(
     name: str, parameters: dict[str, Any], endpoint: str | None, as_json: bool
 ) -> None:
-    with Fish(endpoint) as fish:
-        _print_state(fish.set_controller(name, **parameters), as_json)
+    _change(endpoint, as_json, lambda fish: fish.set_controller(name, **parameters))
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # -1 is a value
-@click.argument("pairs", nargs=-1, required=True, metavar="NAME VALUE [NAME VALUE]...")
+@click.argument(
+    "words",
+    nargs=-1,
+    required=True,
+    metavar="NAME VALUE|NAME=VALUE...",
+    shell_complete=complete_pair,
+)
 @daemon_options
-def set_parameter(pairs: tuple[str, ...], endpoint: str | None, as_json: bool) -> None:
+def set_parameter(words: tuple[str, ...], endpoint: str | None, as_json: bool) -> None:
     """Change parameters of the running controller while the fish swims, all or none of them."""
-    if len(pairs) % 2:
-        raise click.UsageError("every NAME needs a VALUE, such as: C 0.7")
-    with Fish(endpoint) as fish:
-        running = fish.status().controller
-        known = {
-            field.name: field
-            for i in fish.controllers()
-            if i.name == running
-            for field in i.parameters
+    pairs = list(_pairs(words))
+
+    def change(fish: Fish) -> State:
+        known = active_parameters(fish)
+        # The daemon refuses a name that the controller does not have, and says which it has.
+        values = {
+            name: ParameterType(known[name]).convert(text, None, None) if name in known else text
+            for name, text in pairs
         }
-        values: dict[str, Any] = {}
-        for given, text in zip(pairs[::2], pairs[1::2], strict=True):
-            name = given.lstrip("-").replace("-", "_")
-            field = known.get(name)
-            # The daemon refuses a name that the controller does not have, and says which it has.
-            values[name] = ParameterType(field).convert(text, None, None) if field else text
-        _print_state(fish.set_parameters(**values), as_json)
+        return fish.set_parameters(**values)
+
+    _change(endpoint, as_json, change)
+
+
+def _pairs(words: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Names and values of `NAME VALUE`, `NAME=VALUE` and `--NAME VALUE`, in any mixture."""
+    rest = iter(words)
+    for word in rest:
+        name, equals, text = word.partition("=")
+        value = text if equals else next(rest, None)
+        if value is None:
+            raise click.UsageError(f"every NAME needs a VALUE, such as: {name} 0.7, or {name}=0.7")
+        yield name.lstrip("-").replace("-", "_"), value
 
 
 @click.command()
 @daemon_options
 def stop(endpoint: str | None, as_json: bool) -> None:
     """Fade to neutral and stay there."""
-    with Fish(endpoint) as fish:
-        _print_state(fish.stop(), as_json)
+    _change(endpoint, as_json, Fish.stop)
 
 
 @click.command()
@@ -110,16 +130,14 @@ def stop(endpoint: str | None, as_json: bool) -> None:
 @daemon_options
 def estop(message: str, endpoint: str | None, as_json: bool) -> None:
     """Emergency stop: no more pulses, at once, until 'fishctl clear-fault'."""
-    with Fish(endpoint) as fish:
-        _print_state(fish.estop(message), as_json)
+    _change(endpoint, as_json, lambda fish: fish.estop(message))
 
 
 @click.command()
 @daemon_options
 def clear_fault(endpoint: str | None, as_json: bool) -> None:
     """Leave mode fault or estop; the servo gets pulses again and goes to neutral."""
-    with Fish(endpoint) as fish:
-        _print_state(fish.clear_fault(), as_json)
+    _change(endpoint, as_json, Fish.clear_fault)
 
 
 @click.command()
@@ -135,7 +153,10 @@ def mark(words: str, endpoint: str | None, as_json: bool) -> None:
         echo(f"marked before tick {state.seq}: {words}")
 
 
-def _print_state(state: State, as_json: bool) -> None:
+def _change(endpoint: str | None, as_json: bool, change: Callable[[Fish], State]) -> None:
+    """Ask for a change, and print the state afterwards."""
+    with Fish(endpoint) as fish:
+        state = change(fish)
     if as_json:
         print_json(state)
         return
@@ -144,38 +165,58 @@ def _print_state(state: State, as_json: bool) -> None:
     echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
 
 
-def _status_text(status: Status) -> str:
-    reason = f" ({_why(status.reason)})" if status.reason else ""
-    timing = status.timing
-    thrust = "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
-    scheduling = "real-time" if status.realtime else "normal"
+def _status_rows(status: Status) -> list[tuple[str, str]]:
+    """The fish first, the daemon last."""
+    mode = [("mode", status.mode)]
+    if status.reason:
+        mode = [
+            ("mode", f"{status.mode} ({_why(status.reason)})"),
+            ("to do", f"{_remedy(status.reason)}; then: fishctl clear-fault"),
+        ]
     uptime = datetime.timedelta(seconds=int(status.uptime))
     survived = {name: count for name, count in status.counters.items() if count}
-    rows = [
-        ("mode", status.mode + reason),
+    missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
+    return [
+        ("fish", f"{status.name}, {status.robot}"),
+        *mode,
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
-        ("thrust", f"{thrust} mN at {status.frequency:.2f} Hz"),
-        ("servo", f"{_servo(status)}, {_range(status)}"),
+        ("angle", f"{_angle(status)}, {_range(status)}"),
+        ("thrust", f"{_thrust(status)} mN at {status.frequency:.2f} Hz"),
+        *([("calibrating", "the servo, by a client")] if status.calibrating else []),
+        *(("degraded", line) for line in status.degraded),
+        *([("survived", spelled(survived))] if survived else []),
+        *([("late", missed)] if status.missed or status.overruns else []),
+        ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
+        ("telemetry", status.telemetry),
+    ]
+
+
+def _remedy(reason: Reason) -> str:
+    return f"{reason.remedy or 'mend the cause'} ({_HELP}, {reason.code})"
+
+
+def _timing_rows(status: Status) -> list[tuple[str, str]]:
+    timing = status.timing
+    scheduling = "real-time" if status.realtime else "normal"
+    return [
         ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling"),
         ("", f"slots missed: {status.missed}, overruns: {status.overruns}"),
         ("late", _percentiles(timing.lateness)),
         ("busy", _percentiles(timing.busy)),
         *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
-        *([("calibrating", "the servo, by a client")] if status.calibrating else []),
-        ("robot", status.robot),
-        *(("degraded", line) for line in status.degraded),
-        *([("survived", spelled(survived))] if survived else []),
-        ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
-        ("telemetry", status.telemetry),
     ]
-    return "\n".join(f"{name:<12}{value}" for name, value in rows)
 
 
-def _servo(status: Status) -> str:
+def _thrust(status: Status) -> str:
+    return "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
+
+
+def _angle(status: Status) -> str:
     if not status.servo_on:
         return "no pulses"
-    return "cannot be reached, may still have pulses" if status.servo_lost else "on"
+    lost = "; the servo cannot be reached, may still have pulses" if status.servo_lost else ""
+    return f"{status.phi_c:+.3f} rad{lost}"
 
 
 def _range(status: Status) -> str:

@@ -7,31 +7,41 @@ import msgspec
 
 from fishd import __version__
 from fishd.cli.verbs import Verb, Verbs
-from fishd.console import complain, run
-from fishd.errors import FishdError, Refused
+from fishd.core.console import INTERRUPTED, complain, run
+from fishd.core.errors import FishdError, Refused
 
 VERBS = {
-    "status": Verb("control", "status", "Show what the daemon is doing, and how well."),
-    "watch": Verb("watch", "watch", "Watch force, command and timing live."),
-    "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
-    "policies": Verb("policies", "policies", "List the named policies, or show one."),
-    "set-controller": Verb("control", "set_controller", "Put another controller in command."),
-    "set-parameter": Verb("control", "set_parameter", "Change parameters while the fish swims."),
-    "stop": Verb("control", "stop", "Fade to neutral and stay there."),
-    "estop": Verb("control", "estop", "Emergency stop: no more pulses, at once."),
-    "clear-fault": Verb("control", "clear_fault", "Leave mode fault or estop."),
-    "mark": Verb("control", "mark", "Put a mark in the event stream."),
-    "doctor": Verb("doctor", "doctor", "Check this machine, and say how to mend it."),
-    "tare": Verb("calibrate", "tare", "Call the present force zero."),
-    "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
-    "release": Verb(
-        "release", "release", "Last resort without the daemon: neutral, then no pulses."
-    ),
-    "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
-    "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
-    "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
-    "config": Verb("config", "config", "Check, show and explain the configuration."),
-    "completion": Verb("completion", "completion", "Print the completion script of a shell."),
+    "Watch": {
+        "status": Verb("control", "status", "Show what the fish and its daemon are doing."),
+        "watch": Verb("watch", "watch", "Watch force, command and timing live."),
+        "mark": Verb("control", "mark", "Put a mark in the event stream."),
+    },
+    "Swim and stop": {
+        "set-controller": Verb("control", "set_controller", "Let another controller swim."),
+        "set-parameter": Verb("control", "set_parameter", "Change parameters while it swims."),
+        "stop": Verb("control", "stop", "Fade to neutral and stay there."),
+        "estop": Verb("control", "estop", "Emergency stop: no more pulses, at once."),
+        "clear-fault": Verb("control", "clear_fault", "Leave mode fault or estop."),
+        "release": Verb(
+            "release", "release", "Last resort without the daemon: neutral, then no pulses."
+        ),
+        "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
+        "policies": Verb("policies", "policies", "List the named policies, or show one."),
+    },
+    "Calibrate": {
+        "tare": Verb("calibrate", "tare", "Call the present force zero."),
+        "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
+    },
+    "Simulate and learn": {
+        "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
+        "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
+        "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
+    },
+    "Check and configure": {
+        "doctor": Verb("doctor", "doctor", "Check this machine, and say how to mend it."),
+        "config": Verb("config", "config", "Check and show the configuration, print its schema."),
+        "completion": Verb("completion", "completion", "Print the completion script of a shell."),
+    },
 }
 
 
@@ -58,7 +68,7 @@ def main() -> None:
     except msgspec.DecodeError as error:
         complain("fishctl", f"what answers at this endpoint is no fishd: {error}", 1)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except BrokenPipeError:  # the reader, `head` say, has seen enough
         sys.stderr.close()
         sys.exit(0)

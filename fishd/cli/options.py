@@ -8,12 +8,13 @@ from typing import Any, TypeVar, cast
 import click
 from click.shell_completion import CompletionItem
 
+from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
 from fishd.client import Fish
 from fishd.controllers import registry
-from fishd.errors import FishError, UnknownController
-from fishd.schema import Field, names_file, spelled, wanted
-from fishd.signals import ControllerInfo
+from fishd.core.errors import FishError, UnknownController
+from fishd.core.schema import Field, names_file, spelled, wanted
+from fishd.core.signals import ControllerInfo
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -30,6 +31,11 @@ endpoint_option = click.option(
     callback=_remember,
     help="Control socket of the daemon; default: $FISHD_ENDPOINT, else the one on this machine.",
 )
+
+
+def daemon_options(function: F) -> F:
+    """`--endpoint` and `--json`."""
+    return endpoint_option(json_option(function))
 
 
 class ParameterType(click.ParamType[Any]):
@@ -56,14 +62,8 @@ class ParameterType(click.ParamType[Any]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Files, and the names of policies, where the parameter takes them."""
-        if not self.field.file:
-            return []
-        from fishd.policies import library
-
-        names = library.names() if self.field.file == library.SUFFIX else []
-        matching = [CompletionItem(name) for name in names if name.startswith(incomplete)]
-        return [*matching, CompletionItem(incomplete, type="file")]
+        """What there is to choose from."""
+        return complete_value(self.field, incomplete)
 
 
 def _finite(text: str) -> float:
@@ -163,7 +163,7 @@ class ControllerGroup(click.Group):
         self, ctx: click.Context, name: str, unknown: UnknownController
     ) -> ControllerInfo:
         try:
-            with Fish(ctx.params.get("endpoint") or ctx.find_root().obj) as fish:
+            with Fish(endpoint_of(ctx)) as fish:
                 known = {info.name: info for info in map(made_printable, fish.controllers())}
         except FishError:
             raise unknown from None

@@ -1,12 +1,14 @@
 """How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
 
 import re
+from collections.abc import Iterable
+from datetime import datetime
 from typing import Any, TypeVar
 
 import click
 import msgspec
 
-from fishd import text
+from fishd.core import text
 
 T = TypeVar("T")
 
@@ -17,6 +19,11 @@ _MOST = 1_000_000
 def echo(message: Any = "", *, err: bool = False, nl: bool = True) -> None:
     """Print lines without any control character in them, on standard error where wanted."""
     click.echo(text.block(str(message), _MOST), err=err, nl=nl)
+
+
+def echo_rows(rows: Iterable[tuple[str, str]]) -> None:
+    """Print what each thing is called, and what it is, in two columns."""
+    echo("\n".join(f"{name:<12}{what}" for name, what in rows))
 
 
 def print_json(value: Any) -> None:
@@ -43,6 +50,11 @@ def spelled(parameters: dict[str, Any]) -> str:
 def counted(number: int, noun: str) -> str:
     """A number of things: `1 warning`, `2 warnings`."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def time_of_day(t: float) -> str:
+    """Of unix time [s], here: `13:05:59`."""
+    return f"{datetime.fromtimestamp(t):%H:%M:%S}"
 
 
 def _printable(value: Any) -> Any:

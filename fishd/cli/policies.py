@@ -1,20 +1,19 @@
 """The verb that lists the named policies, and shows what a policy file says about itself."""
 
-import os
 from pathlib import Path
 from typing import Any
 
 import click
 
-from fishd import text
-from fishd.addresses import ENDPOINT_VARIABLE
-from fishd.cli.control import daemon_options
+from fishd.cli.control import asked
+from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, print_json
 from fishd.client import Fish
-from fishd.errors import NoDaemon, PolicyError
-from fishd.policies import library
-from fishd.policies.info import PolicyInfo
-from fishd.schema import names_file
+from fishd.controllers.policy import library
+from fishd.core import text
+from fishd.core.errors import PolicyError
+from fishd.core.protocol import PolicyInfo
+from fishd.core.schema import names_file
 
 HEAD = ("name", "Φ [rad]", "tick", "trained in", "steps", "efficiency", "created", "folder")
 WIDEST = 40
@@ -38,7 +37,7 @@ def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
     elif known:
         echo(_table(known))
     else:
-        echo(f"none; put {library.SUFFIX} files into {library.folders()[0]}", err=True)
+        echo(f"no policies here; put {library.SUFFIX} files into {library.folders()[0]}", err=True)
 
 
 @policies.command()
@@ -46,7 +45,10 @@ def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
 @daemon_options
 @click.pass_context
 def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -> None:
-    """Print all that a policy file says about itself: its inputs, and how it was trained."""
+    """Print what a policy file says about itself.
+
+    Its inputs, what it fits, and how it was trained.
+    """
     if names_file(policy, library.SUFFIX):
         found = library.describe(policy)
     else:
@@ -64,14 +66,7 @@ def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -
 
 def _known(endpoint: str | None) -> list[PolicyInfo]:
     """Those that the daemon finds; without one, those of this user and machine."""
-    try:
-        with Fish(endpoint) as fish:
-            return fish.policies()
-    except NoDaemon:
-        if endpoint or os.environ.get(ENDPOINT_VARIABLE):
-            raise
-        echo("fishctl: no fishd is running; these policies are found from here", err=True)
-        return library.describe_all()
+    return asked(endpoint, Fish.policies, library.describe_all, "policies")
 
 
 def _table(known: list[PolicyInfo]) -> str:

@@ -8,9 +8,8 @@ from msgspec.structs import replace
 
 from fishd.cli.config import load_service, service_option, set_option
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config
-from fishd.errors import ConfigError, ServoError
-from fishd.hardware.base import CalibratedServo
-from fishd.recipe import NOT_RELEASED
+from fishd.core.errors import ConfigError, ServoError
+from fishd.hardware.release_recipe import NOT_RELEASED
 
 _NO_FOLDER = "/proc/self/no-calibrations"
 """Nobody can make it: as on a machine where nothing was ever calibrated."""
@@ -22,8 +21,8 @@ _NO_FOLDER = "/proc/self/no-calibrations"
 def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     """Send the servo to neutral and stop its pulses, without the daemon.
 
-    systemd runs this when the service has ended (ExecStopPost). A servo without pulses is left
-    alone. Exit status 1 when the servo cannot be reached, and when no configuration says where a
+    systemd runs this when the service has ended (ExecStopPost). A servo without pulses is not
+    touched. Exit status 1 when the servo cannot be reached, and when no configuration says where a
     servo is: the defaults are those of a simulated fish. One that a file says is simulated has
     nothing to release, and that is no error.
     """
@@ -32,7 +31,7 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     why = f"the service ended with '{ended}': " if ended else ""
     if config.robot != "simulated":
         try:
-            done = _open(config).neutralise()
+            done = _end_pulses(config)
         except ServoError as error:
             raise ServoError(f"{error}; {NOT_RELEASED}") from None
         click.echo(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
@@ -47,16 +46,16 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     return 0
 
 
-def _open(config: Config) -> CalibratedServo:
-    """The servo, even if its calibration cannot be read: neutral may then be off by the trim."""
-    from fishd.clock import SystemClock
-    from fishd.robots import open_servo
+def _end_pulses(config: Config) -> bool:
+    """True where there were any; even if the calibration cannot be read: neutral may then be off
+    by the trim.
+    """
+    from fishd.wiring import end_pulses
 
-    clock = SystemClock()
     try:
-        return open_servo(config, clock, threaded=False)
+        return end_pulses(config)
     except ServoError:
         raise
     except (ConfigError, OSError) as error:
         click.echo(f"fishctl: {error}; going on without it", err=True)
-        return open_servo(replace(config, state_folder=_NO_FOLDER), clock, threaded=False)
+        return end_pulses(replace(config, state_folder=_NO_FOLDER))

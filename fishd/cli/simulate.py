@@ -5,43 +5,38 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.config import load_or_exit, set_option
+from fishd.cli.config import fish_options
 from fishd.cli.options import ControllerGroup, json_option
-from fishd.cli.output import echo, print_json, spelled
+from fishd.cli.output import echo, echo_rows, print_json, spelled
+from fishd.config import Config, load
 
 if TYPE_CHECKING:
     from fishd.simulation import Report
 
+_ROUNDED = "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
 
-def simulation_options(function: Any) -> Any:
-    """The options of a run."""
-    for option in reversed(
-        (
-            click.option(
-                "--seconds", type=float, default=60.0, show_default=True, help="Length of the run."
-            ),
-            click.option(
-                "--settle",
-                type=float,
-                default=10.0,
-                show_default=True,
-                help="Time before figures are taken [s].",
-            ),
-            click.option(
-                "--config",
-                "file",
-                type=click.Path(path_type=Path),
-                help="YAML file; without it, the defaults.",
-            ),
-            set_option,
-            json_option,
-        )
+
+def run_options(function: Any) -> Any:
+    """The options of a run in virtual time, of this verb and of `learn evaluate`."""
+    for option in (
+        json_option,
+        fish_options,
+        click.option(
+            "--settle",
+            type=float,
+            default=10.0,
+            show_default=True,
+            help="Time before figures are taken [s].",
+        ),
+        click.option(
+            "--seconds", type=float, default=60.0, show_default=True, help="Length of each run [s]."
+        ),
     ):
         function = option(function)
     return function
 
 
-@click.group(cls=ControllerGroup, options=simulation_options)
+@click.group(cls=ControllerGroup, options=run_options)
 def simulate() -> None:
     """Swim a simulated fish in virtual time, with the very loop that runs on the robot."""
 
@@ -58,11 +53,12 @@ def _simulate(
 ) -> int:
     from fishd.simulation import simulate as run
 
-    report = run(load_or_exit(file, overrides), name, parameters, seconds, settle)
+    config = load(file, overrides)
+    report = run(config, name, parameters, seconds, settle)
     if as_json:
         print_json(report)
     else:
-        echo(_text(report))
+        echo_rows(_rows(report, config, settle))
     if report.fallback:
         echo(f"fishctl: another controller took over: {report.fallback.message}", err=True)
     if report.reason:
@@ -71,12 +67,15 @@ def _simulate(
     return 0
 
 
-def _text(report: "Report") -> str:
+def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, str]]:
     best = f"{report.best_square_thrust * 1e3:.3f} mN at {report.best_square_frequency:.3f} Hz"
-    rows = [
-        ("controller", f"{report.controller} {spelled(report.parameters)}"),
+    return [
+        (
+            "controller",
+            f"{report.controller} {spelled(report.parameters)} {_until(report, settle)}".rstrip(),
+        ),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
-        ("frequency", f"{report.frequency:.3f} Hz"),
+        ("frequency", f"{report.frequency:.3f} Hz{_half_beats(report, config.tick)}"),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
         (
             "command",
@@ -87,11 +86,30 @@ def _text(report: "Report") -> str:
             "efficiency",
             f"{report.efficiency:.1%} of the best square wave at ±{report.amplitude:g} rad",
         ),
-        ("", f"({best})"),
+        ("", f"({best}, where half beats need not be whole ticks)"),
+        *([("", _ROUNDED)] if config.robot == "virtual-pi" else []),
         (
             "timing",
             f"{report.ticks} ticks of {report.microseconds_per_tick:.0f} µs, "
             f"{report.real_time_factor:.0f} × real time",
         ),
     ]
-    return "\n".join(f"{label:<12}{text}" for label, text in rows)
+
+
+def _until(report: "Report", settle: float) -> str:
+    """Who swam, where that was not only the one that was asked to."""
+    if report.took_over is None:
+        return ""
+    whose = "whose figures these are" if report.took_over <= settle else "the figures are of both"
+    return f"until {report.took_over:.2f} s, then {report.successor}; {whose}"
+
+
+def _half_beats(report: "Report", tick: float) -> str:
+    """The half beats that were swum: a reversal waits for a tick."""
+    lengths = sorted(set(report.half_beats) - {0})
+    if not lengths:
+        return ""
+    ticks = " to ".join(map(str, lengths))
+    alone = " to ".join(f"{0.5 / (length * tick):.3f}" for length in lengths)
+    each = f" ({alone} Hz)" if len(lengths) > 1 else ""
+    return f", in half beats of {ticks} ticks{each}"

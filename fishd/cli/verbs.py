@@ -1,4 +1,4 @@
-"""A group of verbs, each of which is imported only when it is called."""
+"""Groups of verbs: each verb is imported only when it is called, help lists them by purpose."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -21,24 +21,32 @@ class Verb(NamedTuple):
 class Verbs(click.Group):
     """So that `fishctl status` does not wait for what others need."""
 
-    def __init__(self, *args: Any, verbs: Mapping[str, Verb], **kwargs: Any) -> None:
-        """verbs: by name, in the order in which help lists them"""
+    def __init__(self, *args: Any, verbs: Mapping[str, Mapping[str, Verb]], **kwargs: Any) -> None:
+        """verbs: by the heading in help that they stand below, and by name"""
+        self._sections = verbs
+        self._verbs = {name: verb for section in verbs.values() for name, verb in section.items()}
+        # click suggests the nearest of these for a name that is misspelled.
+        stubs = {name: click.Command(name) for name in self._verbs}
         super().__init__(*args, **kwargs)
-        self.verbs = verbs
+        self.commands.update(stubs)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """All verbs."""
-        return list(self.verbs)
+        """All verbs, in the order of help."""
+        return list(self._verbs)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a verb."""
-        verb = self.verbs.get(cmd_name)
+        verb = self._verbs.get(cmd_name)
         if verb is None:
             return None
         command: click.Command = getattr(import_module(f"fishd.cli.{verb.module}"), verb.command)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the verbs without importing any."""
-        with formatter.section("Verbs"):
-            formatter.write_dl([(name, verb.about) for name, verb in self.verbs.items()])
+        """List the verbs below their headings, without importing any."""
+        width = max(map(len, self._verbs))
+        for heading, section in self._sections.items():
+            with formatter.section(heading):
+                formatter.write_dl(
+                    [(f"{name:<{width}}", verb.about) for name, verb in section.items()]
+                )

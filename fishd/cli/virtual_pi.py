@@ -9,38 +9,25 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
-from fishd import realtime
-from fishd.addresses import virtual_pi_socket
-from fishd.cli.config import load_or_exit, set_option
+from fishd.cli.config import fish_options
 from fishd.cli.options import json_option
-from fishd.cli.output import echo, print_json
-from fishd.config import Config
-from fishd.console import complain
-from fishd.emulation.faults import FAULTS
-from fishd.emulation.link import RemotePi
-from fishd.emulation.link_server import LinkServer
-from fishd.emulation.punctual_clock import PunctualClock
-from fishd.emulation.virtual_pi import PiState, VirtualPi
+from fishd.cli.output import echo, echo_rows, print_json
+from fishd.config import Config, load
+from fishd.core.addresses import virtual_pi_socket
+from fishd.core.console import complain
+from fishd.daemon import realtime
 from fishd.hardware.settings import PanelSettings
+from fishd.virtual.pi.faults import FAULTS
+from fishd.virtual.pi.link import RemotePi
+from fishd.virtual.pi.link_server import LinkServer
+from fishd.virtual.pi.virtual_pi import PiState, PunctualClock, VirtualPi
 
 CHIP_PRIORITY = 60
 """SCHED_FIFO priority of a virtual Pi, above that of the fishd that drives it."""
-
-
-def config_options(function: Any) -> Any:
-    """`--config` and `--set`: those of the fishd that uses this virtual Pi."""
-    option = click.option(
-        "--config",
-        "file",
-        type=click.Path(path_type=Path),
-        help="YAML file, the same as for fishd; without it, the defaults.",
-    )
-    return option(set_option(function))
 
 
 def _complete(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -68,10 +55,10 @@ def virtual_pi() -> None:
 
 
 @virtual_pi.command()
-@config_options
+@fish_options
 def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     """Run a virtual Pi until Ctrl-C or SIGTERM."""
-    config = load_or_exit(file, overrides)
+    config = load(file, overrides)
     with contextlib.suppress(OSError):  # where permitted: chips do not wait for a busy machine
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(CHIP_PRIORITY))
     realtime.enter(priority=0, lock_memory=False)  # for the sleeps that stand for bus time
@@ -97,19 +84,19 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
 @virtual_pi.command()
 @click.argument("name", shell_complete=_complete)
 @click.option("--seconds", type=float, help="How long it lasts; without this, until 'clear'.")
-@config_options
+@fish_options
 def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple[str, ...]) -> None:
-    """Let the fault NAME begin; 'fishctl virtual-pi faults' lists them."""
-    with _remote(load_or_exit(file, overrides)) as pi:
+    """Begin the fault NAME; 'fishctl virtual-pi faults' lists them."""
+    with _remote(load(file, overrides)) as pi:
         pi.inject(name, seconds)
 
 
 @virtual_pi.command()
 @click.argument("name", required=False, shell_complete=_complete)
-@config_options
+@fish_options
 def clear(name: str | None, file: Path | None, overrides: tuple[str, ...]) -> None:
     """End the fault NAME, or all faults."""
-    with _remote(load_or_exit(file, overrides)) as pi:
+    with _remote(load(file, overrides)) as pi:
         pi.clear(name)
 
 
@@ -125,11 +112,11 @@ def faults(as_json: bool) -> None:
 
 
 @virtual_pi.command()
-@config_options
+@fish_options
 @json_option
 def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Show pulses, fish and faults of the virtual Pi that is running."""
-    with _remote(load_or_exit(file, overrides)) as pi:
+    with _remote(load(file, overrides)) as pi:
         state = pi.state()
     if as_json:
         print_json(state)
@@ -142,21 +129,21 @@ def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None
         ("faults", _active(state) or "none"),
         ("pigpiod", f"127.0.0.1:{state.pigpio_port}"),
     ]
-    echo("\n".join(f"{label:<12}{text}" for label, text in rows))
+    echo_rows(rows)
 
 
 @virtual_pi.command()
-@config_options
+@fish_options
 def press(file: Path | None, overrides: tuple[str, ...]) -> None:
     """Press the E-stop button and keep it pressed."""
-    _set_button(load_or_exit(file, overrides), pressed=True)
+    _set_button(load(file, overrides), pressed=True)
 
 
 @virtual_pi.command()
-@config_options
+@fish_options
 def unpress(file: Path | None, overrides: tuple[str, ...]) -> None:
     """Let the E-stop button go."""
-    _set_button(load_or_exit(file, overrides), pressed=False)
+    _set_button(load(file, overrides), pressed=False)
 
 
 @contextmanager
@@ -175,7 +162,7 @@ def _signals() -> Iterator[Callable[[float], bool]]:
 def _set_button(config: Config, pressed: bool) -> None:
     panel = config.panel
     if panel.estop_gpio is None:
-        complain("fishctl", "panel.estop_gpio is null: the configuration has no E-stop button", 1)
+        complain("fishctl", "no E-stop button: panel.estop_gpio is null, its GPIO is needed", 1)
     with _remote(config) as pi:
         pi.set_level(panel.estop_gpio, _level(panel, pressed))
 

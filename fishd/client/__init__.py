@@ -1,4 +1,4 @@
-"""The Python API to a running daemon: what fishctl itself is made of.
+"""The Python API to a running daemon, which `fishctl` is made of, too.
 
     with Fish() as fish:
         fish.set_controller("swing", C=0.6)
@@ -12,7 +12,7 @@
 from typing import TYPE_CHECKING, Any
 
 from fishd.client.synchronous import Fish
-from fishd.errors import FishError, NoDaemon, Refused
+from fishd.core.errors import FishError, NoDaemon, Refused
 
 if TYPE_CHECKING:
     from fishd.client.agent import Agent

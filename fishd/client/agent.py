@@ -11,10 +11,8 @@ from typing import Self
 import msgspec
 import zmq
 
-from fishd.addresses import claimed
 from fishd.client.connection import milliseconds_until
-from fishd.errors import FishError, NoDaemon, ParameterError, StartupError
-from fishd.remote.messages import (
+from fishd.controllers.remote.messages import (
     MAX_MESSAGE,
     VERSION,
     Action,
@@ -25,7 +23,8 @@ from fishd.remote.messages import (
     decode_from_fish,
     encode,
 )
-from fishd.zmq_address import why_not_bound
+from fishd.core.addresses import claimed, parse
+from fishd.core.errors import FishError, NoDaemon, ParameterError, StartupError
 
 PATIENCE = 10.0
 """How long to wait for an observation [s]."""
@@ -171,30 +170,31 @@ class Agent:
         if self._strange:
             return NoDaemon(f"{why}, but what is none: {self._strange}")
         if self.latest and not self.in_command:
-            return NoDaemon(f"{why}: another controller is in command, or none")
+            return NoDaemon(f"{why}: another controller is active, or none")
         return NoDaemon(
-            f"{why}: is a fishd running, and in command "
+            f"{why}: is a fishd running, and was it asked to "
             f"'fishctl set-controller remote --agent {self.address}'?"
         )
 
 
 def _bound(address: str, stack: ExitStack) -> "zmq.Socket[bytes]":
     """A socket that listens there until the stack is closed; raises `FishError`."""
-    why = why_not_bound(address)
-    if not why:
-        try:
-            stack.enter_context(claimed(address, "another program", "choose another address"))
-            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-            stack.callback(context.destroy, linger=100)
-            socket = context.socket(zmq.ROUTER)
-            socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
-            socket.set(zmq.LINGER, 100)
-            socket.bind(address)
-            return socket
-        except StartupError as error:
-            raise FishError(f"an agent cannot listen on '{address}': {error}") from None
-        except zmq.ZMQError as error:
-            why = zmq.strerror(error.errno or 0)
+    try:
+        parse(address)
+        stack.enter_context(claimed(address, "another program", "choose another address"))
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        stack.callback(context.destroy, linger=100)
+        socket = context.socket(zmq.ROUTER)
+        socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
+        socket.set(zmq.LINGER, 100)
+        socket.bind(address)
+        return socket
+    except StartupError as error:
+        raise FishError(f"an agent cannot listen on '{address}': {error}") from None
+    except zmq.ZMQError as error:
+        why = zmq.strerror(error.errno or 0)
+    except ValueError as error:
+        why = str(error)
     raise FishError(
         f"an agent cannot listen on '{address}': {why}; "
         "write tcp://127.0.0.1:* for any free port, tcp://HOST:PORT or ipc://PATH"

@@ -10,10 +10,9 @@ import msgspec
 import zmq.asyncio
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
-from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
-from fishd.policies.info import PolicyInfo
-from fishd.protocol import LOADING, Calibrations, State
-from fishd.signals import ControllerInfo, Event, Status, Tick
+from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
+from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
 
@@ -60,7 +59,7 @@ class AsyncFish(Connection):
         return await self._call(dict[str, Any], "config")
 
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Put another controller in command; parameters left out take their defaults.
+        """Select another controller; parameters left out take their defaults.
 
         It may take `protocol.LOADING` seconds to load, beyond the time-out.
         """
@@ -89,7 +88,7 @@ class AsyncFish(Connection):
         return await self._call(State, "mark", text=text)
 
     async def calibrations(self) -> Calibrations:
-        """The calibrations of force sensor and servo that are in force."""
+        """The calibrations of force sensor and servo that are used."""
         return await self._call(Calibrations, "calibrations")
 
     async def sample_force(self, seconds: float = 2.0) -> ForceSample:
@@ -105,31 +104,31 @@ class AsyncFish(Connection):
         return await self._call(Calibrations, "tare", sample=sample.number)
 
     async def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
-        """Put another calibration of the force sensor in force, and save it."""
+        """Apply another calibration of the force sensor, and save it."""
         return await self._call(Calibrations, "calibrate-force", calibration=calibration)
 
     async def calibrate_servo(
-        self, calibration: ServoCalibration, *, save: bool, loan: str | None = None
+        self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
     ) -> Calibrations:
-        """Put another calibration of the servo in force, and save it or not.
+        """Apply another calibration of the servo, and save it or not.
 
-        One that is not saved is a loan, the `loan` of the answer: it ends after `protocol.LOAN`
+        One that is not saved is a lease, the `lease` of the answer: it ends after `protocol.LEASE`
         seconds unless it is renewed. Name it in further changes, and to save.
         """
         return await self._call(
-            Calibrations, "calibrate-servo", calibration=calibration, save=save, loan=loan
+            Calibrations, "calibrate-servo", calibration=calibration, save=save, lease=lease
         )
 
-    async def renew_loan(self, loan: str) -> Calibrations:
+    async def renew_lease(self, lease: str) -> Calibrations:
         """Let a calibration of the servo that is not saved last for another while."""
-        return await self._call(Calibrations, "renew-loan", loan=loan)
+        return await self._call(Calibrations, "renew-lease", lease=lease)
 
-    async def end_loan(self, loan: str) -> Calibrations:
-        """Begin to end a loan: neutral, then the calibration of before is in force again.
+    async def end_lease(self, lease: str) -> Calibrations:
+        """Begin to end a lease: neutral, then the calibration of before is used again.
 
-        That is done when `calibrations` says no `loan` any more.
+        That is done when `calibrations` says no `lease` any more.
         """
-        return await self._call(Calibrations, "end-loan", loan=loan)
+        return await self._call(Calibrations, "end-lease", lease=lease)
 
     def ticks(self) -> AsyncIterator[Tick]:
         """Every tick from the first iteration on; raises `NoDaemon` when none comes in time."""

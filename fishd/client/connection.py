@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import msgspec
 import zmq
 
-from fishd import protocol, text
-from fishd.addresses import ENDPOINT_VARIABLE, find_control, is_deserted, socket_path
-from fishd.errors import NoDaemon, ParameterError, Refused, Untrusted
-from fishd.socket_owner import Listener, listener, stranger
+from fishd.core import protocol, text
+from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, socket_path
+from fishd.core.errors import NoDaemon, ParameterError, Refused, Untrusted
+from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
 
 T = TypeVar("T")
 
@@ -26,6 +26,7 @@ class Connection:
 
     def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
         self.endpoint = endpoint or find_control()
+        self._path = socket_path(self.endpoint)
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.timeout = timeout
         self.telemetry_address = telemetry
@@ -36,7 +37,7 @@ class Connection:
 
         Raises `Untrusted` where a stranger would. An endpoint that the user named is trusted.
         """
-        if is_deserted(self.endpoint):
+        if self._path and is_deserted(self._path):
             raise self._nobody("nobody listens there")
         try:
             self._listener()
@@ -45,7 +46,7 @@ class Connection:
                 f"this user may not ask the fishd at {self.endpoint}: join the group of its socket "
                 "('sudo usermod -aG fishd USER' for the service), log in again, then try again"
             ) from None
-        if not self._was_named and (why := stranger(socket_path(self.endpoint))):
+        if self._path and not self._was_named and (why := stranger(self._path)):
             raise Untrusted(
                 f"what listens at {self.endpoint} is not asked, it may be anybody: {why}; where "
                 "you trust it, name it with --endpoint or $FISHD_ENDPOINT"
@@ -73,9 +74,7 @@ class Connection:
 
     def _listener(self) -> Listener | None:
         """Who listens, where that can be told; raises PermissionError."""
-        if not self.endpoint.startswith("ipc://"):
-            return None
-        return listener(socket_path(self.endpoint))
+        return listener(self._path) if self._path else None
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
         """A new id, and the request as JSON; raises `ParameterError` for NaN and infinity."""

@@ -9,10 +9,9 @@ import msgspec
 import zmq
 
 from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
-from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
-from fishd.policies.info import PolicyInfo
-from fishd.protocol import LOADING, Calibrations, State
-from fishd.signals import ControllerInfo, Event, Status, Tick
+from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
+from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
 
@@ -67,7 +66,7 @@ class Fish(Connection):
         return self._call(dict[str, Any], "config")
 
     def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Put another controller in command; parameters left out take their defaults.
+        """Select another controller; parameters left out take their defaults.
 
         It may take `protocol.LOADING` seconds to load, beyond the time-out.
         """
@@ -96,7 +95,7 @@ class Fish(Connection):
         return self._call(State, "mark", text=text)
 
     def calibrations(self) -> Calibrations:
-        """The calibrations of force sensor and servo that are in force."""
+        """The calibrations of force sensor and servo that are used."""
         return self._call(Calibrations, "calibrations")
 
     def sample_force(self, seconds: float = 2.0) -> ForceSample:
@@ -112,31 +111,31 @@ class Fish(Connection):
         return self._call(Calibrations, "tare", sample=sample.number)
 
     def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
-        """Put another calibration of the force sensor in force, and save it."""
+        """Apply another calibration of the force sensor, and save it."""
         return self._call(Calibrations, "calibrate-force", calibration=calibration)
 
     def calibrate_servo(
-        self, calibration: ServoCalibration, *, save: bool, loan: str | None = None
+        self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
     ) -> Calibrations:
-        """Put another calibration of the servo in force, and save it or not.
+        """Apply another calibration of the servo, and save it or not.
 
-        One that is not saved is a loan, the `loan` of the answer: it ends after `protocol.LOAN`
+        One that is not saved is a lease, the `lease` of the answer: it ends after `protocol.LEASE`
         seconds unless it is renewed. Name it in further changes, and to save.
         """
         return self._call(
-            Calibrations, "calibrate-servo", calibration=calibration, save=save, loan=loan
+            Calibrations, "calibrate-servo", calibration=calibration, save=save, lease=lease
         )
 
-    def renew_loan(self, loan: str) -> Calibrations:
+    def renew_lease(self, lease: str) -> Calibrations:
         """Let a calibration of the servo that is not saved last for another while."""
-        return self._call(Calibrations, "renew-loan", loan=loan)
+        return self._call(Calibrations, "renew-lease", lease=lease)
 
-    def end_loan(self, loan: str) -> Calibrations:
-        """Begin to end a loan: neutral, then the calibration of before is in force again.
+    def end_lease(self, lease: str) -> Calibrations:
+        """Begin to end a lease: neutral, then the calibration of before is used again.
 
-        That is done when `calibrations` says no `loan` any more.
+        That is done when `calibrations` says no `lease` any more.
         """
-        return self._call(Calibrations, "end-loan", loan=loan)
+        return self._call(Calibrations, "end-lease", lease=lease)
 
     def ticks(self) -> Iterator[Tick]:
         """Every tick from now on; raises `NoDaemon` when none comes in time."""

@@ -1,41 +1,33 @@
-"""What no single key can tell: values of a configuration that do not go together.
+"""Cross-field validation of the configuration, and of what no bound can express.
 
-Each check raises `Problem` with the key to blame and what would be right.
+Each check raises `Problem` with the key at fault and what would be right.
 """
 
 import math
-import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.errors import ParameterError, UnknownController
-from fishd.hardware import pulses
-from fishd.hardware.settings import (
-    FULL_SCALES,
-    ForceSensorSettings,
-    PanelSettings,
-    ServoSettings,
-)
-from fishd.schema import Problem
-from fishd.zmq_address import FORM, check_length, is_local, why_not_served
+from fishd.core.addresses import FORM, is_local, why_not_served
+from fishd.core.errors import ParameterError, UnknownController
+from fishd.core.schema import Problem
+from fishd.core.unix_sockets import check_length
+from fishd.hardware.driver import Claim
+from fishd.hardware.servo import pulses
+from fishd.hardware.settings import PanelSettings, ServoSettings
+from fishd.virtual.pi.settings import VirtualPiSettings
 
 REMOVED = {
-    ("servo", "pigpio", "hardware_pwm"): "this key is gone, as such pulses outlive pigpiod and "
-    "nothing ended them; for finer pulses or more than 50 Hz write servo.driver: sysfs-pwm, on the "
-    "same pins, else leave the key out",
+    ("servo", "pigpio"): "its keys stand beside servo.driver now, such as servo.port",
+    ("servo", "sysfs"): "its keys stand beside servo.driver now, such as servo.chip",
+    ("realtime", "rehearse"): "this key has another name; write realtime.warm_up",
 }
 """Keys that older versions had, and what to write instead."""
-SLOWEST_CONVERSION = 1.25
-"""Of the ADC with its tolerance and its transfers, in units of 1 / data rate."""
-I2C_PINS = (2, 3)
-"""SDA and SCL of bus 1."""
 
 
 def check_removed(data: Mapping[str, Any]) -> None:
-    """Nothing is asked for that there is no more; data: the file, with overrides."""
+    """Refuse keys of older versions; data: the file, with overrides."""
     for path, instead in REMOVED.items():
         section: Any = data
         for key in path[:-1]:
@@ -45,7 +37,7 @@ def check_removed(data: Mapping[str, Any]) -> None:
 
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
-    """The controller to start with is there and takes its parameters."""
+    """The controller to start with is installed and accepts its parameters."""
     if controller is None:
         if parameters:
             raise Problem(
@@ -62,7 +54,7 @@ def check_start(controller: str | None, parameters: Mapping[str, Any], limits: L
 
 
 def check_addresses(telemetry: str, control: str | None) -> None:
-    """Both are addresses, not the same, and requests come from this machine only."""
+    """Both are valid and differ, and only this machine can reach `control`."""
     if complaint := why_not_served(telemetry):
         raise Problem(("telemetry", "address"), f"'{telemetry}' is not valid: {complaint}")
     if control is None:
@@ -77,54 +69,6 @@ def check_addresses(telemetry: str, control: str | None) -> None:
         raise Problem(("control", "address"), f"'{control}' is not valid: {complaint}")
     if control == telemetry:
         raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
-
-
-def check_data_rate(sensor: ForceSensorSettings, tick: float) -> None:
-    """A pair of samples comes in each tick [s]."""
-    slowest = 2 * SLOWEST_CONVERSION / sensor.data_rate
-    if slowest > tick:
-        raise Problem(
-            ("force_sensor", "data_rate"),
-            f"{sensor.data_rate} is not valid: a pair of samples would take up to "
-            f"{slowest * 1e3:.1f} ms, longer than a tick of {tick * 1e3:g} ms",
-        )
-
-
-def check_force_sensor(sensor: ForceSensorSettings) -> None:
-    """The ADC has the range, and each force an input of its own."""
-    if sensor.full_scale not in FULL_SCALES:
-        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES)
-        raise Problem(
-            ("force_sensor", "full_scale"),
-            f"{sensor.full_scale:g} is not valid: one of {permitted} V is needed",
-        )
-    low, high = sensor.saturation_low, sensor.saturation_high
-    if low is not None and high is not None and low >= high:
-        raise Problem(
-            ("force_sensor", "saturation_low"),
-            f"{low:g} is not valid: less than saturation_high, {high:g} V, is needed",
-        )
-    if sensor.channel_x == sensor.channel_y:
-        raise Problem(
-            ("force_sensor", "channel_y"), f"'{sensor.channel_y}' is what channel_x is wired to"
-        )
-
-
-def check_servo(servo: ServoSettings, amplitude: float) -> None:
-    """Each angle within ±Φ [rad] has a pulse, and the driver can send it on that pin."""
-    check_neutral(servo)
-    check_pulses(servo, amplitude)
-    if not re.fullmatch(r"\S+", servo.pigpio.host):
-        raise Problem(
-            ("servo", "pigpio", "host"),
-            f"'{servo.pigpio.host}' is not valid: a host is needed, such as 127.0.0.1",
-        )
-    if servo.driver == "pigpio" and servo.frequency != 50.0:
-        raise Problem(
-            ("servo", "frequency"),
-            f"{servo.frequency:g} is not valid: pigpiod's servo pulses come at 50 Hz; for others "
-            "set servo.driver: sysfs-pwm",
-        )
 
 
 def check_neutral(servo: ServoSettings) -> None:
@@ -165,23 +109,26 @@ def check_pulses(servo: ServoSettings, amplitude: float) -> None:
     )
 
 
-def check_pins(sensor: ForceSensorSettings, servo: ServoSettings, panel: PanelSettings) -> None:
-    """No pin has two jobs."""
-    jobs = dict.fromkeys(I2C_PINS, "the I2C bus") if sensor.bus == 1 else {}
-    for section, name, pin in (
-        ("servo", "gpio", servo.gpio),
-        ("panel", "estop_gpio", panel.estop_gpio),
-        ("panel", "led_gpio", panel.led_gpio),
-    ):
-        if pin is None:
-            continue
-        if pin in jobs:
-            raise Problem((section, name), f"{pin} is the pin of {jobs[pin]} already")
-        jobs[pin] = f"{section}.{name}"
+def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> None:
+    """No pin has two jobs. claims: those of the drivers, by their sections"""
+    wanted = [
+        (section, claim.key, pin, claim.what, f"{section}.{claim.key}")
+        for section, found in claims.items()
+        for claim in found
+        for pin in claim.pins
+    ]
+    for key, pin in (("estop_gpio", panel.estop_gpio), ("led_gpio", panel.led_gpio)):
+        if pin is not None:
+            wanted.append(("panel", key, pin, key, f"panel.{key}"))
+    jobs: dict[int, tuple[str, str]] = {}
+    for section, key, pin, what, job in wanted:
+        taken, by = jobs.setdefault(pin, (what, job))
+        if taken != what:  # else two drivers are on one bus
+            raise Problem((section, key), f"GPIO {pin} is taken by {by} already")
 
 
 def check_lockstep(robot: str, lockstep: bool) -> None:
-    """Only a fish that is simulated can wait."""
+    """Lockstep needs a simulated fish: only its time can stand still."""
     if lockstep and robot != "simulated":
         raise Problem(
             ("lockstep",),
@@ -190,13 +137,8 @@ def check_lockstep(robot: str, lockstep: bool) -> None:
         )
 
 
-def check_virtual_pi(robot: str, servo: ServoSettings, pi: VirtualPiSettings) -> None:
-    """The virtual Pi can be built, and has what the servo needs."""
-    if robot == "virtual-pi" and servo.driver != "pigpio":
-        raise Problem(
-            ("servo", "driver"),
-            f"'{servo.driver}' is not valid: the virtual Pi has pigpiod, and no other pulses",
-        )
+def check_virtual_pi(pi: VirtualPiSettings) -> None:
+    """The virtual Pi can be built."""
     if pi.socket is not None:
         if not pi.socket:
             raise Problem(("virtual_pi", "socket"), "'' is not valid: a path or null is needed")

@@ -1,14 +1,14 @@
-"""`KEY=VALUE` of the command line, which overrides a key of a configuration."""
+"""`--set KEY=VALUE` of the command line, which overrides a key of a configuration."""
 
 from collections.abc import Iterable
 from typing import Any
 
-from fishd import strict_yaml
-from fishd.errors import ConfigError
+from fishd.core import strict_yaml
+from fishd.core.errors import ConfigError
 
 
 def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[tuple[str, ...], str]:
-    """Put each `KEY=VALUE` into the data; where each key now comes from, for messages.
+    """Put each `KEY=VALUE` into the data; return, for messages, what set each key.
 
     Raises `ConfigError`.
     """
@@ -31,7 +31,7 @@ def _apply(data: dict[str, Any], override: str) -> tuple[str, ...]:
 
 
 def _value(text: str, dotted: str, override: str) -> Any:
-    """A value from the command line, where a plain `1e-3` is a number."""
+    """A number as Python reads it, such as `1e-3`; anything else as YAML."""
     for number in (int, float):
         try:
             return number(text)

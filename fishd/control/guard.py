@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from fishd import text
+from fishd.core import text
 
 
 class Guard:
@@ -23,7 +23,7 @@ class Guard:
         self.restrict(-amplitude, amplitude)
         full_reversal = 2 * amplitude
         self.step = full_reversal if slew_limit is None else min(full_reversal, slew_limit * tick)
-        """Largest change per tick while a controller is in command [rad]."""
+        """Largest change per tick while a controller is active [rad]."""
         self.fade_step = min(self.step, amplitude * tick / fade_time)
         """Largest change per tick while fading to neutral [rad]."""
 
@@ -38,7 +38,7 @@ class Guard:
         """The instruction angle to send [rad].
 
         command: what the controller wants [rad]: one real number of any kind, numpy's too
-        previous: the angle in force [rad]
+        previous: the angle that is applied now [rad]
         Raises ValueError when the command is no number, or not finite.
         """
         angle = command if type(command) is float else _number(command)

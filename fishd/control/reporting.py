@@ -1,17 +1,19 @@
-"""What the loop tells the world: the record of each tick, events, reasons of overruns."""
+"""What the loop tells the world: the record of each tick, and events."""
 
 import logging
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from msgspec import UNSET
 
-from fishd import text
-from fishd.clock import Clock, Slot
-from fishd.errors import FishdError
-from fishd.signals import Event, Measurement, Observation, Reason, Tick, Truth
-from fishd.statistics import PHASES
-from fishd.supervisor import Mode, Supervisor
+from fishd.control.supervisor import Mode
+from fishd.core import text
+from fishd.core.clock import Clock
+from fishd.core.errors import FishdError
+from fishd.core.signals import Event, EventKind, Level, Reason, Tick
+
+if TYPE_CHECKING:
+    from fishd.control.loop import ControlLoop, Turn
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +36,7 @@ class Reporter:
         self._publisher = publisher
         self._latest_problem = ""
 
-    def event(self, kind: str, message: str, level: str = "info", **data: Any) -> None:
+    def event(self, kind: EventKind, message: str, level: Level = "info", **data: Any) -> None:
         """Publish and log an event; never raises, since bad news must not make things worse."""
         message = text.line(message)
         log.log(logging.getLevelNamesMapping()[level.upper()], "%s: %s", kind, message)
@@ -43,13 +45,14 @@ class Reporter:
         except Exception:
             log.exception("the event could not be published")
 
-    def controller(self, name: str, parameters: Mapping[str, Any], kind: str, does: str) -> None:
-        """Tell who is in command with which parameters; does: such as `takes over with`."""
+    def controller(self, kind: EventKind, name: str, parameters: Mapping[str, Any]) -> None:
+        """Tell that a controller is active now, or has new parameters: kind is `parameters`."""
+        does = "goes on with" if kind == "parameters" else "takes over with"
         message = f"{name} {does} {_spelled(parameters)}"
         self.event(kind, message, controller=name, parameters=parameters)
 
     def fallback(self, before: str, name: str, parameters: Mapping[str, Any], why: Reason) -> None:
-        """Tell that a controller has lost command to another one."""
+        """Tell that a controller gave up and another one is active now."""
         self.event(
             "fallback",
             f"{name} takes over with {_spelled(parameters)}: {why.message}",
@@ -60,13 +63,16 @@ class Reporter:
             code=why.code,
         )
 
-    def mode(self, before: Mode, supervisor: Supervisor, level: str = "info") -> None:
-        """Tell which mode follows on `before`, if it is another."""
-        mode, reason = supervisor.mode, supervisor.reason
-        if mode is before:
+    def mode(self, before: Mode, mode: Mode, reason: Reason | None) -> None:
+        """Tell of a change of mode, and why; that to mode fault is an event of its own kind."""
+        if mode is Mode.FAULT:
+            assert reason is not None
+            message = f"{reason.code}: {reason.message}"
+            self.event("fault", message, "error", code=reason.code, mode=mode.value)
             return
         self._latest_problem = ""  # what fails again after a clear is news
         message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
+        level: Level = "error" if mode is Mode.ESTOP else "info"
         self.event("mode", message, level, before=before.value, mode=mode.value)
 
     def problem(self, what: str, error: Exception) -> str:
@@ -77,47 +83,26 @@ class Reporter:
         self._latest_problem = line
         return line
 
-    def fault(self, supervisor: Supervisor) -> None:
-        """Tell of the fault that was just latched."""
-        reason = supervisor.reason
-        assert reason is not None
-        message = f"{reason.code}: {reason.message}"
-        self.event("fault", message, "error", code=reason.code, mode=supervisor.mode.value)
+    def tick(self, loop: "ControlLoop", turn: "Turn", now: float) -> None:
+        """Publish the record of a tick. The one place that says where each of its fields is from.
 
-    def tick(
-        self,
-        slot: Slot,
-        measurement: Measurement,
-        observation: Observation,
-        truth: Truth | None,
-        *,
-        seq: int,
-        mode: Mode,
-        controller: str,
-        angle: float,
-        servo_on: bool,
-        busy: float,
-        missed: int,
-    ) -> None:
-        """Seal and publish the record of a tick.
-
-        angle: the instruction angle that was sent [rad]
-        busy: time that the tick has taken so far [s]
-        missed: slots skipped since start
+        now: the time after the servo was driven [s, monotonic]
         """
-        now, extremes = slot.now, measurement.extremes
+        slot, measurement, observation, marks = turn
+        extremes = measurement.extremes
+        truth = loop.robot.truth() if loop.robot.truth else None
         self._publisher.tick(
             Tick(
                 t=self._clock.wall(),
-                seq=seq,
-                mode=mode.value,
-                controller=controller,
+                seq=loop.seq,
+                mode=loop.supervisor.mode.value,
+                controller=loop.active.name,
                 fx=observation.fx,
                 fy=observation.fy,
                 fy_rate=observation.fy_rate,
                 fin_velocity=observation.fin_velocity,
-                phi_c=angle,
-                servo_on=servo_on,
+                phi_c=loop.applied,
+                servo_on=loop.servo.on,
                 thrust=observation.thrust,
                 frequency=observation.frequency,
                 samples=measurement.samples,
@@ -125,10 +110,10 @@ class Reporter:
                 fx_max=extremes.fx_max if extremes else UNSET,
                 fy_min=extremes.fy_min if extremes else UNSET,
                 fy_max=extremes.fy_max if extremes else UNSET,
-                age_ms=(now - measurement.time) * 1e3,
-                lateness_us=(now - slot.deadline) * 1e6,
-                busy_us=busy * 1e6,
-                missed=missed,
+                age_ms=(slot.now - measurement.time) * 1e3,
+                lateness_us=(slot.now - slot.deadline) * 1e6,
+                busy_us=(now - marks[0]) * 1e6,
+                missed=loop.statistics.missed,
                 alpha=truth.alpha if truth else UNSET,
                 alpha_rate=truth.alpha_rate if truth else UNSET,
                 phi=truth.phi if truth else UNSET,
@@ -139,39 +124,3 @@ class Reporter:
 def _spelled(parameters: Mapping[str, Any]) -> str:
     texts = (f"{k}={'default' if v is None else v}" for k, v in parameters.items())
     return ", ".join(texts) or "no parameters"
-
-
-def why_overrun(seq: int, marks: tuple[float, ...], period: float) -> str | None:
-    """One line that blames the right phase of a tick that took longer than a period [s], or None.
-
-    marks: times at the start of the tick and after each of PHASES [s]
-    """
-    busy = marks[-1] - marks[0]
-    if busy <= period:
-        return None
-    longest, phase = max(
-        (after - before, name)
-        for before, after, name in zip(marks[:-1], marks[1:], PHASES, strict=True)
-    )
-    return (
-        f"tick {seq} took {busy * 1e3:.1f} ms of its {period * 1e3:g} ms, "
-        f"{longest * 1e3:.1f} ms of it in {phase}"
-    )
-
-
-def why_silent(silence: float) -> str:
-    """One line on a servo that was left alone for so long [s] that it has come to rest."""
-    return (
-        f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral and "
-        "ends its pulses by itself: the machine is overloaded or was suspended"
-    )
-
-
-def why_skipped(seq: int, missed: int) -> str | None:
-    """One line on slots that were skipped although no tick was to blame, or None."""
-    if not missed:
-        return None
-    return (
-        f"{missed} slots were skipped before tick {seq}: fishd was woken late, "
-        "the machine is overloaded or was suspended"
-    )

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
+from fishd.control.supervisor import Mode
 from fishd.hardware.base import Robot
-from fishd.supervisor import Mode
 
 
-class Drive:
+class ServoOutput:
     """Sends angles to the servo of a robot, or releases it."""
 
     def __init__(self, robot: Robot, now: Callable[[], float]) -> None:
@@ -20,13 +20,18 @@ class Drive:
         self._now = now
         self._written = now()
 
-    def silence(self) -> float:
-        """Time since the latest write, where the servo ends its pulses because of it; else 0 [s].
+    def why_at_rest(self) -> str:
+        """One line where the servo was left alone for so long that it came to rest; else empty.
 
-        Such a servo is at neutral, or has no pulses any more: it must not begin again by itself.
+        It is at neutral, or has no pulses any more: it must not begin again by itself.
         """
         silence = self._now() - self._written
-        return silence if self.on and not self.lost and silence > self._countdown else 0.0
+        if not self.on or self.lost or silence <= self._countdown:
+            return ""
+        return (
+            f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral and "
+            "ends its pulses by itself: the machine is overloaded or was suspended"
+        )
 
     def command(self, mode: Mode, angle: float, neutral: bool) -> None:
         """Send an angle [rad], or release the servo: at once in estop, once `neutral` in fault.

@@ -1,9 +1,9 @@
 """How well the loop keeps its time, in constant memory however long it runs."""
 
 from bisect import bisect_left
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
-from fishd.signals import Percentiles, Timing
+from fishd.core.signals import Percentiles, Timing
 
 _STEPS = 3  # 2**3 buckets per octave: an error of at most 12 %
 _LONGEST = (1 << 40) - 1  # ns, 18 minutes; anything longer counts as this
@@ -59,19 +59,37 @@ def _upper_edge(bucket: int) -> float:
 class Statistics:
     """Lateness, time per phase, missed slots and overruns since start."""
 
-    def __init__(self) -> None:
+    def __init__(self, period: float) -> None:
+        """period: of the loop [s]"""
         self.missed = 0
         self.overruns = 0
+        self._period = period
+        self._overran = False
         self._lateness = Histogram()
         self._busy = Histogram()
         self._phases = tuple(Histogram() for _ in PHASES)
 
-    def add(self, seq: int, lateness: float, marks: tuple[float, ...]) -> None:
+    def add(self, seq: int, lateness: float, missed: int, marks: tuple[float, ...]) -> str | None:
         """Count one tick.
 
+        One that took too long, or slots that were skipped for another reason, give a line on it.
+
         lateness: start after the deadline [s]
+        missed: slots that were skipped just before it
         marks: times at the start of the tick and after each of PHASES [s]
         """
+        self._count(seq, lateness, marks)
+        message = self._why_long(seq, marks)
+        self.overruns += message is not None
+        if missed and not message and not self._overran:
+            message = (
+                f"{missed} slots were skipped before tick {seq}: fishd was woken late, "
+                "the machine is overloaded or was suspended"
+            )
+        self._overran = message is not None
+        return message
+
+    def _count(self, seq: int, lateness: float, marks: tuple[float, ...]) -> None:
         if lateness == 0.0 and marks[0] == marks[-1]:
             return  # in virtual time nothing takes any, and there is nothing to count
         self._lateness.add(lateness, seq)
@@ -80,6 +98,18 @@ class Statistics:
             histogram.add(mark - before, seq)
             before = mark
         self._busy.add(before - marks[0], seq)
+
+    def _why_long(self, seq: int, marks: tuple[float, ...]) -> str | None:
+        """One line that blames the longest phase of a tick that took longer than a period."""
+        busy = marks[-1] - marks[0]
+        if busy <= self._period:
+            return None
+        durations = (after - before for before, after in pairwise(marks))
+        longest, phase = max(zip(durations, PHASES, strict=True))
+        return (
+            f"tick {seq} took {busy * 1e3:.1f} ms of its {self._period * 1e3:g} ms, "
+            f"{longest * 1e3:.1f} ms of it in {phase}"
+        )
 
     def timing(self) -> Timing:
         """The distributions so far."""

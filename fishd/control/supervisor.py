@@ -6,17 +6,15 @@ any   ──fail───▶ fault  ──clear──▶ idle
 any   ──estop──▶ estop  ──clear──▶ idle
 """
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Callable
 from enum import StrEnum
 
-from fishd import text
-from fishd.errors import Refused
-from fishd.signals import Reason
+from fishd.control.faults import FAULTS, UNLISTED, Effect
+from fishd.core import text
+from fishd.core.errors import Refused
+from fishd.core.signals import Reason
 
-SENSOR_STREAK = 3
-"""Failed reads in a row that are a fault."""
-SLOW_STREAK = 3
-"""Updates over budget in a row that are a fault."""
 OVERRUN_WINDOW = 100
 OVERRUN_SHARE = 0.2
 """More than this share of overruns among the latest OVERRUN_WINDOW ticks is a fault."""
@@ -32,14 +30,14 @@ class Mode(StrEnum):
 
 
 class Supervisor:
-    """Keeps the mode, the latched reason, and count of the things that may go wrong a few times."""
+    """Keeps the mode and the latched reason, and counts what may go wrong a few times."""
 
-    def __init__(self) -> None:
+    def __init__(self, changed: Callable[[Mode], None] = lambda before: None) -> None:
+        """changed: called after each change of mode, with the mode before it"""
         self.mode = Mode.IDLE
         self.reason: Reason | None = None
-        self._bad_reads = 0
-        self._suspect = 0
-        self._slow_updates = 0
+        self._changed = changed
+        self._failures: Counter[str] = Counter()  # in a row, by the code of their fault
         self._ticks = 0
         self._overruns: deque[int] = deque()  # in which of the latest ticks
 
@@ -55,73 +53,62 @@ class Supervisor:
     def start(self) -> None:
         """A controller takes over; raises `Refused` while a fault or estop is latched."""
         self.check_startable()
-        self.mode = Mode.RUNNING
+        self._enter(Mode.RUNNING)
 
     def stop(self) -> None:
         """Go to idle; with a fault or an emergency stop latched the fish has stopped already."""
         if self.reason is None:
-            self.mode = Mode.IDLE
-
-    def fail(self, code: str, message: str) -> bool:
-        """Latch a fault; False when one is latched already, whose reason is then kept."""
-        if self.reason is not None:
-            return False
-        self.mode = Mode.FAULT
-        self.reason = Reason(code=text.quoted(code), message=text.line(message))
-        return True
-
-    def estop(self, message: str) -> None:
-        """Latch an emergency stop; the reason of an earlier one is kept."""
-        if self.mode is not Mode.ESTOP:
-            self.mode = Mode.ESTOP
-            self.reason = Reason(code="estop", message=text.line(message))
+            self._enter(Mode.IDLE)
 
     def clear(self) -> None:
         """Forget the latched reason, if there is one, and go to idle."""
         if self.reason is not None:
-            self.mode = Mode.IDLE
-            self.reason = None
-            self._bad_reads = self._suspect = self._slow_updates = 0
+            self._failures.clear()
             self._overruns.clear()
+            self._enter(Mode.IDLE)
 
-    def sensor(self, problem: str | None) -> bool:
-        """Count a read, good (None) or not; True when that latches the fault sensor-stale."""
-        self._bad_reads = self._bad_reads + 1 if problem else 0
-        return (
-            problem is not None
-            and self._bad_reads >= SENSOR_STREAK
-            and self.fail("sensor-stale", f"{problem}, {self._bad_reads} times in a row")
-        )
+    def estop(self, message: str) -> None:
+        """Latch an emergency stop; the reason of an earlier one is kept."""
+        self.fail("estop", message)
 
-    def suspect(self, suspicion: str) -> bool:
-        """Count a window, one to believe (empty) or not; True when that latches sensor-range."""
-        self._suspect = self._suspect + 1 if suspicion else 0
-        return self._suspect >= SENSOR_STREAK and self.fail(
-            "sensor-range", f"{suspicion}, in {self._suspect} windows in a row"
-        )
+    def fail(self, code: str, message: str) -> None:
+        """Latch a fault. The first reason is kept, but an emergency stop replaces that of a fault.
+
+        code: that of a row of FAULTS, or of a controller from another package
+        """
+        row = FAULTS.get(code, UNLISTED)
+        mode = Mode.ESTOP if row.effect is Effect.RELEASE else Mode.FAULT
+        if self.reason is None or (mode is Mode.ESTOP and self.mode is Mode.FAULT):
+            self._enter(mode, Reason(text.quoted(code), text.line(message), row.remedy))
+
+    def check(self, code: str, problem: str | None) -> None:
+        """Count a check, failed or passed (None or empty); `in_a_row` failures latch the fault."""
+        if not problem:
+            self._failures[code] = 0
+            return
+        self._failures[code] += 1
+        if self._failures[code] >= FAULTS[code].in_a_row:
+            self.fail(code, f"{problem}, {self._failures[code]} times in a row")
 
     @property
     def sensor_lost(self) -> bool:
-        """Whether the latest SENSOR_STREAK reads gave no force, or none to believe."""
-        return max(self._bad_reads, self._suspect) >= SENSOR_STREAK
+        """Whether the latest reads gave no force, or none to believe."""
+        sensor = ("sensor-stale", "sensor-range")
+        return any(self._failures[code] >= FAULTS[code].in_a_row for code in sensor)
 
-    def update_time(self, seconds: float, budget: float, controller: str) -> bool:
-        """Count an update of the controller; True when that latches the fault controller-slow."""
-        self._slow_updates = self._slow_updates + 1 if seconds > budget else 0
-        return self._slow_updates >= SLOW_STREAK and self.fail(
-            "controller-slow",
-            f"controller {controller} took {seconds * 1e3:.1f} ms of its {budget * 1e3:.1f} ms, "
-            f"{self._slow_updates} times in a row",
-        )
-
-    def overrun(self, overran: bool) -> bool:
-        """Count a tick; True when that latches the fault overrun."""
+    def overrun(self, overran: bool) -> None:
+        """Count a tick; too many overruns latch the fault overrun."""
         self._ticks += 1
         while self._overruns and self._overruns[0] <= self._ticks - OVERRUN_WINDOW:
             self._overruns.popleft()
         if overran:
             self._overruns.append(self._ticks)
-        count = len(self._overruns)
-        return count > OVERRUN_SHARE * OVERRUN_WINDOW and self.fail(
-            "overrun", f"{count} of the last {OVERRUN_WINDOW} ticks took too long or came late"
-        )
+            count = len(self._overruns)
+            if count > OVERRUN_SHARE * OVERRUN_WINDOW:
+                late = f"{count} of the last {OVERRUN_WINDOW} ticks took too long or came late"
+                self.fail("overrun", late)
+
+    def _enter(self, mode: Mode, reason: Reason | None = None) -> None:
+        before, self.mode, self.reason = self.mode, mode, reason
+        if mode is not before:
+            self._changed(before)

@@ -1,1 +1,21 @@
-"""The controllers: each chooses the next instruction angle from an observation, and does no I/O."""
+"""The controllers: an observation in, an instruction angle out.
+
+None of them looks at a clock, a socket or a file while the fish swims, but for `remote`, which
+waits for the answer of its agent. `policy/` reads its file before it takes over.
+"""
+
+from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.core.errors import ParameterError
+from fishd.core.schema import note, unit
+from fishd.core.signals import Observation
+
+__all__ = [
+    "Amplitude",
+    "Controller",
+    "Limits",
+    "Observation",
+    "ParameterError",
+    "amplitude_of",
+    "note",
+    "unit",
+]

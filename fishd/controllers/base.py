@@ -1,13 +1,17 @@
 """What a controller is. docs/writing-a-controller.md works through an example."""
 
+import math
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.controllers.chatter import ChatterSettings
-from fishd.errors import ParameterError
-from fishd.signals import Observation
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Observation
+
+Amplitude = Annotated[float, Meta(gt=0, le=math.pi)] | None
+"""Type of a parameter `amplitude` [rad]; None for all that the robot grants: see `amplitude_of`."""
 
 
 class Limits(Struct, frozen=True):
@@ -65,7 +69,7 @@ class Controller(ABC, Generic[P]):
         """Take new, already checked parameters while running; called between two updates."""
         self.parameters = parameters
 
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Do what `update` does, without any effect, so that it finds warm caches.
 
         Called up to once a tick, just before it; only what takes `update` long from cold is worth

@@ -2,7 +2,9 @@
 
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Struct
+
+from fishd.core.schema import note, unit
 
 LONGEST_DWELL = 2.0
 """[s]"""
@@ -13,24 +15,17 @@ class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     dwell: Annotated[
         float,
-        Meta(
+        unit(
+            "s",
+            "Shortest time between two reversals of ppo, in whole ticks, rounded up; those that "
+            "would come sooner are held back. 0 holds none back.",
             ge=0,
             le=LONGEST_DWELL,
-            description="Shortest time between two reversals of ppo, in whole ticks, rounded up; "
-            "those that would come sooner are held back. 0 holds none back.",
-            extra_json_schema={"unit": "s"},
         ),
     ] = 0.2
     patience: Annotated[
-        float,
-        Meta(
-            ge=0.2,
-            le=600,
-            description="Who insists on such reversals for so long loses command.",
-            extra_json_schema={"unit": "s"},
-        ),
+        float, unit("s", "Who insists on such reversals for so long loses command.", ge=0.2, le=600)
     ] = 2.0
     fallback: Annotated[
-        Literal["swing", "fault"],
-        Meta(description="What comes then: swing takes over, or mode fault."),
+        Literal["swing", "fault"], note("What comes then: swing takes over, or mode fault.")
     ] = "swing"

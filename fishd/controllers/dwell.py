@@ -9,7 +9,7 @@ from typing import Any
 
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.swing import Swing, SwingParameters
-from fishd.errors import ControllerFault
+from fishd.core.errors import ControllerFault
 
 RESTING = 0.05
 """An angle below this share of the amplitude is as good as neutral."""

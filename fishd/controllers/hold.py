@@ -3,24 +3,19 @@
 import math
 from typing import Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from fishd.controllers.base import Controller, Limits
-from fishd.errors import ParameterError
-from fishd.signals import Observation
+from fishd.core.errors import ParameterError
+from fishd.core.schema import unit
+from fishd.core.signals import Observation
 
 
 class HoldParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `hold`."""
 
     angle: Annotated[
-        float,
-        Meta(
-            ge=-math.pi,
-            le=math.pi,
-            description="The instruction angle; 0 is neutral.",
-            extra_json_schema={"unit": "rad"},
-        ),
+        float, unit("rad", "The instruction angle; 0 is neutral.", ge=-math.pi, le=math.pi)
     ] = 0.0
 
 

@@ -2,73 +2,42 @@
 
 import contextlib
 from collections.abc import Mapping
-from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 import msgspec
 from msgspec import Struct
 
-from fishd import text
-from fishd.contained import Attempt, contained
 from fishd.controllers.base import Controller, Limits
-from fishd.errors import ParameterError, UnknownController
-from fishd.schema import Problem, convert, fields_of, nearest
-from fishd.signals import ControllerInfo
+from fishd.core import text
+from fishd.core.errors import ParameterError, UnknownController
+from fishd.core.foreign_code import Attempt, contained
+from fishd.core.plugins import Plugins
+from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest
+from fishd.core.signals import ControllerInfo
 
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
-
-GROUP = "fishd.controllers"
 LONGEST_IMPORT = 10.0
 """How long a package may take to import before its controllers are left out [s]."""
 
 
-@cache
-def _entries() -> "dict[str, EntryPoint]":
-    from importlib.metadata import entry_points  # a third of the time that `fishctl status` takes
-
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
-
-
-def names() -> list[str]:
-    """The names of all installed controllers."""
-    return sorted(_entries())
-
-
-@cache
-def find(name: str) -> type[Controller[Any]]:
-    """The class of the controller `name`.
-
-    Raises `UnknownController`, also where the package that offers it does not load.
-    """
-    if name not in _entries():
-        hint = nearest(name, names())
-        raise UnknownController(f"no controller is named '{text.quoted(name)}'; {hint}")
-    entry = _entries()[name]
-    try:
-        found = contained(entry.load)
-    except Exception as error:
-        raise UnknownController(
-            f"controller '{name}' ({entry.value}) does not load: {text.named(error)}"
-        ) from error
-    if not (isinstance(found, type) and issubclass(found, Controller)):
-        raise UnknownController(
-            f"controller '{name}' ({entry.value}) is no subclass of "
-            "fishd.controllers.base.Controller"
-        )
-    parameters = getattr(found, "Parameters", None)
-    if not (isinstance(parameters, type) and issubclass(parameters, Struct)):
-        raise UnknownController(
-            f"controller '{name}' ({entry.value}) has no Parameters, a msgspec.Struct"
-        )
-    try:
-        contained(msgspec.json.encode, fields_of(parameters))
-    except Exception as error:
-        raise UnknownController(
-            f"controller '{name}' ({entry.value}) has Parameters that cannot be read: "
-            f"{text.named(error)}"
-        ) from error
-    return found
+_found: Plugins[Controller[Any]] = Plugins(
+    "controller",
+    "fishd.controllers",
+    Controller,
+    "Parameters",
+    {
+        "hold": "fishd.controllers.hold:Hold",
+        "square": "fishd.controllers.waveform:Square",
+        "sine": "fishd.controllers.waveform:Sine",
+        "triangle": "fishd.controllers.waveform:Triangle",
+        "swing": "fishd.controllers.swing:Swing",
+        "ppo": "fishd.controllers.policy.controller:Ppo",
+        "remote": "fishd.controllers.remote.controller:Remote",
+    },
+    UnknownController,
+)
+names, find = _found.names, _found.find
+"""All names; and the class of one, or `UnknownController`."""
 
 
 def describe(name: str) -> ControllerInfo:
@@ -98,6 +67,14 @@ def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
     try:
         parameters = contained(convert, dict(values), found.Parameters)
     except Problem as problem:
+        if isinstance(problem, UnknownKey) and len(problem.path) == 1:
+            key = problem.path[0]
+            hint = nearest(
+                key, [field.name for field in fields_of(found.Parameters)], listed="it has"
+            )
+            raise ParameterError(
+                f"unknown parameter '{text.quoted(key)}' of controller {name}; {hint}", problem.path
+            ) from None
         what = text.quoted(".".join(problem.path)) or "parameters"
         raise ParameterError(f"{name}: {what}: {problem}", problem.path) from None
     try:

@@ -1,12 +1,12 @@
 """`swing`: reverse when the fin slows down. The paper's model-free control (Fu et al.)."""
 
-import math
 from typing import Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from fishd.controllers.base import Controller, Limits, amplitude_of
-from fishd.signals import Observation
+from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.core.schema import unit
+from fishd.core.signals import Observation
 
 REFRACTORY = 0.05
 """Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
@@ -17,27 +17,19 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     C: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=1,
-            description="Reverse when the fin's speed falls to C times its last maximum.",
-            extra_json_schema={"unit": "1"},
-        ),
+        unit("1", "Reverse when the fin's speed falls to C times its last maximum.", ge=0, le=1),
     ] = 0.6
     amplitude: Annotated[
-        Annotated[float, Meta(gt=0, le=math.pi)] | None,
-        Meta(
-            description="Instruction angle on either side; null: the robot's amplitude_limit.",
-            extra_json_schema={"unit": "rad"},
-        ),
+        Amplitude,
+        unit("rad", "Instruction angle on either side; null: the robot's amplitude_limit."),
     ] = None
     longest_half_period: Annotated[
         float,
-        Meta(
+        unit(
+            "s",
+            "Reverse after this time even if the fin shows no sign of slowing down.",
             gt=0,
             le=10,
-            description="Reverse after this time even if the fin shows no sign of slowing down.",
-            extra_json_schema={"unit": "s"},
         ),
     ] = 1.0
 

@@ -7,27 +7,20 @@ import math
 from abc import abstractmethod
 from typing import Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from fishd.controllers.base import Controller, Limits, amplitude_of
-from fishd.signals import Observation
+from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.core.schema import unit
+from fishd.core.signals import Observation
 
 
 class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `square`, `sine` and `triangle`."""
 
-    frequency: Annotated[
-        float,
-        Meta(
-            gt=0, le=10, description="Frequency of the waveform.", extra_json_schema={"unit": "Hz"}
-        ),
-    ] = 1.8
+    frequency: Annotated[float, unit("Hz", "Frequency of the waveform.", gt=0, le=10)] = 1.8
     amplitude: Annotated[
-        Annotated[float, Meta(gt=0, le=math.pi)] | None,
-        Meta(
-            description="Largest instruction angle; null: the robot's amplitude_limit.",
-            extra_json_schema={"unit": "rad"},
-        ),
+        Amplitude,
+        unit("rad", "Largest instruction angle; null: the robot's amplitude_limit."),
     ] = None
 
 

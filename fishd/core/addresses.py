@@ -1,26 +1,117 @@
-"""Where the sockets are, for the daemon that binds them and for clients that look for it."""
+"""Addresses: which texts are one, where fishd's sockets are, and how to listen there.
+
+ZeroMQ takes more than fishd does, such as `tcp://SOURCE;HOST:PORT` and names of network
+interfaces. fishd takes only what means to ZeroMQ what it means to a reader of the configuration.
+"""
 
 import errno
+import ipaddress
 import os
+import re
 import socket
 import stat
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import NamedTuple
 
-from fishd.errors import StartupError
-from fishd.lockfile import NotALock, Taken, lock_path, locked
-from fishd.runtime_folder import runtime_folder
-from fishd.socket_owner import stranger
-from fishd.zmq_address import Ipc, parse
+from fishd.core import unix_sockets
+from fishd.core.errors import StartupError
+from fishd.core.runtime_folder import runtime_folder
 
+FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 _SERVICE = Path("/run/fishd/control")
-_LEAVING, _AGAIN = 1.0, 0.02
-"""How long the gateways of a fishd that was killed may take to leave, and a pause meanwhile [s]."""
 _BACKLOG = 128
 """Connections that may wait to be accepted."""
+
+_TCP = re.compile(r"tcp://(?P<host>\*|[^/\s:;*\[\]]+|\[[^/\s;\[\]]*\]):(?P<port>[0-9]+|\*)", re.A)
+_IPC = re.compile(r"ipc://(?P<path>[^@*\s]\S*)")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_DIGITS = re.compile(r"[0-9.]+")
+
+
+class Tcp(NamedTuple):
+    """`tcp://HOST:PORT`; host and port as written, the brackets of an IPv6 address taken off."""
+
+    host: str
+    port: str
+
+
+class Ipc(NamedTuple):
+    """`ipc://PATH`."""
+
+    path: str
+
+
+def parse(text: str) -> Tcp | Ipc:
+    """The parts of an address; host and port may be `*`. Raises ValueError that says why not."""
+    tcp, ipc = _TCP.fullmatch(text), _IPC.fullmatch(text)
+    if ipc:
+        unix_sockets.check_length(ipc["path"])
+        return Ipc(ipc["path"])
+    if not tcp:
+        raise ValueError(FORM)
+    host, port = tcp["host"], tcp["port"]
+    if port != "*" and (len(port) > 5 or int(port) > 65535):
+        raise ValueError(f"{FORM}; {port} is no port, 65535 is the highest")
+    if host.startswith("["):
+        host = host[1:-1]
+        if _number(host.partition("%")[0]) is None:
+            raise ValueError(f"{FORM}; '[{host}]' is no IPv6 address")
+    elif host != "*" and (
+        not _NAME.fullmatch(host) or (_DIGITS.fullmatch(host) and _number(host) is None)
+    ):
+        raise ValueError(f"{FORM}; '{host}' is no host")
+    return Tcp(host, port)
+
+
+def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def is_local(text: str) -> bool:
+    """Is it certain that only this machine can reach an address?"""
+    address = parse(text)
+    if isinstance(address, Ipc) or address.host == "localhost":
+        return True
+    number = _number(address.host)
+    return number is not None and number.version == 4 and number.is_loopback
+
+
+def why_not_served(text: str) -> str:
+    """Why fishd cannot listen there; empty where it can. A port of 0 means any that is free."""
+    try:
+        address = parse(text)
+    except ValueError as error:
+        return str(error)
+    return FORM if isinstance(address, Tcp) and address.port == "*" else ""
+
+
+def why_not_connected(text: str) -> str:
+    """Why nothing can connect to this address; empty where something can."""
+    try:
+        address = parse(text)
+    except ValueError as error:
+        return str(error)
+    if isinstance(address, Ipc):
+        return ""
+    if address.host == "*":
+        return f"{FORM}; * is what an agent binds, here give the host that it runs on"
+    if address.port == "*" or int(address.port) == 0:
+        return (
+            f"{FORM}; {address.port} is what an agent binds, here give the port that it was given"
+        )
+    return ""
+
+
+def socket_path(address: str) -> Path | None:
+    """The file of an ipc address; None for any other address."""
+    path = address.removeprefix("ipc://")
+    return Path(path) if path != address else None
 
 
 def control_address() -> str:
@@ -36,6 +127,10 @@ def virtual_pi_socket(configured: str | None) -> Path:
     if configured is not None:
         return Path(configured)
     return _guarded(_private_socket("virtual-pi"), "virtual_pi.socket")
+
+
+def _private_socket(name: str) -> Path:
+    return Path(runtime_folder()) / name
 
 
 def _guarded(path: Path, key: str) -> Path:
@@ -58,17 +153,17 @@ def _guarded(path: Path, key: str) -> Path:
 def find_control() -> str:
     """The address at which a client looks for the daemon of this machine.
 
-    $FISHD_ENDPOINT, else a daemon of this user, else the system's service. What stands where that
-    of this user would be, but is a stranger's, does not hide the service.
+    $FISHD_ENDPOINT, else a daemon of this user, else the system's service. A socket that another
+    user has put where that of this user would be does not hide the service.
     """
     given = os.environ.get(ENDPOINT_VARIABLE)
     if given:
         return given
-    path = _private_socket("control")
-    own = f"ipc://{path}"
+    own = _private_socket("control")
     # The socket of a daemon that was killed is still there.
-    there_is_none = _is_there(_SERVICE) and (is_deserted(own) or stranger(path))
-    return f"ipc://{_SERVICE}" if there_is_none else own
+    if _is_there(_SERVICE) and (unix_sockets.is_deserted(own) or unix_sockets.stranger(own)):
+        return f"ipc://{_SERVICE}"
+    return f"ipc://{own}"
 
 
 def _is_there(path: Path) -> bool:
@@ -82,79 +177,18 @@ def _is_there(path: Path) -> bool:
     return True
 
 
-def _private_socket(name: str) -> Path:
-    return Path(runtime_folder()) / name
-
-
-@contextmanager
 def claimed(
     address: str,
     rival: str = "another fishd",
     advice: str = "stop it, or give this one another control.address and telemetry.address",
-) -> Iterator[None]:
-    """Make sure that nobody else serves an ipc address, and take its files away at the end.
-
-    Binding alone does not tell: ZeroMQ takes the socket file of a living process away from it, and
-    leaves its own behind. Raises `StartupError`, which names the `rival` and gives the `advice`,
-    when somebody is there, this process included.
-    """
-    if not address.startswith("ipc://"):
-        yield
-        return
+) -> AbstractContextManager[None]:
+    """Make sure that nobody else serves an ipc address: `unix_sockets.claimed`."""
     path = socket_path(address)
-    with ExitStack() as stack:
-        try:
-            if path.exists() and not path.is_socket():
-                raise StartupError(
-                    f"{path} is there already and is no socket; choose another address"
-                )
-            stack.enter_context(locked(path.resolve(), remove=True))
-        except Taken as taken:
-            raise StartupError(
-                f"{rival} (pid {taken.pid}) already serves {address}; {advice}"
-            ) from None
-        except NotALock as error:
-            raise StartupError(
-                f"{error.filename} {error.strerror}; remove it, or choose an address in a folder "
-                "of your own"
-            ) from None
-        except OSError as error:
-            raise StartupError(
-                f"{lock_path(path)}: cannot be made: {error.strerror}; "
-                "choose an address in a folder that exists"
-            ) from None
-        given_up = time.monotonic() + _LEAVING
-        while path.is_socket() and not is_deserted(address):
-            if time.monotonic() > given_up:  # a program that locks nothing
-                raise StartupError(f"another program already serves {address}; {advice}")
-            time.sleep(_AGAIN)
-        try:
-            yield
-        finally:
-            if path.is_socket():
-                path.unlink()
-
-
-def socket_path(address: str) -> Path:
-    """The file of an ipc address."""
-    return Path(address.removeprefix("ipc://"))
-
-
-def is_deserted(address: str) -> bool:
-    """True when it is certain, without a wait, that nobody listens at an ipc address."""
-    if not address.startswith("ipc://"):
-        return False
-    with socket.socket(socket.AF_UNIX) as probe:
-        probe.setblocking(False)
-        nobody = (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED)
-        try:
-            return probe.connect_ex(str(socket_path(address))) in nobody
-        except OSError:  # no socket has a path that long
-            return True
+    return unix_sockets.claimed(path, address, rival, advice) if path else nullcontext()
 
 
 def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
-    """A listening socket; an ipc address must be `claimed` before, what is left there is removed.
+    """A listening socket; an ipc address must be `claimed` before.
 
     key: that of the address in the configuration, which messages name
     group: let user and group of this process connect to a Unix socket, and nobody else
@@ -165,13 +199,11 @@ def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
         where = parse(address)
         if isinstance(where, Ipc):
             server = socket.socket(socket.AF_UNIX)
-            _bind_path(server, where.path, 0o117 if group else None)
+            unix_sockets.bind(server, Path(where.path), 0o117 if group else None)
         else:
-            family = socket.AF_INET6 if ":" in where.host else socket.AF_INET
-            host = "" if where.host == "*" else where.host  # "" is every address
-            server = socket.socket(family)
+            server = socket.socket(socket.AF_INET6 if ":" in where.host else socket.AF_INET)
             server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            _bind_port(server, host, int(where.port))
+            _bind_port(server, where)
         server.listen(_BACKLOG)
     except (OSError, ValueError) as error:
         if server:
@@ -180,34 +212,23 @@ def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
     return server
 
 
-def _bind_port(server: socket.socket, host: str, port: int) -> None:
-    given_up = time.monotonic() + _LEAVING
+def _bind_port(server: socket.socket, where: Tcp) -> None:
+    given_up = time.monotonic() + unix_sockets.LEAVING
+    host = "" if where.host == "*" else where.host  # "" is every address
     while True:
         try:
-            return server.bind((host, port))
+            return server.bind((host, int(where.port)))
         except OSError as error:
             if error.errno != errno.EADDRINUSE or time.monotonic() > given_up:
                 raise
-        time.sleep(_AGAIN)
-
-
-def _bind_path(server: socket.socket, path: str, mask: int | None) -> None:
-    with suppress(FileNotFoundError):
-        Path(path).unlink()  # of a fishd that was killed
-    before = os.umask(mask) if mask is not None else None
-    try:
-        server.bind(path)
-    finally:
-        if before is not None:
-            os.umask(before)
+        time.sleep(unix_sockets.AGAIN)
 
 
 def served(address: str, server: socket.socket) -> str:
     """The address that clients connect to: with the port that was taken where 0 was asked for."""
-    if not address.startswith("tcp://"):
+    if socket_path(address):
         return address
-    host = address.removeprefix("tcp://").rpartition(":")[0].replace("*", "0.0.0.0")
-    return f"tcp://{host}:{server.getsockname()[1]}"
+    return f"{address.rpartition(':')[0].replace('*', '0.0.0.0')}:{server.getsockname()[1]}"
 
 
 def _why(address: str, error: Exception) -> str:
@@ -217,10 +238,9 @@ def _why(address: str, error: Exception) -> str:
     if error.errno == errno.EADDRINUSE:
         return "it is in use, by another fishd perhaps; stop that, or choose another address"
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
-    if unknown and address.startswith("tcp://"):
-        host, _, port = address.removeprefix("tcp://").rpartition(":")
+    if unknown and isinstance(where := parse(address), Tcp):
         return (
-            f"{host} is no address of this machine; write tcp://127.0.0.1:{port}, or "
-            f"tcp://0.0.0.0:{port} for all"
+            f"{where.host} is no address of this machine; write tcp://127.0.0.1:{where.port}, or "
+            f"tcp://0.0.0.0:{where.port} for all"
         )
     return f"{error.strerror or error}; choose another address"

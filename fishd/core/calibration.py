@@ -3,10 +3,17 @@
 import math
 from typing import Annotated, Literal, TypeVar
 
-import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from fishd.hardware.settings import ServoSettings
+from fishd.core.schema import note, unit
+
+Direction = Annotated[Literal[1, -1], note("1 or -1: which way a positive angle turns.")]
+Trim = Annotated[
+    float, unit("us", "Correction of the centre that makes the fin straight.", ge=-500, le=500)
+]
+Scale = Annotated[float, unit("us/rad", "Change of the pulse per angle.", ge=10, le=5000)]
+Lowest = Annotated[float, unit("rad", "Soft limit: no angle below.", ge=-math.pi, le=0)]
+Highest = Annotated[float, unit("rad", "Soft limit: no angle above.", ge=0, le=math.pi)]
 
 WORST_CONDITION = 1e5
 """A matrix of a larger condition number says the same of both forces; that of a fit is less."""
@@ -61,41 +68,14 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the same keys of section `servo` mean, with their bounds; takes precedence over them."""
+    """The keys of section `servo` that a calibration finds; takes precedence over them."""
 
-    trim: Annotated[float, Meta(ge=-500, le=500)] = 0.0
-    """[µs]"""
-    direction: Literal[1, -1] = 1
-    scale: Annotated[float, Meta(ge=10, le=5000)] = 600.0
-    """[µs/rad]"""
-    lowest: Annotated[float, Meta(ge=-math.pi, le=0)] = -1.2
-    """[rad]"""
-    highest: Annotated[float, Meta(ge=0, le=math.pi)] = 1.2
-    """[rad]"""
+    trim: Trim = 0.0
+    direction: Direction = 1
+    scale: Scale = 600.0
+    lowest: Lowest = -1.2
+    highest: Highest = 1.2
     date: str = ""
-
-
-def calibrated(settings: ServoSettings, calibration: ServoCalibration) -> ServoSettings:
-    """The settings with what a calibration says instead."""
-    return msgspec.structs.replace(
-        settings,
-        trim=calibration.trim,
-        direction=calibration.direction,
-        scale=calibration.scale,
-        lowest=calibration.lowest,
-        highest=calibration.highest,
-    )
-
-
-def as_configured(settings: ServoSettings) -> ServoCalibration:
-    """The calibration that the settings themselves amount to."""
-    return ServoCalibration(
-        trim=settings.trim,
-        direction=settings.direction,
-        scale=settings.scale,
-        lowest=settings.lowest,
-        highest=settings.highest,
-    )
 
 
 class ForceSample(Struct, frozen=True):
@@ -109,7 +89,7 @@ class ForceSample(Struct, frozen=True):
     vx_std: float
     vy_std: float
     fx: float
-    """By the calibration in force [N]."""
+    """By the calibration that is used [N]."""
     fy: float
     suspect: str = ""
     """Why this is not to be believed; empty where it is."""

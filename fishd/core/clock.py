@@ -1,18 +1,19 @@
-"""Time: the clocks, and the tickers that say when the next tick is due.
+"""Time: clocks, a timer of the kernel, and the tickers that say when the next tick is due.
 
 Deadlines are absolute, t0 + k·period, so nothing drifts. A late tick runs as soon as it can; slots
 that have passed meanwhile are skipped and counted, and the phase is kept.
 """
 
 import asyncio
+import ctypes
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Protocol
 
 from msgspec import Struct
-
-from fishd.timerfd import TimerFd
 
 
 class Slot(Struct, frozen=True, gc=False):
@@ -29,7 +30,7 @@ class Slot(Struct, frozen=True, gc=False):
 
 
 class Clock(Protocol):
-    """Where time comes from."""
+    """A source of time."""
 
     def monotonic(self) -> float:
         """Time that never jumps [s]; for control."""
@@ -85,6 +86,68 @@ class VirtualTicker:
             self._index += 1
 
 
+_CLOCK_MONOTONIC = 1
+_ABSOLUTE = 1
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+class _Itimerspec(ctypes.Structure):
+    _fields_ = (("interval", _Timespec), ("value", _Timespec))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def _checked(result: int) -> int:
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return result
+
+
+class TimerFd:
+    """A one-shot timer on CLOCK_MONOTONIC whose descriptor an event loop can wait for.
+
+    Python has os.timerfd_create only from 3.13 on; the C library has it everywhere. Raises OSError
+    where the kernel refuses.
+    """
+
+    def __init__(self) -> None:
+        self._fd = _checked(_libc.timerfd_create(_CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC))
+        self._spec = _Itimerspec()
+
+    def fileno(self) -> int:
+        """The descriptor, which is readable once the timer has expired."""
+        return self._fd
+
+    def arm(self, deadline: float) -> None:
+        """Expire at `deadline` [s, monotonic]; at once when that has passed."""
+        seconds = int(deadline)
+        value = self._spec.value
+        value.seconds = seconds
+        value.nanoseconds = max(1, int((deadline - seconds) * 1e9))  # all zero would disarm
+        _checked(_libc.timerfd_settime(self._fd, _ABSOLUTE, ctypes.byref(self._spec), None))
+
+    def clear(self) -> None:
+        """Make the descriptor unreadable again."""
+        with suppress(BlockingIOError):
+            os.read(self._fd, 8)
+
+    @property
+    def closed(self) -> bool:
+        """True after close()."""
+        return self._fd < 0
+
+    def close(self) -> None:
+        """Give the descriptor back; may be called twice."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
 class Ticker:
     """Ticks of real time for an asyncio loop.
 
@@ -95,15 +158,15 @@ class Ticker:
     MARGIN = 2e-3
     """How long before the deadline to stop other work [s], at most a quarter of the period."""
 
-    def __init__(self, period: float, rehearse: Callable[[], None] | None = None) -> None:
+    def __init__(self, period: float, warm_up: Callable[[], None] | None = None) -> None:
         """Must be made inside a running asyncio loop; the first slot is one period from now.
 
-        rehearse: called just before each deadline, if there is time for it
+        warm_up: called just before each deadline, if there is time for it
         """
         self._period = period
-        self._rehearse = rehearse
+        self._warm_up = warm_up
         self._margin = min(self.MARGIN, period / 4)
-        self._rehearsal_time = self._margin / 2
+        self._warm_up_time = self._margin / 2
         self._start = time.monotonic() + period
         self._index = -1
         self._timer = TimerFd()
@@ -127,8 +190,8 @@ class Ticker:
         self._timer.arm(self._start + following * self._period - self._margin)
         await self._woken.wait()
         deadline = self._start + following * self._period
-        if self._rehearse:
-            self._rehearse_before(deadline, self._rehearse)
+        if self._warm_up:
+            self._warm_up_before(deadline, self._warm_up)
         self._sleep_until(deadline)
         now = time.monotonic()
         current = max(following, math.floor((now - self._start) / self._period))
@@ -139,15 +202,15 @@ class Ticker:
         self._timer.clear()
         self._woken.set()
 
-    def _rehearse_before(self, deadline: float, rehearse: Callable[[], None]) -> None:
-        """Rehearse as late as is safe, then wait awake: a sleep would lose the caches again."""
-        self._sleep_until(deadline - 2.0 * self._rehearsal_time)
+    def _warm_up_before(self, deadline: float, warm_up: Callable[[], None]) -> None:
+        """Warm up as late as is safe, then wait awake: a sleep would lose the caches again."""
+        self._sleep_until(deadline - 2.0 * self._warm_up_time)
         begun = time.monotonic()
         # One that took long, on a machine that was busy just then, must not end them for good.
-        self._rehearsal_time *= 0.98
-        if deadline - begun > self._rehearsal_time:
-            rehearse()
-            self._rehearsal_time = max(self._rehearsal_time, time.monotonic() - begun)
+        self._warm_up_time *= 0.98
+        if deadline - begun > self._warm_up_time:
+            warm_up()
+            self._warm_up_time = max(self._warm_up_time, time.monotonic() - begun)
             while time.monotonic() < deadline:
                 pass
 

@@ -1,13 +1,17 @@
 """What `fishd` and `fishctl` say in a terminal: one line a second, and one line for a mistake."""
 
+import os
 import sys
 from typing import NoReturn
 
 import click
 
-from fishd import text
-from fishd.signals import Status
+from fishd.core import text
+from fishd.core.errors import ConfigError
+from fishd.core.signals import Status
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells give it: 128 and the number of SIGINT."""
 _LONGEST = 5000
 """A complaint may list all keys of the configuration, but no more [characters]."""
 
@@ -28,7 +32,9 @@ def status_line(status: Status) -> str:
 
 
 def run(command: click.Command, name: str) -> int:
-    """Run a command whose wrong use gets one line and exit status 2; return its exit status."""
+    """Run a command and return its exit status.
+
+    One line, and exit status 2 for a wrong use, 78 for a wrong configuration."""
     try:
         status = command(prog_name=name, standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -39,8 +45,10 @@ def run(command: click.Command, name: str) -> int:
         complain(name, f"{error.format_message().rstrip('.')}; see '{path} --help'", 2)
     except click.ClickException as error:
         complain(name, error.format_message(), 1)
+    except ConfigError as error:
+        complain(name, str(error), os.EX_CONFIG)
     except click.Abort:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     return status if isinstance(status, int) else 0
 
 

@@ -4,6 +4,7 @@
     ├── ConfigError      (ValueError)   the configuration file or a --set is wrong
     ├── ParameterError   (ValueError)   a controller's parameter is wrong
     ├── UnknownController (LookupError) no controller has that name
+    ├── UnknownDriver    (LookupError)  no driver has that name
     ├── PolicyError      (ValueError)   a policy file cannot be used
     ├── ControllerFault  (RuntimeError) a controller cannot go on, and knows why; see its `code`
     ├── StartupError     (RuntimeError) the daemon cannot start, such as address in use
@@ -44,6 +45,10 @@ class ParameterError(FishdError, ValueError):
 
 class UnknownController(FishdError, LookupError):
     """No installed package offers a controller of that name."""
+
+
+class UnknownDriver(FishdError, LookupError):
+    """No installed package offers a driver of that name, or it does not load."""
 
 
 class PolicyError(FishdError, ValueError):

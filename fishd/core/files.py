@@ -1,4 +1,4 @@
-"""Reads the files that people name: of the right kind, no longer than they may be, without a wait.
+"""Reads the files that people name, and writes files atomically.
 
 Whatever a name leads to, a pipe, a device or a file without an end, the answer comes at once.
 """
@@ -22,7 +22,7 @@ _KINDS = {
 
 
 class FileProblem(Exception):
-    """Why a file cannot be read, in words that follow its name."""
+    """Why a file cannot be read; the message goes after its name."""
 
 
 class NoFile(FileProblem):
@@ -33,7 +33,7 @@ def read(path: Path, longest: int, reader: str) -> bytes:
     """The content of a regular file; raises `FileProblem`.
 
     longest: more is not read [bytes]
-    reader: what the file is for, such as `a policy`, for the complaint
+    reader: what the file is for, such as `a policy`; the message names it
     """
     try:
         _check_kind(path.stat())  # first: to open a device may already do something to it
@@ -41,7 +41,7 @@ def read(path: Path, longest: int, reader: str) -> bytes:
         with os.fdopen(descriptor, "rb") as file:
             found = os.fstat(descriptor)
             _check_kind(found)
-            # What the kernel makes up, as in /proc, has no size until it is read.
+            # A file of /proc has no size until it is read.
             content = file.read(longest + 1) if found.st_size <= longest else None
     except (FileNotFoundError, NotADirectoryError):
         raise NoFile("no such file") from None
@@ -72,3 +72,21 @@ def _check_kind(found: os.stat_result) -> None:
 def _size(longest: int) -> str:
     megabytes = longest / 2**20
     return f"{megabytes:g} MB" if megabytes >= 1 else f"{longest // 2**10} kB"
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file, or replace it; a full disk or a kill leaves the old one, never half a file.
+
+    Raises OSError.
+    """
+    part = path.with_name(f".{path.name}.part")
+    data = content.encode() if isinstance(content, str) else content
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise

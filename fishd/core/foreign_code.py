@@ -1,6 +1,6 @@
-"""The one place where code that is not fishd's is called, such as that of a controller.
+"""The one place that calls code of other packages, such as a controller's.
 
-It may raise anything, and it may never return.
+Such code may raise anything, and may never return.
 """
 
 import ctypes
@@ -10,8 +10,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Generic, ParamSpec, TypeVar
 
-from fishd import text
-from fishd.errors import Escaped
+from fishd.core import text
+from fishd.core.errors import Escaped
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -41,7 +41,7 @@ def _ctrl_c_is_raised() -> bool:
 
 
 class GivenUp(BaseException):
-    """Raised in the thread of an `Attempt` that nobody waits for any more."""
+    """Raised in the thread of an `Attempt` that was given up."""
 
 
 class Attempt(Generic[T]):
@@ -56,9 +56,9 @@ class Attempt(Generic[T]):
         interrupt: bool = True,
     ) -> None:
         """
-        done: called in that thread as soon as there is a result, unless it was given up
-        late: takes the result of one that was given up and returned after all
-        interrupt: end a loop in Python when it is given up; not where half of the work would harm
+        done: called in that thread as soon as there is a result, unless the call was given up
+        late: takes the result of a call that was given up and returned after all
+        interrupt: end a loop in Python when the call is given up; False where that would do harm
         """
         self._function = function
         self._done = done
@@ -69,7 +69,7 @@ class Attempt(Generic[T]):
         self._settling = threading.Lock()
         self._settled = threading.Event()
         self._given_up = False
-        self._thread = threading.Thread(target=self._run, name="aside", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="background call", daemon=True)
         self._thread.start()
 
     @property

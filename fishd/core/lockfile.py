@@ -1,7 +1,7 @@
-"""A lock file beside what only one process may use; it names the process that holds it.
+"""A lock file beside what only one process may use, which names that process.
 
-The lock ends with its process, however that ends: unlike a socket file it never lies. What somebody
-else has put in its place, such as a link to a file that is to be emptied, is left alone.
+The lock ends with its process, however that ends; a socket file stays. What somebody else has put
+in place of the lock file, such as a link to another file, is left alone.
 """
 
 import errno
@@ -24,7 +24,7 @@ class Taken(Exception):
 
 
 class NotALock(OSError):
-    """What has the name of the lock file is none; `strerror` says what it is."""
+    """Something else has the name of the lock file; `strerror` says what."""
 
     def __init__(self, path: Path, what: str) -> None:
         super().__init__(errno.EPERM, f"is {what}, no lock file of fishd", str(path))
@@ -75,7 +75,7 @@ def holder(path: Path) -> str:
 
 
 def _held(path: Path, shared: bool) -> int:
-    """The lock file, open and locked; not one that its holder has removed meanwhile."""
+    """The lock file, open and locked; tries again where its holder has just removed it."""
     while True:
         lock = _opened(lock_path(path), os.O_RDWR, shared=shared)
         try:
@@ -115,7 +115,7 @@ def _opened(path: Path, flags: int, *, shared: bool) -> int:
 
 
 def _strange(found: os.stat_result, folder: Path, shared: bool) -> str:
-    """What an open file is other than a lock file of fishd's; empty where it is one."""
+    """Why an open file is no lock file of fishd; empty where it is one."""
     if not stat.S_ISREG(found.st_mode):
         return "no regular file"
     if found.st_nlink > 1:

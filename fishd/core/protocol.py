@@ -1,24 +1,26 @@
 """The control protocol: JSON requests and replies, shared by server and client.
 
-docs/protocol.md is its reference for clients in other languages.
+docs/protocol.md is its reference for clients in other languages; its tables are written from what
+is declared here (`make docs`).
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from fishd import text
-from fishd.errors import Refused
-from fishd.hardware.calibration import ForceCalibration, ServoCalibration
-from fishd.signals import Reason
+from fishd.core import text
+from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.errors import Refused
+from fishd.core.schema import PRINTABLE, note, unit
+from fishd.core.signals import MODES, Reason
 
 VERSION = 1
 MAX_MESSAGE = 16384
 """Longer messages are not even received [bytes]."""
 
-LOAN = 5.0
-"""How long a servo calibration that is not saved stays in force without being renewed [s]."""
+LEASE = 5.0
+"""How long a servo calibration that is not saved is used without being renewed [s]."""
 FRESH = 10.0
 """How long after it was taken a force sample is good for a tare [s]."""
 
@@ -27,17 +29,19 @@ LOADING = 10.0
 
 RequestId = int | Annotated[str, Meta(max_length=256)] | None
 
-Line = Annotated[str, Meta(max_length=1000, pattern="^[^\x00-\x1f\x7f-\x9f]*$")]
+Line = Annotated[str, Meta(max_length=1000, pattern=PRINTABLE)]
 """Text that goes into logs and terminals: one line without control characters."""
 
 
 class Request(Struct, forbid_unknown_fields=True):
     """What a client asks for."""
 
-    v: int
-    op: Annotated[str, Meta(max_length=64)]
-    id: RequestId = None
-    args: dict[str, Any] = {}
+    v: Annotated[int, note("Version of this protocol: 1.")]
+    op: Annotated[str, note("What to do.", max_length=64)]
+    id: Annotated[RequestId, note("Comes back in the reply; optional.")] = None
+    args: Annotated[
+        dict[str, Any], note("Arguments of the operation; optional where it needs none.")
+    ] = {}
 
 
 class OnlyId(Struct):
@@ -49,33 +53,44 @@ class OnlyId(Struct):
 class Failure(Struct, frozen=True):
     """Why a request was refused."""
 
-    code: str
-    message: str
+    code: Annotated[str, note("One of the codes below.")]
+    message: Annotated[str, note("One line that says what would be right.")]
 
 
 class Reply(Struct, frozen=True):
     """The answer: `result` where `ok`, else `error`."""
 
-    v: int
-    id: RequestId
-    ok: bool
-    result: msgspec.Raw | UnsetType = UNSET
-    error: Failure | UnsetType = UNSET
+    v: Annotated[int, note("Version of this protocol: 1.")]
+    id: Annotated[RequestId, note("That of the request; null where it cannot be read.")]
+    ok: Annotated[bool, note("Was the request carried out?")]
+    result: Annotated[msgspec.Raw | UnsetType, note("What the operation gives.")] = UNSET
+    error: Annotated[Failure | UnsetType, note("Why it was refused.")] = UNSET
 
 
 class State(Struct, frozen=True):
-    """The answer to every request that changes something: what is in force from now on."""
+    """The answer to every request that changes something."""
 
-    seq: int
-    """The first tick that is affected."""
-    mode: str
-    reason: Reason | None
-    controller: str
-    parameters: dict[str, Any]
+    seq: Annotated[int, note("Number of the first tick that is affected.")]
+    mode: Annotated[str, note(MODES)]
+    reason: Annotated[Reason | None, note("Why, in mode fault and estop.")]
+    controller: Annotated[str, note("The active controller.")]
+    parameters: Annotated[dict[str, Any], note("All its parameters.")]
+
+
+class PolicyInfo(Struct, frozen=True, kw_only=True):
+    """A policy, named or by its path."""
+
+    name: str
+    file: str
+    """Its path."""
+    problem: str
+    """Why it cannot be used, in one line; empty where it can."""
+    card: dict[str, Any] | None
+    """What the file says about itself, as JSON; None where it is not a policy file."""
 
 
 class NoArguments(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of status, controllers, policies, config, stop and clear-fault."""
+    """Arguments of an operation that takes none."""
 
 
 class SetController(Struct, frozen=True, forbid_unknown_fields=True):
@@ -110,41 +125,44 @@ class Tare(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CalibrateForce(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of calibrate-force: it is saved, and in force from the next tick on."""
+    """Arguments of calibrate-force."""
 
     calibration: ForceCalibration
 
 
 class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of calibrate-servo: in force from the next tick on, saved or for a loan only.
+    """Arguments of calibrate-servo.
 
-    A loan ends unless it is renewed; whoever has it names it in each change, and to save.
+    A lease ends unless it is renewed; whoever has it names it in each change, and to save.
     """
 
     calibration: ServoCalibration
     save: bool = False
-    loan: str | None = None
+    lease: str | None = None
 
 
-class ServoLoan(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of renew-loan and end-loan."""
+class ServoLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of renew-lease and end-lease."""
 
-    loan: str
+    lease: str
 
 
 class Calibrations(Struct, frozen=True):
-    """The calibrations in force, and their files; null where they come from the configuration.
+    """The calibrations that are used now, and their files."""
 
-    `loan` is null unless that of the servo is in force for a loan only. A force beyond
-    ±`force_limit` [N] is not believed.
-    """
-
-    force: ForceCalibration
-    force_file: str | None
-    servo: ServoCalibration
-    servo_file: str | None
-    force_limit: float
-    loan: str | None = None
+    force: Annotated[ForceCalibration, note("That of the force sensor, see below.")]
+    force_file: Annotated[str | None, note("Its file; null where it comes from the configuration.")]
+    servo: Annotated[
+        ServoCalibration,
+        note("`trim` [µs], `direction`, `scale` [µs/rad], `lowest`, `highest` [rad], `date`."),
+    ]
+    servo_file: Annotated[str | None, note("Its file, likewise.")]
+    force_limit: Annotated[
+        float, unit("N", "A force beyond ± this is not believed: `force_sensor.force_limit`.")
+    ]
+    lease: Annotated[
+        str | None, note("The lease for which that of the servo is tried; null where it is saved.")
+    ] = None
 
 
 class Mark(Struct, frozen=True, forbid_unknown_fields=True):
@@ -152,6 +170,68 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True):
 
     text: Line
 
+
+class Operation(NamedTuple):
+    """What can be asked for."""
+
+    arguments: type[Struct]
+    result: str
+    """What it gives, in the words of docs/protocol.md."""
+    does: str
+    """What it does, likewise."""
+
+
+_STATE = "[state](#state)"
+_CALIBRATIONS = "[calibrations](#calibrations)"
+_CONFIG = "the [configuration](configuration.md) that `fishd` was started with, an object a section"
+OPERATIONS = {
+    "status": Operation(NoArguments, "[status](#status)", "nothing"),
+    "controllers": Operation(NoArguments, "list of [controllers](#controllers)", "nothing"),
+    "policies": Operation(NoArguments, "list of [policies](#policies)", "nothing"),
+    "config": Operation(NoArguments, _CONFIG, "nothing"),
+    "set-controller": Operation(
+        SetController,
+        _STATE,
+        "makes a new controller the active one; parameters left out take their defaults",
+    ),
+    "set-parameter": Operation(
+        SetParameter, _STATE, "changes these parameters of the active controller, all or none"
+    ),
+    "stop": Operation(
+        NoArguments, _STATE, "fades to neutral; mode idle. In fault and estop: nothing"
+    ),
+    "estop": Operation(Estop, _STATE, "stops the pulses at once; mode estop"),
+    "clear-fault": Operation(
+        NoArguments, _STATE, "leaves mode fault or estop for idle. Otherwise: nothing"
+    ),
+    "mark": Operation(Mark, _STATE, "publishes an event `mark`"),
+    "calibrations": Operation(NoArguments, _CALIBRATIONS, "nothing"),
+    "sample-force": Operation(
+        SampleForce, "[force sample](#calibrations)", "measures for so many seconds"
+    ),
+    "tare": Operation(
+        Tare,
+        _CALIBRATIONS,
+        f"calls the force sample of that `number`, one of the last {FRESH:g} s, zero force; saved",
+    ),
+    "calibrate-force": Operation(
+        CalibrateForce,
+        _CALIBRATIONS,
+        "saves it and uses it from the next tick on; what is left out takes its default",
+    ),
+    "calibrate-servo": Operation(
+        CalibrateServo,
+        _CALIBRATIONS,
+        "uses it from the next tick on: saved, or else for a [lease](#leases)",
+    ),
+    "renew-lease": Operation(
+        ServoLease, _CALIBRATIONS, f"lets the lease last for {LEASE:g} s from now"
+    ),
+    "end-lease": Operation(
+        ServoLease, _CALIBRATIONS, "begins to end it: neutral, then the calibration of before"
+    ),
+}
+"""All operations, by name."""
 
 _request_decoder = msgspec.json.Decoder(Request)
 _id_decoder = msgspec.json.Decoder(OnlyId)

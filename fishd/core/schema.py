@@ -1,31 +1,50 @@
-"""One source for everything that is said about parameters.
+"""One source for the bounds, units and descriptions of parameters.
 
 Configuration sections and controller parameters are msgspec structs whose fields carry bounds, unit
-and description. From those this module takes validation with readable errors (`convert`) and a
-description (`fields_of`) that help texts, command-line options and documentation are made from.
+and description (`unit`, `note`). From those this module takes validation with readable errors
+(`convert`) and a description (`fields_of`) for help texts, command-line options and documentation.
 """
 
 import difflib
 import heapq
+import math
 import re
 import reprlib
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any, TypeVar, cast
 
 import msgspec
-from msgspec import Struct, inspect
+from msgspec import Meta, Struct, inspect
 
-from fishd import text
+from fishd.core import text
 
 LONGEST_WORD = 100
 """For a longer one no suggestion is looked for [characters]."""
 _CANDIDATES = 5
+PRINTABLE = "^[^\x00-\x1f\x7f-\x9f]*$"
+"""Pattern of a text without control characters."""
 
 T = TypeVar("T")
 
 Scalar = bool | int | float | str | None
+
+
+def unit(symbol: str, description: str, *, file: str = "", **constraints: Any) -> Meta:
+    """What a field means: `Annotated[float, unit("Hz", "Frequency of the command.", gt=0, le=10)]`.
+
+    symbol: the unit in SI notation, `1` where there is none
+    file: suffix, such as `.onnx`, where a text may be the path of a file
+    constraints: those of `msgspec.Meta`, such as gt, ge, lt, le, min_length, pattern
+    """
+    extra = {"unit": symbol} | ({"file": file} if file else {})
+    return Meta(description=description, extra_json_schema=extra, **constraints)
+
+
+def note(description: str, **constraints: Any) -> Meta:
+    """`unit` for a field that is no quantity, such as a name, a switch or a section."""
+    return Meta(description=description, **constraints)
 
 
 class Field(Struct, frozen=True, omit_defaults=True):
@@ -54,6 +73,21 @@ class Problem(Exception):
         super().__init__(message)
         self.path = path
 
+    def located(self, sources: Mapping[tuple[str, ...], str]) -> str:
+        """The message with the place of its key, of one within it, or of the section around it.
+
+        sources: the place where each key was set, such as `fish.yaml:3`
+        """
+        path = self.path
+        within = [place for key, place in sources.items() if path and key[: len(path)] == path]
+        above = [sources[path[:n]] for n in range(len(path) + 1) if path[:n] in sources]
+        where = sources.get(path) or (within or above[::-1] or [""])[0]
+        return ": ".join(part for part in (where, ".".join(path), str(self)) if part)
+
+
+class UnknownKey(Problem):
+    """There is no such key; it is the last of `path`."""
+
 
 _KINDS: dict[type[inspect.Type], str] = {
     inspect.FloatType: "number",
@@ -68,7 +102,7 @@ _KINDS: dict[type[inspect.Type], str] = {
 
 
 def without_empty_sections(data: Mapping[str, Any], target: type[Struct]) -> dict[str, Any]:
-    """`data` less the sections below which nothing is written, so that they take their defaults."""
+    """`data` without its empty sections (null), which then take their defaults."""
     kept = dict(data)
     for name, section in _sections(target):
         if isinstance(kept.get(name), Mapping):
@@ -78,33 +112,39 @@ def without_empty_sections(data: Mapping[str, Any], target: type[Struct]) -> dic
     return kept
 
 
+@lru_cache(maxsize=256)  # controllers are asked for theirs in every request
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """The fields of a parameter struct, in the order in which they are declared."""
-    return _fields_of(struct)
-
-
-@lru_cache(maxsize=256)  # controllers are asked for theirs in every request
-def _fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     return tuple(_describe(field) for field in _info(struct).fields)
 
 
 @lru_cache(maxsize=256)
 def _info(struct: type[Struct]) -> inspect.StructType:
+    _prepare(struct)
     return cast(inspect.StructType, inspect.type_info(struct))
 
 
-def convert(data: Any, target: type[T], *, prefix: tuple[str, ...] = ()) -> T:
+def convert(
+    data: Any,
+    target: type[T],
+    *,
+    prefix: tuple[str, ...] = (),
+    elsewhere: Callable[[], list[str]] = list,
+) -> T:
     """Validate `data` into the struct `target`.
 
     Raises `Problem`, whose message names the permitted values or the nearest valid key and whose
     path begins with `prefix`.
+
+    elsewhere: gives further keys to suggest, in dotted form
     """
     _prepare(target)
     try:
         return msgspec.convert(data, target)
     except msgspec.ValidationError as error:
-        path, message = _explain(error, data, cast(type[Struct], target))
-        raise Problem(prefix + path, message) from None
+        problem = _explain(error, data, cast(type[Struct], target), elsewhere)
+        problem.path = prefix + problem.path
+        raise problem from None
 
 
 _prepared: set[Any] = set()
@@ -112,7 +152,7 @@ _preparing = threading.Lock()
 
 
 def _prepare(target: Any) -> None:
-    """Let msgspec look at a type for the first time in one thread only: in two, it crashes."""
+    """Let one thread alone use a type for the first time: in two at once, msgspec crashes."""
     if target in _prepared:
         return
     with _preparing:
@@ -135,21 +175,17 @@ def wanted(field: Field) -> str:
     }[field.kind]
     preposition = {"choice": "", "text": "of ", "list": "of "}.get(field.kind, "in ")
     within = preposition + field.interval
-    unit = "" if field.unit in ("", "1") else field.unit
-    words = " ".join(word for word in (kind, within if field.interval else "", unit) if word)
-    return words + (" (or null)" if field.optional else "")
+    words = (kind, within if field.interval else "", field.unit if field.unit != "1" else "")
+    return " ".join(filter(None, words)) + " (or null)" * field.optional
 
 
 def names_file(text: str, suffix: str) -> bool:
-    """Is a text that may be the name of something, or the path of a file, the latter?"""
+    """Is this text the path of a file, rather than a name?"""
     return "/" in text or text.endswith(suffix)
 
 
 def nested_too_deeply(data: Any, levels: int = 20) -> bool:
-    """Are there more than so many lists and mappings in one another?
-
-    Whoever walks through them, such as an encoder, would reach the end of Python's stack.
-    """
+    """Are lists and mappings nested in more levels, so that an encoder might overflow the stack?"""
     if isinstance(data, Mapping):
         data = list(data.values())
     if not isinstance(data, list):
@@ -157,14 +193,14 @@ def nested_too_deeply(data: Any, levels: int = 20) -> bool:
     return levels == 0 or any(nested_too_deeply(part, levels - 1) for part in data)
 
 
-def nearest(word: str, words: list[str]) -> str:
-    """A did-you-mean for `word`, or the list of what there is."""
+def nearest(word: str, words: list[str], *, listed: str = "valid") -> str:
+    """A did-you-mean for `word`, or the list of what there is, introduced by `listed`."""
     close = _close(word, words)
     if not close:  # 'noise' for 'simulation.noise'
         close = [known for known in words if known.rpartition(".")[2] == word]
     if close:
         return f"did you mean '{close[0]}'?"
-    return f"valid: {', '.join(words)}" if words else "none is valid here"
+    return f"{listed}: {', '.join(words)}" if words else "none is valid here"
 
 
 def _close(word: str, words: list[str]) -> list[str]:
@@ -188,22 +224,25 @@ def leaves(struct: type[Struct], prefix: str = "") -> list[str]:
     return keys
 
 
-def _describe(field: inspect.Field) -> Field:
-    kind, optional = field.type, False
+def _unwrapped(kind: inspect.Type) -> tuple[inspect.Type, dict[str, Any], bool]:
+    """A field's type without metadata and null, its metadata, and whether null is permitted."""
     extra: dict[str, Any] = {}
     if isinstance(kind, inspect.Metadata):
-        extra = kind.extra_json_schema or {}
-        kind = kind.type
+        extra, kind = kind.extra_json_schema or {}, kind.type
     if isinstance(kind, inspect.UnionType):
-        optional = True
-        kind = next(part for part in kind.types if not isinstance(part, inspect.NoneType))
-    default = field.default if isinstance(field.default, Scalar) else None
+        kinds = (part for part in kind.types if not isinstance(part, inspect.NoneType))
+        return next(kinds), extra, True
+    return kind, extra, False
+
+
+def _describe(field: inspect.Field) -> Field:
+    kind, extra, optional = _unwrapped(field.type)
     return Field(
         name=field.encode_name,
         kind=_KINDS.get(type(kind), "text"),
         unit=extra.get("unit", ""),
         description=extra.get("description", ""),
-        default=default,
+        default=field.default if isinstance(field.default, Scalar) else None,
         interval=_interval(kind),
         optional=optional,
         required=field.required,
@@ -213,7 +252,8 @@ def _describe(field: inspect.Field) -> Field:
 
 def _interval(kind: inspect.Type) -> str:
     if isinstance(kind, inspect.StrType) and kind.max_length is not None:
-        return f"up to {kind.max_length} printable characters"
+        least = f"{kind.min_length}" if kind.min_length else "up"
+        return f"{least} to {kind.max_length} printable characters"
     if isinstance(kind, inspect.LiteralType):
         return " | ".join(str(value) for value in kind.values)
     if isinstance(kind, inspect.VarTupleType):
@@ -228,40 +268,69 @@ def _interval(kind: inspect.Type) -> str:
 
 
 def _explain(
-    error: msgspec.ValidationError, data: Any, target: type[Struct]
-) -> tuple[tuple[str, ...], str]:
-    """Turn msgspec's first complaint into a path and one readable sentence."""
-    text = str(error)
-    complaint, _, where = text.partition(" - at `$")
+    error: msgspec.ValidationError,
+    data: Any,
+    target: type[Struct],
+    elsewhere: Callable[[], list[str]],
+) -> Problem:
+    """Turn msgspec's first error into a path and one readable sentence."""
+    complaint, _, where = str(error).partition(" - at `$")
     keys = re.findall(r"[^.\[\]`]+", where)
     while keys and keys[-1].isdigit():  # an element of a list is shown with all of the list
         keys.pop()
     path = tuple(key for key in keys if not key.isdigit())
-    unknown = re.search(r"unknown field `(.*)`", complaint)
-    if unknown:
-        key = unknown.group(1)
-        valid = [field.name for field in fields_of(_struct_at(target, path))]
-        dotted = ".".join(path)
-        everywhere = [dotted + "." + name if dotted else name for name in valid] + leaves(target)
-        hint = nearest(key, valid)
-        if not hint.startswith("did"):
-            elsewhere = nearest(key, everywhere)
-            hint = elsewhere if elsewhere.startswith("did") else hint
-        if key in everywhere and "." in key:
-            section, _, name = key.rpartition(".")
-            hint = f"write '{section}:' and below it, indented, '{name}:'"
-        return (*path, key), f"unknown key; {hint}"
-    missing = re.search(r"missing required field `(.*)`", complaint)
-    if missing:
-        key = missing.group(1)
-        return (*path, key), f"is missing: {_wanted(target, (*path, key))}"
+    if unknown := re.search(r"unknown field `(.*)`", complaint):
+        return _unknown(unknown[1], path, target, elsewhere())
+    if missing := re.search(r"missing required field `(.*)`", complaint):
+        path = (*path, missing[1])
+        return Problem(path, f"is missing: {wanted(_describe(_field_at(target, path)))} is needed")
     value = data
     for key in keys:
         if isinstance(value, Mapping):
             value = value[key]
         elif isinstance(value, list | tuple):
             value = value[int(key)]
-    return path, f"{_shown(value)} is not valid: {_wanted(target, path)}"
+    if not path:
+        return Problem(path, f"{_shown(value)} is not valid: a mapping of keys to values is needed")
+    field = _field_at(target, path)
+    return Problem(
+        path,
+        f"{_shown(value)} is not valid: {wanted(_describe(field))} is needed"
+        + _degrees(value, field),
+    )
+
+
+def _unknown(
+    key: str, path: tuple[str, ...], target: type[Struct], elsewhere: list[str]
+) -> UnknownKey:
+    """Suggests a key of the same section, else one of any, else lists those of the section."""
+    valid = [field.name for field in fields_of(_struct_at(target, path))]
+    everywhere = [".".join((*path, name)) for name in valid] + leaves(target) + elsewhere
+    hint = nearest(key, valid)
+    if "." in key and key in everywhere:
+        section, _, name = key.rpartition(".")
+        hint = f"write '{section}:' and below it, indented, '{name}:'"
+    elif not hint.startswith("did") and (other := nearest(key, everywhere)).startswith("did"):
+        hint = other
+    return UnknownKey((*path, key), f"unknown key; {hint}")
+
+
+def _degrees(value: Any, field: inspect.Field) -> str:
+    """A question for whoever gave an angle [rad] that is permitted only as one in degrees."""
+    kind, extra, _ = _unwrapped(field.type)
+    if extra.get("unit") != "rad" or not isinstance(kind, inspect.FloatType):
+        return ""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 360:
+        return ""
+    angle = math.radians(value)
+    above = angle >= kind.ge if kind.ge is not None else kind.gt is None or angle > kind.gt
+    below = angle <= kind.le if kind.le is not None else kind.lt is None or angle < kind.lt
+    return f" (degrees? that is {angle:.3g} rad)" if above and below else ""
+
+
+def _field_at(target: type[Struct], path: tuple[str, ...]) -> inspect.Field:
+    fields = _info(_struct_at(target, path[:-1])).fields
+    return next(field for field in fields if field.encode_name == path[-1])
 
 
 def _struct_at(target: type[Struct], path: tuple[str, ...]) -> type[Struct]:
@@ -280,14 +349,6 @@ def _sections(
             kind = kind.item_type
         if isinstance(kind, inspect.StructType):
             yield field.name, kind.cls
-
-
-def _wanted(target: type[Struct], path: tuple[str, ...]) -> str:
-    if not path:
-        return "a mapping of keys to values is needed"
-    fields = fields_of(_struct_at(target, path[:-1]))
-    field = next(field for field in fields if field.name == path[-1])
-    return f"{wanted(field)} is needed"
 
 
 def _shown(value: Any) -> str:

@@ -1,17 +1,21 @@
-"""YAML as people mean it: values with the line they stand on, and no silent surprises.
+"""Reads YAML, with the line of each key, and refuses values that YAML reads unexpectedly.
 
 PyYAML follows YAML 1.1, in which `on` is true, `1e2` is a text, `1:30` is ninety and the second of
 two equal keys wins. Each of these is refused here, with the line and what to write instead.
 """
 
+import os
+import pathlib
 import re
 from typing import Any, NamedTuple
 
 import yaml
 
-from fishd.files import SETTINGS
+from fishd.core import files
+from fishd.core.errors import ConfigError
 
 Path = tuple[str, ...]
+"""The keys that lead to a value."""
 
 
 class Document(NamedTuple):
@@ -22,7 +26,7 @@ class Document(NamedTuple):
 
 
 class YamlProblem(Exception):
-    """The text is not acceptable YAML; `line` counts from 1."""
+    """What is wrong with the YAML; `line` counts from 1."""
 
     def __init__(self, line: int, message: str) -> None:
         super().__init__(message)
@@ -33,18 +37,39 @@ _WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false
 _BARE_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?")
 _DEEPEST = 20
-_LONGEST = SETTINGS
-"""Longest text [characters]."""
 _MOST = 2000
 """Values and keys in one document; an alias counts as all that it stands for."""
 _LONGEST_NUMBER = 100
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
+def read(
+    file: str | os.PathLike[str], reader: str, example: str
+) -> tuple[dict[str, Any], dict[Path, str]]:
+    """The mapping in a file, and the place of each key, such as `fish.yaml:3`.
+
+    reader: what the file is for, such as `a configuration`; example: a line that would be right
+    Raises `ConfigError` that names file and line.
+    """
+    try:
+        data, lines = parse(files.read_text(pathlib.Path(file), files.SETTINGS, reader))
+    except YamlProblem as problem:
+        raise ConfigError(f"{file}:{problem.line}: {problem}") from None
+    except files.NoFile as problem:
+        raise ConfigError(
+            f"{file}: {problem}; give the path of a YAML file, or none for the defaults"
+        ) from None
+    except files.FileProblem as problem:
+        raise ConfigError(f"{file}: {problem}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{file}:1: keys and values are needed, such as '{example}'")
+    return data, {key: f"{file}:{line}" for key, line in lines.items()}
+
+
 def parse(text: str, name: str = "the document") -> Document:
-    """Parse `text`; raises `YamlProblem`. A lone value is called `name` in complaints."""
-    if len(text) > _LONGEST:
-        raise YamlProblem(1, f"longer than {_LONGEST // 2**10} kB")
+    """Parse `text`; raises `YamlProblem`, which calls a value outside of any key `name`."""
+    if len(text) > files.SETTINGS:
+        raise YamlProblem(1, f"longer than {files.SETTINGS // 2**10} kB")
     try:
         root = _Loader(text).get_single_node()
     except yaml.MarkedYAMLError as error:
@@ -58,14 +83,14 @@ def parse(text: str, name: str = "the document") -> Document:
 
 
 class _Loader(yaml.SafeLoader):
-    """Gives up as soon as a text is larger or deeper than any document of people is."""
+    """Stops as soon as a document has too many values or levels."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self._count = self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """As the loader does, which calls this for each node in the text."""
+        """Count the node, which the loader asks for, and its level."""
         self._count += 1
         self._depth += 1
         line = int(self.line) + 1
@@ -78,7 +103,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Builder:
-    """Makes plain values of the nodes of a document."""
+    """Converts the nodes of a document to plain values."""
 
     def __init__(self, name: str) -> None:
         self.lines: dict[Path, int] = {}
@@ -87,7 +112,7 @@ class _Builder:
         self._constructor = yaml.constructor.SafeConstructor()
 
     def build(self, node: yaml.Node, path: Path) -> Any:
-        """The value of a node, which is found under these keys."""
+        """The value of the node at this path of keys."""
         line = node.start_mark.line + 1
         self._count += 1
         _check_count(self._count, line)
@@ -142,7 +167,7 @@ def _check_count(count: int, line: int) -> None:
 
 
 def _surprise(text: str, tag: str) -> str | None:
-    """What YAML 1.1 takes a plain scalar for that people do not, and what to write instead."""
+    """What YAML 1.1 makes of a plain scalar that few people expect, and what to write instead."""
     if text.lower() in _WORDS:
         meant = _WORDS[text.lower()]
         return f"is {meant} in YAML; write {meant}, or quote it where a text is meant"
@@ -156,7 +181,7 @@ def _surprise(text: str, tag: str) -> str | None:
 
 
 def _dotted(text: str) -> str:
-    """The exponent form that YAML 1.1 does read as a number: a dot and a signed exponent."""
+    """The number with a dot and a signed exponent, as YAML 1.1 wants it."""
     mantissa, _, exponent = text.lower().partition("e")
     mantissa = mantissa if "." in mantissa else mantissa + ".0"
     return f"{mantissa}e{exponent if exponent[0] in '+-' else '+' + exponent}"

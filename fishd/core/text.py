@@ -1,6 +1,6 @@
-"""Text from outside, such as that of an exception, made safe for logs, replies and terminals."""
+"""Makes text from outside, such as an exception's, safe for logs, replies and terminals."""
 
-from fishd.errors import Escaped, FishdError
+from fishd.core.errors import Escaped, FishdError
 
 LONGEST = 1000
 """Longer texts are cut, in the middle [characters]."""
@@ -9,7 +9,7 @@ LONGEST_WORD = 60
 
 
 def line(text: str, longest: int = LONGEST) -> str:
-    """One printable line that can be encoded: line breaks become spaces, what else is odd `?`."""
+    """One printable line that can be encoded: line breaks become spaces, odd characters `?`."""
     text = block(text, longest)
     if "\n" not in text:
         return text.strip()
@@ -28,12 +28,12 @@ def block(text: str, longest: int = LONGEST) -> str:
 
 
 def quoted(word: str) -> str:
-    """A word that somebody gave, as short as a message can bear it."""
+    """A word from outside, cut to fit in a message."""
     return line(word, LONGEST_WORD)
 
 
 def said(error: BaseException) -> str:
-    """What an exception says, in one line; that may be nothing. Never raises."""
+    """The text of an exception in one line, which may be empty. Never raises."""
     try:
         return line(str(error))
     except BaseException as worse:  # whoever wrote the exception wrote its __str__, too

@@ -1,4 +1,4 @@
-"""Calls that must not hold up the ticks: what loads files, and what may never return."""
+"""Calls in threads of their own: they load files, may never return, and hold up no tick."""
 
 import asyncio
 import os
@@ -7,19 +7,19 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
-from fishd.contained import Attempt
-from fishd.errors import Refused
+from fishd.core.errors import Refused
+from fishd.core.foreign_code import Attempt
 
 T = TypeVar("T")
 
 MOST_AT_ONCE = 4
 """Calls that may be under way, each in a thread of its own."""
 MOST_GIVEN_UP = 8
-"""Threads of calls that were given up and would not end; with more, nothing is begun."""
+"""Threads of calls that were given up and do not end; with more, no call begins."""
 
 
-class Asides:
-    """Makes calls in threads of their own, and gives up those that take too long.
+class BackgroundCalls:
+    """Makes calls in threads, and gives up those that take too long.
 
     The interpreter does not wait for these threads when it ends, as it does for asyncio's own.
     """
@@ -52,7 +52,7 @@ class Asides:
     ) -> T:
         """What the function returns or raises.
 
-        complaint: what to say of it when it takes too long, such as `'chirp' has not loaded`
+        complaint: begins the message when it takes too long, such as `'chirp' has not loaded`
         late: takes the result of a call that returns after it was given up
         interrupt: as for `Attempt`
         Raises `Refused`: busy as `check_busy` says, too-slow for a call that takes too long. It is
@@ -83,7 +83,7 @@ class Asides:
         return attempt.result()
 
     def dispose(self, function: Callable[[], Any]) -> None:
-        """Call what nobody waits for, such as the `close` of a controller that is not wanted."""
+        """Make a call that nobody waits for, such as the `close` of an unused controller."""
         self._given_up.append(Attempt(function))
 
 

@@ -1,4 +1,4 @@
-"""What can be asked about calibrations: measure, tare, and put another one in force."""
+"""What can be asked about calibrations: measure, tare, and apply another one."""
 
 import asyncio
 import datetime
@@ -9,17 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec import Struct
 
-from fishd.asides import Asides
-from fishd.clock import Clock
 from fishd.config import Config
-from fishd.errors import ConfigError, Refused
-from fishd.hardware.base import Bench
-from fishd.hardware.calibration import C, ForceCalibration, ForceSample, ServoCalibration
-from fishd.hardware.calibration_files import CalibrationFolder, check
-from fishd.loop import ControlLoop
-from fishd.protocol import (
+from fishd.control.loop import ControlLoop
+from fishd.core.calibration import C, ForceCalibration, ForceSample, ServoCalibration
+from fishd.core.clock import Clock
+from fishd.core.errors import ConfigError, Refused
+from fishd.core.protocol import (
     FRESH,
     LOADING,
     CalibrateForce,
@@ -27,24 +23,27 @@ from fishd.protocol import (
     Calibrations,
     NoArguments,
     SampleForce,
-    ServoLoan,
+    ServoLease,
     Tare,
 )
-from fishd.schema import Problem
-from fishd.servo_bench import ServoBench, resting_bench
+from fishd.core.schema import Problem
+from fishd.daemon.background_calls import BackgroundCalls
+from fishd.daemon.trial_calibration import TrialCalibration, calibrated_parts_at_rest
+from fishd.hardware.base import CalibratedParts
+from fishd.hardware.calibration_files import CalibrationFolder, check
 
 MOST_SAMPLES = 4
 """Samples of the force that may be taken at once: each adds to every read of the sensor."""
 _LOOK = 0.05
 """Time between two looks at whether a controller has been started meanwhile [s]."""
 _GLANCE = 0.2
-"""How long the present force is looked at before another calibration is put in force [s]."""
+"""How long the present force is looked at before another calibration is applied [s]."""
 
-Operations = dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]]
-"""What can be asked for: the arguments, and what answers."""
+Handlers = dict[str, Callable[[Any], Awaitable[Any]]]
+"""What answers, by the name of an operation; `protocol.OPERATIONS` says what its arguments are."""
 
 
-class Workbench:
+class CalibrationRequests:
     """Answers the requests about calibrations of a robot; refuses them for a simulated fish."""
 
     def __init__(self, loop: ControlLoop, clock: Clock, config: Config, folder: Path) -> None:
@@ -54,45 +53,45 @@ class Workbench:
         self._folder = CalibrationFolder(folder)
         self._sensor = config.force_sensor
         self._changing = asyncio.Lock()
-        """Held while a calibration is replaced: the newest file must be the one in force."""
-        self._servo = ServoBench(loop, clock, config.servo, self._changing)
+        """Held while a calibration is replaced: the newest file must be the one that is used."""
+        self._servo = TrialCalibration(loop, clock, config.servo, self._changing)
         self._samples: dict[int, tuple[float, ForceSample]] = {}
         """When each fresh sample was taken, and what it says, by its number."""
         self._sampled = 0
         self._sampling = 0
-        self._asides = Asides(LOADING)
+        self._calls = BackgroundCalls(LOADING)
         self._force_file = self._file(ForceCalibration)
         self._servo_file = self._file(ServoCalibration)
-        self.operations: Operations = {
-            "calibrations": (NoArguments, self._calibrations),
-            "sample-force": (SampleForce, self._sample_force),
-            "tare": (Tare, self._tare),
-            "calibrate-force": (CalibrateForce, self._calibrate_force),
-            "calibrate-servo": (CalibrateServo, self._calibrate_servo),
-            "renew-loan": (ServoLoan, self._renew_loan),
-            "end-loan": (ServoLoan, self._end_loan),
+        self.handlers: Handlers = {
+            "calibrations": self._calibrations,
+            "sample-force": self._sample_force,
+            "tare": self._tare,
+            "calibrate-force": self._calibrate_force,
+            "calibrate-servo": self._calibrate_servo,
+            "renew-lease": self._renew_lease,
+            "end-lease": self._end_lease,
         }
         self.check_startable = self._servo.check_startable
         """Raises `Refused` while a controller of that name must not take over."""
 
     @property
     def calibrating(self) -> bool:
-        """True while a client has the servo on loan."""
-        return self._servo.loan is not None
+        """True while a client has the servo on lease."""
+        return self._servo.lease is not None
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
-        bench = self._bench()
+        parts = self._calibrated_parts()
         return Calibrations(
-            force=bench.sensor.calibration,
+            force=parts.sensor.calibration,
             force_file=self._force_file,
-            servo=bench.servo.calibration,
+            servo=parts.servo.calibration,
             servo_file=self._servo_file,
-            loan=self._servo.loan,
+            lease=self._servo.lease,
             force_limit=self._sensor.force_limit,
         )
 
     async def _sample_force(self, wanted: SampleForce) -> ForceSample:
-        sensor = resting_bench(self._loop).sensor
+        sensor = calibrated_parts_at_rest(self._loop).sensor
         if self._sampling >= MOST_SAMPLES:
             raise Refused("busy", f"{self._sampling} samples are being taken; try again")
         watch = sensor.watch()
@@ -111,12 +110,12 @@ class Workbench:
         return sample
 
     async def _rest_for(self, seconds: float) -> None:
-        """Wait; raises `Refused` as soon as a controller is in command."""
+        """Wait; raises `Refused` as soon as a controller is active."""
         now = asyncio.get_running_loop().time
         until = now() + seconds
         while (left := until - now()) > 0.0:
             await asyncio.sleep(min(left, _LOOK))
-            resting_bench(self._loop)
+            calibrated_parts_at_rest(self._loop)
 
     def _forget_old_samples(self) -> None:
         oldest = self._clock.monotonic() - FRESH
@@ -135,7 +134,7 @@ class Workbench:
         if sample.suspect:
             raise Refused("suspect", f"the forces are not to be believed: {sample.suspect}")
         async with self._changing:
-            before = resting_bench(self._loop).sensor.calibration
+            before = calibrated_parts_at_rest(self._loop).sensor.calibration
             restless = max(
                 math.hypot(before.xx * sample.vx_std, before.xy * sample.vy_std),
                 math.hypot(before.yx * sample.vx_std, before.yy * sample.vy_std),
@@ -169,7 +168,7 @@ class Workbench:
 
     async def _check_present_force(self, calibration: ForceCalibration) -> None:
         """Of what the sensor says now, the calibration must not make a fault in the next ticks."""
-        watch = resting_bench(self._loop).sensor.watch()
+        watch = calibrated_parts_at_rest(self._loop).sensor.watch()
         try:
             await asyncio.sleep(_GLANCE)
         finally:
@@ -185,10 +184,10 @@ class Workbench:
             )
 
     async def _adopt_force(self, calibration: ForceCalibration) -> Calibrations:
-        resting_bench(self._loop)
+        calibrated_parts_at_rest(self._loop)
         saved, path = await self._save(calibration)
-        # The newest file is in force from the next start on, so it is now, whatever else began.
-        self._bench().sensor.recalibrate(saved)
+        # The newest file is used from the next start on, so it is now, whatever else began.
+        self._calibrated_parts().sensor.recalibrate(saved)
         self._force_file = str(path)
         self._announce("force sensor", path)
         return await self._calibrations(NoArguments())
@@ -196,36 +195,36 @@ class Workbench:
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
         async with self._changing:
             calibration = _sensible(wanted.calibration)
-            self._servo.check(calibration, wanted.loan, keep=wanted.save)
+            self._servo.check(calibration, wanted.lease, keep=wanted.save)
             if wanted.save:
                 calibration, path = await self._save(calibration)
-                self._servo.check(calibration, wanted.loan, keep=True)
+                self._servo.check(calibration, wanted.lease, keep=True)
                 self._servo.keep(calibration)
                 self._servo_file = str(path)
                 self._announce("servo", path)
             else:
-                self._servo.lend(calibration)
+                self._servo.try_out(calibration)
             return await self._calibrations(NoArguments())
 
-    async def _renew_loan(self, wanted: ServoLoan) -> Calibrations:
-        self._servo.renew(wanted.loan)
+    async def _renew_lease(self, wanted: ServoLease) -> Calibrations:
+        self._servo.renew(wanted.lease)
         return await self._calibrations(NoArguments())
 
-    async def _end_loan(self, wanted: ServoLoan) -> Calibrations:
-        self._servo.end(wanted.loan)
+    async def _end_lease(self, wanted: ServoLease) -> Calibrations:
+        self._servo.end(wanted.lease)
         return await self._calibrations(NoArguments())
 
-    def _bench(self) -> Bench:
-        bench = self._loop.robot.bench
-        if bench is None:
+    def _calibrated_parts(self) -> CalibratedParts:
+        parts = self._loop.robot.calibrated
+        if parts is None:
             raise Refused(
                 "simulated", "a simulated fish has nothing to calibrate; see robot: virtual-pi"
             )
-        return bench
+        return parts
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:
-            return await self._asides.call(
+            return await self._calls.call(
                 "the calibration has not been written",
                 partial(self._folder.save, calibration, self._date()),
                 late=_withdraw,
@@ -239,7 +238,7 @@ class Workbench:
             ) from None
 
     def _file(self, kind: type[C]) -> str | None:
-        found = self._folder.newest(kind) if self._loop.robot.bench else None
+        found = self._folder.newest(kind) if self._loop.robot.calibrated else None
         return str(found[1]) if found else None
 
     def _date(self) -> datetime.datetime:
@@ -250,7 +249,7 @@ class Workbench:
 
 
 def _withdraw(saved: tuple[C, Path]) -> None:
-    """Remove a file that came too late: it must not be in force from the next start on."""
+    """Remove a file that came too late: it must not be used from the next start on."""
     saved[1].unlink()
 
 

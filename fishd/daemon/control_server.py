@@ -6,9 +6,9 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from fishd import protocol, text
-from fishd.errors import Refused
-from fishd.gateway import link
+from fishd.core import protocol, text
+from fishd.core.errors import Refused
+from fishd.daemon.gateway import link
 
 log = logging.getLogger(__name__)
 

@@ -1,24 +1,24 @@
-"""Lockstep: ticks of virtual time for a daemon, which wait for the agent that is in command."""
+"""Lockstep: ticks of virtual time, which wait for the agent while `remote` is active."""
 
 import asyncio
 import os
 from collections.abc import Callable
 from typing import Self
 
-from fishd.clock import Slot, Ticker, VirtualClock, VirtualTicker
-from fishd.loop import ControlLoop
-from fishd.remote.controller import Remote
-from fishd.supervisor import Mode
+from fishd.control.loop import ControlLoop
+from fishd.control.supervisor import Mode
+from fishd.controllers.remote.controller import Remote
+from fishd.core.clock import Slot, Ticker, VirtualClock, VirtualTicker
 
-GLANCE = 0.02
-"""How soon a wait notices that somebody else has taken command, or that fishd ends [s]."""
+POLL = 0.02
+"""How soon a wait notices that another controller is active, or that fishd ends [s]."""
 
 
 class Lockstep:
     """Yields slots as a `Ticker` does, and turns the loop in them.
 
-    While `remote` is in command, a tick follows as soon as the agent has answered. While anything
-    else is, ticks come at the pace of real time.
+    While `remote` is active, a tick follows as soon as the agent has answered. Otherwise ticks come
+    at the pace of real time.
     """
 
     def __init__(self, loop: ControlLoop, clock: VirtualClock, period: float) -> None:
@@ -44,30 +44,30 @@ class Lockstep:
             await anext(self._pace)
         return next(self._slots)
 
-    async def tick(self, slot: Slot, glance: Callable[[], None]) -> None:
-        """One turn of the loop, which waits for the agent as long as that is in command.
+    async def tick(self, slot: Slot, poll: Callable[[], None]) -> None:
+        """One turn of the loop, which waits for the agent as long as `remote` is active.
 
-        glance: called again and again meanwhile; may put something else in command
+        poll: called again and again meanwhile; may select another controller
         """
         turn = self._loop.observe(slot)
         while (agent := self._agent()) and not agent.ready(turn.observation):
             await self._wait_for(agent)
-            glance()
+            poll()
         self._loop.act(turn)
 
     def _agent(self) -> Remote | None:
-        """The controller that waits for an agent, if that is in command."""
-        controller = self._loop.controller
+        """The active controller, where it waits for an agent."""
+        controller = self._loop.active.controller
         running = self._loop.supervisor.mode is Mode.RUNNING
         return controller if running and isinstance(controller, Remote) else None
 
     async def _wait_for(self, agent: Remote) -> None:
-        # A copy: whoever takes command closes the socket, while this still waits for it.
+        # A copy: a change of controller closes the socket while this still waits for it.
         descriptor = os.dup(agent.fileno())
         self._news.clear()
         self._events.add_reader(descriptor, self._news.set)
         try:
-            async with asyncio.timeout(GLANCE):
+            async with asyncio.timeout(POLL):
                 await self._news.wait()
         except TimeoutError:
             pass

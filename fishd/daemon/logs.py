@@ -1,6 +1,6 @@
 """Structured logs on standard error, written by a thread of their own.
 
-A terminal that is stopped or a pipe that nobody reads blocks its writer; it must not block a tick.
+A stopped terminal or a pipe that nobody reads blocks its writer, which must not be the tick.
 """
 
 import logging
@@ -14,7 +14,7 @@ from contextlib import suppress
 
 import msgspec
 
-from fishd import text
+from fishd.core import text
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ _LONGEST_TRACEBACK = 10_000
 
 
 class _Formatter(logging.Formatter):
-    """Where all that is logged is made safe, whoever said it."""
+    """Makes everything that is logged safe to read."""
 
     def message(self, record: logging.LogRecord) -> str:
         """The message, in one line."""
@@ -43,7 +43,7 @@ class _Formatter(logging.Formatter):
 
 
 class TextFormatter(_Formatter):
-    """`12:00:00.123 warning fishd.loop: message`, or with journald's level prefix for a journal."""
+    """`12:00:00.123 warning fishd.daemon.main: text`, with journald's prefix in a journal."""
 
     def __init__(self, journal: bool) -> None:
         super().__init__()
@@ -77,7 +77,7 @@ class JsonFormatter(_Formatter):
 
 
 class _NoLock:
-    """A lock that nobody can hold, in the place of one that a controller may never let go of."""
+    """In place of a lock that a controller may never release: this one cannot be held."""
 
     def acquire(self) -> bool:
         """Succeeds."""
@@ -94,7 +94,7 @@ class _NoLock:
 
 class _Queued(logging.handlers.QueueHandler):
     def createLock(self) -> None:  # noqa: N802  (logging's name)
-        """A queue needs no lock: whoever hangs while it formats its line must stop nobody else."""
+        """A queue needs no lock: a thread that hangs while it formats must not block the others."""
         self.lock = _NoLock()  # type: ignore[assignment]
 
     def enqueue(self, record: logging.LogRecord) -> None:
@@ -108,13 +108,13 @@ class _Queued(logging.handlers.QueueHandler):
         return record
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
-        """Say nothing: it would be said on standard error, which may be stuck."""
+        """Ignore it: standard error, where it would be printed, may be stuck."""
 
 
 class LogWriter:
     """Sends all logs to standard error; lines for `console` go to standard output as they are.
 
-    Python's own complaints, such as warnings, take the same way.
+    Python's own warnings and errors go the same way.
     """
 
     def __init__(self, style: str) -> None:
@@ -134,7 +134,7 @@ class LogWriter:
         self._thread.start()
 
     def close(self) -> None:
-        """Write what is left, as far as that does not take long; may be called twice."""
+        """Write what is left, within a time limit; may be called twice."""
         until = time.monotonic() + _CLOSING
         with suppress(queue.Full):
             self._lines.put(None, timeout=_CLOSING)

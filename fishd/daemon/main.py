@@ -1,9 +1,10 @@
-"""The daemon: wiring and lifetimes, from a configuration to a fish that swims until it is told."""
+"""The daemon: from a configuration to a fish that swims until a signal ends it."""
 
 import asyncio
 import itertools
 import logging
 import math
+import os
 import sys
 import time
 from contextlib import ExitStack, suppress
@@ -12,34 +13,35 @@ from pathlib import Path
 
 import click
 
-from fishd import __version__, addresses, build, realtime, robots
-from fishd.clock import SystemClock, Ticker, VirtualClock
+from fishd import __version__, wiring
 from fishd.config import Config, load
-from fishd.console import complain, run, status_line
+from fishd.control.loop import SETTLING
 from fishd.controllers import registry
-from fishd.ending import Ending, leave
-from fishd.errors import ConfigError, FishdError, ServoError
-from fishd.gateway.gateways import Gateways
-from fishd.hardware.pulses import REST
-from fishd.lockstep import Lockstep
-from fishd.logs import LogWriter
-from fishd.loop import SETTLING
-from fishd.notify import SystemdNotifier
-from fishd.operations import Operations
-from fishd.policies.runtime import preload
-from fishd.rehearsal import rehearsal
-from fishd.remote import wire
-from fishd.server import ControlServer
-from fishd.telemetry import Telemetry
-from fishd.workbench import Workbench
+from fishd.controllers.policy.runtime import preload
+from fishd.controllers.remote import wire
+from fishd.core import addresses
+from fishd.core.clock import SystemClock, Ticker, VirtualClock
+from fishd.core.console import run, status_line
+from fishd.core.errors import ConfigError, FishdError, ServoError
+from fishd.daemon import realtime
+from fishd.daemon.calibration_requests import CalibrationRequests
+from fishd.daemon.control_server import ControlServer
+from fishd.daemon.gateway.gateways import Gateways
+from fishd.daemon.lockstep import Lockstep
+from fishd.daemon.logs import LogWriter
+from fishd.daemon.requests import Operations
+from fishd.daemon.shutdown import Shutdown, leave
+from fishd.daemon.systemd_notify import SystemdNotifier
+from fishd.daemon.telemetry import Telemetry
+from fishd.daemon.warm_up import mock_ticks
+from fishd.hardware.servo.pulses import REST
 
 log = logging.getLogger(__name__)
 console = logging.getLogger("console")
 
-EX_CONFIG = 78
 FADE_LIMIT = 0.5
 """Longest time from a signal to exit that fading to neutral may take [s]."""
-HOUSEKEEPING = 1.0
+STATUS_PERIOD = 1.0
 """Time between two status messages [s]."""
 
 
@@ -57,8 +59,8 @@ class Daemon:
         self._print_status = print_status
         self._clock = VirtualClock() if config.lockstep else SystemClock()
         self._events = asyncio.get_running_loop()
-        self._chores = itertools.cycle((self._report, realtime.collect_garbage))
-        self._next_chore = 0.0
+        self._housekeeping = itertools.cycle((self._report, realtime.collect_garbage))
+        self._next_housekeeping = 0.0
         self._stack = ExitStack()
 
     def __enter__(self) -> "Daemon":
@@ -72,25 +74,27 @@ class Daemon:
             self._gateways = Gateways(address, config.telemetry.address, stack)
             wire.start_context(stack)
             self._telemetry = Telemetry(self._gateways.telemetry.send)
-            self._rehearse = None if config.lockstep else rehearsal(config)
+            self._mock_ticks = None if config.lockstep else mock_ticks(config)
             controllers = registry.describe_all()  # imports what other packages offer
-            preload()  # of what would hold up the ticks later
-            robot = robots.open_robot(config, self._clock, stack, self._file)
-            self._loop = build.build_loop(
+            preload()  # which would hold up the ticks later
+            robot = wiring.open_robot(config, self._clock, stack, self._file)
+            self._loop = wiring.build_loop(
                 config, robot, self._clock, self._telemetry, self._notifier.ticked
             )
             stack.callback(self._loop.close)
             stack.callback(self._come_to_rest)
             if robot.panel:
                 robot.panel.on_press = self._on_press
-            workbench = Workbench(self._loop, self._clock, config, robots.state_folder(config))
+            calibration_requests = CalibrationRequests(
+                self._loop, self._clock, config, wiring.state_folder(config)
+            )
             fifo = not config.lockstep and realtime.enter(
                 config.realtime.priority, config.realtime.lock_memory
             )
             self._operations = Operations(
                 self._loop,
                 self._clock,
-                workbench,
+                calibration_requests,
                 config,
                 controllers,
                 self._gateways.telemetry.address,
@@ -136,20 +140,20 @@ class Daemon:
             if isinstance(clock, VirtualClock)
             else None
         )
-        ticker = lockstep or Ticker(self._config.tick, self._rehearse and self._rehearse_tick)
+        ticker = lockstep or Ticker(self._config.tick, self._mock_ticks and self._warm_up)
 
-        def glance() -> None:
-            self._do_chores()
+        def poll() -> None:
+            self._between_ticks()
             if stopping.is_set():
                 self._loop.stop()
 
         try:
             async for slot in ticker:
                 if lockstep:
-                    await lockstep.tick(slot, glance)
+                    await lockstep.tick(slot, poll)
                 else:
                     self._loop.tick(slot)
-                self._do_chores()
+                self._between_ticks()
                 if stopping.is_set():
                     break
             log.info("stopping: fading to neutral")
@@ -164,22 +168,22 @@ class Daemon:
         finally:
             ticker.close()
 
-    def _do_chores(self) -> None:
-        """One at a time, to fit between two ticks of 2 ms."""
+    def _between_ticks(self) -> None:
+        """Housekeeping, one job at a time, to fit between two ticks of 2 ms."""
         self._server.ticked()
         now = time.monotonic()
-        if now >= self._next_chore:
-            self._next_chore = now + HOUSEKEEPING / 2
-            next(self._chores)()
+        if now >= self._next_housekeeping:
+            self._next_housekeeping = now + STATUS_PERIOD / 2
+            next(self._housekeeping)()
 
-    def _rehearse_tick(self) -> None:
-        assert self._rehearse
-        self._rehearse()
-        self._loop.rehearse()
+    def _warm_up(self) -> None:
+        assert self._mock_ticks
+        self._mock_ticks()
+        self._loop.warm_up()
 
     def _come_to_rest(self) -> None:
         """Where fishd failed and could not fade: neutral, and time to get there."""
-        if self._loop.servo_on and self._loop.applied != 0.0:
+        if self._loop.servo.on and self._loop.applied != 0.0:
             with suppress(ServoError):  # closing it comes next, and says what could not be done
                 self._loop.robot.servo.write(0.0)
                 self._clock.sleep(REST)
@@ -194,9 +198,8 @@ class Daemon:
         self._loop.robot.servo.close()
 
     def _on_press(self) -> None:
-        """The E-stop button was pressed, says a thread of the driver: do not wait for a tick."""
-        message = "the E-stop button was pressed"
-        self._events.call_soon_threadsafe(self._loop.estop, message)
+        """Called from a thread of the driver; the E-stop does not wait for a tick."""
+        self._events.call_soon_threadsafe(self._loop.estop, "the E-stop button was pressed")
 
     def _report(self) -> None:
         status = self._operations.status()
@@ -208,18 +211,18 @@ class Daemon:
 
 
 async def swim(
-    config: Config, print_status: bool, ending: Ending, file: Path | None = None
+    config: Config, print_status: bool, shutdown: Shutdown, file: Path | None = None
 ) -> None:
-    """Run a daemon until a signal, which counts from before it touches the servo.
+    """Run a daemon until a signal; one that comes before the servo is touched counts as well.
 
     file: where the configuration comes from
     """
     stopping = asyncio.Event()
     events = asyncio.get_running_loop()
-    ending.when_asked(partial(events.call_soon_threadsafe, stopping.set))
+    shutdown.when_asked(partial(events.call_soon_threadsafe, stopping.set))
     with Daemon(config, print_status, file) as daemon:
-        ending.release = daemon.release_at_once
-        await asyncio.sleep(0)  # what was asked meanwhile counts before the first tick
+        shutdown.release = daemon.release_at_once
+        await asyncio.sleep(0)  # lets an earlier signal set `stopping`
         if not stopping.is_set():
             await daemon.run(stopping)
 
@@ -259,19 +262,16 @@ def fishd(
     Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 78 when the
     configuration is wrong.
     """
-    try:
-        config = load(path, overrides)
-    except ConfigError as error:
-        complain("fishd", str(error), EX_CONFIG)
+    config = load(path, overrides)
     logs = LogWriter(log_format)
-    ending = Ending()
-    ending.last_words = logs.close
+    shutdown = Shutdown()
+    shutdown.last_words = logs.close
     show = bool(sys.stdout and sys.stdout.isatty()) if print_status is None else print_status
     try:
-        asyncio.run(swim(config, show, ending, path))
+        asyncio.run(swim(config, show, shutdown, path))
     except ConfigError as error:  # in a calibration file
         log.critical("%s", error)
-        return EX_CONFIG
+        return os.EX_CONFIG
     except FishdError as error:
         log.critical("%s", error)
         return 1

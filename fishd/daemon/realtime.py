@@ -1,4 +1,4 @@
-"""What the operating system and the interpreter can do for a loop that must be on time."""
+"""Settings of the operating system and the interpreter for a loop that must be on time."""
 
 import contextlib
 import ctypes
@@ -20,10 +20,10 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def enter(priority: int, lock_memory: bool) -> bool:
-    """Prepare this thread and process for the loop; True when real-time scheduling is in force.
+    """Prepare this thread and process for the loop; True when it got real-time scheduling.
 
-    What is not permitted is left out, with one warning for all of it. Call it once everything is
-    loaded, from the thread that ticks.
+    Skips what is not permitted, with one warning. Call it once everything is loaded, from the
+    thread that ticks.
     """
     _libc.prctl(_PR_SET_TIMERSLACK, 1)  # wake up when asked, not up to 50 µs later
     sys.setswitchinterval(_SWITCH_INTERVAL)
@@ -52,7 +52,7 @@ def enter(priority: int, lock_memory: bool) -> bool:
 
 
 def _keep_running(thread: int, priority: int) -> None:
-    """Let no ordinary program stop a thread, which might hold the interpreter just then.
+    """Let no ordinary program preempt a thread that may hold the interpreter.
 
     The loop would have to wait for it, however high its own priority is.
     """
@@ -61,12 +61,12 @@ def _keep_running(thread: int, priority: int) -> None:
 
 
 def quiet_garbage_collector() -> None:
-    """Take everything that exists out of its sight, and let it run only in `collect_garbage`."""
+    """Exempt all objects that exist now; later ones are collected only by `collect_garbage`."""
     gc.collect()
     gc.freeze()
     gc.disable()
 
 
 def collect_garbage() -> None:
-    """Collect what has come since; call it between ticks."""
+    """Collect newer objects; call it between ticks."""
     gc.collect(1)

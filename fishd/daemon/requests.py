@@ -2,28 +2,29 @@
 
 import logging
 import os
-from collections.abc import Awaitable, Callable
+import socket
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from msgspec import Struct
 
-from fishd import __version__, protocol, text
-from fishd.asides import Asides
-from fishd.clock import Clock
+from fishd import __version__
 from fishd.config import Config
-from fishd.contained import contained
+from fishd.control.loop import ControlLoop
+from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
-from fishd.errors import ParameterError, Refused, UnknownController
-from fishd.loop import ControlLoop
-from fishd.policies import library
-from fishd.policies.info import PolicyInfo
-from fishd.protocol import State
-from fishd.schema import Problem, convert, fields_of, nearest
-from fishd.signals import ControllerInfo, Status
-from fishd.supervisor import Mode
-from fishd.workbench import Workbench
+from fishd.controllers.policy import library
+from fishd.core import protocol, text
+from fishd.core.clock import Clock
+from fishd.core.errors import ParameterError, Refused, UnknownController
+from fishd.core.foreign_code import contained
+from fishd.core.protocol import PolicyInfo, State
+from fishd.core.schema import Problem, convert, fields_of, nearest
+from fishd.core.signals import ControllerInfo, Status
+from fishd.daemon.background_calls import BackgroundCalls
+from fishd.daemon.calibration_requests import CalibrationRequests, Handlers
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ class Operations:
         self,
         loop: ControlLoop,
         clock: Clock,
-        workbench: Workbench,
+        calibration_requests: CalibrationRequests,
         config: Config,
         controllers: list[ControllerInfo],
         telemetry: str,
@@ -45,9 +46,9 @@ class Operations:
     ) -> None:
         """
         config: what fishd was started with
-        controllers: all that can be put in command
+        controllers: all that can be made active
         telemetry: the address that clients are told
-        realtime: is SCHED_FIFO in force?
+        realtime: does the loop run under SCHED_FIFO?
         counters: what was survived outside of the robot, since start
         loading: how long a controller may take to load [s]
         """
@@ -56,38 +57,39 @@ class Operations:
         self._telemetry = telemetry
         self._realtime = realtime
         self._counters = counters
-        self._workbench = workbench
+        self._calibrations = calibration_requests
         self._config = config
+        self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
         self._started = clock.monotonic()
         self._decisions = 0
-        self._asides = Asides(loading)
+        self._calls = BackgroundCalls(loading)
         self._controllers = controllers
-        self._operations: dict[str, tuple[type[Struct], Callable[[Any], Awaitable[Any]]]] = {
-            "status": (protocol.NoArguments, self._status),
-            "controllers": (protocol.NoArguments, self._list_controllers),
-            "policies": (protocol.NoArguments, self._list_policies),
-            "config": (protocol.NoArguments, self._tell_config),
-            "set-controller": (protocol.SetController, self._set_controller),
-            "set-parameter": (protocol.SetParameter, self._set_parameter),
-            "stop": (protocol.NoArguments, self._stop),
-            "estop": (protocol.Estop, self._estop),
-            "clear-fault": (protocol.NoArguments, self._clear_fault),
-            "mark": (protocol.Mark, self._mark),
-            **workbench.operations,
+        self._at_start = set(registry.names())
+        self._handlers: Handlers = {
+            "status": self._status,
+            "controllers": self._list_controllers,
+            "policies": self._list_policies,
+            "config": self._tell_config,
+            "set-controller": self._set_controller,
+            "set-parameter": self._set_parameter,
+            "stop": self._stop,
+            "estop": self._estop,
+            "clear-fault": self._clear_fault,
+            "mark": self._mark,
+            **calibration_requests.handlers,
         }
 
     async def perform(self, op: str, args: dict[str, Any]) -> Any:
         """Do what a request asks for and return its result; raises `Refused`."""
-        if op not in self._operations:
-            hint = nearest(op, list(self._operations))
+        if op not in self._handlers:
+            hint = nearest(op, list(self._handlers))
             raise Refused("unknown-op", f"no such op '{text.quoted(op)}'; {hint}")
-        expected, operation = self._operations[op]
         try:
-            arguments: Any = convert(args, expected)
+            arguments: Any = convert(args, protocol.OPERATIONS[op].arguments)
         except Problem as problem:
             path = text.quoted(".".join(problem.path))
             raise Refused("bad-arguments", f"{op}: {path}: {problem}") from None
-        return await operation(arguments)
+        return await self._handlers[op](arguments)
 
     def status(self) -> Status:
         """The daemon in one snapshot."""
@@ -100,9 +102,9 @@ class Operations:
             uptime=self._clock.monotonic() - self._started,
             mode=loop.supervisor.mode.value,
             reason=loop.supervisor.reason,
-            controller=loop.controller_name,
-            parameters=loop.parameters,
-            servo_on=loop.servo_on,
+            controller=loop.active.name,
+            parameters=loop.active.parameters,
+            servo_on=loop.servo.on,
             thrust=observation.thrust if observation else 0.0,
             frequency=observation.frequency if observation else 0.0,
             tick=loop.limits.tick,
@@ -118,10 +120,12 @@ class Operations:
             counters={**loop.robot.counters(), **self._counters()},
             realtime=self._realtime,
             telemetry=self._telemetry,
-            servo_lost=loop.servo_lost,
-            fallback=loop.fallback,
+            servo_lost=loop.servo.lost,
+            fallback=loop.active.fallback,
             sensor_lost=loop.supervisor.sensor_lost,
-            calibrating=self._workbench.calibrating,
+            calibrating=self._calibrations.calibrating,
+            name=self._name,
+            phi_c=loop.applied,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
@@ -131,18 +135,18 @@ class Operations:
         return self._controllers
 
     async def _list_policies(self, _: protocol.NoArguments) -> list[PolicyInfo]:
-        self._asides.check_busy()
+        self._calls.check_busy()
         limits = self._loop.limits
         describe = partial(library.describe_all, limits.tick, limits.amplitude)
-        return await self._asides.call("the policy files have not been read", describe)
+        return await self._calls.call("the policy files have not been read", describe)
 
     async def _tell_config(self, _: protocol.NoArguments) -> Config:
         return self._config
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
-        self._workbench.check_startable(wanted.name)
-        self._asides.check_busy()
+        self._calibrations.check_startable(wanted.name)
+        self._calls.check_busy()
         decision = self._decide()
         controller = await self._load(wanted)
         if decision != self._decisions:
@@ -151,7 +155,7 @@ class Operations:
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
         try:
-            self._workbench.check_startable(wanted.name)
+            self._calibrations.check_startable(wanted.name)
             self._loop.set_controller(wanted.name, controller)
         except Exception as error:  # a fault since, a calibration, or parameters that it has lost
             self._dispose(controller)
@@ -160,10 +164,17 @@ class Operations:
 
     async def _load(self, wanted: protocol.SetController) -> Controller[Any]:
         create = partial(registry.create, wanted.name, wanted.parameters, self._loop.limits)
+        new = wanted.name not in self._at_start
+        if new:
+            create = partial(_create_newly_installed, wanted.name, create)
         try:
-            return await self._asides.call(f"'{wanted.name}' has not loaded", create, late=_close)
+            found = await self._calls.call(f"'{wanted.name}' has not loaded", create, late=_close)
         except Exception as error:
             raise _refusal(wanted.name, "cannot start", error) from error
+        if new and wanted.name not in (info.name for info in self._controllers):
+            self._controllers.append(registry.describe(wanted.name))
+            self._controllers.sort(key=lambda info: info.name)
+        return found
 
     async def _set_parameter(self, wanted: protocol.SetParameter) -> State:
         loop = self._loop
@@ -175,17 +186,17 @@ class Operations:
                 "start one with 'fishctl set-controller'",
             )
         try:
-            loop.retune(contained(self._retuned, wanted.parameters))
+            loop.active.retune(contained(self._retuned, wanted.parameters))
         except Exception as error:
-            raise _refusal(loop.controller_name, "refused", error) from error
+            raise _refusal(loop.active.name, "refused", error) from error
         return self._state()
 
     def _retuned(self, values: dict[str, Any]) -> Struct:
         loop = self._loop
-        for field in fields_of(type(loop.controller.parameters)):
+        for field in fields_of(loop.active.controller.Parameters):
             if field.file and field.name in values:  # no tick waits for a file
-                raise ParameterError(_why_not_in_flight(loop.controller_name, field.name))
-        return registry.merged(loop.controller, loop.controller_name, values)
+                raise ParameterError(_why_not_in_flight(loop.active.name, field.name))
+        return registry.merged(loop.active.controller, loop.active.name, values)
 
     async def _stop(self, _: protocol.NoArguments) -> State:
         self._decide()
@@ -207,11 +218,11 @@ class Operations:
         return self._state()
 
     def _dispose(self, controller: Controller[Any]) -> None:
-        """Close a controller that was never in command, which may take its time."""
-        self._asides.dispose(partial(_close, controller))
+        """Close a controller that was never active, which may take its time."""
+        self._calls.dispose(partial(_close, controller))
 
     def _decide(self) -> int:
-        """Count a decision on who is in command; one that loads slowly must not undo a newer."""
+        """Count a choice of the controller; one that loads slowly must not undo a newer one."""
         self._decisions += 1
         return self._decisions
 
@@ -221,9 +232,21 @@ class Operations:
             seq=loop.seq + 1,
             mode=loop.supervisor.mode.value,
             reason=loop.supervisor.reason,
-            controller=loop.controller_name,
-            parameters=loop.parameters,
+            controller=loop.active.name,
+            parameters=loop.active.parameters,
         )
+
+
+def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) -> Controller[Any]:
+    """Create a controller that was not there when fishd started."""
+    try:
+        return create()
+    except UnknownController as error:
+        if name in registry.names():  # its package cannot be imported: a new folder to look in, say
+            raise UnknownController(
+                f"{text.said(error)}; it was installed after fishd had started: restart fishd"
+            ) from error
+        raise
 
 
 def _close(controller: Controller[Any]) -> None:

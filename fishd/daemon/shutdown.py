@@ -1,4 +1,4 @@
-"""The end of the process: what asks for it, and that it comes soon, whatever hangs."""
+"""The orderly shutdown that a signal asks for, and a last resort where the process hangs."""
 
 import logging
 import os
@@ -12,21 +12,21 @@ from functools import partial
 from types import FrameType
 from typing import NoReturn
 
-from fishd import text
+from fishd.core import text
 
 log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 PATIENCE = 2.0
-"""Time from a signal until fishd no longer waits for an orderly end [s]."""
+"""Time from a signal until fishd no longer waits for an orderly shutdown [s]."""
 _RELEASE = 0.5
-"""What the last resort may take to let go of the servo then [s]."""
+"""Time that the last resort has to release the servo then [s]."""
 _FLUSH = 0.1
-"""What writing the rest of the output may take at the very end [s]."""
+"""Time to write the rest of the output at the very end [s]."""
 
 
-class Ending:
-    """Listens for signals in a thread, which also ends the process when it hangs.
+class Shutdown:
+    """Waits for a signal in a thread, asks for an orderly shutdown, and ends what hangs.
 
     A signal reaches this thread even where the main one is stuck, as long as that does not keep
     the interpreter to itself: then only SIGKILL helps, which systemd's watchdog sends.
@@ -37,20 +37,20 @@ class Ending:
         self._asked = threading.Event()
         self._tell: Callable[[], object] = lambda: None
         self.release: Callable[[], None] | None = None
-        """Lets go of the servo, from any thread: called where fishd hangs; None while it starts."""
+        """Releases the servo, from any thread; called where fishd hangs. None while it starts."""
         self.last_words: Callable[[], None] = lambda: None
-        """Writes what is left of the log, as far as that is possible at once."""
+        """Writes the rest of the log, as far as that is possible at once."""
         self._main = threading.get_ident()
         self._reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         for number in SIGNALS:
             if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, _noticed)
-        threading.Thread(target=self._watch, name="ending", daemon=True).start()
+                signal.signal(number, _ignore)
+        threading.Thread(target=self._watch, name="shutdown", daemon=True).start()
 
     def when_asked(self, tell: Callable[[], object]) -> None:
-        """Call that from the listening thread at the first signal; at once if there was one."""
+        """Call `tell` from the waiting thread at the first signal; at once if there was one."""
         self._tell = tell
         if self._asked.is_set():
             tell()
@@ -65,21 +65,22 @@ class Ending:
         self._end_at_once(signal.Signals(number).name)
 
     def _end_at_once(self, name: str) -> NoReturn:
-        """Nothing here may wait: what hangs may hold any lock, that of logging too."""
+        """Waits for no lock: the thread that hangs may hold any, that of logging too."""
         release = self.release
         if release:
             _within(_RELEASE, release)
         what = "the servo is released and" if release else "it has not begun to drive the servo;"
         place = _place(sys._current_frames().get(self._main))
-        line = f"{name} came {PATIENCE:g} s ago, and fishd hangs {place}: "
-        line += f"{what} the process is ended"
+        line = (
+            f"{name} came {PATIENCE:g} s ago, and fishd hangs {place}: {what} the process is ended"
+        )
         _within(_FLUSH, partial(log.critical, "%s", line))
         _within(_FLUSH, self.last_words)
         os._exit(1)
 
 
 def leave(status: int) -> NoReturn:
-    """End the process without waiting for threads, or for somebody to read the output."""
+    """End the process without waiting for threads or for a reader of the output."""
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:  # as where it was closed before the start
             _within(_FLUSH, stream.flush)
@@ -97,8 +98,8 @@ def _quietly(function: Callable[[], object]) -> None:
         function()
 
 
-def _noticed(number: int, frame: FrameType | None) -> None:
-    """The thread that listens does the rest; without a handler it would hear nothing."""
+def _ignore(number: int, frame: FrameType | None) -> None:
+    """A signal needs a handler to wake the thread that waits for it."""
 
 
 def _place(frame: FrameType | None) -> str:

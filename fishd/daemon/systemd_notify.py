@@ -1,4 +1,4 @@
-"""What fishd tells systemd: that it is ready, that it still ticks, that it stops.
+"""Tells systemd that fishd is ready, still ticks, or stops.
 
 The protocol of sd_notify(3): datagrams to the socket that $NOTIFY_SOCKET names. Without systemd,
 nothing is sent.

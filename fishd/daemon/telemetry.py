@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import msgspec
 
-from fishd.gateway.link import pair, published
-from fishd.signals import Event, Status, Tick
+from fishd.core.signals import Event, Status, Tick
+from fishd.daemon.gateway.link import published
 
 
 class Telemetry:
@@ -30,14 +30,3 @@ class Telemetry:
     def status(self, status: Status) -> None:
         """Publish on topic `status`."""
         self._send(published(b"status", self._encode(status)))
-
-
-def unheard() -> Telemetry:
-    """Telemetry that goes through the kernel as any does, and that nobody gets."""
-    ours, theirs = pair()
-
-    def send(message: bytes) -> None:
-        ours.send(message)
-        theirs.recv(len(message))
-
-    return Telemetry(send)

@@ -1,1 +1,1 @@
-"""The force sensor and the servo, real and simulated, behind two small protocols."""
+"""The robot's parts: force sensor, servo and operator's panel, behind small protocols."""

@@ -1,12 +1,16 @@
-"""The seam between the loop and any fish: two protocols and the robot that joins them."""
+"""The seam between the loop and any fish: protocols, and the robot that joins them."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from fishd.hardware.calibration import ForceCalibration, ForceSample, ServoCalibration
-from fishd.signals import Measurement, Truth
+from fishd.core.calibration import ServoCalibration
+from fishd.core.signals import Measurement, Truth
+
+if TYPE_CHECKING:
+    from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+    from fishd.hardware.servo.calibrated_servo import CalibratedServo
 
 
 class ForceSensor(Protocol):
@@ -58,50 +62,6 @@ class Panel(Protocol):
         """Switch the light off and let go of the pins; may be called twice."""
 
 
-class CalibratedSensor(ForceSensor, Protocol):
-    """A force sensor that measures voltages, and can be calibrated."""
-
-    calibration: ForceCalibration
-
-    def watch(self) -> "Watch":
-        """Begin to add up the voltages of every pair that is read from now on."""
-
-    def recalibrate(self, calibration: ForceCalibration) -> None:
-        """Use another calibration from the next read on."""
-
-    def counters(self) -> dict[str, int]:
-        """Errors that were survived, since start."""
-
-
-class CalibratedServo(Servo, Protocol):
-    """A servo whose pulses can be calibrated."""
-
-    calibration: ServoCalibration
-    degraded: tuple[str, ...]
-    """Why its pulses are not as good as they could be, a line each."""
-    countdown: float
-    """How long it goes on without a write; then it goes to neutral and ends its pulses [s]."""
-
-    def recalibrate(self, calibration: ServoCalibration) -> None:
-        """Use another calibration from the next write on."""
-
-    def counters(self) -> dict[str, int]:
-        """Errors that were survived, since start."""
-
-    def neutralise(self) -> bool:
-        """Last resort, from a process that does not drive this servo: neutral, then no pulses.
-
-        False when there were no pulses. Raises `ServoError` when the servo cannot be reached.
-        """
-
-
-class Watch(Protocol):
-    """Voltages that are being added up."""
-
-    def close(self) -> ForceSample:
-        """Stop, and say what came in; may be called twice."""
-
-
 @dataclass(frozen=True)
 class Robot:
     """All that the loop reads from and writes to."""
@@ -112,7 +72,7 @@ class Robot:
     truth: Callable[[], Truth] | None = None
     """The true state at the latest read, where the fish is simulated."""
     panel: Panel | None = None
-    bench: "Bench | None" = None
+    calibrated: "CalibratedParts | None" = None
     """What can be calibrated; None for a simulated fish, which has nothing to calibrate."""
     degraded: Callable[[], tuple[str, ...]] = tuple
     """What keeps this robot from being as good as it could be now, a line each."""
@@ -123,10 +83,10 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """A robot's sensor and servo, as far as they can be calibrated."""
+class CalibratedParts:
+    """A robot's sensor and servo as what can be calibrated."""
 
-    sensor: CalibratedSensor
-    servo: CalibratedServo
+    sensor: "SampledSensor"
+    servo: "CalibratedServo"
     recalibrated: Callable[[ServoCalibration], None] = lambda calibration: None
-    """Called when another calibration of the servo is in force."""
+    """Called when another calibration of the servo applies."""

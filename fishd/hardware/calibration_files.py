@@ -14,10 +14,10 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from fishd import files, strict_yaml
-from fishd.errors import ConfigError
-from fishd.hardware.calibration import C, ForceCalibration, ServoCalibration
-from fishd.schema import Problem, convert
+from fishd.core import files, strict_yaml
+from fishd.core.calibration import C, ForceCalibration, ServoCalibration
+from fishd.core.errors import ConfigError
+from fishd.core.schema import Problem, convert
 
 _STAMP = "%Y-%m-%dT%H%M%S.%fZ"
 _NAME = re.compile(r"(force|servo)-(?P<stamp>\d{4}-\d\d-\d\dT\d{6}\.\d{6}Z)\+*\.yaml", re.ASCII)

@@ -5,10 +5,12 @@ import warnings
 from importlib import metadata
 from typing import Any
 
-from fishd.errors import StartupError
+from fishd.core.errors import StartupError
 
 log = logging.getLogger(__name__)
 
+PACKAGE = "RPi.GPIO"
+"""What a driver that calls `load` has among its `packages`."""
 _PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
 _EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
 
@@ -27,8 +29,7 @@ def load() -> Any:
         from RPi import GPIO
     except ImportError:
         raise StartupError(
-            "E-stop button, status light and servo driver rpi-gpio need the package RPi.GPIO: "
-            f"install {_EXTRAS}"
+            f"the pins of the header need the package RPi.GPIO: install {_EXTRAS}"
         ) from None
     except OSError as error:
         # lgpio makes a pipe, .lgd-nfyN, in the working folder as soon as it is imported.

@@ -5,14 +5,14 @@ Two programs on one bus would take each other's samples, without an error.
 
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from fishd.errors import StartupError
-from fishd.hardware.settings import ForceSensorSettings, ServoSettings
-from fishd.lockfile import Taken, holder, lock_path, locked
+from fishd.core.errors import StartupError
+from fishd.core.lockfile import Taken, holder, lock_path, locked
+from fishd.hardware.driver import Claim
 
 log = logging.getLogger(__name__)
 
@@ -20,7 +20,6 @@ FOLDER = Path("/run/lock")
 """Where every user of the machine may make lock files."""
 TRIES, PAUSE = 5, 0.02
 """How often a claim is tried, as somebody may only be asking; and the time between [s]."""
-_LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 class Part(NamedTuple):
@@ -34,18 +33,14 @@ class Part(NamedTuple):
     """The configuration key that names another one."""
 
 
-def parts_of_pi(sensor: ForceSensorSettings, servo: ServoSettings) -> tuple[Part, ...]:
-    """What robot pi drives: its I2C bus, and the pin or the PWM channel of its servo."""
-    name, what, key = f"gpio{servo.gpio}", f"the servo on GPIO {servo.gpio}", "servo.gpio"
-    pigpio, sysfs = servo.pigpio, servo.sysfs
-    if servo.driver == "pigpio" and pigpio.host not in _LOCAL:
-        place = f"{pigpio.host}:{pigpio.port}"
-        name, what = f"{place}-{name}", f"{what} of {place}"
-    elif servo.driver == "sysfs-pwm" and sysfs.channel is not None:
-        name = f"{sysfs.chip or 'pwm'}-{sysfs.channel}"
-        what, key = f"channel {sysfs.channel} of the kernel's PWM", "servo.sysfs.channel"
-    bus = Part(FOLDER / f"fishd-i2c-{sensor.bus}", f"/dev/i2c-{sensor.bus}", "force_sensor.bus")
-    return bus, Part(FOLDER / f"fishd-{name.replace('/', '_')}", what, key)
+def parts_of_pi(claims: Mapping[str, Iterable[Claim]]) -> tuple[Part, ...]:
+    """What robot pi drives: all that its drivers claim, by the section of each."""
+    parts: dict[Path, Part] = {}
+    for section, found in claims.items():
+        for claim in found:
+            path = FOLDER / f"fishd-{claim.name.replace('/', '_')}"
+            parts.setdefault(path, Part(path, claim.what, f"{section}.{claim.key}"))
+    return tuple(parts.values())
 
 
 def parts_of_virtual_pi(socket: Path) -> tuple[Part, ...]:

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from fishd.errors import MissingPackage
+from fishd.core import text
+from fishd.core.errors import FishdError, MissingPackage, StartupError
 
 PACKAGES = {
     "adafruit_ads1x15": "adafruit-circuitpython-ads1x15",
@@ -12,23 +13,36 @@ PACKAGES = {
     "Adafruit_PureIO": "Adafruit-PureIO",
     "board": "Adafruit-Blinka",
     "busio": "Adafruit-Blinka",
+    "pigpio": "pigpio",
 }
-"""Where a module has another name than its package."""
+"""The package of each module that a driver of fishd imports."""
 
 
 @contextmanager
-def driver_packages() -> Iterator[None]:
-    """Import drivers inside of this; raises `MissingPackage` where a library is not installed."""
+def driver_packages(driver: str = "") -> Iterator[None]:
+    """Import and open a driver inside of this.
+
+    Raises `MissingPackage` where a library is not installed, and `StartupError` for whatever else
+    a driver, if it is named, raises that is no error of fishd's.
+    """
     try:
         yield
+    except FishdError:
+        raise
     except ImportError as error:
-        raise MissingPackage(describe(error)) from None
+        raise MissingPackage(describe(error, driver)) from None
+    except Exception as error:
+        if not driver:
+            raise
+        raise StartupError(f"driver '{driver}' cannot start: {text.named(error)}") from error
 
 
-def describe(error: ImportError) -> str:
+def describe(error: ImportError, driver: str = "") -> str:
     """One line that names the package to blame for a failed import."""
     module = (error.name or "").partition(".")[0]
     package = PACKAGES.get(module, module)
+    if driver and package not in PACKAGES.values():
+        return f"driver '{driver}' needs the package {package or 'that it imports'}: {error}"
     if isinstance(error, ModuleNotFoundError) and package:
         return f"the package {package} is missing; install fishd[pi]"
     return f"the package {package or 'of a driver'} cannot be imported ({error}); install fishd[pi]"

@@ -4,8 +4,8 @@ import logging
 import threading
 from collections.abc import Callable
 
-from fishd.clock import Clock
-from fishd.errors import StartupError
+from fishd.core.clock import Clock
+from fishd.core.errors import StartupError
 from fishd.hardware import header
 from fishd.hardware.settings import PanelSettings
 

@@ -11,26 +11,43 @@ from binascii import crc32
 from contextlib import suppress
 from typing import Any
 
-from fishd.runtime_folder import runtime_folder
+from fishd.core.errors import ServoError, StartupError
+from fishd.core.runtime_folder import runtime_folder
 
 NOT_RELEASED = "the servo was not released and may still have pulses: cut its power"
 """What to say where a release has failed."""
 
 _LARGEST = 65_536
-_NUMBERS = (("gpio", 0, 27), ("neutral", 500, 2500), ("frequency", 40, 333), ("port", 1, 65_535))
-_TEXTS = ("driver", "host", "root", "config")
+_SHORTEST, _LONGEST = 500, 2500
 
 
-def write(config: str, servo: dict[str, Any]) -> None:
+def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
+    """End the pulses as a driver's `LastResort` says; True where there were any.
+
+    neutral: its pulse [µs]
+    Raises `ServoError`, in one line also for what else the function raises, but ImportError.
+    """
+    module, _, name = function.partition(":")
+    try:
+        found = getattr(__import__(module, fromlist=[name]), name)
+        return bool(found(neutral, **arguments))
+    except (ServoError, StartupError, ImportError):
+        raise
+    except Exception as error:
+        raise ServoError(f"{function}: {type(error).__name__}: {error}") from error
+
+
+def write(config: str, function: str, neutral: float, arguments: dict[str, Any]) -> None:
     """Leave the recipe for the fishd that runs with a configuration file; atomic.
 
-    servo: driver, gpio, neutral [µs], frequency [Hz], host, port, root, chip, channel
-    Where it cannot be written there is none, and `fishd-release` takes its time.
+    The rest is for `carry_out`. Where it cannot be written there is none, and `fishd-release`
+    takes its time.
     """
+    recipe = {"function": function, "neutral": neutral, "arguments": arguments}
     path = _path(config)
     temporary = f"{path}.{os.getpid()}"
     with suppress(OSError):
-        text = json.dumps(servo | {"config": _absolute(config), "file": _signature(config)})
+        text = json.dumps(recipe | {"config": _absolute(config), "file": _signature(config)})
         os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
         if not _ours(os.lstat(os.path.dirname(path)), stat.S_ISDIR):
             return
@@ -66,8 +83,9 @@ def read(config: str) -> dict[str, Any] | None:
             os.close(file)
         good = (
             found["config"] == _absolute(config)
-            and all(isinstance(found[key], str) for key in _TEXTS)
-            and all(low <= found[key] <= high for key, low, high in _NUMBERS)
+            and isinstance(found["function"], str)
+            and isinstance(found["arguments"], dict)
+            and _SHORTEST <= found["neutral"] <= _LONGEST
         )
         return found | {"fresh": found["file"] == _signature(config)} if good else None
     except (OSError, ValueError, LookupError, TypeError):

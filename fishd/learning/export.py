@@ -1,4 +1,4 @@
-"""From a checkpoint, or a model of one's own, to the one file that the controller `ppo` runs."""
+"""Writes a checkpoint, or any model of stable-baselines3, to one file for the controller `ppo`."""
 
 from pathlib import Path
 
@@ -12,23 +12,22 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.config import Config
-from fishd.errors import FishdError, PolicyError
-from fishd.learning import checkpoints, runs
-from fishd.learning.environment import SwimEnv
-from fishd.learning.ppo import Deterministic, activation_of, layers_of
-from fishd.learning.provenance import make_card
+from fishd.controllers.policy.card import Card
+from fishd.controllers.policy.file import PolicyFile
+from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.runtime import Network
+from fishd.core.errors import FishdError, PolicyError
+from fishd.core.files import write_atomically
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.evaluation import Evaluation, in_simulation
+from fishd.learning.ppo.model import DeterministicPolicy, activation_of, layers_of
+from fishd.learning.run_folder import checkpoints, runs
+from fishd.learning.run_folder.provenance import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
-from fishd.learning.trials import Trial, in_simulation
-from fishd.learning.whole import write_whole
-from fishd.plant.optimum import best_square_wave
-from fishd.plant.parameters import PlantParameters
-from fishd.policies.card import Card
-from fishd.policies.file import PolicyFile
-from fishd.policies.network import to_onnx
-from fishd.policies.runtime import Network
+from fishd.virtual.plant.parameters import PlantParameters
 
 TOLERANCE = 1e-5
-"""The file must say what the trained policy says, to this share of Φ."""
+"""Largest difference between the outputs of the file and of the trained policy, as a share of Φ."""
 _PROBES = 1000
 
 
@@ -38,43 +37,42 @@ class Exported(Struct, frozen=True):
     path: Path
     checkpoint: Path
     card: Card
-    trial: Trial
+    evaluation: Evaluation
     size: int
     """[bytes]"""
 
 
 def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "") -> Exported:
-    """Write the policy of a checkpoint to `target`, once it is known to be right.
+    """Evaluate the policy of a checkpoint, and write it to `target`.
 
     force: also where it stalls
     note: for people, kept in the file
 
-    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would not say
-    what the policy says.
+    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would give other
+    outputs than the policy.
     """
     card = checkpoints.read_card(checkpoint)
     policy = checkpoints.load_policy(checkpoint)
-    settings = msgspec.convert(card.provenance.settings, TrainingSettings)
-    trial = _swim(checkpoint, card, policy, settings)
-    if trial.stalled and not force:
+    found = _evaluated(checkpoint, card, policy)
+    if found.stalled and not force:
         raise PolicyError(
             f"{checkpoint}: this policy stalls when it swims without exploration: "
-            f"{trial.frequency:.2f} Hz, |φ_c| {trial.fullness:.0%} of Φ; train longer, choose "
+            f"{found.frequency:.2f} Hz, |φ_c| {found.fullness:.0%} of Φ; train longer, choose "
             "another checkpoint, or export it all the same with --force"
         )
-    card = _completed(card, trial, note)
+    card = _completed(card, found, note)
     size = _write(target, card, policy)
-    return Exported(target, checkpoint, card, trial, size)
+    return Exported(target, checkpoint, card, found, size)
 
 
 def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Path:
     """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
 
-    model: PPO or A2C with an `MlpPolicy` of tanh or relu, and without `VecNormalize`: it would see
-        what the policy file does not know of
+    model: PPO or A2C with an `MlpPolicy` of tanh or relu, and without `VecNormalize`, whose
+        averages are no part of a policy file
     note: for people, kept in the file
 
-    Raises `PolicyError` for any other, and where the file would not say what the policy says.
+    Raises `PolicyError` for any other, and where the file would give other outputs than the policy.
     """
     path = Path(target)
     vec_env, policy = model.get_env(), model.policy
@@ -82,12 +80,12 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     if not isinstance(env, SwimEnv):
         raise PolicyError(
             f"{path}: the environment of this model, {type(vec_env).__name__}, is not a SwimEnv "
-            "alone: what the network sees cannot be told"
+            "alone, so the inputs of the network are not known"
         )
     if not isinstance(policy, ActorCriticPolicy) or not isinstance(
         policy.features_extractor, FlattenExtractor
     ):
-        raise PolicyError(f"{path}: {type(policy).__name__} is no MlpPolicy of PPO or A2C")
+        raise PolicyError(f"{path}: {type(policy).__name__} is not an MlpPolicy of PPO or A2C")
     card = make_card(env.config, TrainingSettings(), env.features, "a SwimEnv", 0, None, note)
     past = replace(
         card.provenance,
@@ -97,73 +95,54 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
         settings={"environment": msgspec.to_builtins(env.settings)},
     )
     card = replace(card, provenance=past)
-    decide = Deterministic(policy, card.observation, card.amplitude)
-    trial = in_simulation(env.config, decide, EvaluationSettings())
-    _write(path, _completed(card, trial, ""), policy)
+    decide = DeterministicPolicy(policy, card.observation, card.amplitude)
+    _write(path, _completed(card, in_simulation(env.config, decide, EvaluationSettings())), policy)
     return path
 
 
 def _write(target: Path, card: Card, policy: ActorCriticPolicy) -> int:
-    """Write the file, whole or not at all; its size [bytes]. Raises `PolicyError`."""
+    """Write the file atomically; its size [bytes]. Raises `PolicyError`."""
     content = to_onnx(layers_of(policy), activation_of(policy), card)
     _verify(PolicyFile(target, content, card), policy)
     if not target.name or (target.exists() and not target.is_file()):
-        raise PolicyError(f"{target}: is there already, and is no regular file")
+        raise PolicyError(f"{target}: exists already, and is not a regular file")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(target, content)
+        write_atomically(target, content)
     except OSError as error:
         raise PolicyError(f"{target}: cannot be written: {error.strerror}") from None
     return len(content)
 
 
-def _swim(
-    checkpoint: Path, card: Card, policy: ActorCriticPolicy, settings: TrainingSettings
-) -> Trial:
-    """How the policy swims: as last seen on the robot, else the simulated fish of its training."""
+def _evaluated(checkpoint: Path, card: Card, policy: ActorCriticPolicy) -> Evaluation:
+    """The latest evaluation on the robot, else one on the simulated fish of its training."""
     state = checkpoints.read_state(checkpoint)
-    seen = state.latest
-    if seen and state.on == "robot" and seen.steps == state.steps:
-        return Trial(seen.thrust, seen.frequency, seen.fullness, card.tick)
-    decide = Deterministic(policy, card.observation, card.amplitude)
-    return in_simulation(_fish(checkpoint, card), decide, settings.evaluation)
-
-
-def _fish(checkpoint: Path, card: Card) -> Config:
-    """The fish of the run, imperfections of its rig included where its folder is still there."""
-    try:
+    if state.on == "robot" and state.latest and state.latest.steps == state.steps:
+        return state.latest
+    try:  # with the imperfections of its rig, where the run folder still exists
         config, _ = runs.read(checkpoint.parent)
     except FishdError:
         config = Config()
-    return replace(
-        config,
-        tick=card.tick,
-        amplitude_limit=card.amplitude,
-        plant=msgspec.convert(card.provenance.plant, PlantParameters),
-    )
+    plant = msgspec.convert(card.provenance.plant, PlantParameters)
+    config = replace(config, tick=card.tick, amplitude_limit=card.amplitude, plant=plant)
+    decide = DeterministicPolicy(policy, card.observation, card.amplitude)
+    settings = msgspec.convert(card.provenance.settings, TrainingSettings)
+    return in_simulation(config, decide, settings.evaluation)
 
 
-def _completed(card: Card, trial: Trial, note: str) -> Card:
-    """The card with what the last evaluation says, and the note."""
-    past = card.provenance
-    plant = msgspec.convert(past.plant, PlantParameters)
-    best = float(best_square_wave(plant, card.amplitude).thrust)
-    return replace(
-        card,
-        provenance=replace(
-            past,
-            efficiency=trial.thrust / best,
-            frequency=trial.frequency,
-            note="; ".join(part for part in (past.note, note) if part),
-        ),
+def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
+    """The card with the figures of an evaluation, and the note."""
+    past = replace(
+        card.provenance,
+        efficiency=evaluation.efficiency,
+        frequency=evaluation.frequency,
+        note="; ".join(part for part in (card.provenance.note, note) if part),
     )
+    return replace(card, provenance=past)
 
 
 def _verify(file: PolicyFile, policy: ActorCriticPolicy) -> None:
-    """Compare what the robot will run with the policy, on random observations.
-
-    Raises `PolicyError`.
-    """
+    """Compare the file, run as on the robot, with the policy; raises `PolicyError`."""
     network = Network(file)
     shape = (_PROBES, len(file.card.observation))
     probes = np.random.default_rng(0).normal(0.0, 1.5, shape).astype(np.float32)
@@ -174,6 +153,6 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy) -> None:
         worst = max(worst, abs(network.run() - float(action[0])))
     if not worst <= TOLERANCE:
         raise PolicyError(
-            f"the file would say something else than the policy, by up to {worst:.2g} of Φ: "
-            "this onnxruntime cannot be trusted with it"
+            f"with this onnxruntime, the outputs of the file differ from those of the policy, by "
+            f"up to {worst:.2g} of Φ; install another version of it"
         )

@@ -1,16 +1,16 @@
 """The settings of a training, from a YAML file: every hyper-parameter, with bounds and units."""
 
-from pathlib import Path
-from typing import Annotated, Any, Literal
+import os
+from typing import Annotated, Literal
 
 import msgspec
 import yaml
 from msgspec import Meta, Struct
 
-from fishd import files, strict_yaml
-from fishd.errors import ConfigError
-from fishd.policies.card import FeatureName
-from fishd.schema import Problem, convert, without_empty_sections
+from fishd.controllers.policy.card import FeatureName
+from fishd.core import strict_yaml
+from fishd.core.errors import ConfigError
+from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
 
 Share = Annotated[float, Meta(ge=0, lt=1)]
 
@@ -19,37 +19,22 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """What the agent sees, and what it is rewarded for."""
 
     observation: Annotated[
-        tuple[FeatureName, ...],
-        Meta(description="What the agent sees, in order.", min_length=1),
+        tuple[FeatureName, ...], note("What the agent sees, in order.", min_length=1)
     ] = ("fy", "fy_rate", "instruction_angle", "previous_angle", "fin_velocity")
     force_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
-        Meta(
-            description="F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant.",
-            extra_json_schema={"unit": "N"},
-        ),
+        unit("N", "F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant."),
     ] = None
     thrust_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
-        Meta(
-            description="F_x whose reward is `reward_scale`; null: the best square wave's thrust.",
-            extra_json_schema={"unit": "N"},
-        ),
+        unit("N", "F_x whose reward is `reward_scale`; null: the best square wave's thrust."),
     ] = None
-    reward_scale: Annotated[float, Meta(gt=0, le=1000, description="Reward for thrust_scale.")] = (
-        0.3
-    )
-    episode: Annotated[
-        int,
-        Meta(ge=2, description="Steps of an episode.", extra_json_schema={"unit": "ticks"}),
-    ] = 768
+    reward_scale: Annotated[float, note("Reward for thrust_scale.", gt=0, le=1000)] = 0.3
+    episode: Annotated[int, unit("ticks", "Steps of an episode.", ge=2)] = 768
     longest_start: Annotated[
         int,
-        Meta(
-            ge=0,
-            le=1000,
-            description="An episode begins after up to so many ticks at a random angle.",
-            extra_json_schema={"unit": "ticks"},
+        unit(
+            "ticks", "An episode begins after up to so many ticks at a random angle.", ge=0, le=1000
         ),
     ] = 10
 
@@ -66,33 +51,23 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     coupling: Share = 0.0
     noise: Share = 0.0
     offset: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=10,
-            description="Offset of F_y, uniform in ±offset about the configured one.",
-            extra_json_schema={"unit": "N"},
-        ),
+        float, unit("N", "Offset of F_y, uniform in ±offset about the configured one.", ge=0, le=10)
     ] = 0.0
 
 
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Hyper-parameters of PPO, named as stable-baselines3 names them."""
 
-    n_steps: Annotated[int, Meta(ge=2, le=1_000_000, description="Steps between two updates.")] = (
-        128
+    n_steps: Annotated[int, note("Steps between two updates.", ge=2, le=1_000_000)] = 128
+    batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 64
+    n_epochs: Annotated[int, note("Passes over the steps of an update.", ge=1, le=1000)] = 10
+    gamma: Annotated[float, note("Discount factor.", ge=0, le=1)] = 0.95
+    gae_lambda: Annotated[float, note("Bias against variance of the advantages.", ge=0, le=1)] = (
+        0.95
     )
-    batch_size: Annotated[int, Meta(ge=2, le=1_000_000, description="Size of a minibatch.")] = 64
-    n_epochs: Annotated[
-        int, Meta(ge=1, le=1000, description="Passes over the steps of an update.")
-    ] = 10
-    gamma: Annotated[float, Meta(ge=0, le=1, description="Discount factor.")] = 0.95
-    gae_lambda: Annotated[
-        float, Meta(ge=0, le=1, description="Bias against variance of the advantages.")
-    ] = 0.95
-    learning_rate: Annotated[float, Meta(gt=0, le=1, description="At the first step.")] = 3e-3
+    learning_rate: Annotated[float, note("At the first step.", gt=0, le=1)] = 3e-3
     final_learning_rate: Annotated[
-        float, Meta(gt=0, le=1, description="From `decay_steps` on; linear until then.")
+        float, note("From `decay_steps` on; linear until then.", gt=0, le=1)
     ] = 3e-4
     decay_steps: Annotated[int, Meta(ge=1)] = 10_000
     clip_range: Annotated[float, Meta(gt=0, le=1)] = 0.2
@@ -101,17 +76,14 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     max_grad_norm: Annotated[float, Meta(gt=0, le=100)] = 0.5
     target_kl: Annotated[float, Meta(gt=0, le=10)] | None = None
     log_std_init: Annotated[
-        float, Meta(ge=-5, le=2, description="Log of the exploration's deviation, in units of Φ.")
+        float, note("Log of the exploration's deviation, in units of Φ.", ge=-5, le=2)
     ] = 0.7
     symmetric: Annotated[
-        bool,
-        Meta(
-            description="Build into the networks that left and right are alike; not with F_x seen."
-        ),
+        bool, note("Build into the networks that left and right are alike; not with F_x seen.")
     ] = True
     hidden: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1024)], ...],
-        Meta(min_length=1, description="Sizes of the hidden layers, of policy and value each."),
+        note("Sizes of the hidden layers, of policy and value each.", min_length=1),
     ] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
 
@@ -119,40 +91,28 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The deterministic evaluations during training."""
 
-    every: Annotated[
-        int, Meta(ge=0, description="An evaluation after so many updates; 0 for none.")
-    ] = 1
-    seconds: Annotated[
-        float,
-        Meta(ge=1, le=3600, description="Its length.", extra_json_schema={"unit": "s"}),
-    ] = 20.0
+    every: Annotated[int, note("An evaluation after so many updates; 0 for none.", ge=0)] = 1
+    seconds: Annotated[float, unit("s", "Its length.", ge=1, le=3600)] = 20.0
     settle: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=3600,
-            description="Time at its beginning that is not judged.",
-            extra_json_schema={"unit": "s"},
-        ),
+        float, unit("s", "Time at its beginning that is not judged.", ge=0, le=3600)
     ] = 5.0
     rest: Annotated[
         float,
-        Meta(
+        unit(
+            "s",
+            "On a robot, the tail rests for so long before and after; its zero is then between "
+            "F_x of the last thirds, whatever the sensor drifts. 0: the sensor's own zero.",
             ge=0,
             le=60,
-            description="On a robot, the tail rests for so long before and after; its zero is then "
-            "between F_x of the last thirds, whatever the sensor drifts. 0: the sensor's own zero.",
-            extra_json_schema={"unit": "s"},
         ),
     ] = 3.0
     others: Annotated[
         int,
-        Meta(
+        note(
+            "In simulation, so many other fish are tried too, at the edges of the randomisation "
+            "and shaken first; the policy counts as the best that does best on its worst fish.",
             ge=0,
             le=100,
-            description="In simulation, so many other fish are tried too, at the edges of the "
-            "randomisation and shaken first; the policy counts as the best that does best on its "
-            "worst fish.",
         ),
     ] = 0
 
@@ -160,37 +120,26 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A whole training; the defaults suit the default fish."""
 
-    steps: Annotated[int, Meta(ge=1, description="Control steps to learn from.")] = 8000
-    seed: Annotated[
-        int, Meta(ge=0, le=2**32 - 1, description="Of networks, exploration and start.")
-    ] = 0
-    checkpoint_every: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 5000
+    steps: Annotated[int, note("Control steps to learn from.", ge=1)] = 8000
+    seed: Annotated[int, note("Of networks, exploration and start.", ge=0, le=2**32 - 1)] = 0
+    checkpoint_every: Annotated[int, note("Steps between checkpoints.", ge=1)] = 5000
     environment: EnvironmentSettings = EnvironmentSettings()
     randomisation: Randomisation = Randomisation()
     ppo: PpoSettings = PpoSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
 
 
-def load(path: Path | None) -> TrainingSettings:
+def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
     """The settings in a file, or the defaults; raises `ConfigError` that names file and key."""
     if path is None:
         return TrainingSettings()
+    data, sources = strict_yaml.read(path, "a training", "steps: 8000")
     try:
-        document = strict_yaml.parse(files.read_text(path, files.SETTINGS, "a training"))
-        data: Any = document.data
-        if not isinstance(data, dict):
-            raise ConfigError(f"{path}:1: keys and values are needed, such as 'steps: 8000'")
         settings = convert(without_empty_sections(data, TrainingSettings), TrainingSettings)
         _check(settings)
         return settings
-    except strict_yaml.YamlProblem as problem:
-        raise ConfigError(f"{path}:{problem.line}: {problem}") from None
     except Problem as problem:
-        line = document.lines.get(problem.path)
-        where = f"{path}:{line}" if line else f"{path}"
-        raise ConfigError(f"{where}: {'.'.join(problem.path)}: {problem}") from None
-    except files.FileProblem as problem:
-        raise ConfigError(f"{path}: {problem}") from None
+        raise ConfigError(problem.located(sources)) from None
 
 
 def to_yaml(settings: TrainingSettings) -> str:

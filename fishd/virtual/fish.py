@@ -4,11 +4,11 @@ It advances when it is read, by the time since the previous read, under the inst
 was last written. So it knows no clock and runs as well in real time as in virtual time.
 """
 
+from fishd.core.signals import Measurement, Truth
 from fishd.hardware.base import Robot
-from fishd.hardware.imperfections import Imperfections, SimulationSettings
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import TetheredFish, TrueWindow, Window
-from fishd.signals import Measurement, Truth
+from fishd.virtual.imperfections import Imperfections, SimulationSettings
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import TetheredFish, TrueWindow, Window
 
 
 class SimulatedFish:
@@ -23,17 +23,20 @@ class SimulatedFish:
         self._sample_rate = settings.sample_rate
         self._tick = tick
         self._time: float | None = None
+        self._start = 0.0
         self._angle: float | None = None
         self._fin_speed = 0.0
 
     def read(self, now: float) -> Measurement:
         """Swim until `now` [s] and measure the forces on the way."""
-        duration = self._tick if self._time is None else round(now - self._time, 9)
+        if self._time is None:
+            self._start = self._time = now - self._tick
+        duration = round(now - self._time, 9)
         self._time = now
         samples = max(1, round(self._sample_rate * duration))
         self.window = window = self.fish.advance(self._angle, duration, samples)
         fx, fy = self._imperfections.apply(
-            window.sampled_thrust, window.sampled_lateral_force, now, duration
+            window.sampled_thrust, window.sampled_lateral_force, now - self._start, duration
         )
         return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
 

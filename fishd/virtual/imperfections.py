@@ -1,4 +1,4 @@
-"""What a real rig does to the force before anyone sees it, as settings and as a function of time.
+"""Errors of a real rig's force measurement, as settings and as a function of time.
 
 A real sensor is turned against the fish, carries an offset that drifts slowly, and is noisy.
 """
@@ -7,7 +7,9 @@ import math
 import random
 from typing import Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Struct
+
+from fishd.core.schema import note, unit
 
 DRIFT_PERIOD = 60.0
 """Period of the slow drift [s]: a few thousandths of the tail beat, as warming electronics do."""
@@ -17,58 +19,44 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """How imperfect the simulated rig is."""
 
     noise: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=1,
-            description="Noise of each force, rms of the mean over one tick.",
-            extra_json_schema={"unit": "N"},
-        ),
+        float, unit("N", "Noise of each force, rms of the mean over one tick.", ge=0, le=1)
     ] = 1e-3
-    offset_x: Annotated[
-        float,
-        Meta(ge=-10, le=10, description="Constant offset on F_x.", extra_json_schema={"unit": "N"}),
-    ] = 0.0
-    offset_y: Annotated[
-        float,
-        Meta(ge=-10, le=10, description="Constant offset on F_y.", extra_json_schema={"unit": "N"}),
-    ] = 0.0
+    offset_x: Annotated[float, unit("N", "Constant offset on F_x.", ge=-10, le=10)] = 0.0
+    offset_y: Annotated[float, unit("N", "Constant offset on F_y.", ge=-10, le=10)] = 0.0
     drift: Annotated[
         float,
-        Meta(
+        unit(
+            "N",
+            "Amplitude of a slow drift of both offsets, a sine of 60 s whose phase depends on the "
+            "seed.",
             ge=0,
             le=10,
-            description="Amplitude of a slow drift of both offsets, a sine of 60 s "
-            "whose phase depends on the seed.",
-            extra_json_schema={"unit": "N"},
         ),
     ] = 0.0
     rotation: Annotated[
         float,
-        Meta(
+        unit(
+            "rad",
+            "Angle by which the sensor's axes are turned against the fish.",
             ge=-math.pi,
             le=math.pi,
-            description="Angle by which the sensor's axes are turned against the fish.",
-            extra_json_schema={"unit": "rad"},
         ),
     ] = 0.0
     sample_rate: Annotated[
         float,
-        Meta(
+        unit(
+            "1/s",
+            "Pairs of samples per second; a window's mean is the mean of the samples that fall in "
+            "it, at least one.",
             ge=1,
             le=10_000,
-            description="Pairs of samples per second; a window's mean is the mean of the samples "
-            "that fall in it, at least one.",
-            extra_json_schema={"unit": "1/s"},
         ),
     ] = 200.0
-    seed: Annotated[
-        int, Meta(ge=0, description="Same seed, same noise and drift, to the last bit.")
-    ] = 0
+    seed: Annotated[int, note("Same seed, same noise and drift, to the last bit.", ge=0)] = 0
 
 
 class Imperfections:
-    """Turns true forces into those that the rig would show."""
+    """Turns true forces into measured ones."""
 
     def __init__(self, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period that `settings.noise` refers to [s]."""
@@ -83,6 +71,7 @@ class Imperfections:
     def apply(self, fx: float, fy: float, time: float, duration: float) -> tuple[float, float]:
         """The forces as the rig shows them [N], for a window of `duration` that ends at `time` [s].
 
+        time: since the start, for the same seed to mean the same drift in every run
         Noise of a longer window averages out as white noise does.
         """
         settings = self._settings

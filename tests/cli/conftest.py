@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from doctor_tree import Examine, examiner
-from operator_rig import Bench, Dialogue, Talk, bench, pi_process
-from processes import Daemon
+from rigs.doctor_tree import Examine, examiner
+from rigs.operator_rig import Bench, Dialogue, Talk, bench, pi_process
+from rigs.processes import Daemon
 
 
 @pytest.fixture(autouse=True)

@@ -5,11 +5,11 @@ import signal
 import time
 
 import pytest
-from operator_rig import Bench, Talk, calibrations
-from processes import PATIENCE, Daemon, Subscriber
+from rigs.operator_rig import Bench, Talk, calibrations
+from rigs.processes import PATIENCE, Daemon, Subscriber
 
 from fishd.client import Fish
-from fishd.protocol import LOAN
+from fishd.core.protocol import LEASE
 
 
 def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
@@ -45,29 +45,6 @@ def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
         assert (found.servo.lowest, found.servo.highest) == (-1.2, 0.1)
         assert fish.status().mode == "idle"
     pi.wait_for_pulse(1529, 1531)
-
-
-def test_the_servo_calibration_that_was_saved_is_in_force_in_the_next_daemon(
-    talk: Talk, pi: Bench
-) -> None:
-    with pi.daemon() as daemon, Fish(daemon.endpoint) as fish:
-        dialogue = talk(daemon, "calibrate", "servo")
-        for prompt, line in (
-            ("trim +0 µs> ", "--"),
-            ("trim -25 µs> ", "ok"),
-            ("again: ", "y"),
-            ("rad> ", "ok"),  # at 0: the tail could not move at all
-            ("first, or keep", ""),
-            ("rad> ", "keep"),
-            ("rad> ", "keep"),
-            ("Save it?", "y"),
-        ):
-            dialogue.answer(prompt, line)
-        assert dialogue.finish() == 0
-        saved = fish.calibrations()
-    with pi.daemon() as daemon, Fish(daemon.endpoint) as fish:
-        assert fish.calibrations() == saved
-        pi.wait_for_pulse(1474, 1476)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM, None])
@@ -115,7 +92,8 @@ def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.expect("trim +25 µs> ")
-    time.sleep(LOAN + 2.0)  # which is not renewed but by fishctl
+    time.sleep(LEASE + 2.0)  # which is not renewed but by fishctl
+    assert "\ncalibrating the servo, by a client\n" in daemon.fishctl("status").stdout
     swim, second = daemon.fishctl("set-controller", "swing"), daemon.fishctl("calibrate", "servo")
     for ended in (swim, second):
         assert re.fullmatch(
@@ -124,76 +102,52 @@ def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
     dialogue.answer("", "-")
     dialogue.expect("trim +20 µs> ")
     assert dialogue.finish() == 130
-
-
-def test_status_shows_that_somebody_calibrates_the_servo(
-    talk: Talk, pi: Bench, daemon: Daemon
-) -> None:
-    assert "calibrating" not in daemon.fishctl("status").stdout
-    dialogue = talk(daemon, "calibrate", "servo")
-    dialogue.expect("trim +0 µs> ")
-    assert "\ncalibrating the servo, by a client\n" in daemon.fishctl("status").stdout
-    assert dialogue.finish() == 130
     assert "calibrating" not in daemon.fishctl("status").stdout
 
 
-def test_where_pulses_end_before_the_amplitude_the_limit_is_there_and_can_be_saved(
+def test_where_pulses_end_before_the_amplitude_the_limit_is_there_and_saved_after_a_yes(
     talk: Talk, pi: Bench
 ) -> None:
-    with pi.daemon("--set", "servo.centre=2300", "--set", "servo.highest=0.3") as daemon:
-        dialogue = talk(daemon, "calibrate", "servo")
-        for prompt, line in (
-            ("trim +0 µs> ", "+"),  # 2305 µs: 195 µs, 0.325 rad are left
-            ("trim +5 µs> ", "++"),  # 0.2833 rad are left, less than the limit of before
-            ("trim +30 µs> ", "ok"),
-            ("again: ", "y"),
-            ("highest +0.00 rad> ", "keep"),
-        ):
-            dialogue.answer(prompt, line)
-        dialogue.expect("highest is +0.2833 rad now, where the pulses of a servo end")
-        dialogue.answer("lowest +0.00 rad> ", "keep")
-        dialogue.answer("Save it?", "y")
-        assert dialogue.finish() == 0
+    with pi.daemon("--set", "servo.centre=2480", "--set", "servo.highest=0.02") as daemon:
+        before = calibrations(daemon)
+        for answer, status in (("n", 1), ("y", 0)):
+            assert calibrations(daemon) == before
+            dialogue = talk(daemon, "calibrate", "servo")
+            dialogue.answer("trim +0 µs> ", "++")
+            assert "beyond 500 to 2500" in dialogue.expect("trim +0 µs> ")
+            for line in ("+", "+", "ok"):  # 10 µs are left, 0.0167 rad: less than the limit
+                dialogue.answer("" if line == "+" else "trim +10 µs> ", line)
+            dialogue.answer("again: ", "y")
+            dialogue.answer("highest +0.00 rad> ", "ok")
+            dialogue.answer("could not go this way at all; go to its limit first, or keep", "keep")
+            dialogue.expect("highest is +0.0166 rad now, where the pulses of a servo end")
+            dialogue.answer("lowest +0.00 rad> ", "keep")
+            dialogue.answer("Save it?", answer)
+            assert dialogue.finish() == status
         found = calibrations(daemon).servo
-    assert (found.highest, found.lowest) == (0.2833, -1.2)
+    assert (found.trim, found.highest, found.lowest) == (10.0, 0.0166, -1.2)
 
 
-def test_who_was_away_for_too_long_is_told_so_at_the_prompt(
-    talk: Talk, pi: Bench, daemon: Daemon
+@pytest.mark.parametrize("what", ["fishctl is stopped", "fishd is restarted"])
+def test_a_lease_that_ends_of_itself_is_told_at_the_prompt(
+    talk: Talk, pi: Bench, what: str
 ) -> None:
-    dialogue = talk(daemon, "calibrate", "servo")
-    dialogue.answer("trim +0 µs> ", "++")
-    dialogue.expect("trim +25 µs> ")
-    pi.wait_for_pulse(1524, 1526)
-    dialogue.process.send_signal(signal.SIGSTOP)
-    pi.wait_for_pulse(1499, 1501)
-    dialogue.process.send_signal(signal.SIGCONT)
-    said = dialogue.expect("[no-loan]\n")
-    assert "the servo is at neutral; its calibration is as before\n" in said
-    assert re.search(r"\nfishctl: this loan has ended[^\n]+\n$", said)
-    assert dialogue.process.wait(PATIENCE) == 1
-
-
-def test_a_restart_of_fishd_is_told_at_the_prompt(talk: Talk, pi: Bench) -> None:
     with pi.daemon() as first:
         dialogue = talk(first, "calibrate", "servo")
         dialogue.answer("trim +0 µs> ", "++")
         dialogue.expect("trim +25 µs> ")
-    with pi.daemon():
-        assert "its calibration is as before" in dialogue.expect("[no-loan]\n")
-        assert dialogue.process.wait(PATIENCE) == 1
-
-
-def test_who_does_not_save_the_servo_calibration_keeps_the_one_before(
-    talk: Talk, pi: Bench, daemon: Daemon
-) -> None:
-    before = calibrations(daemon)
-    dialogue = talk(daemon, "calibrate", "servo")
-    for line in ("++", "ok", "y", "keep", "keep", "n"):
-        dialogue.answer(": " if line in "yn" else "> ", line)
-    assert dialogue.finish() == 1
-    assert "not saved" in dialogue.text
-    assert calibrations(daemon) == before
+        pi.wait_for_pulse(1524, 1526)
+        if what == "fishctl is stopped":
+            dialogue.process.send_signal(signal.SIGSTOP)
+            pi.wait_for_pulse(1499, 1501)
+            dialogue.process.send_signal(signal.SIGCONT)
+            said = dialogue.expect("[no-lease]\n")
+    if what == "fishd is restarted":
+        with pi.daemon():
+            said = dialogue.expect("[no-lease]\n")
+    assert "the servo is at neutral; its calibration is as before\n" in said
+    assert re.search(r"\nfishctl: this lease has ended[^\n]+\n$", said)
+    assert dialogue.process.wait(PATIENCE) == 1
 
 
 def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_before(
@@ -223,7 +177,7 @@ def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench, daem
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.expect("trim +0 µs> ")
     daemon.process.kill()
-    daemon.process.wait()
+    daemon.process.wait(PATIENCE)
     dialogue.answer("", "+")
     assert dialogue.finish() == 1
     assert re.search(
@@ -239,18 +193,8 @@ def test_the_servo_is_not_calibrated_while_the_fish_swims_or_after_a_fault(
     daemon.fishctl("estop", "a test")
     stopped = daemon.fishctl("calibrate", "servo")
     assert (swimming.returncode, stopped.returncode) == (1, 1)
-    assert swimming.stderr == "fishctl: swing is in command; stop it with 'fishctl stop'\n"
+    assert (
+        swimming.stderr
+        == "fishctl: swing is the active controller; stop it with 'fishctl stop' [running]\n"
+    )
     assert re.fullmatch(r"fishctl: fishd is in estop: a test; [^\n]+\n", stopped.stderr)
-
-
-def test_a_trim_that_no_servo_takes_is_refused_and_the_dialogue_goes_on(
-    talk: Talk,
-    pi: Bench,
-) -> None:
-    with pi.daemon("--set", "servo.centre=2480", "--set", "servo.highest=0.02") as daemon:
-        dialogue = talk(daemon, "calibrate", "servo")
-        dialogue.answer("trim +0 µs> ", "++")
-        assert "beyond 500 to 2500" in dialogue.expect("trim +0 µs> ")
-        dialogue.answer("", "+")
-        dialogue.expect("trim +5 µs> ")
-        assert dialogue.finish() == 130

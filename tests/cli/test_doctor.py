@@ -1,42 +1,16 @@
 """`fishctl doctor` as a user meets it: on real processes, a virtual Pi and a broken one."""
 
-import json
 import os
 import socket
-import subprocess
 from pathlib import Path
 
 import pytest
-from operator_rig import Bench
-from processes import FISHCTL, PATIENCE, running
+from rigs.doctor_process import doctor, free_telemetry
+from rigs.operator_rig import Bench
+from rigs.processes import fishctl
 
-Findings = dict[str, tuple[str, str]]
 WELL = ("ok", "warning")
 """Levels of what is timed: a busy machine may give fewer samples than a healthy bus."""
-
-
-def doctor(
-    folder: Path, *settings: str, under: tuple[str, ...] = (), **env: str
-) -> tuple[int, Findings]:
-    """Exit status, and level and message of each check; a FAIL or warning says how to mend it."""
-    control = ("--set", f"control.address=ipc://{folder}/control")
-    ended = subprocess.run(
-        [*under, FISHCTL, "doctor", "--json", *control, *settings],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE,
-        env=os.environ | env,
-    )
-    assert ended.stderr == ""
-    findings = json.loads(ended.stdout)
-    assert all(bool(f["mend"]) == (f["level"] in ("warning", "FAIL")) for f in findings)
-    assert not any("broke off" in finding["message"] for finding in findings)
-    return ended.returncode, {f["check"]: (f["level"], f["message"]) for f in findings}
-
-
-def free_telemetry() -> list[str]:
-    return ["--set", "telemetry.address=tcp://127.0.0.1:0"]
 
 
 def test_on_a_simulated_robot_only_what_it_needs_is_checked(tmp_path: Path) -> None:
@@ -44,15 +18,12 @@ def test_on_a_simulated_robot_only_what_it_needs_is_checked(tmp_path: Path) -> N
     assert status == 0
     assert {"configuration", "packages", "disk", "daemon"} <= findings.keys()
     assert not {"adc", "force", "pigpiod", "i2c bus", "calibrations"} & findings.keys()
+    ended = fishctl("--endpoint", f"ipc://{tmp_path}/control", "doctor", *free_telemetry())
+    assert ended.stdout.endswith("\na simulated fish needs no hardware, so none was checked\n")
 
 
 def test_the_table_has_a_line_for_each_check_and_says_how_to_mend(pi: Bench) -> None:
-    ended = subprocess.run(
-        [FISHCTL, "doctor", *pi.settings, *free_telemetry(), "--endpoint", "ipc:///nowhere"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ended = fishctl("doctor", *pi.settings, *free_telemetry(), "--endpoint", "ipc:///nowhere")
     assert (ended.returncode, ended.stderr) == (0, "")
     lines = ended.stdout.splitlines()
     assert (
@@ -64,16 +35,6 @@ def test_the_table_has_a_line_for_each_check_and_says_how_to_mend(pi: Bench) -> 
     warnings = sum(line.startswith("warning ") for line in lines)
     noun = "warning" if warnings == 1 else "warnings"
     assert f", {warnings} {noun}, 0 failed, 0 skipped" in lines[-1]
-
-
-def test_a_simulated_robot_says_that_no_hardware_was_checked(tmp_path: Path) -> None:
-    ended = subprocess.run(
-        [FISHCTL, "--endpoint", f"ipc://{tmp_path}/control", "doctor", *free_telemetry()],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert "no hardware, so none was checked" in ended.stdout
 
 
 def test_a_healthy_virtual_pi_is_all_well_with_and_without_a_daemon(pi: Bench) -> None:
@@ -161,23 +122,14 @@ def test_a_daemon_in_fault_fails_with_its_reason(pi: Bench) -> None:
     assert "sensor-stale" in findings["daemon"][1]
 
 
-def test_a_daemon_that_drives_another_robot_is_pointed_out(tmp_path: Path) -> None:
-    with running(tmp_path):
-        _, findings = doctor(tmp_path, "--set", "robot=pi")
-    assert findings["daemon"][0] == "warning"
-    assert "robot simulated" in findings["daemon"][1]
-
-
 def test_what_a_fishd_of_another_robot_measures_is_not_taken_for_this_ones(pi: Bench) -> None:
     with pi.daemon() as daemon:
         own = ("--set", "robot=pi", "--set", f"state_folder={pi.folder}/of-pi")
         _, findings = doctor(pi.folder, *own)
-    for name in ("adc", "force"):
-        assert findings[name] == (
-            "skipped",
-            f"the fishd at {daemon.endpoint} drives another robot, virtual-pi; "
-            "name this one's with --endpoint",
-        )
+    another = f"the fishd at {daemon.endpoint} drives another robot, virtual-pi; name this one's"
+    assert findings["adc"] == findings["force"] == ("skipped", f"{another} with --endpoint")
+    assert findings["daemon"][0] == "warning"
+    assert "robot virtual-pi" in findings["daemon"][1]
     assert f"{pi.folder}/of-pi" in findings["state folder"][1]
     assert findings["control"][0] == "ok"
 
@@ -238,9 +190,7 @@ def test_a_driver_that_is_too_old_fails_only_where_it_is_needed(tmp_path: Path) 
 def test_a_wrong_configuration_is_one_line_and_exit_status_78(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("tik: 0.05\n")
-    ended = subprocess.run(
-        [FISHCTL, "doctor", "--config", str(file)], capture_output=True, text=True, check=False
-    )
+    ended = fishctl("doctor", "--config", str(file))
     assert (ended.returncode, ended.stdout) == (78, "")
     assert ended.stderr == f"fishctl: {file}:1: tik: unknown key; did you mean 'tick'?\n"
 

@@ -1,25 +1,161 @@
 """Checks of `fishctl doctor` that look at a Raspberry Pi's own files, on a tree of such files."""
 
-import contextlib
 import os
 import shutil
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from doctor_tree import Examine, level, put
-from test_doctor import doctor, free_telemetry
+from rigs.doctor_process import doctor, free_telemetry
+from rigs.doctor_tree import Examine, put, unprivileged
+from rigs.processes import call
+
+MODEL, BUS = "proc/device-tree/model", "of_node/clock-frequency"
+PI_4 = {MODEL: "Raspberry Pi 4 Model B Rev 1.5\0"}
+PI_5 = {MODEL: "Raspberry Pi 5 Model B Rev 1.0\0"}
+CHIP = "proc/device-tree/compatible"
+ZERO_W = {MODEL: "Raspberry Pi Zero W Rev 1.1\0", CHIP: "raspberrypi,model-zero-w\0brcm,bcm2835\0"}
+ZERO_2 = {MODEL: "Raspberry Pi Zero 2 W Rev 1\0", CHIP: "raspberrypi,zero-2-w\0brcm,bcm2837\0"}
+DEBIAN = {
+    "proc/sys/kernel/osrelease": "6.12.43+deb13-arm64\n",
+    "etc/os-release": 'PRETTY_NAME="Debian GNU/Linux 13 (trixie)"\nVERSION_ID="13"\n',
+}
+RASPBERRY_PI_OS = {
+    **DEBIAN,
+    "proc/sys/kernel/osrelease": "6.12.47+rpt-rpi-v8\n",
+    "etc/rpi-issue": "Raspberry Pi reference 2025-10-01\n",
+    "proc/device-tree/__overrides__/any": "",
+}
+RP1 = {"sys/bus/platform/devices/1f00074000.i2c/uevent": ""}
+OWN_KERNEL = (
+    "Debian GNU/Linux 13 (trixie) with its own kernel, 6.12.43+deb13-arm64: dtparam= and "
+    "dtoverlay= in config.txt do nothing"
+)
+FAST, SLOW = (speed.to_bytes(4, "big") for speed in (400_000, 100_000))
+SPEED, SPEED_BEFORE = f"sys/bus/i2c/devices/i2c-1/{BUS}", f"sys/class/i2c-adapter/i2c-1/{BUS}"
+FLAGS = "sys/devices/platform/soc/soc:firmware/get_throttled"
+MONITOR = {
+    "sys/class/hwmon/hwmon0/name": "cpu_thermal\n",
+    "sys/class/hwmon/hwmon1/name": "rpi_volt\n",
+}
+ALARM = "sys/class/hwmon/hwmon1/in0_lcrit_alarm"
+GOVERNORS = {
+    f"sys/devices/system/cpu/cpu{n}/cpufreq/scaling_governor": "performance\n" for n in range(4)
+}
+PINS = {
+    "sys/kernel/debug/gpio": "gpiochip0: GPIOs 512-565, parent: platform/fe200000.gpio:\n"
+    " gpio-529 (GPIO17              )\n"
+    " gpio-530 (GPIO18              |pps-gpio            ) in  lo\n"
+    " gpio-539 (GPIO27              |sysfs               ) out lo\n"
+}
+SYSTEMD = {"run/systemd/system/any": ""}
+UNIT = {"etc/systemd/system/fishd.service": "[Service]\n"}
+WANTED = {"etc/systemd/system/multi-user.target.wants/fishd.service": ""}
+MATRIX = "xx: 2.0, xy: 0.0, x0: 0.0, yx: 0.0, yy: 2.0, y0: 0.0, date: '2026-01-02'"
+FORCE = {"state/pi/force-2026-01-02T000000.000000Z.yaml": f"{{{MATRIX}}}\n"}
+TARED = {
+    "state/pi/force-2026-01-02T000000.000000Z.yaml": "{xx: 1.0, xy: 0.0, x0: 0.3, yx: 0.0, "
+    "yy: 1.0, y0: 0.0, date: '2026-01-02', tared: '2026-01-02'}\n"
+}
+SERVO = {
+    "state/pi/servo-2026-01-03T000000.000000Z.yaml": "{trim: 10.0, direction: 1, scale: 600.0, "
+    "lowest: -1.0, highest: 1.0, date: '2026-01-03'}\n"
+}
+BACKUP = {"state/pi/force-backup.yaml": f"{{{MATRIX}}}\n"}
+BROKEN = {"state/pi/force-2026-02-02T000000.000000Z.yaml": "xx: a lot\n"}
+
+CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
+    ("model", "warning", "no Raspberry Pi", {}, []),
+    ("model", "ok", "Raspberry Pi 4 Model B Rev 1.5", PI_4 | {CHIP: "brcm,bcm2711\0"}, []),
+    ("model", "FAIL", "too slow", ZERO_W, []),
+    ("model", "ok", "Zero 2 W", ZERO_2, []),
+    ("system", "", "", {}, []),
+    ("system", "warning", f"{OWN_KERNEL}, the PWM of the header is off", PI_4 | DEBIAN,
+     ["servo.driver=sysfs-pwm"]),
+    ("system", "warning", f"{OWN_KERNEL}, there is no pigpiod", PI_4 | DEBIAN, []),
+    ("system", "ok", "Raspberry Pi OS (Debian GNU/Linux 13 (trixie)), kernel 6.12.47+rpt-rpi-v8",
+     PI_4 | RASPBERRY_PI_OS, []),
+    ("system", "FAIL", "does not know the header of a Pi 5", PI_5 | DEBIAN, []),
+    ("system", "warning", OWN_KERNEL, PI_5 | DEBIAN | RP1, []),
+    ("i2c bus", "FAIL", "does not exist", {}, []),
+    ("i2c bus", "ok", "", {"dev/i2c-1": ""}, []),
+    ("i2c bus", "FAIL", "there is i2c-1", {"dev/i2c-1": ""}, ["force_sensor.bus=3"]),
+    ("i2c speed", "skipped", "does not tell", {}, []),
+    ("i2c speed", "ok", "400 kbit/s", {SPEED: FAST}, []),
+    ("i2c speed", "warning", "100 kbit/s", {SPEED: SLOW}, []),
+    ("i2c speed", "ok", "400 kbit/s", {SPEED_BEFORE: FAST}, []),
+    ("i2c speed", "warning", "100 kbit/s", {SPEED_BEFORE: SLOW}, []),
+    ("i2c speed", "ok", "less while this Pi's core clock is lowered", {SPEED: FAST} | PI_4, []),
+    ("power", "ok", "no under-voltage", {FLAGS: "0\n"}, []),
+    ("power", "FAIL", "under-voltage", {FLAGS: "1\n"}, []),
+    ("power", "FAIL", "under-voltage", {FLAGS: "50005\n"}, []),
+    ("power", "warning", "the Pi is throttled", {FLAGS: "4\n"}, []),
+    ("power", "warning", "too hot", {FLAGS: "8\n"}, []),
+    ("power", "warning", "has been under-voltage and throttled", {FLAGS: "50000\n"}, []),
+    ("power", "skipped", "does not tell", {}, []),
+    ("power", "ok", "no under-voltage", MONITOR | {ALARM: "0\n"}, []),
+    ("power", "FAIL", "under-voltage", MONITOR | {ALARM: "1\n"}, []),
+    ("governor", "skipped", "", {}, []),
+    ("governor", "ok", "performance", GOVERNORS, []),
+    ("governor", "warning", "slows down", GOVERNORS | {min(GOVERNORS): "ondemand\n"}, []),
+    ("clock", "ok", "", {"run/systemd/timesync/synchronized": ""}, []),
+    ("pigpiod", "FAIL", "set servo.driver: sysfs-pwm", PI_5, []),
+    ("pigpiod", "", "", PI_5, ["servo.driver=sysfs-pwm"]),
+    ("pigpiod", "FAIL", "systemctl enable --now pigpiod", {"usr/bin/pigpiod": ""},
+     ["servo.port=1"]),
+    ("pigpiod", "FAIL", "apt install pigpio", RASPBERRY_PI_OS, ["servo.port=1"]),
+    ("pigpiod", "FAIL", "Debian has no pigpiod", DEBIAN, ["servo.port=1"]),
+    ("gpio pins", "warning", "GPIO18 (servo.gpio) is used by pps-gpio", PINS, []),
+    ("gpio pins", "ok", "", PINS, ["servo.gpio=17"]),
+    ("gpio pins", "warning", "GPIO27", PINS, ["servo.gpio=17", "panel.led_gpio=27"]),
+    ("gpio package", "", "", {}, []),
+    ("gpio package", "ok", "rpi-lgpio", {}, ["panel.estop_gpio=4"]),
+    ("amplifier", "ok", "", {}, ["force_sensor.full_scale=2.048"]),
+    ("amplifier", "ok", "", {}, ["force_sensor.full_scale=4.096"]),
+    ("amplifier", "warning", "would pass for a force", {},
+     ["force_sensor.full_scale=4.096", "force_sensor.saturation_high=null"]),
+    ("amplifier", "warning", "would pass for a force", {},
+     ["force_sensor.channel_x=A0", "force_sensor.channel_y=A1"]),
+    ("amplifier", "ok", "", {}, ["force_sensor.channel_x=A0", "force_sensor.channel_y=A1",
+     "force_sensor.saturation_low=0.1"]),
+    ("systemd", "skipped", "", {}, []),
+    ("systemd", "warning", "make install-pi", SYSTEMD, []),
+    ("systemd", "warning", "enable --now", SYSTEMD | UNIT, []),
+    ("systemd", "ok", "", SYSTEMD | UNIT | WANTED, []),
+    ("state folder", "ok", "", {}, []),
+    ("state folder", "FAIL", "is no folder", {"state": "a file"}, []),
+    ("calibrations", "warning", "fishctl calibrate force", {}, []),
+    ("calibrations", "warning", "fishctl calibrate servo", FORCE, []),
+    ("calibrations", "ok", "force of 2026-01-02, servo of 2026-01-03", FORCE | SERVO, []),
+    ("calibrations", "warning", "force-backup.yaml is no dated calibration file and is ignored",
+     FORCE | SERVO | BACKUP, []),
+    ("calibrations", "FAIL", "force-2026-02-02", FORCE | SERVO | BROKEN, []),
+    ("calibrations", "warning", "tared 2026-01-02, but never calibrated", TARED, []),
+]  # fmt: skip
 
 
-def test_the_i2c_bus_must_be_there(root: Path, examine: Examine) -> None:
-    assert level(examine("i2c bus")) == "FAIL"
-    put(root, "dev/i2c-1")
-    assert level(examine("i2c bus")) == "ok"
-    other = examine("i2c bus", "force_sensor.bus=3")
-    assert level(other) == "FAIL"
-    assert other is not None
-    assert "there is i2c-1" in other.message
+@pytest.mark.parametrize(
+    ("check", "level", "words", "files", "settings"),
+    CASES,
+    ids=[f"{check}: {level} {words[:30]}" for check, level, words, *_ in CASES],
+)
+def test_a_check_says_what_it_finds_on_a_pi(
+    root: Path,
+    examine: Examine,
+    check: str,
+    level: str,
+    words: str,
+    files: dict[str, str | bytes],
+    settings: list[str],
+) -> None:
+    for path, content in files.items():
+        put(root, path, content)
+    found, message, mend = examine(check, *settings)
+    assert (found, words in f"{message}; {mend}") == (level, True), message
+
+
+def as_root() -> None:
+    if os.geteuid() != 0:
+        pytest.skip("needs root: a file gets another owner or group")
 
 
 @pytest.mark.parametrize(
@@ -33,16 +169,13 @@ def test_the_i2c_bus_must_be_there(root: Path, examine: Examine) -> None:
 def test_the_i2c_bus_must_be_accessible_to_this_user(
     root: Path, examine: Examine, group: str, mode: int, remedy: str
 ) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("needs root: a device gets another group")
+    as_root()
     device = put(root, "dev/i2c-1")
     shutil.chown(device, group=group)
     device.chmod(mode)
     with unprivileged():
-        found = examine("i2c bus")
-    assert level(found) == "FAIL"
-    assert found is not None
-    assert remedy in found.mend
+        level, _, mend = examine("i2c bus")
+    assert (level, remedy in mend) == ("FAIL", True)
 
 
 @pytest.mark.parametrize(
@@ -52,198 +185,23 @@ def test_the_i2c_bus_must_be_accessible_to_this_user(
 def test_a_state_folder_of_another_user_is_not_taken_away_from_him(
     root: Path, examine: Examine, owner: int, remedy: str
 ) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("needs root: a folder gets another owner")
+    as_root()
     folder = root / "state" / "pi"
     folder.mkdir(parents=True)
     os.chown(folder, owner, owner)
     folder.chmod(0o500)
     with unprivileged():
-        found = examine("state folder")
-    assert level(found) == "FAIL"
-    assert found is not None
-    assert remedy in found.mend
-    assert "chown" not in found.mend
-    assert "set state_folder" in found.mend
-
-
-@contextlib.contextmanager
-def unprivileged() -> Iterator[None]:
-    """As user 65534; the groups are given back as well."""
-    groups = os.getgroups()
-    os.setgroups([])
-    os.setresgid(65534, 65534, 0)
-    os.setresuid(65534, 65534, 0)
-    try:
-        yield
-    finally:
-        os.setresuid(0, 0, 0)
-        os.setresgid(0, 0, 0)
-        os.setgroups(groups)
-
-
-def test_pigpio_on_a_pi_5_fails_before_anything_is_tried(root: Path, examine: Examine) -> None:
-    put(root, "proc/device-tree/model", "Raspberry Pi 5 Model B Rev 1.0\0")
-    found = examine("pigpiod")
-    assert level(found) == "FAIL"
-    assert found is not None
-    assert "sysfs-pwm" in found.mend
-    assert examine("pigpiod", "servo.driver=sysfs-pwm") is None
-
-
-@pytest.mark.parametrize(
-    ("flags", "expected", "word"),
-    [
-        ("0", "ok", "no under-voltage"),
-        ("1", "FAIL", "under-voltage"),
-        ("50005", "FAIL", "under-voltage"),
-        ("4", "warning", "the Pi is throttled"),
-        ("8", "warning", "too hot"),
-        ("50000", "warning", "has been under-voltage and throttled"),
-    ],
-)
-def test_the_firmwares_word_on_power_is_understood(
-    root: Path, examine: Examine, flags: str, expected: str, word: str
-) -> None:
-    put(root, "sys/devices/platform/soc/soc:firmware/get_throttled", f"{flags}\n")
-    found = examine("power")
-    assert level(found) == expected
-    assert found is not None
-    assert word in found.message
-
-
-def test_without_the_firmware_the_kernels_alarm_is_asked(root: Path, examine: Examine) -> None:
-    assert level(examine("power")) == "skipped"
-    put(root, "sys/class/hwmon/hwmon0/name", "cpu_thermal\n")
-    put(root, "sys/class/hwmon/hwmon1/name", "rpi_volt\n")
-    put(root, "sys/class/hwmon/hwmon1/in0_lcrit_alarm", "0\n")
-    assert level(examine("power")) == "ok"
-    put(root, "sys/class/hwmon/hwmon1/in0_lcrit_alarm", "1\n")
-    assert level(examine("power")) == "FAIL"
-
-
-def test_a_governor_that_slows_any_processor_down_is_a_warning(
-    root: Path, examine: Examine
-) -> None:
-    assert level(examine("governor")) == "skipped"
-    for cpu in range(4):
-        put(root, f"sys/devices/system/cpu/cpu{cpu}/cpufreq/scaling_governor", "performance\n")
-    assert level(examine("governor")) == "ok"
-    put(root, "sys/devices/system/cpu/cpu2/cpufreq/scaling_governor", "ondemand\n")
-    assert level(examine("governor")) == "warning"
-
-
-def test_a_clock_that_systemd_has_synchronised_is_well(root: Path, examine: Examine) -> None:
-    put(root, "run/systemd/timesync/synchronized")
-    assert level(examine("clock")) == "ok"
-
-
-def test_why_nobody_can_see_who_uses_pins_is_told(root: Path, examine: Examine) -> None:
-    def said() -> str:
-        found = examine("gpio pins")
-        assert level(found) == "skipped"
-        assert found is not None
-        return found.message
-
-    if os.geteuid() != 0:
-        assert "only root can see" in said()
-        return
-    (root / "sys/kernel/debug").mkdir(parents=True)
-    assert "debugfs is not mounted: mount -t debugfs none /sys/kernel/debug" in said()
-    put(root, "sys/kernel/debug/clk/clk_summary")
-    assert "this kernel does not say who uses GPIO pins" in said()
-    with unprivileged():
-        assert "only root can see" in said()
-
-
-def test_a_gpio_pin_of_somebody_else_is_a_warning(root: Path, examine: Examine) -> None:
-    assert level(examine("gpio pins")) == "skipped"
-    put(
-        root,
-        "sys/kernel/debug/gpio",
-        "gpiochip0: GPIOs 512-565, parent: platform/fe200000.gpio, pinctrl-bcm2711:\n"
-        " gpio-529 (GPIO17              )\n"
-        " gpio-530 (GPIO18              |pps-gpio            ) in  lo\n"
-        " gpio-539 (GPIO27              |sysfs               ) out lo\n",
-    )
-    found = examine("gpio pins")
-    assert level(found) == "warning"
-    assert found is not None
-    assert found.message == "GPIO18 (servo.gpio) is used by pps-gpio"
-    assert level(examine("gpio pins", "servo.gpio=17")) == "ok"
-    assert level(examine("gpio pins", "servo.gpio=17", "panel.led_gpio=27")) == "warning"
-
-
-def pwm_channel(root: Path) -> Path:
-    """A Pi 5's channel of GPIO 18, exported."""
-    chip = root / "sys/class/pwm/pwmchip2"
-    device = root / "devices/1f00098000.pwm"
-    device.mkdir(parents=True)
-    chip.mkdir(parents=True)
-    (chip / "device").symlink_to(device)
-    for name in ("period", "duty_cycle", "enable"):
-        put(chip, f"pwm2/{name}", "0\n")
-    return chip / "pwm2"
-
-
-def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) -> None:
-    driver = "servo.driver=sysfs-pwm"
-    assert examine("pwm") is None
-    missing = examine("pwm", driver)
-    assert level(missing) == "FAIL"
-    channel = pwm_channel(root)
-    assert level(examine("pwm", driver)) == "ok"
-    (channel / "enable").write_text("1\n")
-    (channel / "duty_cycle").write_text("1500000\n")
-    left_on = examine("pwm", driver)
-    assert level(left_on) == "warning"
-    assert left_on is not None
-    assert left_on.mend == "fishctl release"
-    assert (channel / "duty_cycle").read_text() == "1500000\n"
-
-
-def test_calibrations_are_asked_for_and_a_broken_file_fails(root: Path, examine: Examine) -> None:
-    assert level(examine("calibrations")) == "warning"
-    matrix = "{xx: 2.0, xy: 0.0, x0: 0.0, yx: 0.0, yy: 2.0, y0: 0.0, date: '2026-01-02'}\n"
-    put(root, "state/pi/force-2026-01-02T000000.000000Z.yaml", matrix)
-    found = examine("calibrations")
-    assert level(found) == "warning"
-    assert found is not None
-    assert found.mend == "fishctl calibrate servo"
-    pulses = "trim: 10.0, direction: 1, scale: 600.0, lowest: -1.0, highest: 1.0"
-    put(
-        root, "state/pi/servo-2026-01-03T000000.000000Z.yaml", f"{{{pulses}, date: '2026-01-03'}}\n"
-    )
-    assert examine("calibrations") == ("ok", "force of 2026-01-02, servo of 2026-01-03", "")
-    backup = put(root, "state/pi/force-backup.yaml", matrix)
-    ignored = examine("calibrations")
-    assert level(ignored) == "warning"
-    assert ignored is not None
-    assert ignored.message == (
-        "force of 2026-01-02, servo of 2026-01-03; "
-        f"{backup} is no dated calibration file and is ignored"
-    )
-    backup.unlink()
-    put(root, "state/pi/force-2026-02-02T000000.000000Z.yaml", "xx: a lot\n")
-    assert level(examine("calibrations")) == "FAIL"
-
-
-def test_a_force_that_was_only_tared_is_not_calibrated(root: Path, examine: Examine) -> None:
-    matrix = "xx: 1.0, xy: 0.0, x0: 0.3, yx: 0.0, yy: 1.0, y0: 0.0"
-    name = "state/pi/force-2026-01-02T000000.000000Z.yaml"
-    put(root, name, f"{{{matrix}, date: '2026-01-02', tared: '2026-01-02'}}\n")
-    found = examine("calibrations")
-    assert level(found) == "warning"
-    assert found is not None
-    assert "tared 2026-01-02, but never calibrated" in found.message
-    assert found.mend == "fishctl calibrate force"
+        level, _, mend = examine("state folder")
+    assert (level, remedy in mend) == ("FAIL", True)
+    assert "chown" not in mend
+    assert "set state_folder" in mend
 
 
 def test_a_read_only_file_system_is_not_taken_for_a_permission(root: Path) -> None:
     (root / "state").mkdir()
     mount = 'mount -t tmpfs -o ro none "$0" && exec "$@"'
     apart = ["unshare", *([] if os.geteuid() == 0 else ["-r"]), "-m", "sh", "-c", mount]
-    if subprocess.run([*apart, str(root / "state"), "true"], check=False).returncode:
+    if call(*apart, str(root / "state"), "true").returncode:
         pytest.skip("needs a file system of its own")
     settings = ("--set", "robot=pi", "--set", f"state_folder={root}/state", *free_telemetry())
     _, found = doctor(root, *settings, under=(*apart, str(root / "state")))
@@ -252,30 +210,41 @@ def test_a_read_only_file_system_is_not_taken_for_a_permission(root: Path) -> No
     assert f"{root}/state is on a read-only file system" in message
 
 
-def test_the_state_folder_must_be_one_that_can_be_written_to(root: Path, examine: Examine) -> None:
-    assert level(examine("state folder")) == "ok"
-    assert not (root / "state").exists()
-    put(root, "state", "a file")
-    assert level(examine("state folder")) == "FAIL"
+def test_why_nobody_can_see_who_uses_pins_is_told(root: Path, examine: Examine) -> None:
+    only_root = "only root can see who uses GPIO pins: sudo fishctl doctor"
+    if os.geteuid() == 0:
+        (root / "sys/kernel/debug").mkdir(parents=True)
+        assert "debugfs is not mounted: mount -t debugfs none /" in examine("gpio pins")[1]
+        put(root, "sys/kernel/debug/clk/clk_summary")
+        assert "this kernel does not say who uses GPIO pins" in examine("gpio pins")[1]
+    with unprivileged():
+        assert examine("gpio pins") == ("skipped", only_root, "")
 
 
-def test_the_unit_must_be_installed_and_enabled(root: Path, examine: Examine) -> None:
-    assert level(examine("systemd")) == "skipped"
-    (root / "run/systemd/system").mkdir(parents=True)
-    assert level(examine("systemd")) == "warning"
-    unit = put(root, "etc/systemd/system/fishd.service", "[Service]\n")
-    not_enabled = examine("systemd")
-    assert level(not_enabled) == "warning"
-    assert not_enabled is not None
-    assert "enable --now" in not_enabled.mend
-    wants = root / "etc/systemd/system/multi-user.target.wants"
-    wants.mkdir()
-    (wants / "fishd.service").symlink_to(unit)
-    assert level(examine("systemd")) == "ok"
+def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) -> None:
+    driver = "servo.driver=sysfs-pwm"
+    assert examine("pwm") == ("", "", "")
+    assert examine("pwm", driver)[0] == "FAIL"
+    chip, device = root / "sys/class/pwm/pwmchip2", root / "devices/1f00098000.pwm"
+    for folder in (chip, device):
+        folder.mkdir(parents=True)
+    (chip / "device").symlink_to(device)
+    for name in ("period", "duty_cycle", "enable"):
+        put(chip, f"pwm2/{name}", "0\n")
+    assert examine("pwm", driver)[0] == "ok"
+    put(chip, "pwm2/enable", "1\n")
+    duty = put(chip, "pwm2/duty_cycle", "1500000\n")
+    level, _, mend = examine("pwm", driver)
+    assert (level, mend) == ("warning", "fishctl release")
+    assert duty.read_text() == "1500000\n"
 
 
-def test_pins_are_used_without_a_package_for_them_only_in_vain(
-    root: Path, examine: Examine
+def test_a_button_that_nothing_can_read_is_not_passed_over(
+    examine: Examine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert examine("gpio package") is None
-    assert level(examine("gpio package", "panel.estop_gpio=4")) == "ok"  # rpi-lgpio is here
+    """The installation goes on without its package, and nobody may take that for a working one."""
+    monkeypatch.setattr("fishd.cli.doctor.checks.software.metadata.distributions", lambda: iter(()))
+    assert examine("gpio package") == ("", "", "")
+    level, message, mend = examine("gpio package", "panel.estop_gpio=17")
+    assert (level, message.startswith("neither RPi.GPIO nor rpi-lgpio is")) == ("FAIL", True)
+    assert "make install-pi" in mend

@@ -1,6 +1,5 @@
 """`fishd-release`: as `fishctl release`, by the recipe that fishd leaves, and in little time."""
 
-import json
 import os
 import re
 import resource
@@ -8,21 +7,23 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pigpio
 import pytest
-from operator_rig import Bench
-from processes import PATIENCE
+from rigs.operator_rig import Bench
+from rigs.processes import PATIENCE, fishctl
 
-from fishd import recipe
 from fishd.client import Fish
-from fishd.hardware.calibration import ServoCalibration
+from fishd.core.calibration import ServoCalibration
+from fishd.hardware import release_recipe
+from fishd.hardware.servo.sysfs_pwm import SysfsPwm, SysfsPwmSettings
 
 HEAVY = ("click", "msgspec", "numpy", "pathlib", "yaml", "zmq")
 SOURCE = f"""
 import sys
-from fishd.release import main
+from fishd.cli.fishd_release import main
 try:
     main()
 finally:
@@ -45,15 +46,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def file(pi: Bench) -> Path:
     """A configuration file for the virtual Pi."""
     path = pi.folder / "fishd.yaml"
-    pairs = [word.partition("=") for word in pi.settings if "=" in word]
-    sections: dict[str, object] = {}
-    for key, _, value in pairs:
-        *above, name = key.split(".")
-        section = sections
-        for part in above:
-            section = section.setdefault(part, {})  # type: ignore[assignment]
-        section[name] = json.loads(value) if re.fullmatch(r"[\d.]+", value) else value
-    path.write_text(json.dumps(sections))
+    path.write_text(fishctl("config", "show", *pi.settings).stdout)
     return path
 
 
@@ -61,11 +54,22 @@ def file(pi: Bench) -> Path:
 def killed(pi: Bench, file: Path) -> Iterator[None]:
     """A fishd that was killed; another program keeps its pulses where they were."""
     kill_one(pi, file)
+    with pulses_of_another(pi):
+        yield
+
+
+@contextmanager
+def pulses_of_another(pi: Bench) -> Iterator[None]:
     client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
-    client.set_servo_pulsewidth(18, 1750)
-    pi.wait_for_pulse(1750, 1750)
-    yield
-    client.stop()
+    try:
+        for script in range(32):  # the countdown would end those pulses, too
+            with suppress(pigpio.error):
+                client.delete_script(script)
+        client.set_servo_pulsewidth(18, 1750)
+        pi.wait_for_pulse(1750, 1750)
+        yield
+    finally:
+        client.stop()
 
 
 def kill_one(pi: Bench, file: Path, calibration: ServoCalibration | None = None) -> None:
@@ -106,48 +110,39 @@ def test_it_ends_pulses_at_neutral_and_loads_next_to_nothing(pi: Bench, file: Pa
 @pytest.mark.usefixtures("killed")
 def test_neutral_is_that_of_a_calibration_made_while_it_ran(pi: Bench, file: Path) -> None:
     kill_one(pi, file, ServoCalibration(trim=-40.0))
-    client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
-    client.set_servo_pulsewidth(18, 1750)
-    client.stop()
-    ended = release("--config", str(file))
+    with pulses_of_another(pi):
+        ended = release("--config", str(file))
     assert (ended.returncode, ended.stderr) == (0, "loaded:\n")
     assert pi.pi.widths()[-2:] == [1460, 0]
 
 
-@pytest.mark.usefixtures("killed")
-def test_without_a_recipe_it_does_what_fishctl_does(pi: Bench, file: Path, runtime: Path) -> None:
-    for path in runtime.glob("release-*"):
-        path.unlink()
-    ended = release("--config", str(file))
-    assert (ended.returncode, said(ended)) == (0, [])
-    assert ended.stdout == "pulses were on: neutral, then off\n"
-    assert "click" in ended.stderr
-
-
-@pytest.mark.usefixtures("killed")
-def test_a_recipe_that_others_may_have_written_is_none(
+def test_without_a_sound_recipe_it_does_what_fishctl_does(
     pi: Bench, file: Path, runtime: Path
 ) -> None:
+    kill_one(pi, file)
     (path,) = runtime.glob("release-*")
-    path.chmod(0o666)
-    ended = release("--config", str(file))
-    assert ended.returncode == 0
-    assert "click" in ended.stderr
+    sound = path.read_text()
 
+    def check() -> None:
+        with pulses_of_another(pi):
+            ended = release("--config", str(file))
+        assert (ended.returncode, said(ended)) == (0, [])
+        assert ended.stdout == "pulses were on: neutral, then off\n"
+        assert "click" in ended.stderr
 
-@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"config": 3}', "\0", "nul" * 30_000])
-@pytest.mark.usefixtures("killed")
-def test_a_damaged_recipe_is_none(pi: Bench, file: Path, runtime: Path, text: str) -> None:
-    (path,) = runtime.glob("release-*")
-    path.write_text(text)
-    ended = release("--config", str(file))
-    assert (ended.returncode, said(ended)) == (0, [])
-    assert ended.stdout == "pulses were on: neutral, then off\n"
+    for damaged in ("", "{}", "[1]", '{"config": 3}', "\0", "nul" * 30_000):
+        path.write_text(damaged)
+        check()
+    path.write_text(sound)
+    path.chmod(0o666)  # others may have written it
+    check()
+    path.unlink()
+    check()
 
 
 @pytest.mark.usefixtures("killed")
 def test_a_file_that_has_changed_since_counts_too(pi: Bench, file: Path) -> None:
-    file.write_text(file.read_text().replace('"robot"', '"tick": 0.04, "robot"'))
+    file.write_text(file.read_text() + "# changed\n")
     ended = release("--config", str(file))
     assert (ended.returncode, said(ended)) == (0, [])
     assert ended.stdout == "pulses were on: neutral, then off\nthere were no pulses\n"
@@ -181,23 +176,15 @@ def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(
 
 @pytest.mark.parametrize("words", [(), ("--config", "/nowhere/fishd.yaml"), ("--steam",)])
 def test_whatever_else_is_asked_fishctl_answers(words: tuple[str, ...]) -> None:
-    quick = release(*words, FISHD_CONFIG="")
-    fishctl = Path(sys.executable).with_name("fishctl")
-    slow = subprocess.run(
-        [fishctl, "release", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE,
-        env=os.environ | {"FISHD_CONFIG": ""},
-    )
+    quick, slow = release(*words), fishctl("release", *words)
     assert slow.returncode != 0
     assert (quick.returncode, quick.stdout) == (slow.returncode, slow.stdout)
     assert said(quick) == slow.stderr.splitlines()
 
 
+@pytest.mark.parametrize("recipe", [True, False])
 @pytest.mark.parametrize("enabled", [1, 0])
-def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int) -> None:
+def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int, recipe: bool) -> None:
     channel = tmp_path / "pwm" / "pwmchip3" / "pwm2"
     channel.mkdir(parents=True)
     device = tmp_path / "devices" / "1f00098000.pwm"
@@ -206,12 +193,14 @@ def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int) -> None:
     for name, value in (("period", 20_000_000), ("duty_cycle", 1_800_000), ("enable", enabled)):
         (channel / name).write_text(f"{value}\n")
     file = tmp_path / "fishd.yaml"
-    file.write_text("robot: pi\n")
-    servo = {"driver": "sysfs-pwm", "gpio": 18, "frequency": 50.0, "neutral": 1490.0}
-    where = {"host": "127.0.0.1", "port": 8888, "chip": None, "channel": None}
-    recipe.write(str(file), {**servo, **where, "root": str(tmp_path / "pwm")})
+    servo = f"{{driver: sysfs-pwm, root: {tmp_path / 'pwm'}}}"
+    file.write_text(f"robot: pi\nservo: {servo}\nstate_folder: {tmp_path}\n")
+    if recipe:
+        function, arguments = SysfsPwm.last_resort(SysfsPwmSettings(root=str(tmp_path / "pwm")))
+        release_recipe.write(str(file), function, 1490.0, arguments)
     ended = release("--config", str(file))
-    assert (ended.returncode, ended.stderr) == (0, "loaded:\n")
+    assert (ended.returncode, said(ended)) == (0, [])
+    assert ("click" in ended.stderr) != recipe
     assert ended.stdout.startswith("pulses were on" if enabled else "there were no pulses")
     duty, on = ((channel / name).read_text().split()[0] for name in ("duty_cycle", "enable"))
     assert (int(duty), int(on)) == ((0, 0) if enabled else (1_800_000, 0))
@@ -223,7 +212,7 @@ def test_it_costs_little(pi: Bench, file: Path) -> None:
     for _ in range(5):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(
-            [sys.executable, "-m", "fishd.release", "--config", str(file)],
+            [sys.executable, "-m", "fishd.cli.fishd_release", "--config", str(file)],
             check=True,
             capture_output=True,
             timeout=PATIENCE,

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from operator_rig import Bench
-from processes import FISHD, Daemon, running
-from test_doctor import doctor, free_telemetry
+from rigs.doctor_process import doctor, free_telemetry
+from rigs.operator_rig import Bench
+from rigs.processes import FISHD, Daemon, running
 
 from fishd.hardware import ownership
 
@@ -22,7 +22,7 @@ BUS = 150 + os.getpid() % 50
 """A bus that no machine has, and no other test just now."""
 PI = [
     *("--set", "robot=pi", "--set", f"force_sensor.bus={BUS}"),
-    *("--set", "servo.pigpio.host=127.0.0.2", "--set", f"servo.pigpio.port={20000 + BUS}"),
+    *("--set", "servo.host=127.0.0.2", "--set", f"servo.port={20000 + BUS}"),
 ]
 
 

@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 import pytest
-from operator_rig import Bench, fishctl_alone
-from processes import Daemon
+from rigs.operator_rig import Bench, fishctl_alone
+from rigs.processes import Daemon
 
 from fishd.client import Fish
 
@@ -85,7 +85,7 @@ def test_loads_measured_earlier_are_fitted_without_a_question(pi: Bench, daemon:
         ("force,volts\n0,0\n", r":1: one column fx_N or fx_g is needed"),
         ("fx_N,fy_N\n0,0\n0.1,\n", r":3: fy_N: '' is not a number"),
         ("fx_N,fy_N\n0,nan\n", r":2: fy_N: 'nan' is not a number"),
-        ("fx_N,fy_N\n", r"there is no load in it"),
+        ("fx_N,fy_N\n", r"no loads below the header"),
         (None, r"no such file"),
     ],
 )

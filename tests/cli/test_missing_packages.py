@@ -7,8 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from operator_rig import Bench
-from processes import FISHCTL, FISHD, PATIENCE
+from rigs.operator_rig import Bench
+from rigs.processes import FISHCTL, FISHD, PATIENCE
 
 from fishd.hardware import ownership, packages
 
@@ -16,12 +16,17 @@ MODULES = ("pigpio", "adafruit_extended_bus", "adafruit_ads1x15", "Adafruit_Pure
 ONE_LINE = r"[^\n]*the package %s is missing; install fishd\[pi\]\n"
 
 
+def without(folder: Path, *modules: str) -> dict[str, str]:
+    """The environment of a Python that cannot import these."""
+    blocked = "".join(f"sys.modules[{name!r}] = None\n" for name in modules)
+    (folder / "sitecustomize.py").write_text(f"import sys\n{blocked}")
+    return os.environ | {"PYTHONPATH": str(folder)}
+
+
 @pytest.fixture
-def without(tmp_path: Path) -> dict[str, str]:
-    """The environment of a Python that cannot import the drivers."""
-    blocked = "".join(f"sys.modules[{name!r}] = None\n" for name in MODULES)
-    (tmp_path / "sitecustomize.py").write_text(f"import sys\n{blocked}")
-    return os.environ | {"PYTHONPATH": str(tmp_path)}
+def env(tmp_path: Path) -> dict[str, str]:
+    """Without the drivers."""
+    return without(tmp_path, *MODULES)
 
 
 def call(env: dict[str, str], *command: str) -> subprocess.CompletedProcess[str]:
@@ -35,51 +40,49 @@ def own(folder: Path) -> list[str]:
     return [word for setting in settings for word in ("--set", setting)]
 
 
-def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, without: dict[str, str]) -> None:
-    ended = call(without, FISHD, *pi.settings, *own(pi.folder))
+def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, env: dict[str, str]) -> None:
+    ended = call(env, FISHD, *pi.settings, *own(pi.folder))
     assert ended.returncode == 1
     assert re.fullmatch(ONE_LINE % "adafruit-extended-bus", ended.stderr)
 
 
-def test_fishd_on_a_pi_names_the_package(tmp_path: Path, without: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    ("gpio", "modules", "settings", "complaint"),
+    [
+        (7, MODULES, [], ONE_LINE % "adafruit-circuitpython-ads1x15"),
+        (8, ["RPi"], ["--set", "panel.estop_gpio=9"],
+         r"[^\n]*the pins of the header need[^\n]*\n"),
+    ],
+)  # fmt: skip
+def test_fishd_on_a_pi_does_not_start_without_what_it_needs(
+    tmp_path: Path, gpio: int, modules: list[str], settings: list[str], complaint: str
+) -> None:
     bus = 100 + os.getpid() % 50  # that no machine has
-    pi = ("--set", "robot=pi", "--set", f"force_sensor.bus={bus}", "--set", "servo.gpio=7")
-    ended = call(without, FISHD, *pi, "--set", f"state_folder={tmp_path}", *own(tmp_path))
-    for lock in (f"fishd-i2c-{bus}.lock", "fishd-gpio7.lock"):
+    pi = ("--set", "robot=pi", "--set", f"force_sensor.bus={bus}", "--set", f"servo.gpio={gpio}")
+    state = ("--set", f"state_folder={tmp_path}")
+    ended = call(without(tmp_path, *modules), FISHD, *pi, *settings, *state, *own(tmp_path))
+    for lock in (f"fishd-i2c-{bus}.lock", f"fishd-gpio{gpio}.lock"):
         (ownership.FOLDER / lock).unlink(missing_ok=True)
     assert ended.returncode == 1
-    assert re.fullmatch(ONE_LINE % "adafruit-circuitpython-ads1x15", ended.stderr)
+    assert re.fullmatch(complaint, ended.stderr)
 
 
-def test_fishd_does_not_start_with_a_button_that_it_cannot_read(tmp_path: Path) -> None:
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['RPi'] = None\n")
-    bus = 150 + os.getpid() % 50  # that no machine has
-    settings = ("robot=pi", f"force_sensor.bus={bus}", "servo.gpio=8", "panel.estop_gpio=9")
-    pi = [word for setting in settings for word in ("--set", setting)]
-    env = os.environ | {"PYTHONPATH": str(tmp_path)}
-    ended = call(env, FISHD, *pi, "--set", f"state_folder={tmp_path}", *own(tmp_path))
-    for lock in (f"fishd-i2c-{bus}.lock", "fishd-gpio8.lock"):
-        (ownership.FOLDER / lock).unlink(missing_ok=True)
-    assert ended.returncode == 1
-    assert "E-stop button, status light and servo driver rpi-gpio need" in ended.stderr
-
-
-def test_release_names_the_package(tmp_path: Path, without: dict[str, str]) -> None:
+def test_release_names_the_package(tmp_path: Path, env: dict[str, str]) -> None:
     settings = ("--set", "robot=pi", "--set", f"state_folder={tmp_path}")
-    ended = call(without, FISHCTL, "release", *settings)
+    ended = call(env, FISHCTL, "release", *settings)
     assert (ended.returncode, ended.stdout) == (1, "")
     assert re.fullmatch(ONE_LINE % "pigpio", ended.stderr)
 
 
-def test_a_simulation_of_the_virtual_pi_names_the_package(without: dict[str, str]) -> None:
-    ended = call(without, FISHCTL, "simulate", "hold", "--set", "robot=virtual-pi")
+def test_a_simulation_of_the_virtual_pi_names_the_package(env: dict[str, str]) -> None:
+    ended = call(env, FISHCTL, "simulate", "hold", "--set", "robot=virtual-pi")
     assert ended.returncode == 1
     assert re.fullmatch(ONE_LINE % "adafruit-extended-bus", ended.stderr)
 
 
-def test_no_check_of_doctor_breaks_off(pi: Bench, without: dict[str, str]) -> None:
+def test_no_check_of_doctor_breaks_off(pi: Bench, env: dict[str, str]) -> None:
     doctor = (FISHCTL, "doctor", "--json", *pi.settings, *own(pi.folder))
-    ended = call(without, *doctor)
+    ended = call(env, *doctor)
     assert (ended.returncode, ended.stderr) == (1, "")
     found = {line["check"]: line for line in json.loads(ended.stdout)}
     for name in ("adc", "force", "pigpiod"):
@@ -96,3 +99,20 @@ def test_a_package_that_is_there_but_broken_is_not_called_missing() -> None:
         "the package adafruit-circuitpython-ads1x15 cannot be imported (cannot import name "
         "'ADS1115'); install fishd[pi]"
     )
+
+
+@pytest.mark.parametrize("missing", [["torch"], ["torch", "gymnasium", "stable_baselines3"]])
+def test_training_without_the_extra_names_it_in_one_line(
+    tmp_path: Path, missing: list[str]
+) -> None:
+    run = str(tmp_path / "run")
+    found = call(without(tmp_path, *missing), FISHCTL, "learn", "ppo", "--folder", run)
+    assert found.returncode == 1
+    assert re.fullmatch(
+        r"fishctl: \w+ is not installed; where the sources of fishd are: pip install [^\n]+ "
+        r"--editable '.\[learn\]'\n",
+        found.stderr,
+    )
+    assert not (tmp_path / "run").exists()
+    shown = call(without(tmp_path, *missing), FISHCTL, "learn", "ppo", "--help")
+    assert (shown.returncode, "--resume" in shown.stdout) == (0, True)

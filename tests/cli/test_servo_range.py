@@ -2,38 +2,36 @@
 
 import datetime
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
-from operator_rig import Bench, calibrations
-from processes import FISHCTL
+from rigs.operator_rig import Bench, calibrations
+from rigs.processes import fishctl
 
 from fishd.client import Fish
 from fishd.config import load
-from fishd.errors import ConfigError
-from fishd.hardware import pulses
-from fishd.hardware.calibration import ServoCalibration
+from fishd.core.calibration import ServoCalibration
+from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder
+from fishd.hardware.servo import pulses
 from fishd.hardware.settings import ServoSettings
 
 
-def test_status_shows_the_whole_range_where_nothing_cuts_it(pi: Bench) -> None:
-    with pi.daemon() as daemon:
+@pytest.mark.parametrize(
+    ("highest", "shown"),
+    [(1.2, "within ±0.42 rad\n"), (0.3, "within -0.42 to +0.3 rad, less than ±0.42 rad")],
+)
+def test_status_shows_the_range_and_a_soft_limit_is_no_complaint(
+    pi: Bench, highest: float, shown: str
+) -> None:
+    with pi.daemon("--set", f"servo.highest={highest}") as daemon:
         status = json.loads(daemon.fishctl("status", "--json").stdout)
-        assert (status["lowest"], status["highest"]) == (-0.42, 0.42)
-        assert "within ±0.42 rad\n" in daemon.fishctl("status").stdout
-
-
-def test_a_soft_limit_of_the_configuration_is_shown_and_no_complaint(pi: Bench) -> None:
-    with pi.daemon("--set", "servo.highest=0.3") as daemon:
-        with Fish(daemon.endpoint) as fish:
-            status = fish.status()
-        assert (status.lowest, status.highest) == (-0.42, 0.3)
-        assert not any("servo" in line for line in status.degraded)
-        assert "within -0.42 to +0.3 rad, less than ±0.42 rad" in daemon.fishctl("status").stdout
+        assert (status["lowest"], status["highest"]) == (-0.42, min(highest, 0.42))
+        assert not any("servo" in line for line in status["degraded"])
+        assert shown in daemon.fishctl("status").stdout
         _, _, err = daemon.end()
-    assert "servo.lowest and servo.highest permit -0.42 to +0.3 rad of ±0.42 rad" in err
+    cut = "servo.lowest and servo.highest permit -0.42 to +0.3 rad of ±0.42 rad"
+    assert (cut in err) == (highest < 0.42)
 
 
 def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Bench) -> None:
@@ -57,9 +55,7 @@ def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Benc
 def test_config_check_tells_of_a_range_that_is_chosen(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("robot: pi\nservo: {lowest: -0.25}\n")
-    ended = subprocess.run(
-        [FISHCTL, "config", "check", str(file)], capture_output=True, text=True, check=False
-    )
+    ended = fishctl("config", "check", str(file))
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout == (
         f"{file}: good\n"

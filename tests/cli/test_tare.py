@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from operator_rig import Bench, fishctl_alone, forces
-from processes import FISHCTL, PATIENCE, Daemon, running
+from rigs.operator_rig import Bench, fishctl_alone, forces
+from rigs.processes import FISHCTL, PATIENCE, Daemon, running
 
 
 def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import FISHCTL, PATIENCE, Daemon, running
 from rich.console import Console
 from rich.screen import Screen
+from rigs.processes import FISHCTL, PATIENCE, Daemon, running
 
-from fishd.cli.watch import View
+from fishd.cli.watch_screen import View
 from fishd.client import Fish
-from fishd.signals import Percentiles, Reason, Status, Tick, Timing
+from fishd.core.signals import Percentiles, Reason, Status, Tick, Timing
 
 ENTER_SCREEN, LEAVE_SCREEN = "\x1b[?1049h", "\x1b[?1049l"
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
@@ -131,30 +131,29 @@ def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) 
     assert (ended.returncode, ended.stderr) == (0, "")
     lines = ended.stdout.splitlines()
     assert 1 <= len(lines) <= 3
-    assert all(re.fullmatch(r"\d\d:\d\d:\d\d  running swing .* ticks", line) for line in lines)
-
-
-def test_on_a_terminal_it_draws_and_leaves_the_terminal_as_it_was(daemon: Daemon) -> None:
-    terminal = Terminal(daemon, "--seconds", "3")
-    terminal.wait_for("RUNNING")
-    assert terminal.finish() == 0
-    assert terminal.restored
-    assert COLOUR.search(terminal.text)
-    assert BRAILLE.search(terminal.text)
-    for word in ("swing", "thrust", "tail beat", "late", "busy", "missed", "lost"):
-        assert word in terminal.text
-    for trace in ("fx mN", "fy mN", "phi_c rad"):
-        assert trace in terminal.text
-    assert terminal.text.endswith((LEAVE_SCREEN, SHOW_CURSOR))
+    assert all(re.fullmatch(r"\d\d:\d\d:\d\d  \S+  running swing .* ticks", line) for line in lines)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_a_clean_end_and_restores_the_terminal(daemon: Daemon, number: int) -> None:
+def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
+    daemon: Daemon, number: int
+) -> None:
     terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
+    with Fish(daemon.endpoint) as fish:
+        fish.mark("a weight on the sensor")
+        terminal.wait_for("mark: a weight on the sensor")
+        fish.estop("the net")
+    terminal.wait_for("estop: the net")
     terminal.signal(number)
     assert terminal.finish() == 0
     assert terminal.restored
+    assert terminal.text.endswith((LEAVE_SCREEN, SHOW_CURSOR))
+    assert COLOUR.search(terminal.text)
+    assert BRAILLE.search(terminal.text)
+    figures = ("swing", "thrust", "tail beat", "late", "busy", "missed", "lost")
+    for word in (*figures, "fx mN", "fy mN", "phi_c rad"):
+        assert word in terminal.text
     assert "Traceback" not in terminal.text
 
 
@@ -178,18 +177,6 @@ def test_it_follows_the_terminal_through_any_size_without_colour_if_asked(daemon
     terminal.signal(signal.SIGINT)
     assert terminal.finish() == 0
     assert not COLOUR.search(terminal.text)
-
-
-def test_an_event_is_shown_when_it_happens(daemon: Daemon) -> None:
-    terminal = Terminal(daemon)
-    terminal.wait_for("RUNNING")
-    with Fish(daemon.endpoint) as fish:
-        fish.mark("a weight on the sensor")
-        terminal.wait_for("mark: a weight on the sensor")
-        fish.estop("the net")
-    terminal.wait_for("estop: the net")
-    terminal.signal(signal.SIGINT)
-    assert terminal.finish() == 0
 
 
 def tick(seq: int, t: float | None = None, **fields: Any) -> Tick:
@@ -240,9 +227,8 @@ def test_lost_ticks_are_counted_and_leave_a_gap_in_the_traces() -> None:
 
 
 def test_a_daemon_that_was_restarted_is_not_a_loss() -> None:
-    before = (tick(seq) for seq in range(1000, 1050))
-    after = (tick(seq, t=60.0 + 0.05 * seq) for seq in range(1, 50))
-    assert shown(view_of([*before, *after]))[2].split()[-1] == "0"
+    after = [tick(seq, t=60.0 + 0.05 * seq) for seq in range(1, 50)]
+    assert shown(view_of([*map(tick, range(1000, 1050)), *after]))[2].split()[-1] == "0"
 
 
 def test_late_and_busy_are_the_worst_of_what_is_shown() -> None:
@@ -255,21 +241,21 @@ def test_late_and_busy_are_the_worst_of_what_is_shown() -> None:
 
 def test_a_fault_is_explained_in_full_however_narrow_the_screen() -> None:
     message = "no force sample for 0.15 s: is the sensor's cable plugged in at both of its ends?"
-    faulty = view_of(
-        [tick(1, mode="fault", servo_on=False)],
-        mode="fault",
-        reason=Reason("sensor-stale", message),
-    )
+    reason = Reason("sensor-stale", message)
+    faulty = view_of([tick(1, mode="fault", servo_on=False)], mode="fault", reason=reason)
     screen = shown(faulty, width=30, height=24)
     assert screen[0].startswith(" FAULT ")
     assert message in " ".join(screen)
     assert "no pulses" in shown(faulty)[0]
 
 
-def test_a_thrust_of_before_is_not_shown_and_a_lost_servo_is() -> None:
-    lost = shown(view_of([tick(1)], sensor_lost=True, servo_lost=True))
-    assert "– mN" in lost[2]
-    assert "servo not reached" in lost[0]
+def test_a_lost_sensor_or_servo_and_a_controller_that_took_over_are_shown() -> None:
+    why = Reason("chatter", "ppo gave up: in 30 of the last 40 ticks it wanted to reverse too soon")
+    screen = shown(view_of([tick(1)], sensor_lost=True, servo_lost=True, fallback=why), width=120)
+    assert screen[0].startswith(" RUNNING ")
+    assert "servo not reached" in screen[0]
+    assert screen[1] == f"took over: chatter: {why.message}"
+    assert "– mN" in screen[3]
 
 
 def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_change() -> None:
@@ -277,10 +263,6 @@ def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_
     assert view_of([tick(1, t=101.0)], t=100.0).outdated
     assert view_of([tick(1, t=100.5, mode="estop")], t=100.0).outdated
     assert view_of([tick(1, t=100.5, controller="sine")], t=100.0).outdated
-
-
-def test_it_draws_from_the_first_tick_on() -> None:
-    assert shown(view_of([tick(1)], tick=0.002))[0].startswith(" RUNNING ")
 
 
 def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
@@ -296,9 +278,3 @@ def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
 def test_traces_are_whole_lines_at_any_period_of_the_loop(period: float) -> None:
     ticks = (tick(seq, t=period * seq) for seq in range(1, round(6.0 / period)))
     assert re.search("[\u2801-\u28ff]{60}", still_trace(shown(view_of(ticks, tick=period))))
-
-
-def test_a_controller_that_took_over_says_why() -> None:
-    message = "ppo lost command: in 30 of the last 40 ticks it wanted to reverse too soon"
-    view = view_of(map(tick, range(1, 101)), fallback=Reason("chatter", message))
-    assert f"took over: chatter: {message}"[:60] in shown(view, width=120)[1]

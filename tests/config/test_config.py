@@ -1,5 +1,6 @@
 """The configuration: what is accepted, and what is said about what is not."""
 
+import json
 import time
 from pathlib import Path
 
@@ -8,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fishd.config import SERVICE_FILE, Config, load, to_yaml
-from fishd.errors import ConfigError
-from fishd.strict_yaml import YamlProblem, parse
+from fishd.core.errors import ConfigError
+from fishd.core.strict_yaml import YamlProblem, parse
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 7)
@@ -34,8 +35,16 @@ def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
 
 
 def test_the_shipped_configuration_is_good() -> None:
-    config = load(Path(__file__).parent.parent / "config" / "simulated.yaml")
+    config = load(Path(__file__).parents[2] / "config" / "simulated.yaml")
     assert config.start.controller == "swing"
+
+
+def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("tick: 0.1\n")
+    assert load(str(file)).tick == 0.1
+    with pytest.raises(ConfigError, match=r"^nowhere\.yaml: no such file"):
+        load("nowhere.yaml")
 
 
 def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> None:
@@ -51,110 +60,116 @@ def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
     assert load(file) == original
 
 
+BAD_FILES = """\
+tick: 0.05
+plant:
+  omega: 3
+=> fish.yaml:3: plant.omega: unknown key; did you mean 'omega0'?
+
+noise: 0.1
+=> fish.yaml:1: noise: unknown key; did you mean 'simulation.noise'?
+
+plant:
+  xi: soft
+=> fish.yaml:2: plant.xi: 'soft' is not valid: a number in [0, 20] is needed
+
+
+tick: 1
+=> fish.yaml:2: tick: 1 is not valid: a number in [0.002, 0.2] s is needed
+
+tick: .nan
+=> fish.yaml:1: tick: nan is not valid: a number in [0.002, 0.2] s is needed
+
+tick: true
+=> fish.yaml:1: tick: true is not valid: a number in [0.002, 0.2] s is needed
+
+realtime: {priority: 50.5}
+=> fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99]
+
+tick: 0.05
+tick: 0.1
+=> fish.yaml:2: tick: duplicate key, first given on line 1; keep one
+
+realtime:
+  lock_memory: on
+=> fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true, or quote it
+
+simulation:
+  seed: 1e2
+=> fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 1.0e+2
+
+plant: 3
+=> fish.yaml:1: plant: 3 is not valid: a section (a mapping of keys to values)
+
+- 1
+=> fish.yaml:1: keys and values are needed, such as 'tick: 0.05'
+
+tick: [
+=> fish.yaml:2: not valid YAML
+
+tick: 1:30
+=> fish.yaml:1: tick: '1:30' counts in sixties in YAML
+
+a: &a [*a]
+=> nested too deeply
+
+plant.xi: 2
+=> plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'
+
+telemetry: {address: 'tcp://127.0.0.1:99999'}
+=> tcp://HOST:PORT or ipc://PATH
+
+control: {address: 'tcp://127.evil.com:99'}
+=> taken from this machine only
+
+control: {address: 'ipc:///tmp/a'}
+telemetry: {address: 'ipc:///tmp/a'}
+=> fish.yaml:1: control.address: 'ipc:///tmp/a' is the address of telemetry already
+
+start: {controller: swim}
+=> fish.yaml:1: start.controller: no controller is named 'swim'; did you mean 'swing'?
+
+start:
+  controller: swing
+  parameters:
+    c: 0.5
+=> fish.yaml:4: start.parameters.c: unknown parameter 'c' of controller swing; it has:
+
+start:
+  controller: swing
+  parameters:
+    amplitude: 0.5
+=> amplitude: 0.5 rad is beyond the robot's amplitude_limit, 0.42 rad
+
+start: {parameters: {C: 1}}
+=> there is no start.controller to take these
+
+control: {address: 'tcp://0.0.0.0:5000'}
+=> fish.yaml:1: control.address: 'tcp://0.0.0.0:5000' is not valid
+
+telemetry: {address: localhost}
+=> fish.yaml:1: telemetry.address: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH is needed
+"""
+"""Each with what is said about it."""
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "tick: 0.05\nplant:\n  omega: 3\n",
-            "fish.yaml:3: plant.omega: unknown key; did you mean 'omega0'?",
-        ),
-        ("noise: 0.1\n", "fish.yaml:1: noise: unknown key; did you mean 'simulation.noise'?"),
-        (
-            "plant:\n  xi: soft\n",
-            "fish.yaml:2: plant.xi: 'soft' is not valid: a number in [0, 20] is needed",
-        ),
-        ("\ntick: 1\n", "fish.yaml:2: tick: 1 is not valid: a number in [0.002, 0.2] s is needed"),
-        (
-            "tick: .nan\n",
-            "fish.yaml:1: tick: nan is not valid: a number in [0.002, 0.2] s is needed",
-        ),
-        (
-            "tick: true\n",
-            "fish.yaml:1: tick: true is not valid: a number in [0.002, 0.2] s is needed",
-        ),
-        (
-            "realtime: {priority: 50.5}\n",
-            "fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99]",
-        ),
-        (
-            "tick: 0.05\ntick: 0.1\n",
-            "fish.yaml:2: tick: duplicate key, first given on line 1; keep one",
-        ),
-        (
-            "realtime:\n  lock_memory: on\n",
-            "fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true, or quote it",
-        ),
-        (
-            "simulation:\n  seed: 1e2\n",
-            "fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 1.0e+2",
-        ),
-        (
-            "plant: 3\n",
-            "fish.yaml:1: plant: 3 is not valid: a section (a mapping of keys to values)",
-        ),
-        ("- 1\n", "fish.yaml:1: keys and values are needed, such as 'tick: 0.05'"),
-        ("tick: [\n", "fish.yaml:2: not valid YAML"),
-        ("tick: 1:30\n", "fish.yaml:1: tick: '1:30' counts in sixties in YAML"),
-        ("a: &a [*a]\n", "nested too deeply"),
+        *(case.split("=> ") for case in BAD_FILES[:-1].split("\n\n")),
         ("a: " + "[" * 3000, "nested too deeply"),
         ("x: 1\n" + "- " * 500, "fish.yaml:2: "),
         (BOMB, "fish.yaml:1: more than 2000 values and keys, each alias counted as all that it"),
         ("a: [" + "x, " * 3000 + "]", "fish.yaml:1: more than 2000 values and keys"),
-        ("# " + "x" * 70_000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
+        ("# " + "x" * 70000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
         ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 letters"),
-        ("a: !!int '" + "1:" * 20_000 + "1'", "fish.yaml:1: a: a number of 40001 letters"),
-        ("plant.xi: 2\n", "plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'"),
-        ("telemetry: {address: 'tcp://127.0.0.1:99999'}\n", "tcp://HOST:PORT or ipc://PATH"),
-        ("control: {address: 'tcp://127.evil.com:99'}\n", "taken from this machine only"),
-        (
-            "control: {address: 'ipc:///tmp/a'}\ntelemetry: {address: 'ipc:///tmp/a'}\n",
-            "fish.yaml:1: control.address: 'ipc:///tmp/a' is the address of telemetry already",
-        ),
-        (
-            "start: {controller: swim}\n",
-            "fish.yaml:1: start.controller: no controller is named 'swim'; did you mean 'swing'?",
-        ),
-        (
-            "start:\n  controller: swing\n  parameters:\n    c: 0.5\n",
-            "fish.yaml:4: start.parameters.c: swing: c: unknown key; valid: C, amplitude",
-        ),
-        (
-            "start:\n  controller: swing\n  parameters:\n    amplitude: 0.5\n",
-            "amplitude: 0.5 rad is beyond the robot's amplitude_limit, 0.42 rad",
-        ),
-        ("start: {parameters: {C: 1}}\n", "there is no start.controller to take these"),
-        (
-            "control: {address: 'tcp://0.0.0.0:5000'}\n",
-            "fish.yaml:1: control.address: 'tcp://0.0.0.0:5000' is not valid",
-        ),
-        (
-            "telemetry: {address: localhost}\n",
-            "fish.yaml:1: telemetry.address: 'localhost' is not valid: "
-            "tcp://HOST:PORT or ipc://PATH is needed",
-        ),
+        ("a: !!int '" + "1:" * 20000 + "1'", "fish.yaml:1: a: a number of 40001 letters"),
     ],
 )
 def test_a_bad_file_gets_one_line_that_names_place_and_remedy(
     text: str, message: str, tmp_path: Path
 ) -> None:
     assert message in complaint(text, tmp_path)
-
-
-def test_a_missing_file_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file"):
-        load(Path("nowhere.yaml"))
-
-
-def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
-        load(tmp_path)
-
-
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "fish.yaml"
-    file.write_bytes(b"tick: \xff\xfe")
-    with pytest.raises(ConfigError, match="not a text file in UTF-8"):
-        load(file)
 
 
 @pytest.mark.parametrize(
@@ -217,8 +232,8 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
         (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),
         (["servo.centre=2300", "servo.trim=400"], "servo.trim", "2700 µs"),
-        (["servo.pigpio.host="], "servo.pigpio.host", "127.0.0.1"),
-        (["servo.pigpio.host=my pi"], "servo.pigpio.host", "'my pi' is not valid"),
+        (["servo.host="], "servo.host", "127.0.0.1"),
+        (["servo.host=my pi"], "servo.host", "'my pi' is not valid"),
         (["virtual_pi.socket="], "virtual_pi.socket", "a path or null"),
         ([f"virtual_pi.socket=/tmp/{'x' * 103}"], "virtual_pi.socket", "this one has 108"),
         ([f"control.address=ipc:///tmp/{'x' * 103}"], "control.address", "at most 107 bytes"),
@@ -228,15 +243,16 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
             "start.parameters",
             "there is no start.controller to take these; name one, or remove them",
         ),
-        (["servo.frequency=100"], "servo.frequency", "servo.driver: sysfs-pwm"),
-        (
-            ["servo.pigpio.hardware_pwm=true"],
-            "servo.pigpio.hardware_pwm",
-            "write servo.driver: sysfs-pwm, on the same pins",
-        ),
-        (["servo.pigpio.hardware_pwm=false"], "servo.pigpio.hardware_pwm", "leave the key out"),
+        (["servo.frequency=100"], "servo.frequency", "drivers that have it: rpi-gpio, sysfs-pwm"),
+        (["servo.pigpio.port=9"], "servo.pigpio", "stand beside servo.driver now"),
+        (["servo.driver=steam"], "servo.driver", "installed: pigpio, rpi-gpio, sysfs-pwm"),
+        (["servo.driver=sysfs"], "servo.driver", "did you mean 'sysfs-pwm'?"),
+        (["servo.driver=3"], "servo.driver", "one of pigpio, rpi-gpio, sysfs-pwm"),
+        (["force_sensor=3"], "force_sensor", "a section"),
+        (["gpio=3"], "gpio", "did you mean 'servo.gpio'?"),
+        (["realtime.rehearse=false"], "realtime.rehearse", "write realtime.warm_up"),
         (["panel.led_gpio=18"], "panel.led_gpio", "servo.gpio"),
-        (["panel.estop_gpio=3"], "panel.estop_gpio", "I2C"),
+        (["panel.estop_gpio=3"], "panel.estop_gpio", "force_sensor.bus"),
         (["panel.estop_gpio=5", "panel.led_gpio=5"], "panel.led_gpio", "panel.estop_gpio"),
         (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
         (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
@@ -263,5 +279,13 @@ def test_the_longest_path_that_a_unix_socket_takes_is_good() -> None:
 
 
 def test_what_is_installed_on_a_pi_is_the_file_that_the_verbs_look_for() -> None:
-    layout = (Path(__file__).parent.parent / "tools" / "pi_layout.sh").read_text()
+    layout = (Path(__file__).parents[2] / "tools" / "pi_layout.sh").read_text()
     assert f"\nCONFIG={SERVICE_FILE}\n" in layout
+
+
+@pytest.mark.parametrize("name", ["", " tank", "tank ", "a\nb", "tank\n", "a\x1bb", "x" * 41])
+def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
+    line = complaint(f"name: {json.dumps(name)}\n", tmp_path)
+    assert line.startswith("fish.yaml:1: name: ")
+    assert "a text of 1 to 40 printable characters (or null) is needed" in line
+    assert load(None, ["name=Große Fische 2"]).name == "Große Fische 2"

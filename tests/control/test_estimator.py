@@ -5,11 +5,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from harness import Rig
+from rigs.harness import Rig
 
-from fishd.estimators.lateral_force import EstimatorSettings, LateralForceEstimator
-from fishd.estimators.tail_beat import TailBeat
-from fishd.signals import Measurement
+from fishd.control.estimators.lateral_force import EstimatorSettings, LateralForceEstimator
+from fishd.control.estimators.tail_beat import TailBeat
+from fishd.core.signals import Measurement
 
 DT = 0.05
 

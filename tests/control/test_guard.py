@@ -7,7 +7,7 @@ from fishd_zoo import BAD, GOOD
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.guard import Guard
+from fishd.control.guard import Guard
 
 angles = st.floats(-10, 10)
 amplitudes = st.floats(1e-3, 1.5)

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import Rig, Scripted, Wrapped
-from lockstep_rig import NEUTRAL, LockstepRig, lockstep_rig
+from rigs.harness import Rig, Scripted, Wrapped
+from rigs.lockstep_rig import NEUTRAL, LockstepRig, lockstep_rig
 
+from fishd.core.signals import Observation
 from fishd.hardware.base import Robot
-from fishd.signals import Observation
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_after_a_hang_longer_than_the_countdown_the_servo_is_released_until_a_cl
     assert (rig.mode, rig.reason) == ("fault", "overrun")
     widths = [width for _, width in rig.pulses_since(since)]
     assert widths == [pytest.approx(NEUTRAL, abs=5), 0.0]  # and nothing after it
-    assert not rig.loop.servo_on
+    assert not rig.loop.servo.on
     rig.loop.clear_fault()
     rig.run_for(0.2)
     assert rig.mode == "idle"
@@ -73,7 +73,7 @@ def test_a_hang_while_fading_in_fault_ends_in_a_release(rig: LockstepRig) -> Non
         pytest.approx(NEUTRAL, abs=5),
         0.0,
     ]
-    assert not rig.loop.servo_on
+    assert not rig.loop.servo.on
 
 
 def test_a_shorter_hang_is_survived(rig: LockstepRig) -> None:

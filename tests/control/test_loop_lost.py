@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import fragile_rig
-from lockstep_rig import LockstepRig, lockstep_rig
+from rigs.harness import fragile_rig
+from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
-from fishd.console import status_line
-from fishd.errors import SensorError, ServoError
-from fishd.signals import Percentiles, Status, Timing
+from fishd.core.console import status_line
+from fishd.core.errors import SensorError, ServoError
+from fishd.core.signals import Percentiles, Status, Timing
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
     with lockstep_rig(tmp_path) as rig:
         rig.start("square")
         rig.run_for(1.0)
-        assert (rig.loop.servo_on, rig.loop.servo_lost) == (True, False)
+        assert (rig.loop.servo.on, rig.loop.servo.lost) == (True, False)
         yield rig
 
 
@@ -27,10 +27,10 @@ def test_a_servo_behind_a_dead_pigpiod_is_lost_and_may_have_pulses_until_it_is_r
 ) -> None:
     rig.pi.faults.inject(fault)
     rig.run_for(1.0)
-    assert (rig.loop.servo_on, rig.loop.servo_lost) == (True, True)
+    assert (rig.loop.servo.on, rig.loop.servo.lost) == (True, True)
     rig.pi.faults.clear()
     rig.run_for(3.0)
-    assert (rig.loop.servo_on, rig.loop.servo_lost) == (False, False)
+    assert (rig.loop.servo.on, rig.loop.servo.lost) == (False, False)
     assert rig.pulse == 0.0
 
 
@@ -40,7 +40,7 @@ def test_a_servo_that_was_released_before_it_was_lost_has_no_pulses() -> None:
     rig.loop.estop("test")
     robot.release_error = ServoError("pigpiod is gone")
     rig.run(2)
-    assert (rig.loop.servo_on, rig.loop.servo_lost) == (False, True)
+    assert (rig.loop.servo.on, rig.loop.servo.lost) == (False, True)
 
 
 def test_a_force_is_lost_with_the_third_read_that_fails_and_back_with_the_next_good_one() -> None:

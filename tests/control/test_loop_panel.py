@@ -3,10 +3,10 @@
 import dataclasses
 from collections.abc import Callable
 
-from harness import Rig, fragile_rig
+from rigs.harness import Rig, fragile_rig
 
-from fishd.clock import Slot
-from fishd.errors import ServoError
+from fishd.core.clock import Slot
+from fishd.core.errors import ServoError
 from fishd.hardware.base import Robot
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import msgspec
 import pytest
 from fishd_zoo import BAD, RAISED, Zoo, ZooParameters
-from harness import LIMITS, Rig
+from rigs.harness import LIMITS, Rig
 
-from fishd import text
+from fishd.core import text
 
 
 @pytest.fixture(autouse=True)
@@ -59,10 +59,10 @@ def test_an_exception_in_the_tick_is_a_fault(method: str, deed: str) -> None:
 
 
 @pytest.mark.parametrize("deed", RAISED)
-def test_an_exception_in_a_rehearsal_is_a_fault(deed: str) -> None:
-    rig = started("rehearse", deed)
+def test_an_exception_in_a_warm_up_is_a_fault(deed: str) -> None:
+    rig = started("warm_up", deed)
     rig.run(3)
-    rig.loop.rehearse()
+    rig.loop.warm_up()
     check_latched(rig)
 
 
@@ -82,9 +82,9 @@ def test_an_exception_in_retune_is_for_whoever_asked(deed: str) -> None:
     rig = started("retune", deed)
     rig.run(3)
     with pytest.raises(Exception) as caught:  # noqa: PT011  (that it is one is what matters)
-        rig.loop.retune(ZooParameters(method="retune", deed=deed, nudge=1))
+        rig.loop.active.retune(ZooParameters(method="retune", deed=deed, nudge=1))
     assert text.named(caught.value)
-    assert rig.loop.parameters["nudge"] == 0
+    assert rig.loop.active.parameters["nudge"] == 0
     assert rig.run(3)[-1].mode == "running"
 
 
@@ -111,5 +111,5 @@ def test_a_controller_that_lost_its_parameters_does_not_take_over(lost: Any) -> 
     with pytest.raises(Exception) as caught:  # noqa: PT011  (that it is one is what matters)
         rig.start(Forgetful(lost))
     assert text.named(caught.value)
-    assert rig.loop.controller_name == "square"
+    assert rig.loop.active.name == "square"
     assert rig.run(3)[-1].mode == "running"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-TOOL = Path(__file__).parents[1] / "tools" / "soak.py"
+TOOL = Path(__file__).parents[2] / "tools" / "reliability"
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ TOOL = Path(__file__).parents[1] / "tools" / "soak.py"
 )
 def test_a_soak_keeps_its_promises(arguments: list[str], promise: str) -> None:
     run = subprocess.run(
-        [sys.executable, str(TOOL), *arguments],
+        [sys.executable, str(TOOL), "soak", *arguments],
         capture_output=True,
         text=True,
         check=False,
@@ -27,7 +27,7 @@ def test_a_soak_keeps_its_promises(arguments: list[str], promise: str) -> None:
     )
     assert run.returncode == 0, run.stderr
     assert promise in run.stdout
-    assert run.stderr == ""
+    assert run.stderr == f"soak: {arguments[0]}\n"
 
 
 @pytest.mark.parametrize(
@@ -35,22 +35,22 @@ def test_a_soak_keeps_its_promises(arguments: list[str], promise: str) -> None:
     [
         (
             ["simulated", "--ticks", "20000"],
-            "from fishd.guard import Guard\n"
+            "from fishd.control.guard import Guard\n"
             "Guard.apply = lambda self, command, previous: float(command)",
             "rad",
         ),
         (
             ["simulated", "--ticks", "5000"],
-            "from fishd.statistics import Statistics\n"
+            "from fishd.control.statistics import Statistics\n"
             "add, kept = Statistics.add, []\n"
-            "Statistics.add = lambda *given: (kept.append(given), add(*given))",
+            "Statistics.add = lambda *given: kept.append(given) or add(*given)",
             "objects are left behind per tick",
         ),
         (
             ["virtual-pi", "--ticks", "800"],
-            "from fishd.hardware.ads1115 import Ads1115Sensor\n"
-            "read, kept = Ads1115Sensor.read, []\n"
-            "Ads1115Sensor.read = lambda *given: kept.append(read(*given)) or kept[-1]",
+            "from fishd.hardware.force_sensor.sampled_sensor import SampledSensor\n"
+            "read, kept = SampledSensor.read, []\n"
+            "SampledSensor.read = lambda *given: kept.append(read(*given)) or kept[-1]",
             "objects are left behind per tick",
         ),
     ],
@@ -58,8 +58,8 @@ def test_a_soak_keeps_its_promises(arguments: list[str], promise: str) -> None:
 def test_a_broken_promise_is_noticed(soak: list[str], sabotage: str, promise: str) -> None:
     """The same soaks with a guard that lets everything through, and with parts that leak."""
     program = (
-        f"import sys; sys.path.insert(0, {str(TOOL.parent)!r}); sys.argv[1:] = {soak!r}\n"
-        f"{sabotage}\nimport soak; sys.exit(soak.main())"
+        f"import runpy, sys; sys.argv[1:] = ['soak', *{soak!r}]\n"
+        f"{sabotage}\nrunpy.run_path({str(TOOL)!r}, run_name='__main__')"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=200

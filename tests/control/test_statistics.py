@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.statistics import PHASES, Histogram, Statistics
+from fishd.control.statistics import PHASES, Histogram, Statistics
 
 
 @given(st.lists(st.floats(1e-7, 100.0), min_size=1, max_size=300), st.floats(0.01, 1.0))
@@ -40,8 +40,8 @@ def test_nothing_and_negative_and_endless_durations_are_no_problem() -> None:
 
 
 def test_each_phase_is_told_apart() -> None:
-    statistics = Statistics()
-    statistics.add(1, 5e-6, (0.0, 0.001, 0.003, 0.006, 0.010, 0.015))
+    statistics = Statistics(period=0.05)
+    statistics.add(1, 5e-6, 0, (0.0, 0.001, 0.003, 0.006, 0.010, 0.015))
     phases = statistics.timing().phases
     assert list(phases) == list(PHASES)
     worst = [round(phase.worst) for phase in phases.values()]

@@ -1,14 +1,19 @@
 """The supervisor: which mode follows which, and that a reason once latched stays."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from fishd.errors import Refused
-from fishd.signals import Reason
-from fishd.supervisor import Mode, Supervisor
+from fishd.control.faults import FAULTS, Effect
+from fishd.control.supervisor import Mode, Supervisor
+from fishd.core.errors import Refused
+from fishd.core.signals import Reason
 
-codes = st.sampled_from(["sensor-stale", "servo-link", "controller-error"])
+COUNTED = [code for code, row in FAULTS.items() if row.in_a_row == 3]
+counted = st.sampled_from(COUNTED)
+codes = st.sampled_from([code for code, row in FAULTS.items() if row.effect is Effect.FADE])
 
 
 class Transitions(RuleBasedStateMachine):
@@ -35,7 +40,10 @@ class Transitions(RuleBasedStateMachine):
 
     @rule(code=codes)
     def fail(self, code: str) -> None:
-        assert self.supervisor.fail(code, "it broke") is (self.latched is None)
+        self.supervisor.fail(code, "it broke")
+        if self.latched is None:
+            assert self.supervisor.reason is not None
+            assert self.supervisor.reason.code == code
         self.latched = self.supervisor.reason
 
     @rule()
@@ -53,11 +61,10 @@ class Transitions(RuleBasedStateMachine):
         assert not was_latched or self.supervisor.mode is Mode.IDLE
 
     @precondition(lambda self: self.latched is None)
-    @rule(bad=st.integers(0, 2))
-    def a_few_bad_reads_are_no_fault(self, bad: int) -> None:
-        assert not self.supervisor.sensor(None)
-        assert not any(self.supervisor.sensor("nothing came") for _ in range(bad))
-        assert not self.supervisor.sensor(None)
+    @rule(code=counted, bad=st.integers(0, 2))
+    def a_few_failed_checks_are_no_fault(self, code: str, bad: int) -> None:
+        for problem in (None, *["it failed"] * bad, None):
+            self.supervisor.check(code, problem)
 
     @invariant()
     def latched_modes_have_a_reason_and_keep_it(self) -> None:
@@ -68,39 +75,55 @@ class Transitions(RuleBasedStateMachine):
 TestTransitions = Transitions.TestCase
 
 
-def test_three_bad_reads_in_a_row_are_a_fault() -> None:
+@pytest.mark.parametrize("code", COUNTED)
+def test_three_failed_checks_in_a_row_are_a_fault(code: str) -> None:
     supervisor = Supervisor()
-    assert [supervisor.sensor("silent") for _ in range(4)] == [False, False, True, False]
-    assert supervisor.reason == Reason("sensor-stale", "silent, 3 times in a row")
+    latched = []
+    for problem in ["odd", "odd", None, "odd", "odd", "odd", "odd"]:
+        supervisor.check(code, problem)
+        latched.append(supervisor.reason is not None)
+    assert latched == [False] * 5 + [True] * 2
+    assert supervisor.reason is not None
+    assert supervisor.reason.code == code
+    assert supervisor.reason.message == "odd, 3 times in a row"
 
 
 def test_clearing_starts_all_counts_anew() -> None:
     supervisor = Supervisor()
-    for _ in range(3):
-        supervisor.sensor("silent")
-        supervisor.suspect("clipped")
+    for code in [*COUNTED] * 3:
+        supervisor.check(code, "odd")
     supervisor.clear()
-    assert not supervisor.sensor("silent")
-    assert not supervisor.suspect("clipped")
+    for code in [*COUNTED] * 2:
+        supervisor.check(code, "odd")
     assert supervisor.mode is Mode.IDLE
 
 
-def test_up_to_twenty_overruns_in_a_hundred_ticks_are_tolerated() -> None:
+def test_up_to_twenty_overruns_in_a_hundred_ticks_are_tolerated_more_are_a_fault() -> None:
     supervisor = Supervisor()
-    pattern = ([True] + [False] * 4) * 200
-    assert not any(supervisor.overrun(overran) for overran in pattern)
-
-
-def test_more_than_twenty_overruns_in_a_hundred_ticks_are_a_fault() -> None:
-    supervisor = Supervisor()
-    for _ in range(20):
-        assert not supervisor.overrun(True)
-    assert supervisor.overrun(True)
+    for overran in ([True] + [False] * 4) * 200:
+        supervisor.overrun(overran)
+    assert supervisor.reason is None
+    supervisor.overrun(True)
+    supervisor.overrun(True)
     assert supervisor.reason is not None
     assert supervisor.reason.code == "overrun"
 
 
-def test_a_slow_update_now_and_then_is_tolerated_three_in_a_row_are_not() -> None:
-    supervisor = Supervisor()
-    times = [0.03, 0.03, 0.01, 0.03, 0.03, 0.03]
-    assert [supervisor.update_time(t, 0.025, "slug") for t in times] == [False] * 5 + [True]
+def test_every_change_of_mode_is_told_once_with_the_mode_before() -> None:
+    told: list[tuple[Mode, Mode]] = []
+    supervisor = Supervisor(lambda before: told.append((before, supervisor.mode)))
+    for deed in (
+        supervisor.start,
+        supervisor.start,
+        supervisor.stop,
+        supervisor.stop,
+        lambda: supervisor.fail("servo-link", "gone"),
+        lambda: supervisor.fail("overrun", "late"),
+        lambda: supervisor.estop("leak"),
+        lambda: supervisor.estop("leak"),
+        supervisor.clear,
+        supervisor.clear,
+    ):
+        deed()
+    modes = [Mode.IDLE, Mode.RUNNING, Mode.IDLE, Mode.FAULT, Mode.ESTOP, Mode.IDLE]
+    assert told == [*pairwise(modes)]

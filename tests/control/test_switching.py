@@ -3,7 +3,7 @@
 import random
 
 import pytest
-from harness import Rig
+from rigs.harness import Rig
 
 SWITCHES = 10_000
 CHOICES = {
@@ -15,6 +15,7 @@ CHOICES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slew_limit", [None, 3.0])
 def test_ten_thousand_switches_stay_within_amplitude_and_slew_limit(
     slew_limit: float | None,

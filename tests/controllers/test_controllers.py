@@ -4,13 +4,13 @@ import math
 from itertools import pairwise
 
 import pytest
-from harness import LIMITS, commands, observe
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.harness import LIMITS, commands, observe
 
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
-from fishd.errors import ParameterError, UnknownController
+from fishd.core.errors import ParameterError, UnknownController
 
 frequencies = st.floats(0.1, 5.0)
 in_force = st.floats(-0.42, 0.42)
@@ -120,8 +120,20 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
         ({"C": 1.5}, r"swing: C: 1\.5 is not valid: a number in \[0, 1\] is needed"),
         ({"C": math.nan}, r"swing: C: nan is not valid: a number in \[0, 1\] is needed"),
         ({"C": "0.6"}, r"swing: C: '0\.6' is not valid: a number in \[0, 1\] is needed"),
-        ({"c": 0.6}, "swing: c: unknown key; valid: C, amplitude, longest_half_period"),
-        ({"amplitud": 0.2}, "swing: amplitud: unknown key; did you mean 'amplitude'"),
+        ({"amplitude": 24}, r"swing: amplitude: 24 is .* \(degrees\? that is 0\.419 rad\)$"),
+        ({"amplitude": 240}, r"swing: amplitude: 240 is not valid: .* rad \(or null\) is needed$"),
+        ({"amplitude": -24}, r"swing: amplitude: -24 is not valid: .* rad \(or null\) is needed$"),
+        ({"amplitude": True}, r"swing: amplitude: true is .* rad \(or null\) is needed$"),
+        ({"longest_half_period": 24}, r"swing: longest_half_period: 24 is .* s is needed$"),
+        (
+            {"c": 0.6},
+            "^unknown parameter 'c' of controller swing; "
+            "it has: C, amplitude, longest_half_period$",
+        ),
+        (
+            {"amplitud": 0.2},
+            r"^unknown parameter 'amplitud' of controller swing; did you mean 'amplitude'\?$",
+        ),
     ],
 )
 def test_a_wrong_parameter_is_named_with_what_is_right(

@@ -3,15 +3,15 @@
 from itertools import pairwise
 
 import pytest
-from harness import LIMITS
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from rigs.harness import LIMITS
 
 from fishd.controllers.base import Limits
 from fishd.controllers.chatter import ChatterSettings
 from fishd.controllers.dwell import DwellLimit
-from fishd.errors import ControllerFault
+from fishd.core.errors import ControllerFault
 
 PATIENT = ChatterSettings(patience=600.0)
 
@@ -89,7 +89,6 @@ def test_without_a_dwell_every_command_passes() -> None:
     assert limited(wanted, dwell=0.0) == wanted
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=200),
     st.sampled_from([0.005, 0.02, 0.05, 0.2]),

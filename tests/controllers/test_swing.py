@@ -5,7 +5,7 @@ from concurrent.futures import ProcessPoolExecutor
 from itertools import pairwise
 
 import pytest
-from harness import LIMITS, Rig, commands, observe
+from rigs.harness import LIMITS, Rig, commands, observe
 
 from fishd.config import load
 from fishd.controllers import registry
@@ -83,6 +83,7 @@ def efficiency(job: tuple[float, int]) -> float:
     return simulate(config, "swing", {"C": 0.6}).efficiency
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "least"),
     [

@@ -5,10 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from fishd.addresses import listen, served
 from fishd.config import load
-from fishd.errors import ConfigError, StartupError
-from fishd.zmq_address import is_local, why_not_bound, why_not_connected, why_not_served
+from fishd.core.addresses import (
+    is_local,
+    listen,
+    parse,
+    served,
+    why_not_connected,
+    why_not_served,
+)
+from fishd.core.errors import ConfigError, StartupError
 
 
 @pytest.mark.parametrize(
@@ -34,7 +40,8 @@ from fishd.zmq_address import is_local, why_not_bound, why_not_connected, why_no
 )
 def test_what_zeromq_would_understand_in_another_way_is_no_address(address: str) -> None:
     assert why_not_served(address)
-    assert why_not_bound(address)
+    with pytest.raises(ValueError, match=r"^tcp://HOST:PORT or ipc://PATH is needed"):
+        parse(address)
     assert why_not_connected(address)
 
 

@@ -2,26 +2,30 @@
 
 import asyncio
 import time
+from collections.abc import Callable, Mapping
 from itertools import islice, pairwise
 
 import pytest
 
-from fishd.clock import Slot, Ticker, VirtualClock, VirtualTicker
-from fishd.timerfd import TimerFd
+from fishd.core.clock import Slot, Ticker, TimerFd, VirtualClock, VirtualTicker
 
 PERIOD = 0.02
 
 
-async def slots(count: int, *, nap_before: dict[int, float]) -> list[Slot]:
+async def slots(
+    count: int,
+    nap_before: Mapping[int, float] | None = None,
+    warm_up: Callable[[], None] | None = None,
+) -> list[Slot]:
     """Slots of a real ticker; the body of a turn takes as long as `nap_before` says."""
-    ticker = Ticker(PERIOD)
+    ticker = Ticker(PERIOD, warm_up)
     found: list[Slot] = []
     try:
         async for slot in ticker:
             found.append(slot)
             if len(found) == count:
                 return found
-            time.sleep(nap_before.get(len(found), 0.0))
+            time.sleep((nap_before or {}).get(len(found), 0.0))
     finally:
         ticker.close()
     raise AssertionError("a ticker never ends")
@@ -34,12 +38,12 @@ def test_virtual_time_is_never_late_and_moves_its_clock() -> None:
 
 
 def test_no_tick_begins_before_its_deadline() -> None:
-    for slot in asyncio.run(slots(20, nap_before={})):
+    for slot in asyncio.run(slots(20)):
         assert slot.now >= slot.deadline
 
 
 def test_deadlines_are_whole_periods_apart_for_ever() -> None:
-    found = asyncio.run(slots(20, nap_before={5: 0.013, 9: 0.031}))
+    found = asyncio.run(slots(20, {5: 0.013, 9: 0.031}))
     first = found[0]
     for slot in found:
         elapsed = slot.deadline - first.deadline
@@ -47,7 +51,7 @@ def test_deadlines_are_whole_periods_apart_for_ever() -> None:
 
 
 def test_a_long_turn_costs_whole_slots_which_are_counted_and_not_caught_up() -> None:
-    found = asyncio.run(slots(10, nap_before={4: 3.5 * PERIOD}))
+    found = asyncio.run(slots(10, {4: 3.5 * PERIOD}))
     assert found[4].missed >= 2
     for before, after in pairwise(found):
         assert after.index - before.index == after.missed + 1
@@ -65,7 +69,7 @@ def test_the_asyncio_loop_is_served_between_ticks_even_under_overload() -> None:
                 await asyncio.sleep(0)
 
         task = asyncio.create_task(other())
-        await slots(5, nap_before=dict.fromkeys(range(5), 1.5 * PERIOD))
+        await slots(5, dict.fromkeys(range(5), 1.5 * PERIOD))
         task.cancel()
         return served
 
@@ -89,40 +93,21 @@ def test_a_timer_in_the_past_expires_at_once_and_can_be_closed_twice() -> None:
     asyncio.run(run())
 
 
-def test_a_rehearsal_comes_before_each_deadline_and_delays_no_tick() -> None:
-    async def run() -> None:
-        rehearsed: list[float] = []
-        ticker = Ticker(PERIOD, lambda: rehearsed.append(time.monotonic()))
-        try:
-            async for slot in ticker:
-                if slot.index >= 20:
-                    break
-        finally:
-            ticker.close()
-        assert len(rehearsed) >= 5
-        deadlines = [slot.deadline - k * PERIOD for k in range(25)]
-        for moment in rehearsed:
-            assert any(0 < deadline - moment < Ticker.MARGIN for deadline in deadlines)
-
-    asyncio.run(run())
+def test_a_warm_up_comes_just_before_each_deadline_and_delays_no_tick() -> None:
+    warmed: list[float] = []
+    first = asyncio.run(slots(20, warm_up=lambda: warmed.append(time.monotonic())))[0]
+    assert len(warmed) >= 5
+    for moment in warmed:
+        to_go = (first.deadline - moment) % PERIOD
+        assert 0 < to_go < Ticker.MARGIN
 
 
-def test_a_rehearsal_for_which_there_is_no_time_is_left_out() -> None:
-    async def run() -> int:
-        rehearsals = 0
+def test_a_warm_up_for_which_there_is_no_time_is_left_out() -> None:
+    warmed: list[float] = []
 
-        def slow() -> None:
-            nonlocal rehearsals
-            rehearsals += 1
-            time.sleep(PERIOD)
+    def slow() -> None:
+        warmed.append(time.monotonic())
+        time.sleep(PERIOD)
 
-        ticker = Ticker(PERIOD, slow)
-        try:
-            async for slot in ticker:
-                if slot.index >= 20:
-                    break
-        finally:
-            ticker.close()
-        return rehearsals
-
-    assert asyncio.run(run()) == 1
+    asyncio.run(slots(20, warm_up=slow))
+    assert len(warmed) == 1

@@ -9,13 +9,13 @@ from pathlib import Path
 import click
 import pytest
 
-from fishd import files
-from fishd.cli import load_files
+from fishd.cli.calibrate import load_files
 from fishd.config import load
-from fishd.errors import ConfigError, FishdError, PolicyError
-from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.controllers.policy import file as policy_file
+from fishd.core import files
+from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.errors import ConfigError, FishdError, PolicyError
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.policies import file as policy_file
 
 PATIENCE = 20.0
 FORCE = "force-2026-01-01T000000.000000Z.yaml"

@@ -9,9 +9,10 @@ from types import FrameType
 
 import pytest
 from fishd_zoo import RAISED
+from rigs.processes import wait_until
 
-from fishd.contained import Attempt, contained
-from fishd.errors import Escaped
+from fishd.core.errors import Escaped
+from fishd.core.foreign_code import Attempt, contained
 
 PATIENCE = 10.0
 
@@ -70,10 +71,7 @@ def test_a_loop_in_python_ends_when_it_is_given_up() -> None:
     attempt = Attempt(loop)
     assert begun.wait(PATIENCE)
     assert attempt.give_up()
-    deadline = time.monotonic() + PATIENCE
-    while attempt.alive and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not attempt.alive
+    wait_until(lambda: not attempt.alive)
     assert not attempt.wait(0.0)
 
 

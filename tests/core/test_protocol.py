@@ -1,12 +1,17 @@
 """The decoder of requests: whatever arrives becomes a request or a refusal."""
 
+from pathlib import Path
+
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.harness import Rig
 
-from fishd import protocol
-from fishd.errors import Refused
+from fishd.core import protocol
+from fishd.core.errors import Refused
+from fishd.daemon.calibration_requests import CalibrationRequests
+from fishd.daemon.requests import Operations
 
 json_values = st.recursive(
     st.none()
@@ -38,8 +43,8 @@ def test_any_json_becomes_a_request_or_a_refusal(value: object) -> None:
 
 
 @given(
-    st.text(),
-    st.integers(-(2**63), 2**63 - 1) | st.text(),
+    st.text(max_size=64),
+    st.integers(-(2**63), 2**63 - 1) | st.text(max_size=256),
     st.dictionaries(st.text(), json_values, max_size=3),
 )
 def test_a_well_formed_request_arrives_as_it_was_sent(
@@ -80,3 +85,10 @@ def test_the_id_of_a_broken_request_is_found_where_there_is_one() -> None:
     assert protocol.request_id(b'{"id": 7, "op": 3}') == 7
     assert protocol.request_id(b'{"id": [7]}') is None
     assert protocol.request_id(b"\x00") is None
+
+
+def test_what_the_protocol_lists_is_what_fishd_answers(tmp_path: Path) -> None:
+    rig = Rig()
+    bench = CalibrationRequests(rig.loop, rig.clock, rig.config, tmp_path)
+    operations = Operations(rig.loop, rig.clock, bench, rig.config, [], "", realtime=False)
+    assert [*operations._handlers] == [*protocol.OPERATIONS]

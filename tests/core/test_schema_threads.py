@@ -6,7 +6,7 @@ import sys
 MANY_AT_ONCE = """
 import sys, threading
 from msgspec import Struct, defstruct
-from fishd.schema import convert
+from fishd.core.schema import convert
 
 sys.setswitchinterval(1e-5)
 for number in range(400):
@@ -16,14 +16,14 @@ for number in range(400):
     start = threading.Barrier(4)
 
     def work():
-        start.wait()
+        start.wait(20)
         convert(data, outer)
 
     threads = [threading.Thread(target=work) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(20)
 """
 
 

@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import pytest
 
-from fishd.config import Config
-from fishd.schema import LONGEST_WORD, Problem, convert, leaves, nearest
+from fishd.config import Config, keys
+from fishd.core.schema import LONGEST_WORD, Problem, convert, nearest
 
 POLICIES = [f"policy-{number:04d}-swim" for number in range(500)]
-KEYS = leaves(Config)
+KEYS = keys()
 
 
 def fastest(function: Callable[[], object]) -> float:

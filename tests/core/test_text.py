@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd import text
-from fishd.errors import Escaped, Refused
+from fishd.core import text
+from fishd.core.errors import Escaped, Refused
 
 anything = st.text(st.characters(codec=None, exclude_categories=()), max_size=3000)
 

@@ -3,20 +3,19 @@
 import os
 import shutil
 import socket
-import subprocess
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
-from processes import FISHCTL, PATIENCE, running
+from rigs.processes import FISHCTL, call, one_line, running
 
-from fishd import addresses
 from fishd.client import Fish, NoDaemon
-from fishd.errors import Untrusted
-from fishd.socket_owner import stranger
+from fishd.core import addresses
+from fishd.core.errors import Untrusted
+from fishd.core.unix_sockets import stranger
 
 USER, OTHER = 60101, 60102
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two other users")
@@ -103,23 +102,15 @@ def test_an_estop_is_not_sent_to_a_folder_that_another_user_planted(
 def test_fishctl_says_in_one_line_that_it_was_not_asked() -> None:
     path = Path(f"/tmp/fishd-{USER}/control")  # where it would be without a session
     drop = ["setpriv", f"--reuid={USER}", f"--regid={USER}", "--clear-groups"]
-    if subprocess.run([*drop, FISHCTL, "--help"], capture_output=True, check=False).returncode:
+    if call(*drop, FISHCTL, "--help").returncode:
         pytest.skip("another user cannot start this fishctl: its folder, or Python's, is private")
     try:
         with Listener(path, OTHER) as planted:
-            done = subprocess.run(
-                [*drop, FISHCTL, "estop"],
-                capture_output=True,
-                text=True,
-                check=False,
-                timeout=PATIENCE,
-            )
+            done = call(*drop, FISHCTL, "estop")
             assert not any(planted.told)
     finally:
         shutil.rmtree(path.parent)
-    assert done.returncode != 0
-    assert done.stderr.startswith(f"fishctl: what listens at ipc://{path} is not asked")
-    assert (done.stdout, done.stderr.count("\n")) == ("", 1)
+    assert one_line(done).startswith(f"fishctl: what listens at ipc://{path} is not asked")
 
 
 @as_root
@@ -150,7 +141,7 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
         folder.mkdir()
         os.chown(folder, owner, owner)
         folder.chmod(0o777)
-        with Listener(folder / "control", listener) if listener else _nothing():
+        with Listener(folder / "control", listener) if listener else nullcontext():
             folder.chmod(mode)
             with user(USER):
                 return stranger(folder / "control").replace(str(folder), "FOLDER")
@@ -167,11 +158,6 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
     with user(USER):
         assert stranger(shared / "link" / "control") == f"{shared / 'link'} is a symbolic link"
         assert stranger(shared / "nowhere" / "control") == ""
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield
 
 
 def test_the_fishd_of_the_same_user_is_asked(

@@ -6,14 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lockstep_rig import LockstepRig, lockstep_rig
 from msgspec.structs import replace
+from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
-from fishd.errors import Refused
-from fishd.hardware.calibration import ForceCalibration, ServoCalibration
-from fishd.protocol import FRESH, CalibrateForce, CalibrateServo, NoArguments, SampleForce, Tare
-from fishd.robots import state_folder
-from fishd.workbench import MOST_SAMPLES, Workbench
+from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.errors import Refused
+from fishd.core.protocol import (
+    FRESH,
+    CalibrateForce,
+    CalibrateServo,
+    NoArguments,
+    SampleForce,
+    Tare,
+)
+from fishd.daemon.calibration_requests import MOST_SAMPLES, CalibrationRequests
+from fishd.wiring import state_folder
 
 ANOTHER_BUS = ("force_sensor.bus=2", "virtual_pi.bus=2")
 BRIEFLY = SampleForce(seconds=0.2)
@@ -26,7 +33,7 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
         yield rig
 
 
-def perform(rig: LockstepRig, bench: Workbench, *requests: tuple[str, Any]) -> list[Any]:
+def perform(rig: LockstepRig, asked: CalibrationRequests, *requests: tuple[str, Any]) -> list[Any]:
     """Answers to requests that are made at the same time, while the loop ticks.
 
     A tare is that of a sample that is taken first.
@@ -34,9 +41,9 @@ def perform(rig: LockstepRig, bench: Workbench, *requests: tuple[str, Any]) -> l
 
     async def answer(name: str, arguments: Any) -> Any:
         if name == "tare" and isinstance(arguments, SampleForce):
-            sample = await bench.operations["sample-force"][1](arguments)
+            sample = await asked.handlers["sample-force"](arguments)
             arguments = Tare(sample.number)
-        return await bench.operations[name][1](arguments)
+        return await asked.handlers[name](arguments)
 
     async def run() -> list[Any]:
         answers: Awaitable[list[Any]] = asyncio.gather(*(answer(*request) for request in requests))
@@ -49,13 +56,13 @@ def perform(rig: LockstepRig, bench: Workbench, *requests: tuple[str, Any]) -> l
     return asyncio.run(run())
 
 
-def workbench(rig: LockstepRig) -> Workbench:
-    return Workbench(rig.loop, rig.clock, rig.config, state_folder(rig.config))
+def subject(rig: LockstepRig) -> CalibrationRequests:
+    return CalibrationRequests(rig.loop, rig.clock, rig.config, state_folder(rig.config))
 
 
 def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig) -> None:
-    bench = workbench(rig)
-    (after,) = perform(rig, bench, ("tare", BRIEFLY))
+    asked = subject(rig)
+    (after,) = perform(rig, asked, ("tare", BRIEFLY))
     assert after.force.x0 == pytest.approx(-0.2, abs=1e-3)
     assert (after.force.xx, after.force.yy) == (1.0, 1.0)
     assert after.force.tared
@@ -65,37 +72,37 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
 
 def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> None:
     not_calibrated = "the force is not calibrated: fishctl calibrate force"
-    bench = workbench(rig)
-    perform(rig, bench, ("tare", BRIEFLY))
+    asked = subject(rig)
+    perform(rig, asked, ("tare", BRIEFLY))
     assert not_calibrated in rig.robot.degraded()
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
         assert not_calibrated in again.robot.degraded()
     fitted = ForceCalibration(x0=-0.2, loads=5)
-    perform(rig, bench, ("calibrate-force", CalibrateForce(fitted)))
+    perform(rig, asked, ("calibrate-force", CalibrateForce(fitted)))
     assert not_calibrated not in rig.robot.degraded()
 
 
 def test_two_tares_at_the_same_time_are_one(rig: LockstepRig) -> None:
-    bench = workbench(rig)
-    perform(rig, bench, ("tare", BRIEFLY), ("tare", BRIEFLY), ("tare", SampleForce(seconds=0.3)))
+    asked = subject(rig)
+    perform(rig, asked, ("tare", BRIEFLY), ("tare", BRIEFLY), ("tare", SampleForce(seconds=0.3)))
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
-    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
     assert found.force.x0 == pytest.approx(-0.2, abs=1e-3)
 
 
 def test_a_sample_alone_changes_nothing(rig: LockstepRig) -> None:
-    bench = workbench(rig)
-    perform(rig, bench, ("sample-force", BRIEFLY))
-    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    asked = subject(rig)
+    perform(rig, asked, ("sample-force", BRIEFLY))
+    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
     assert (found.force.x0, found.force_file) == (0.0, None)
 
 
 def test_four_samples_at_once_are_all(rig: LockstepRig) -> None:
-    bench = workbench(rig)
+    asked = subject(rig)
 
     async def ask(request: SampleForce) -> Any:
         try:
-            return await bench.operations["sample-force"][1](request)
+            return await asked.handlers["sample-force"](request)
         except Refused as refusal:
             return refusal.code
 
@@ -109,16 +116,16 @@ def test_four_samples_at_once_are_all(rig: LockstepRig) -> None:
     answers = asyncio.run(run())
     assert answers.count("busy") == 3
     assert all(answer.pairs for answer in answers if answer != "busy")
-    (again,) = perform(rig, bench, ("sample-force", BRIEFLY))
+    (again,) = perform(rig, asked, ("sample-force", BRIEFLY))
     assert again.pairs
 
 
 def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: LockstepRig) -> None:
-    bench = workbench(rig)
+    asked = subject(rig)
 
     async def run() -> list[Any]:
         long = SampleForce(seconds=60.0)
-        request = bench.operations["sample-force"][1]
+        request = asked.handlers["sample-force"]
         answers = asyncio.gather(
             *(request(long) for _ in range(MOST_SAMPLES)), return_exceptions=True
         )
@@ -128,16 +135,16 @@ def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: Lock
 
     refusals = asyncio.run(run())
     assert [refusal.code for refusal in refusals] == ["running"] * MOST_SAMPLES
-    assert str(refusals[0]) == "square is in command; stop it with 'fishctl stop'"
+    assert str(refusals[0]) == "square is the active controller; stop it with 'fishctl stop'"
 
 
 def test_a_sample_is_good_for_a_tare_only_while_it_is_fresh(rig: LockstepRig) -> None:
-    bench = workbench(rig)
-    (sample,) = perform(rig, bench, ("sample-force", BRIEFLY))
+    asked = subject(rig)
+    (sample,) = perform(rig, asked, ("sample-force", BRIEFLY))
     rig.run_for(FRESH + 1.0)
     for number in (sample.number, sample.number + 1, 0):
         with pytest.raises(Refused, match=f"no sample {number} of the last 10 s") as refusal:
-            perform(rig, bench, ("tare", Tare(number)))
+            perform(rig, asked, ("tare", Tare(number)))
         assert refusal.value.code == "no-samples"
 
 
@@ -147,20 +154,20 @@ def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path
         ("calibrate-force", CalibrateForce(force)),
         ("calibrate-servo", CalibrateServo(servo, save=True)),
     )
-    perform(rig, workbench(rig), *requests)
+    perform(rig, subject(rig), *requests)
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.4, abs=5e-3)
     assert rig.pulse == pytest.approx(1530.0)
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
         again.run_for(0.2)
         assert again.pulse == pytest.approx(1530.0)
-        assert again.robot.bench is not None
-        assert again.robot.bench.sensor.calibration.xx == 2.0
+        assert again.robot.calibrated is not None
+        assert again.robot.calibrated.sensor.calibration.xx == 2.0
 
 
 def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
     rig: LockstepRig, tmp_path: Path
 ) -> None:
-    perform(rig, workbench(rig), ("calibrate-servo", CalibrateServo(ServoCalibration(trim=30.0))))
+    perform(rig, subject(rig), ("calibrate-servo", CalibrateServo(ServoCalibration(trim=30.0))))
     rig.run_for(0.2)
     assert rig.pulse == pytest.approx(1530.0)
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
@@ -170,7 +177,7 @@ def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
 
 def test_new_soft_limits_hold_for_the_next_command(rig: LockstepRig) -> None:
     calibration = ServoCalibration(lowest=-0.1, highest=0.2)
-    perform(rig, workbench(rig), ("calibrate-servo", CalibrateServo(calibration)))
+    perform(rig, subject(rig), ("calibrate-servo", CalibrateServo(calibration)))
     rig.start("square")
     angles = [tick.phi_c for tick in rig.run_for(3.0)]
     assert (min(angles), max(angles)) == (-0.1, 0.2)
@@ -187,7 +194,7 @@ def test_a_calibration_that_would_make_the_tail_jump_is_refused(
     rig.run_for(1.0)
     wanted = CalibrateServo(replace(ServoCalibration(), **change))
     with pytest.raises(Refused) as refusal:
-        perform(rig, workbench(rig), ("calibrate-servo", wanted))
+        perform(rig, subject(rig), ("calibrate-servo", wanted))
     assert refusal.value.code == "not-neutral"
     rig.run_for(0.5)
     assert rig.mode == "running"
@@ -195,7 +202,7 @@ def test_a_calibration_that_would_make_the_tail_jump_is_refused(
 
 
 def test_nothing_is_measured_or_calibrated_while_the_fish_swims(rig: LockstepRig) -> None:
-    bench = workbench(rig)
+    asked = subject(rig)
     rig.start("swing")
     for request in (
         ("tare", BRIEFLY),
@@ -204,7 +211,7 @@ def test_nothing_is_measured_or_calibrated_while_the_fish_swims(rig: LockstepRig
         ("calibrate-servo", CalibrateServo(ServoCalibration())),
     ):
         with pytest.raises(Refused) as refusal:
-            perform(rig, bench, request)
+            perform(rig, asked, request)
         assert refusal.value.code == "running"
 
 
@@ -213,13 +220,13 @@ def test_a_calibration_that_cannot_be_written_is_not_in_force(
 ) -> None:
     folder = state_folder(rig.config)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    bench = workbench(rig)
+    asked = subject(rig)
     folder.write_text("in the way")
     with pytest.raises(Refused) as refusal:
-        perform(rig, bench, ("calibrate-force", CalibrateForce(ForceCalibration(xx=5.0))))
+        perform(rig, asked, ("calibrate-force", CalibrateForce(ForceCalibration(xx=5.0))))
     assert refusal.value.code == "not-saved"
-    assert rig.robot.bench is not None
-    assert rig.robot.bench.sensor.calibration.xx == 1.0
+    assert rig.robot.calibrated is not None
+    assert rig.robot.calibrated.sensor.calibration.xx == 1.0
 
 
 @pytest.mark.parametrize(
@@ -238,34 +245,34 @@ def test_a_matrix_that_says_the_same_of_both_forces_is_refused(
 ) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(**matrix)))
     with pytest.raises(Refused, match="says the same"):
-        perform(rig, workbench(rig), request)
+        perform(rig, subject(rig), request)
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 4.0])
 def test_a_matrix_is_judged_by_its_shape_and_not_by_its_size(rig: LockstepRig, size: float) -> None:
     matrix = ForceCalibration(xx=size, xy=0.1 * size, yx=-0.1 * size, yy=8.0 * size)
-    (after,) = perform(rig, workbench(rig), ("calibrate-force", CalibrateForce(matrix)))
+    (after,) = perform(rig, subject(rig), ("calibrate-force", CalibrateForce(matrix)))
     assert after.force.yy == 8.0 * size
 
 
 def test_a_calibration_that_would_be_a_fault_at_once_is_refused_before_it_is_saved(
     rig: LockstepRig,
 ) -> None:
-    bench = workbench(rig)
+    asked = subject(rig)
     with pytest.raises(Refused, match=r"beyond force_sensor.force_limit, 10 N.*grams") as refusal:
-        perform(rig, bench, ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0))))
+        perform(rig, asked, ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0))))
     assert refusal.value.code == "too-large"
-    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
     assert (found.force_file, found.force_limit) == (None, 10.0)
     good = ForceCalibration(xx=100.0, x0=-20.0)
-    perform(rig, bench, ("calibrate-force", CalibrateForce(good)))
+    perform(rig, asked, ("calibrate-force", CalibrateForce(good)))
 
 
 def test_a_calibration_can_be_saved_while_the_sensor_says_nothing(rig: LockstepRig) -> None:
     rig.pi.faults.inject("unplugged")
     rig.run_until_fault(3.0)
     request = ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0)))
-    (after,) = perform(rig, workbench(rig), request)
+    (after,) = perform(rig, subject(rig), request)
     assert after.force.xx == 100.0
 
 
@@ -281,18 +288,18 @@ def test_a_calibration_can_be_saved_while_the_sensor_says_nothing(rig: LockstepR
 def test_a_servo_calibration_is_saved_only_if_the_configuration_would_take_it(
     rig: LockstepRig, change: dict[str, Any], words: str
 ) -> None:
-    bench = workbench(rig)
+    asked = subject(rig)
     calibration = replace(ServoCalibration(), **change)
     with pytest.raises(Refused, match=f"^{words}") as refusal:
-        perform(rig, bench, ("calibrate-servo", CalibrateServo(calibration, save=True)))
+        perform(rig, asked, ("calibrate-servo", CalibrateServo(calibration, save=True)))
     assert refusal.value.code == "bad-arguments"
-    (found,) = perform(rig, bench, ("calibrations", NoArguments()))
+    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
     assert (found.servo, found.servo_file) == (ServoCalibration(), None)
     within = replace(calibration, lowest=-0.1, highest=0.0)  # who wants less says so
-    perform(rig, bench, ("calibrate-servo", CalibrateServo(within, save=True)))
+    perform(rig, asked, ("calibrate-servo", CalibrateServo(within, save=True)))
 
 
 def test_a_date_that_a_file_could_not_hold_is_refused(rig: LockstepRig) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(tared="today")))
     with pytest.raises(Refused, match="tared: 'today' is no date: one in ISO 8601 is needed"):
-        perform(rig, workbench(rig), request)
+        perform(rig, subject(rig), request)

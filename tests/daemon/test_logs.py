@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import msgspec
 import pytest
 
-from fishd.logs import JsonFormatter, LogWriter, TextFormatter
+from fishd.daemon.logs import JsonFormatter, LogWriter, TextFormatter
 
 
 def record(message: str, error: BaseException | None = None) -> logging.LogRecord:
@@ -89,6 +89,7 @@ class Stuck(io.StringIO):
         return len(text)
 
 
+@pytest.mark.realtime
 def test_it_closes_soon_where_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     stuck = Stuck()
     with writer(monkeypatch, stuck) as logs:

@@ -1,4 +1,4 @@
-"""A servo calibration that is not saved is a loan: who has it, and how fishd takes it back."""
+"""A servo calibration that is not saved is a lease: who has it, and how fishd takes it back."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lockstep_rig import LockstepRig, lockstep_rig
 from msgspec.structs import asdict
+from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
-from fishd.errors import Refused
-from fishd.hardware.calibration import ServoCalibration
-from fishd.operations import Operations
-from fishd.protocol import LOAN
-from fishd.robots import state_folder
-from fishd.workbench import Workbench
+from fishd.core.calibration import ServoCalibration
+from fishd.core.errors import Refused
+from fishd.core.protocol import LEASE
+from fishd.daemon.calibration_requests import CalibrationRequests
+from fishd.daemon.requests import Operations
+from fishd.wiring import state_folder
 
 WIDE = ServoCalibration(trim=30.0, lowest=-3.0, highest=3.0)
 
@@ -24,17 +24,17 @@ class Client:
 
     def __init__(self, rig: LockstepRig) -> None:
         self.rig = rig
-        bench = Workbench(rig.loop, rig.clock, rig.config, state_folder(rig.config))
-        self._operations = Operations(rig.loop, rig.clock, bench, rig.config, [], "", False)
+        requests = CalibrationRequests(rig.loop, rig.clock, rig.config, state_folder(rig.config))
+        self._operations = Operations(rig.loop, rig.clock, requests, rig.config, [], "", False)
 
     async def ask(self, op: str, **args: Any) -> Any:
         return await self._operations.perform(op, args)
 
     async def calibrate(
-        self, calibration: ServoCalibration, *, save: bool = False, loan: str | None = None
+        self, calibration: ServoCalibration, *, save: bool = False, lease: str | None = None
     ) -> Any:
         values = asdict(calibration)
-        return await self.ask("calibrate-servo", calibration=values, save=save, loan=loan)
+        return await self.ask("calibrate-servo", calibration=values, save=save, lease=lease)
 
     async def refused(self, op: str, **args: Any) -> str:
         """The code with which a request is refused."""
@@ -43,16 +43,16 @@ class Client:
         return refusal.value.code
 
     async def until_over(self, limit: float = 20.0) -> None:
-        """Tick until there is no loan any more, for so long of virtual time [s]."""
+        """Tick until there is no lease any more, for so long of virtual time [s]."""
         deadline = self.rig.now + limit
-        while (await self.ask("calibrations")).loan:
+        while (await self.ask("calibrations")).lease:
             assert self.rig.now < deadline
             self.rig.run_for(self.rig.config.tick)
             await asyncio.sleep(0.005)
 
 
 async def watched() -> None:
-    """Time for fishd to look at its loans, in which nothing ticks."""
+    """Time for fishd to look at its leases, in which nothing ticks."""
     await asyncio.sleep(0.3)
 
 
@@ -77,7 +77,7 @@ def taken_back(rig: LockstepRig) -> list[str]:
     return [event.level for event in rig.recorder.events if "of before" in event.message]
 
 
-def test_a_loan_that_nobody_renews_ends_at_neutral_with_the_calibration_of_before(
+def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_before(
     rig: LockstepRig,
 ) -> None:
     async def story(client: Client) -> None:
@@ -98,68 +98,68 @@ def test_a_loan_that_nobody_renews_ends_at_neutral_with_the_calibration_of_befor
     assert rig.mode == "running"
 
 
-def test_a_loan_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> None:
+def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        loan = (await client.calibrate(WIDE)).loan
-        rig.run_for(LOAN - 1.0)
-        await client.ask("renew-loan", loan=loan)
-        rig.run_for(LOAN - 1.0)
-        await client.calibrate(WIDE, loan=loan)
-        rig.run_for(LOAN - 1.0)
+        lease = (await client.calibrate(WIDE)).lease
+        rig.run_for(LEASE - 1.0)
+        await client.ask("renew-lease", lease=lease)
+        rig.run_for(LEASE - 1.0)
+        await client.calibrate(WIDE, lease=lease)
+        rig.run_for(LEASE - 1.0)
         await watched()
-        assert (await client.ask("calibrations")).loan == loan
+        assert (await client.ask("calibrations")).lease == lease
         rig.run_for(2.0)
         await watched()
-        assert (await client.ask("calibrations")).loan is None
-        for op in ("renew-loan", "end-loan"):
-            assert await client.refused(op, loan=loan) == "no-loan"
-        with pytest.raises(Refused, match="not in force any more"):
-            await client.calibrate(WIDE, loan=loan)
+        assert (await client.ask("calibrations")).lease is None
+        for op in ("renew-lease", "end-lease"):
+            assert await client.refused(op, lease=lease) == "no-lease"
+        with pytest.raises(Refused, match="calibration of before is used again"):
+            await client.calibrate(WIDE, lease=lease)
 
     tell(rig, story)
 
 
-def test_status_tells_that_the_servo_is_on_loan(rig: LockstepRig) -> None:
+def test_status_tells_that_the_servo_is_leased(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         assert not (await client.ask("status")).calibrating
-        loan = (await client.calibrate(WIDE)).loan
+        lease = (await client.calibrate(WIDE)).lease
         assert (await client.ask("status")).calibrating
-        await client.calibrate(WIDE, save=True, loan=loan)
+        await client.calibrate(WIDE, save=True, lease=lease)
         assert not (await client.ask("status")).calibrating
 
     tell(rig, story)
 
 
-def test_a_loan_that_is_given_back_ends_at_once_and_without_a_warning(rig: LockstepRig) -> None:
+def test_a_lease_that_is_given_back_ends_at_once_and_without_a_warning(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo
-        loan = (await client.calibrate(WIDE)).loan
+        lease = (await client.calibrate(WIDE)).lease
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
         rig.run_for(1.0)
-        await client.ask("end-loan", loan=loan)
-        assert await client.refused("renew-loan", loan=loan) == "no-loan"
+        await client.ask("end-lease", lease=lease)
+        assert await client.refused("renew-lease", lease=lease) == "no-lease"
         for name in ("swing", "hold"):  # the tail has to come to neutral first
             assert await client.refused("set-controller", name=name) == "calibrating"
-        await client.until_over(LOAN - 2.0)
+        await client.until_over(LEASE - 2.0)
         assert (await client.ask("calibrations")).servo == before
 
     tell(rig, story)
     assert taken_back(rig) == ["info"]
 
 
-def test_nothing_but_hold_takes_over_while_a_loan_lasts(rig: LockstepRig) -> None:
+def test_nothing_but_hold_takes_over_while_a_lease_lasts(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        loan = (await client.calibrate(WIDE)).loan
+        lease = (await client.calibrate(WIDE)).lease
         assert await client.refused("set-controller", name="swing") == "calibrating"
         assert (await client.ask("set-controller", name="hold")).mode == "running"
-        await client.ask("end-loan", loan=loan)
+        await client.ask("end-lease", lease=lease)
         await client.until_over()
         assert (await client.ask("set-controller", name="swing")).controller == "swing"
 
     tell(rig, story)
 
 
-def test_a_controller_that_was_loading_when_a_loan_began_does_not_take_over(
+def test_a_controller_that_was_loading_when_a_lease_began_does_not_take_over(
     rig: LockstepRig,
 ) -> None:
     async def story(client: Client) -> None:
@@ -174,19 +174,19 @@ def test_a_controller_that_was_loading_when_a_loan_began_does_not_take_over(
     assert rig.mode == "idle"
 
 
-def test_only_who_has_the_loan_changes_or_saves_a_servo_calibration(rig: LockstepRig) -> None:
+def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        loan = (await client.calibrate(WIDE)).loan
+        lease = (await client.calibrate(WIDE)).lease
         for save in (False, True):
             with pytest.raises(Refused) as refusal:
                 await client.calibrate(ServoCalibration(), save=save)
             assert refusal.value.code == "calibrating"
             with pytest.raises(Refused) as refusal:
-                await client.calibrate(ServoCalibration(), save=save, loan="another")
-            assert refusal.value.code == "no-loan"
-        saved = await client.calibrate(WIDE, save=True, loan=loan)
-        assert (saved.loan, saved.servo.trim) == (None, 30.0)
-        rig.run_for(LOAN + 1.0)
+                await client.calibrate(ServoCalibration(), save=save, lease="another")
+            assert refusal.value.code == "no-lease"
+        saved = await client.calibrate(WIDE, save=True, lease=lease)
+        assert (saved.lease, saved.servo.trim) == (None, 30.0)
+        rig.run_for(LEASE + 1.0)
         await watched()
         found = await client.ask("calibrations")
         assert (found.servo, found.servo_file) == (saved.servo, saved.servo_file)
@@ -195,19 +195,19 @@ def test_only_who_has_the_loan_changes_or_saves_a_servo_calibration(rig: Lockste
     assert taken_back(rig) == []
 
 
-def test_after_an_emergency_stop_a_loan_ends_before_the_tail_is_driven_again(
+def test_after_an_emergency_stop_a_lease_ends_before_the_tail_is_driven_again(
     rig: LockstepRig,
 ) -> None:
     async def story(client: Client) -> None:
-        loan = (await client.calibrate(WIDE)).loan
+        lease = (await client.calibrate(WIDE)).lease
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
         rig.run_for(1.0)
         await client.ask("estop")
-        await client.ask("end-loan", loan=loan)
+        await client.ask("end-lease", lease=lease)
         rig.run_for(0.5)
         await watched()
         # The limits of before would not permit the angle that the pulses begin with again.
-        assert (await client.ask("calibrations")).loan == loan
+        assert (await client.ask("calibrations")).lease == lease
         await client.ask("clear-fault")
         assert await client.refused("set-controller", name="swing") == "calibrating"
         await client.until_over()
@@ -217,7 +217,7 @@ def test_after_an_emergency_stop_a_loan_ends_before_the_tail_is_driven_again(
     assert rig.mode == "idle"
 
 
-def test_a_fault_meanwhile_does_not_keep_a_loan_from_ending(rig: LockstepRig) -> None:
+def test_a_fault_meanwhile_does_not_keep_a_lease_from_ending(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         await client.calibrate(WIDE)
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4})

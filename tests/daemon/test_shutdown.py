@@ -1,4 +1,4 @@
-"""The end of the process: it comes when it is asked for, however the process hangs."""
+"""A shutdown comes when it is asked for, however the process hangs."""
 
 import asyncio
 import dataclasses
@@ -9,22 +9,22 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import Rig, Wrapped
-from processes import PATIENCE, Daemon
+from rigs.harness import Wrapped, fragile_rig
+from rigs.processes import PATIENCE, Daemon
 
 from fishd.config import Config
-from fishd.daemon import Daemon as Inside
+from fishd.daemon.main import Daemon as Inside
 from fishd.hardware.base import Robot
 
 PROGRAM = """
 import sys, threading, time
-from fishd.ending import Ending, leave
+from fishd.daemon.shutdown import Shutdown, leave
 
-ending = Ending()
+shutdown = Shutdown()
 asked = threading.Event()
-ending.when_asked(asked.set)
-ending.release = lambda: (print("released", flush=True), {release})
-ending.last_words = lambda: print("last words", flush=True)
+shutdown.when_asked(asked.set)
+shutdown.release = lambda: (print("released", flush=True), {release})
+shutdown.last_words = lambda: print("last words", flush=True)
 print("up", flush=True)
 {hang}
 asked.wait()
@@ -50,7 +50,7 @@ def end(hang: str = "", release: str = "None", number: int = signal.SIGTERM) -> 
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_an_orderly_end_is_nobodys_business(number: int) -> None:
+def test_an_orderly_shutdown_needs_no_last_resort(number: int) -> None:
     assert end(number=number) == (7, "")
 
 
@@ -86,16 +86,14 @@ def test_below_nohup_a_terminal_that_closes_is_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("countdown", [0.2, float("inf")])
 def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdown: float) -> None:
-    made: list[Wrapped] = []
+    class Robust(Wrapped):
+        def robot(self) -> Robot:
+            return dataclasses.replace(super().robot(), countdown=countdown)
 
-    def wrap(robot: Robot) -> Robot:
-        made.append(Wrapped(robot))
-        return dataclasses.replace(made[0].robot(), countdown=countdown)
-
-    rig = Rig(wrap=wrap)
+    rig, robot = fragile_rig(kind=Robust)
     rig.start("hold", angle=0.3)
     rig.run(10)
-    made[0].log.clear()
+    robot.log.clear()
 
     async def release() -> None:
         daemon = Inside(Config(lockstep=True), print_status=False)
@@ -103,4 +101,4 @@ def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdo
         daemon.release_at_once()
 
     asyncio.run(release())
-    assert made[0].log == ([None] if countdown == 0.2 else [0.0, None])
+    assert robot.log == ([None] if countdown == 0.2 else [0.0, None])

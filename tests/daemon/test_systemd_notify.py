@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fishd.notify import SystemdNotifier
+from fishd.daemon.systemd_notify import SystemdNotifier
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from fishd.config import Config, load
-from fishd.errors import ConfigError
-from fishd.schema import leaves
+from fishd.core.errors import ConfigError
+from fishd.core.schema import leaves
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 REFERENCE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 FISHCTL = str(Path(sys.executable).with_name("fishctl"))
 
 
@@ -101,6 +101,14 @@ def test_a_bad_parameter_is_refused_in_one_line(
     assert done.stderr.startswith(f"fishctl: {complaint}")
     assert done.stderr.count("\n") == 1
     assert not done.stdout
+
+
+def test_the_page_about_it_shows_what_a_run_prints(laptop: Laptop) -> None:
+    page = (ROOT / "docs" / "writing-a-controller.md").read_text(encoding="utf-8")
+    shown = page.partition("$ fishctl simulate chirp --seconds 130\n")[2].partition("timing ")[0]
+    assert (
+        shown == laptop.fishctl("simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
+    )
 
 
 @pytest.mark.parametrize("name", ["fishd_chirp.py", "pyproject.toml"])

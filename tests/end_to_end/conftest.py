@@ -2,7 +2,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from processes import Daemon, running
+from rigs.processes import Daemon, running
 
 
 @pytest.fixture

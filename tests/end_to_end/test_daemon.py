@@ -7,41 +7,30 @@ import subprocess
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import get_type_hints
 
 import msgspec
 import pytest
-from processes import FISHCTL, FISHD, PATIENCE, Daemon, Subscriber, running
+from rigs.documents import ROOT
+from rigs.processes import FISHD, PATIENCE, Daemon, Subscriber, running, sets, wait_until
 
-SHIPPED = str(Path(__file__).parents[2] / "config" / "simulated.yaml")
+from fishd.core.signals import Tick
+from fishd.core.unix_sockets import is_deserted
 
+SHIPPED = str(ROOT / "config" / "simulated.yaml")
+
+EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # which a simulated fish leaves out
 TICK_FIELDS = {
-    "t": float,
-    "seq": int,
-    "mode": str,
-    "controller": str,
-    "fx": float,
-    "fy": float,
-    "fy_rate": float,
-    "fin_velocity": float,
-    "phi_c": float,
-    "servo_on": bool,
-    "thrust": float,
-    "frequency": float,
-    "samples": int,
-    "age_ms": float,
-    "lateness_us": float,
-    "busy_us": float,
-    "missed": int,
-    "alpha": float,
-    "alpha_rate": float,
-    "phi": float,
+    name: kind if isinstance(kind, type) else float
+    for name, kind in get_type_hints(Tick).items()
+    if name not in EXTREMES
 }
 
 
 def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(idle_daemon: Daemon) -> None:
     with Subscriber(idle_daemon.telemetry, b"tick") as subscriber:
         for _ in range(5):
-            topic, payload = subscriber.frames()
+            topic, payload = subscriber.socket.recv_multipart()
             assert topic == b"tick"
             tick = msgspec.json.decode(payload)
             assert {name: type(value) for name, value in tick.items()} == TICK_FIELDS
@@ -97,6 +86,14 @@ def test_a_signal_fades_to_neutral_and_exits_with_0(tmp_path: Path, number: int)
     assert "Traceback" not in errors
 
 
+def refused(folder: Path, *settings: str) -> str:
+    """What a fishd says that cannot start with these settings."""
+    status, out, errors = Daemon(folder, *sets(*settings)).finish()
+    assert (status, out) == (1, "")
+    assert "Traceback" not in errors
+    return errors
+
+
 def test_a_bad_configuration_exits_with_78_and_one_line(tmp_path: Path) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text("plant:\n  omega: 12\n")
@@ -105,87 +102,62 @@ def test_a_bad_configuration_exits_with_78_and_one_line(tmp_path: Path) -> None:
     assert errors == f"fishd: {file}:2: plant.omega: unknown key; did you mean 'omega0'?\n"
 
 
-def test_a_second_daemon_on_the_same_control_address_says_so_and_exits(idle_daemon: Daemon) -> None:
-    folder = Path(idle_daemon.endpoint.removeprefix("ipc://")).parent
-    second = Daemon(folder)
-    status, _, errors = second.finish()
-    assert status == 1
-    assert (
-        f"another fishd (pid {idle_daemon.process.pid}) already serves {idle_daemon.endpoint}"
-        in errors
-    )
-    assert "Traceback" not in errors
-    assert idle_daemon.fishctl("status").returncode == 0
-
-
-def test_a_second_daemon_on_the_same_telemetry_address_says_so_and_exits(
-    daemon: Daemon, tmp_path: Path
+def test_a_second_daemon_on_the_same_address_says_so_and_exits(
+    tmp_path: Path, idle_daemon: Daemon
 ) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    second = Daemon(other, "--set", f"telemetry.address={daemon.telemetry}")
-    status, _, errors = second.finish()
-    assert status == 1
-    assert f"telemetry.address: cannot listen on {daemon.telemetry}: it is in use" in errors
-    assert "Traceback" not in errors
+    with running(tmp_path, *sets(f"telemetry.address=ipc://{tmp_path}/telemetry")) as first:
+        rival = f"another fishd (pid {first.process.pid}) already serves"
+        assert f"{rival} {first.endpoint}" in refused(tmp_path)
+        (tmp_path / "other").mkdir()
+        same = f"telemetry.address={first.telemetry}"
+        assert f"{rival} {first.telemetry}" in refused(tmp_path / "other", same)
+        assert first.fishctl("status").returncode == 0
+    assert not (tmp_path / "telemetry").exists()
+    assert not (tmp_path / "control").exists()
+    tcp = idle_daemon.telemetry
+    in_use = f"telemetry.address: cannot listen on {tcp}: it is in use"
+    assert in_use in refused(tmp_path, f"telemetry.address={tcp}")
 
 
+@pytest.mark.parametrize("host", ["nohost.invalid", "192.0.2.1"])  # which is nobody's
 def test_a_telemetry_address_of_another_machine_is_one_line_with_what_would_be_right(
-    tmp_path: Path,
+    tmp_path: Path, host: str
 ) -> None:
-    for host in ("nohost.invalid", "192.0.2.1"):  # which is nobody's
-        status, _, errors = Daemon(
-            tmp_path, "--set", f"telemetry.address=tcp://{host}:9872"
-        ).finish()
-        assert status == 1
-        assert (
-            f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is no address of this "
-            "machine; write tcp://127.0.0.1:9872, or tcp://0.0.0.0:9872 for all\n"
-        ) in errors
+    assert (
+        f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is no address of this "
+        "machine; write tcp://127.0.0.1:9872, or tcp://0.0.0.0:9872 for all\n"
+    ) in refused(tmp_path, f"telemetry.address=tcp://{host}:9872")
 
 
-def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("key", ["control", "telemetry"])
+def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path, key: str) -> None:
     precious = tmp_path / "precious.txt"
     precious.write_text("data")
-    for key in ("control", "telemetry"):
-        status, _, errors = Daemon(tmp_path, "--set", f"{key}.address=ipc://{precious}").finish()
-        assert status == 1
-        assert f"{precious} is there already and is no socket" in errors
-        assert "Traceback" not in errors
+    errors = refused(tmp_path, f"{key}.address=ipc://{precious}")
+    assert f"{precious} is there already and is no socket" in errors
     assert precious.read_text() == "data"
-
-
-def test_a_second_daemon_on_the_same_telemetry_socket_says_so_and_exits(tmp_path: Path) -> None:
-    address = ("--set", f"telemetry.address=ipc://{tmp_path}/telemetry")
-    other = tmp_path / "other"
-    other.mkdir()
-    with running(tmp_path, *address) as first:
-        status, _, errors = Daemon(other, *address).finish()
-        assert status == 1
-        assert f"another fishd (pid {first.process.pid}) already serves ipc://" in errors
-    assert not (tmp_path / "telemetry").exists()
-
-
-def test_after_its_end_nothing_is_left_to_connect_to(tmp_path: Path) -> None:
-    with running(tmp_path) as daemon:
-        assert daemon.end()[0] == 0
-        assert not (tmp_path / "control").exists()
 
 
 def test_after_a_kill_a_client_knows_at_once_that_nobody_is_there(tmp_path: Path) -> None:
     with running(tmp_path) as daemon:
-        daemon.process.kill()
-        daemon.process.wait()
+        daemon.kill()
         assert (tmp_path / "control").exists()
-        assert "nobody listens there" in daemon.fishctl("status").stderr
+        wait_until(lambda: is_deserted(tmp_path / "control"))  # its gateways leave in a moment
+        done = daemon.fishctl("status")
+    assert (done.returncode, done.stderr) == (
+        1,
+        f"fishctl: no fishd at {daemon.endpoint}: nobody listens there; start one with 'fishd', "
+        "or name another with --endpoint or $FISHD_ENDPOINT\n",
+    )
 
 
-def test_after_a_kill_the_next_daemon_takes_the_socket_over(tmp_path: Path) -> None:
-    with running(tmp_path) as first:
-        first.process.kill()
-        first.process.wait()
-    with running(tmp_path) as second:
-        assert second.fishctl("status").returncode == 0
+def test_after_a_kill_the_next_daemon_takes_the_place_over_without_a_pause(tmp_path: Path) -> None:
+    telemetry = "tcp://127.0.0.1:0"
+    for _ in range(3):
+        with running(tmp_path, *sets(f"telemetry.address={telemetry}")) as daemon:
+            assert daemon.fishctl("status").returncode == 0
+            telemetry = daemon.telemetry
+            daemon.kill()
 
 
 def test_logs_can_be_json(tmp_path: Path) -> None:
@@ -203,7 +175,7 @@ def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None
         unprivileged += ["setpriv", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"]
         unprivileged += ["--inh-caps=-sys_nice,-ipc_lock,-sys_resource"]
     with running(tmp_path, under=unprivileged) as daemon:
-        assert json.loads(daemon.fishctl("status", "--json").stdout)["realtime"] is False
+        assert not daemon.status().realtime
         status, _, errors = daemon.end()
     assert status == 0
     assert errors.count("warning") == 1
@@ -212,47 +184,27 @@ def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None
 
 
 def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:
-    modest = ("--set", "realtime.priority=0", "--set", "realtime.lock_memory=false")
+    modest = sets("realtime.priority=0", "realtime.lock_memory=false")
     with running(tmp_path, *modest) as daemon:
-        assert json.loads(daemon.fishctl("status", "--json").stdout)["realtime"] is False
-        _, _, errors = daemon.end()
-    assert "warning" not in errors
+        assert not daemon.status().realtime
+        assert "warning" not in daemon.end()[2]
 
 
-def test_fishctl_says_when_no_daemon_is_there(tmp_path: Path) -> None:
-    endpoint = f"ipc://{tmp_path}/nobody"
-    command = [FISHCTL, "status", "--endpoint", endpoint]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr == (
-        f"fishctl: no fishd at {endpoint}: nobody listens there; start one with 'fishd', "
-        "or name another with --endpoint or $FISHD_ENDPOINT\n"
-    )
-
-
+@pytest.mark.realtime
 @pytest.mark.parametrize("delay", [0.05, 0.15, 0.3, 0.45, 0.6])
 def test_a_ctrl_c_at_any_moment_of_the_start_ends_it_without_a_traceback_or_a_beat(
     tmp_path: Path, delay: float
 ) -> None:
-    command = [FISHD, "--config", SHIPPED, "--set", f"control.address=ipc://{tmp_path}/control"]
-    command += ["--set", "telemetry.address=tcp://127.0.0.1:0"]
+    own = sets(f"control.address=ipc://{tmp_path}/control", "telemetry.address=tcp://127.0.0.1:0")
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        [FISHD, "--config", SHIPPED, *own],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     time.sleep(delay)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode in (0, 130, -signal.SIGINT)
     assert "Traceback" not in errors
-
-
-def test_a_fishd_that_was_killed_is_followed_by_the_next_one_without_a_pause(
-    tmp_path: Path,
-) -> None:
-    for _ in range(3):
-        with running(tmp_path, "--set", "telemetry.address=tcp://127.0.0.1:0") as first:
-            port = first.telemetry
-            first.process.kill()
-            first.process.wait()
-            with running(tmp_path, "--set", f"telemetry.address={port}") as second:
-                assert second.fishctl("status").returncode == 0

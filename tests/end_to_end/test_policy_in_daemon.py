@@ -2,16 +2,15 @@
 
 import json
 import pickle
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from policy_files import FLIP, card, linear, random_layers, write
-from processes import FISHCTL, PATIENCE, Daemon, Subscriber, running
+from rigs.policy_files import FLIP, card, linear, random_layers, write
+from rigs.processes import Daemon, Subscriber, install, one_line, running
 
 from fishd.client import Fish, Refused
-from fishd.policies.network import to_onnx
+from fishd.controllers.policy.network import to_onnx
 
 
 @pytest.fixture
@@ -31,6 +30,7 @@ def daemon(folder: Path, tmp_path: Path) -> Iterator[Daemon]:
         yield found
 
 
+@pytest.mark.realtime
 def test_a_policy_that_shakes_the_servo_loses_command_and_everyone_is_told(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -48,7 +48,7 @@ def test_a_policy_that_shakes_the_servo_loses_command_and_everyone_is_told(
         assert (status.mode, status.controller) == ("running", "swing")
         assert status.fallback
         assert (status.fallback.code, status.missed) == ("chatter", 0)
-        assert "took over: chatter: ppo lost command" in daemon.fishctl("status").stdout
+        assert "took over: chatter: ppo gave up" in daemon.fishctl("status").stdout
         fish.set_controller("ppo", policy="flip")
         assert fish.status().fallback is None
 
@@ -65,26 +65,13 @@ def test_a_named_policy_swims(daemon: Daemon) -> None:
 
 def test_a_relative_path_is_that_of_the_one_who_asks(daemon: Daemon, tmp_path: Path) -> None:
     write(tmp_path / "elsewhere", FLIP, "mine")
-    done = subprocess.run(
-        [
-            FISHCTL,
-            "--endpoint",
-            daemon.endpoint,
-            "set-controller",
-            "ppo",
-            "--policy",
-            "./mine.onnx",
-        ],
-        cwd=tmp_path / "elsewhere",
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE,
-    )
+    ask = ("set-controller", "ppo", "--policy", "./mine.onnx")
+    done = daemon.fishctl_apart(*ask, cwd=tmp_path / "elsewhere")
     assert (done.returncode, done.stderr) == (0, "")
     assert f"ppo policy={tmp_path}/elsewhere/mine.onnx" in done.stdout
 
 
+@pytest.mark.realtime
 def test_a_policy_that_loads_costs_no_tick(daemon: Daemon, folder: Path) -> None:
     write(folder, to_onnx(random_layers(1, 64, 64, 1), "tanh", card()), "real")
     with Subscriber(daemon.telemetry, b"tick") as ticks:
@@ -94,26 +81,17 @@ def test_a_policy_that_loads_costs_no_tick(daemon: Daemon, folder: Path) -> None
     assert after["missed"] == before["missed"]
 
 
-@pytest.mark.parametrize(
-    ("policy", "message"),
-    [
-        (
-            "flop",
-            "no policy is named 'flop'; did you mean 'flip'? There are: default-fish, ",
-        ),
-        ("torch", "this is a pickle, which could run any code"),
-        ("quick", "it was trained at a tick of 20 ms, this robot's is 50 ms"),
-        ("/nowhere/x.onnx", "ppo: policy: /nowhere/x.onnx: no such file [bad-parameter]"),
-    ],
-)
-def test_a_policy_that_cannot_be_used_is_refused_in_one_line(
-    daemon: Daemon, policy: str, message: str
-) -> None:
-    done = daemon.fishctl("set-controller", "ppo", "--policy", policy)
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert json.loads(daemon.fishctl("status", "--json").stdout)["mode"] == "idle"
+def test_a_policy_that_cannot_be_used_is_refused_in_one_line(daemon: Daemon) -> None:
+    for policy, message in {
+        "flop": "no policy is named 'flop'; did you mean 'flip'? There are: default-fish, ",
+        "torch": "this is a pickle, which could run any code",
+        "quick": "it was trained at a tick of 20 ms, this robot's is 50 ms",
+        "/nowhere/x.onnx": "ppo: policy: /nowhere/x.onnx: no such file [bad-parameter]",
+    }.items():
+        done = daemon.fishctl("set-controller", "ppo", "--policy", policy)
+        assert done.returncode == 1
+        assert message in one_line(done)
+        assert daemon.status().mode == "idle"
 
 
 def test_a_policy_does_not_change_in_flight(daemon: Daemon) -> None:
@@ -172,28 +150,29 @@ def test_fishd_starts_with_a_policy_of_its_configuration(folder: Path, tmp_path:
     )
 
 
-def test_a_running_fishd_rehearses_its_controller(tmp_path: Path) -> None:
-    """A controller of another package, whose angle counts how often it was rehearsed."""
-    package = tmp_path / "site" / "rehearsing-1.dist-info"
-    package.mkdir(parents=True)
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: rehearsing\nVersion: 1\n")
-    (package / "entry_points.txt").write_text(
-        "[fishd.controllers]\nrehearsing = rehearsing:Rehearsing\n"
-    )
-    (tmp_path / "site" / "rehearsing.py").write_text(
-        "from fishd.controllers.hold import Hold\n\n\n"
-        "class Rehearsing(Hold):\n"
-        '    """Count."""\n\n'
-        "    count = 0\n\n"
-        "    def rehearse(self):\n"
-        "        self.count += 1\n\n"
-        "    def update(self, observation):\n"
-        "        return 1e-3 * self.count\n"
-    )
-    under = ("env", f"PYTHONPATH={tmp_path / 'site'}")
+WARMING = """
+from fishd.controllers.hold import Hold
+
+
+class Warming(Hold):
+    "Commands an angle that counts how often it has warmed up."
+
+    count = 0
+
+    def warm_up(self):
+        self.count += 1
+
+    def update(self, observation):
+        return 1e-3 * self.count
+"""
+
+
+def test_a_running_fishd_warms_up_its_controller(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    install(site, {"warming": WARMING}, warming="warming:Warming")
+    under = ("env", f"PYTHONPATH={site}")
     with running(tmp_path, under=under) as daemon, Subscriber(daemon.telemetry, b"tick") as ticks:
-        with Fish(daemon.endpoint) as fish:
-            fish.set_controller("rehearsing")
-        ticks.until(controller="rehearsing")
+        daemon.fishctl("set-controller", "warming")
+        ticks.until(controller="warming")
         angles = (ticks.message()["phi_c"] for _ in range(200))
-        assert any(angle > 5e-3 for angle in angles)  # one for which there is no time is left out
+        assert any(angle > 5e-3 for angle in angles)  # where there is no time, it is left out

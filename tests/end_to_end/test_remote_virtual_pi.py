@@ -3,17 +3,17 @@
 import time
 from pathlib import Path
 
-from processes import running
-from test_virtual_pi_swims import virtual_pi
+from rigs.processes import running
+from rigs.virtual_pi_process import virtual_pi
 
-from fishd.learning.on_daemon import OnDaemon
+from fishd.learning.env.fishd_link import FishdLink
 
 
 def test_an_agent_swims_the_virtual_pi(tmp_path: Path) -> None:
     with virtual_pi(tmp_path) as pi, running(tmp_path, *pi.settings) as daemon:
-        link = OnDaemon(daemon.endpoint, deadline=0.0225)
+        link = FishdLink(daemon.endpoint, deadline=0.0225)
         try:
-            link.start()
+            link.reset()
             in_time = 0
             for step in range(40):
                 angle = 0.3 if step % 12 < 6 else -0.3

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from processes import Daemon, Subscriber, running
+from rigs.processes import PATIENCE, Daemon, Subscriber, install, one_line, running
 
 from fishd.client import Fish, Refused
 
@@ -63,30 +63,24 @@ class Untyped(Hold):
 
     Parameters = Parameters
 '''
-ENTRY_POINTS = """[fishd.controllers]
-slow = manners:Slow
-shapeless = manners:Shapeless
-explosive = manners:Explosive
-drunk = manners:Drunk
-absent = nowhere:Absent
-quitter = quitter:Quitter
-untyped = untyped:Untyped
-function = time:sleep
-"""
+CONTROLLERS = {
+    "slow": "manners:Slow",
+    "shapeless": "manners:Shapeless",
+    "explosive": "manners:Explosive",
+    "drunk": "manners:Drunk",
+    "absent": "nowhere:Absent",
+    "quitter": "quitter:Quitter",
+    "untyped": "untyped:Untyped",
+    "function": "time:sleep",
+}
 
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
     """A daemon on a machine where a package of bad controllers is installed."""
-    installed = tmp_path / "site"
-    info = installed / "manners-1.0.dist-info"
-    info.mkdir(parents=True)
-    (installed / "manners.py").write_text(MODULE)
-    (installed / "quitter.py").write_text(QUITTER)
-    (installed / "untyped.py").write_text(UNTYPED)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: manners\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    monkeypatch.setenv("PYTHONPATH", str(installed))
+    modules = {"manners": MODULE, "quitter": QUITTER, "untyped": UNTYPED}
+    install(tmp_path / "site", modules, **CONTROLLERS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     with running(tmp_path) as found:
         yield found
 
@@ -112,21 +106,44 @@ def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> No
 def test_one_that_cannot_start_says_why_in_one_line(
     daemon: Daemon, name: str, message: str
 ) -> None:
-    done = daemon.fishctl("set-controller", name)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    done = daemon.fishctl_apart("set-controller", name)
+    assert done.returncode == 1
+    assert message in one_line(done)
+
+
+def test_one_that_is_installed_while_fishd_runs_is_found(daemon: Daemon, tmp_path: Path) -> None:
+    assert daemon.fishctl_apart("set-controller", "still").returncode == 1
+    late = "from fishd.controllers.hold import Hold\nclass Late(Hold):\n    'Comes late.'\n"
+    install(tmp_path / "site", {"late": late}, late="late:Late")
+    assert daemon.fishctl_apart("set-controller", "late").stdout.startswith("running: late")
+    known = [info["name"] for info in json.loads(daemon.fishctl("controllers", "--json").stdout)]
+    assert "late" in known
+    assert known == sorted(known)
+
+
+def test_one_that_was_installed_since_and_cannot_be_imported_needs_a_restart(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    install(tmp_path / "site", {}, hidden="hidden:Hidden")
+    with Fish(daemon.endpoint) as fish, pytest.raises(Refused) as refusal:
+        fish.set_controller("hidden")
+    assert str(refusal.value) == (
+        "controller 'hidden' (hidden:Hidden) does not load: ModuleNotFoundError: No module named "
+        "'hidden'; it was installed after fishd had started: restart fishd"
+    )
 
 
 def test_one_that_fails_in_the_tick_is_a_fault_with_its_reason(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry, b"tick") as ticks:
         daemon.fishctl("set-controller", "drunk")
         ticks.until(mode="fault", servo_on=False)
-    status = json.loads(daemon.fishctl("status", "--json").stdout)
-    assert status["reason"]["code"] == "controller-error"
-    assert "the command is nan, not an angle" in status["reason"]["message"]
+    reason = daemon.status().reason
+    assert reason
+    assert reason.code == "controller-error"
+    assert "the command is nan, not an angle" in reason.message
 
 
+@pytest.mark.realtime
 def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry, b"tick") as ticks:
         before = ticks.message()
@@ -158,7 +175,7 @@ def test_one_that_is_still_loading_does_not_undo_a_newer_request(
         assert getattr(fish, newer)().mode == {"stop": "idle", "estop": "estop"}[newer]
         fish.clear_fault()
         for thread in loading:
-            thread.join()
+            thread.join(PATIENCE)
         assert fish.status().mode == "idle"
     assert set(refusals) == {"busy", "superseded"}
     assert len(refusals) == 8

@@ -1,11 +1,10 @@
 """A fishd that ends while its pigpiod is stopped says that the servo may keep its pulses."""
 
 import signal
-import subprocess
 from pathlib import Path
 
-from processes import FISHCTL, PATIENCE, Subscriber, running
-from virtual_pi_process import virtual_pi
+from rigs.processes import Subscriber, fishctl, running
+from rigs.virtual_pi_process import virtual_pi
 
 
 def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_path: Path) -> None:
@@ -22,12 +21,6 @@ def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_pat
         assert "reconnecting" not in last
         assert pi.pulse() > 0.0
         pi.control("clear")
-        release = subprocess.run(
-            [FISHCTL, "release", *pi.settings],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=PATIENCE,
-        )
+        release = fishctl("release", *pi.settings)
         assert "pulses were on: neutral, then off" in release.stdout, release.stderr
         assert pi.pulse() == 0.0

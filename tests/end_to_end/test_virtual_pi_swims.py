@@ -1,11 +1,10 @@
 """The daemon on a virtual Pi in a process of its own, as the README shows it."""
 
-import json
 from collections.abc import Iterator
 
 import pytest
-from processes import Daemon, Subscriber, running
-from virtual_pi_process import Pi, virtual_pi
+from rigs.processes import Daemon, Subscriber, running
+from rigs.virtual_pi_process import Pi, virtual_pi
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +23,9 @@ def test_the_shipped_configuration_swims_through_the_whole_hardware_path(
             assert tick["mode"] == "running", daemon.fishctl("status").stdout
     assert tick["samples"] >= 4
     assert 1.2 < tick["frequency"] < 2.2
-    status = json.loads(daemon.fishctl("status", "--json").stdout)
-    assert status["robot"] == "virtual-pi"
-    assert any("not calibrated" in line for line in status["degraded"])
+    status = daemon.status()
+    assert status.robot == "virtual-pi"
+    assert any("not calibrated" in line for line in status.degraded)
 
 
 def test_a_sensor_that_is_pulled_out_is_a_fault_that_a_clear_ends(
@@ -36,10 +35,11 @@ def test_a_sensor_that_is_pulled_out_is_a_fault_that_a_clear_ends(
     with Subscriber(daemon.telemetry, b"tick") as ticks:
         pi.control("inject", "unplugged")
         ticks.until(mode="fault", servo_on=False)
-        assert pi.pulse() == 0.0
-        reason = json.loads(daemon.fishctl("status", "--json").stdout)["reason"]
-        assert reason["code"] == "sensor-stale"
-        assert "check" in reason["message"]
+        pi.wait_until_released()
+        reason = daemon.status().reason
+        assert reason
+        assert reason.code == "sensor-stale"
+        assert "check" in reason.message
         pi.control("clear", "unplugged")
         ticks.until(samples=0)
         while ticks.message()["samples"] < 2:
@@ -56,10 +56,14 @@ def test_the_button_of_the_panel_stops_the_pulses_until_it_is_released_and_the_s
     with Subscriber(daemon.telemetry, b"tick") as ticks:
         pi.control("press")
         ticks.until(mode="estop", servo_on=False)
-        assert pi.pulse() == 0.0
+        pi.wait_until_released()
         assert daemon.fishctl("set-controller", "swing").returncode == 1
         daemon.fishctl("clear-fault")
-        ticks.until(mode="estop", servo_on=False)
+        while "button is pressed" not in daemon.fishctl("status", "--json").stdout:  # not: was
+            ticks.message()
         pi.control("unpress")
-        daemon.fishctl("clear-fault")
+        for _ in range(100):  # until fishd has seen that, too
+            daemon.fishctl("clear-fault")
+            if [ticks.message()["mode"] for _ in range(5)] == ["idle"] * 5:
+                break
         ticks.until(mode="idle", servo_on=True)

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from msgspec import Struct, inspect
 
-from fishd.errors import ConfigError
-from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.settings import ServoSettings
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from fishd.clock import VirtualClock
-from fishd.emulation.lgpio import EmulatedLgpio
-from fishd.emulation.pins import Pins
-from fishd.errors import StartupError
+from fishd.core.clock import VirtualClock
+from fishd.core.errors import StartupError
 from fishd.hardware.panel import RpiGpioPanel
 from fishd.hardware.settings import PanelSettings
+from fishd.virtual.pi.lgpio import EmulatedLgpio
+from fishd.virtual.pi.pins import Pins
 
 BUTTON, LIGHT = 17, 27
 OPENS = PanelSettings(estop_gpio=BUTTON, estop_pressed="high", led_gpio=LIGHT)

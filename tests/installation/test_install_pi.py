@@ -12,8 +12,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from rigs.documents import ROOT as CHECKOUT
+from rigs.processes import call
 
-CHECKOUT = Path(__file__).resolve().parents[1]
 CONFIG = "etc/fishd/fishd.yaml"
 AS_INSTALLED = "opt/fishd/fishd.yaml.installed"
 
@@ -33,21 +34,25 @@ class Pi:
         self.disk = disk
         self._wheel = wheel
 
-    def run(self, script: str, **variables: str) -> list[str]:
-        """Run a script without a network; the lines that it says."""
-        environment = {**os.environ, "DESTDIR": str(self.disk), "PYTHON": sys.executable}
-        environment |= {"FISHD_WHEEL": str(self._wheel), "PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1"}
-        environment |= {"FISHD_GPIO": "none"}
-        done = self.attempt(script, environment | variables)
+    def run(self, *words: str, **variables: str) -> list[str]:
+        """Run a script, or one step of the installation, without a network; what it says."""
+        done = self.attempt(*words, **variables)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
         return done.stdout.splitlines()
 
-    @staticmethod
-    def attempt(script: str, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    def attempt(self, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
+        """words: the name of a script, or of a function of install_pi.sh and its arguments"""
+        environment = {**os.environ, "DESTDIR": str(self.disk), "PYTHON": sys.executable}
+        environment |= {"FISHD_WHEEL": str(self._wheel), "PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1"}
+        environment |= {"FISHD_GPIO": "none", "PIP_NO_COMPILE": "1"}
+        command = [str(CHECKOUT / "tools" / words[0])]
+        if not words[0].endswith(".sh"):  # sourced, the script only defines its functions
+            step = f'source {CHECKOUT}/tools/install_pi.sh; workspace=$(mktemp -d); "$@"'
+            command = ["bash", "-c", f"{step}; rm -r $workspace", "install_pi.sh", *words]
         return subprocess.run(
-            [CHECKOUT / "tools" / script],
-            env=environment,
+            command,
+            env=environment | variables,
             capture_output=True,
             text=True,
             check=False,
@@ -61,14 +66,20 @@ class Pi:
 
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pi:
+    """An installation where the Python of an earlier one is gone."""
     pi = Pi(tmp_path_factory.mktemp("pi"), wheel)
-    pi.run("install_pi.sh")
+    left = pi.disk / "opt/fishd"
+    for name in ("python", "python3", f"python3.{sys.version_info[1]}"):
+        (left / "bin").mkdir(parents=True, exist_ok=True)
+        (left / "bin" / name).symlink_to("/nowhere/python3")
+    (left / "lib/python3.9/site-packages/fishd").mkdir(parents=True)
+    assert pi.run("install_pi.sh")[0].startswith("/opt/fishd: made with Python 3.")
     return pi
 
 
 @pytest.fixture
 def pi(installed: Pi, tmp_path: Path) -> Pi:
-    """As after a first installation."""
+    """A copy of it."""
     return installed.copy(tmp_path / "pi")
 
 
@@ -110,39 +121,32 @@ def test_installing_twice_changes_nothing(pi: Pi) -> None:
     assert said[0].startswith("/opt/fishd: has Python 3.")
 
 
-def test_an_edited_config_is_kept(pi: Pi) -> None:
+@pytest.mark.parametrize("renewed", [False, True])
+def test_an_edited_config_is_kept_and_a_new_default_lies_beside_it(pi: Pi, renewed: bool) -> None:
     (pi.disk / CONFIG).write_text("robot: simulated\n")
-    assert "/etc/fishd/fishd.yaml: yours, kept" in pi.run("install_pi.sh")
+    if renewed:
+        (pi.disk / AS_INSTALLED).write_text("# what an older version had installed\n")
+    (said,) = (line for line in pi.run("install_config") if line.startswith(f"/{CONFIG}: "))
+    kept = "/etc/fishd/fishd.yaml: yours, kept"
+    news = "; what is new is in /etc/fishd/fishd.yaml.new"
+    assert said == (kept + news if renewed else kept)
     assert (pi.disk / CONFIG).read_text() == "robot: simulated\n"
-    assert not (pi.disk / f"{CONFIG}.new").exists()
-
-
-def test_a_new_default_config_lies_beside_an_edited_one(pi: Pi) -> None:
-    (pi.disk / CONFIG).write_text("robot: simulated\n")
-    (pi.disk / AS_INSTALLED).write_text("# what an older version had installed\n")
-    said = [line for line in pi.run("install_pi.sh") if ".new" in line]
-    assert said == [
-        "/etc/fishd/fishd.yaml: yours, kept; what is new is in /etc/fishd/fishd.yaml.new"
-    ]
-    assert (pi.disk / CONFIG).read_text() == "robot: simulated\n"
-    assert (pi.disk / f"{CONFIG}.new").read_text() == (CHECKOUT / "config/pi.yaml").read_text()
+    new = pi.disk / f"{CONFIG}.new"
+    assert new.exists() is renewed
+    if renewed:
+        assert new.read_text() == (CHECKOUT / "config/pi.yaml").read_text()
 
 
 def test_a_config_that_nobody_edited_is_renewed(pi: Pi) -> None:
     for name in (CONFIG, AS_INSTALLED):
         (pi.disk / name).write_text("# what an older version had installed\n")
-    pi.run("install_pi.sh")
+    pi.run("install_config")
     assert (pi.disk / CONFIG).read_text() == (CHECKOUT / "config/pi.yaml").read_text()
 
 
 def test_a_python_that_is_gone_is_replaced(pi: Pi) -> None:
-    python = pi.disk / "opt/fishd/bin/python3"
-    version = pi.disk / f"opt/fishd/bin/python3.{sys.version_info[1]}"
-    for link in (python, version, pi.disk / "opt/fishd/bin/python"):
-        link.unlink(missing_ok=True)
-        link.symlink_to("/nowhere/python3")
-    assert pi.run("install_pi.sh")[0].startswith("/opt/fishd: made with Python 3.")
-    subprocess.run([python, "-I", "-c", "import fishd"], check=True)
+    subprocess.run([pi.disk / "opt/fishd/bin/python3", "-I", "-c", "import fishd"], check=True)
+    assert not (pi.disk / "opt/fishd/lib/python3.9").exists()
 
 
 def test_uninstalling_leaves_nothing(pi: Pi) -> None:
@@ -164,16 +168,20 @@ def test_uninstalling_keeps_an_edited_config_and_calibrations(pi: Pi) -> None:
 def test_without_root_and_without_a_folder_nothing_is_done() -> None:
     drop = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
     for script in ("install_pi.sh", "uninstall_pi.sh"):
-        done = subprocess.run(
-            [*(drop if os.geteuid() == 0 else []), "bash", "-s", script],
+        done = call(
+            *(drop if os.geteuid() == 0 else []),
+            *("bash", "-s", script),
             input=f"source {CHECKOUT}/tools/pi_layout.sh; need_root",
             env={"PATH": os.environ["PATH"]},
-            capture_output=True,
-            text=True,
-            check=False,
         )
         assert done.returncode == 1
         assert "needs root: run it with sudo" in done.stderr
+
+
+def said_by(function: str, *arguments: str) -> str:
+    """What a function of the script says; sourced, the script only defines them."""
+    script = f'source {CHECKOUT}/tools/install_pi.sh; {function} "$@"'
+    return call("bash", "-c", script, "bash", *arguments, check=True).stdout.strip()
 
 
 @pytest.mark.parametrize(
@@ -190,29 +198,36 @@ def test_without_root_and_without_a_folder_nothing_is_done() -> None:
     ],
 )
 def test_the_gpio_package_suits_the_pi(model: str, debian: str, kernel: str, extra: str) -> None:
-    # Sourced, the script only defines its functions.
-    script = f'source {CHECKOUT}/tools/install_pi.sh; gpio_extra "$@"'
-    chosen = subprocess.check_output(
-        ["bash", "-c", script, "bash", model, debian, kernel], text=True
-    )
-    assert chosen.strip() == extra
+    assert said_by("gpio_extra", model, debian, kernel) == extra
+
+
+def wheel_of(folder: Path, name: str) -> Path:
+    """A built package that provides RPi."""
+    path = folder / f"{name}-0.6-py3-none-any.whl"
+    info = f"{name}-0.6.dist-info/"
+    files = {
+        "RPi/__init__.py": "",
+        info + "METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.6\n",
+        info + "WHEEL": "Wheel-Version: 1.0\nTag: py3-none-any\n",
+    }
+    files[info + "RECORD"] = "".join(f"{name},,\n" for name in (*files, info + "RECORD"))
+    with zipfile.ZipFile(path, "w") as wheel:
+        for name, text in files.items():
+            wheel.writestr(name, text)
+    return path
 
 
 def sdist(folder: Path, name: str, build: str, requires: str = "") -> None:
-    """Sources of a package whose build does this, and needs that, a quoted name."""
+    """Sources of that package, whose build does this, and needs that, a quoted name."""
+    folder.mkdir(exist_ok=True)
+    built = wheel_of(folder.parent, name)
     backend = f"""
-import os, zipfile
+import os, shutil
 
 def build_wheel(folder, settings=None, metadata=None):
     {build}
-    name = "{name}-0.6-py3-none-any.whl"
-    with zipfile.ZipFile(folder + "/" + name, "w") as wheel:
-        info = "{name}-0.6.dist-info/"
-        wheel.writestr("RPi/__init__.py", "")
-        wheel.writestr(info + "METADATA", "Metadata-Version: 2.1\\nName: {name}\\nVersion: 0.6\\n")
-        wheel.writestr(info + "WHEEL", "Wheel-Version: 1.0\\nTag: py3-none-any\\n")
-        wheel.writestr(info + "RECORD", "RPi/__init__.py,,\\n")
-    return name
+    shutil.copy({str(built)!r}, folder)
+    return {built.name!r}
 """
     files = {
         "backend.py": backend,
@@ -220,7 +235,6 @@ def build_wheel(folder, settings=None, metadata=None):
         'backend-path = ["."]\n',
         "PKG-INFO": f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.6\n",
     }
-    folder.mkdir(exist_ok=True)
     with tarfile.open(folder / f"{name}-0.6.tar.gz", "w:gz") as tar:
         for path, text in files.items():
             info = tarfile.TarInfo(f"{name}-0.6/{path}")
@@ -242,45 +256,41 @@ def test_a_gpio_package_that_cannot_be_built_does_not_keep_fishd_from_being_inst
 
 def test_the_gpio_package_is_built_with_what_its_sources_want(pi: Pi, tmp_path: Path) -> None:
     sdist(tmp_path / "sources", "rpi_lgpio", 'assert os.environ["PYPI"] == "1"')
-    options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
+    install = ("install_gpio", "rpi-lgpio")
     built = "rpi-lgpio: installed, for E-stop button and status light"
-    assert built in pi.run("install_pi.sh", **options)
+    assert built in pi.run(*install, PIP_FIND_LINKS=str(tmp_path / "sources"))
     # The second time it is there, and is neither fetched nor built.
-    there = "rpi-lgpio: there, for E-stop button and status light"
-    assert there in pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio")
+    assert "rpi-lgpio: there, for E-stop button and status light" in pi.run(*install)
 
 
 def test_the_other_gpio_package_goes_only_once_the_new_one_is_built(pi: Pi, tmp_path: Path) -> None:
-    sources = tmp_path / "sources"
-    sdist(sources, "RPi.GPIO", "pass")
+    sources, install = tmp_path / "sources", ("install_gpio", "rpi-lgpio")
+    (site,) = (pi.disk / "opt/fishd/lib").glob("python3*/site-packages")
+    with zipfile.ZipFile(wheel_of(tmp_path, "RPi.GPIO")) as other:
+        other.extractall(site)
     sdist(sources, "rpi_lgpio", 'raise SystemExit("error: swig failed")')
-    links = {"PIP_FIND_LINKS": str(sources)}
-    python = pi.disk / "opt/fishd/bin/python"
-    pip = [python, "-m", "pip", "--quiet", "install", "--no-index", f"--find-links={sources}"]
-    subprocess.run([*pip, "--no-deps", "RPi.GPIO"], check=True)
-    pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **links)
-    show = [python, "-m", "pip", "show"]
-    assert subprocess.run([*show, "RPi.GPIO"], capture_output=True, check=False).returncode == 0
-    sdist(sources, "rpi_lgpio", "pass")
+    pi.run(*install, PIP_FIND_LINKS=str(sources))
+    assert (site / "RPi.GPIO-0.6.dist-info").exists()
+    wheel_of(sources, "rpi_lgpio")
     assert "RPi.GPIO: removed, it excludes rpi-lgpio" in pi.run(
-        "install_pi.sh", FISHD_GPIO="rpi-lgpio", **links
+        *install, PIP_FIND_LINKS=str(sources)
     )
-    subprocess.run([python, "-I", "-c", "import RPi"], check=True)
+    assert not (site / "RPi.GPIO-0.6.dist-info").exists()
+    subprocess.run([pi.disk / "opt/fishd/bin/python", "-I", "-c", "import RPi"], check=True)
 
 
 def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_path: Path) -> None:
+    install = ("install_gpio", "rpi-lgpio")
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # bound, but nobody listens: connections are refused
         index = f"http://127.0.0.1:{nobody.getsockname()[1]}/simple"
         options = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": index, "PIP_EXTRA_INDEX_URL": ""}
         options |= {"PIP_FIND_LINKS": "", "PIP_RETRIES": "1", "PIP_CONFIG_FILE": os.devnull}
-        optional = "\n".join(pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **options))
+        optional = "\n".join(pi.run(*install, **options))
         sdist(tmp_path / "sources", "rpi_lgpio", "pass", requires='"setuptools"')
         links = {"PIP_FIND_LINKS": str(tmp_path / "sources")}
-        half = "\n".join(pi.run("install_pi.sh", FISHD_GPIO="rpi-lgpio", **options | links))
-        environment = {**os.environ, "DESTDIR": str(pi.disk), "PYTHON": sys.executable, **options}
-        environment |= {"PIP_NO_DEPS": "0", "FISHD_GPIO": "none"}
-        needed = pi.attempt("install_pi.sh", environment)
+        half = "\n".join(pi.run(*install, **options | links))
+        needed = pi.attempt("install_package", **options | {"PIP_NO_DEPS": "0"})
     assert "NOT available" in optional
     assert "NOT available" in half
     assert needed.returncode == 1
@@ -300,9 +310,7 @@ def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_pa
     ],
 )
 def test_policies_are_for_a_python_of_64_bits(bits: str, platform: str, extras: str) -> None:
-    script = f'source {CHECKOUT}/tools/install_pi.sh; core_extras "$@"'
-    chosen = subprocess.check_output(["bash", "-c", script, "bash", bits, platform], text=True)
-    assert chosen.strip() == extras
+    assert said_by("core_extras", bits, platform) == extras
 
 
 def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> None:
@@ -310,9 +318,7 @@ def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> Non
     narrow = "import struct, sys; struct.calcsize = lambda form: 4; exec(sys.argv.pop(2))"
     python.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{narrow}' \"$@\"\n")
     python.chmod(0o755)
-    script = f'source {CHECKOUT}/tools/install_pi.sh; about_python "$@"'
-    said = subprocess.check_output(["bash", "-c", script, "bash", python], text=True)
-    assert said.startswith("32 linux-")
+    assert said_by("about_python", str(python)).startswith("32 linux-")
 
 
 def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:
@@ -326,19 +332,10 @@ def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:
     assert ">=10" in wanted["adafruit-blinka"]
 
 
-def test_an_unknown_gpio_package_is_refused_before_anything_is_done(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [CHECKOUT / "tools/install_pi.sh"],
-        env={
-            **os.environ,
-            "DESTDIR": str(tmp_path),
-            "PYTHON": sys.executable,
-            "FISHD_GPIO": "gpio",
-        },
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_an_unknown_gpio_package_is_refused_before_anything_is_done(
+    wheel: Path, tmp_path: Path
+) -> None:
+    done = Pi(tmp_path, wheel).attempt("install_pi.sh", FISHD_GPIO="gpio")
     assert done.returncode == 1
     assert done.stderr == "install_pi.sh: FISHD_GPIO=gpio: rpi-gpio, rpi-lgpio or none\n"
     assert files(tmp_path) == set()
@@ -348,7 +345,5 @@ def test_shellcheck_has_nothing_to_say_against_the_scripts() -> None:
     if shutil.which("shellcheck") is None:
         pytest.skip("shellcheck is not installed: apt install shellcheck")
     scripts = ["tools/install_pi.sh", "tools/uninstall_pi.sh", "tools/arm64_trial.sh"]
-    done = subprocess.run(
-        ["shellcheck", "-x", *scripts], cwd=CHECKOUT, capture_output=True, text=True, check=False
-    )
+    done = call("shellcheck", "-x", *scripts, cwd=CHECKOUT)
     assert done.stdout + done.stderr == ""

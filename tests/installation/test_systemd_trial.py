@@ -1,6 +1,5 @@
 """The trial under a real systemd, as far as it can be tried without one: what it takes inside."""
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -8,18 +7,15 @@ from typing import Any
 
 import pytest
 
-CHECKOUT = Path(__file__).resolve().parents[1]
+from reliability.systemd import root
+
+CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def test_the_trial_collects_what_the_installation_inside_will_ask_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There is no network inside."""
-    spec = importlib.util.spec_from_file_location("root", CHECKOUT / "tools/systemd_trial/root.py")
-    assert spec
-    assert spec.loader
-    root = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(root)
     collected: list[str] = []
     run = subprocess.run
 

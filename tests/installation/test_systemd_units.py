@@ -8,8 +8,12 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from rigs.documents import ROOT
+from rigs.processes import call
 
-SYSTEMD = Path(__file__).resolve().parents[1] / "systemd"
+from fishd.config import Config, load
+
+SYSTEMD = ROOT / "systemd"
 UNITS = ("fishd.service", "fishd-failure.service")
 MOST_EXPOSED = 2.0
 """`systemd-analyze security`: 0 is shut, 10 is open."""
@@ -32,10 +36,6 @@ def need(tool: str, package: str) -> None:
         pytest.skip(f"{tool} is not installed: apt install {package}")
 
 
-def call(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A root folder with the units of fishd among those of systemd, and what they start."""
@@ -44,14 +44,8 @@ def root(tmp_path: Path) -> Path:
     shutil.copytree(SYSTEMD, own)
     shutil.copytree(SHIPPED_UNITS, tmp_path / "usr/lib/systemd/system", symlinks=True)
     (tmp_path / "usr/lib/systemd/system/pigpiod.service").write_text(PIGPIOD)
-    programs = (
-        "opt/fishd/bin/fishd",
-        "opt/fishd/bin/fishd-release",
-        "usr/bin/pigpiod",
-        "bin/sh",
-        "bin/systemctl",
-    )
-    for program in programs:
+    fishd = "opt/fishd/bin/fishd"
+    for program in (fishd, f"{fishd}-release", "usr/bin/pigpiod", "bin/sh", "bin/systemctl"):
         (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / program).touch(0o755)
     return tmp_path
@@ -121,10 +115,8 @@ def test_the_devices_of_the_robot_are_allowed_and_no_others(unit: str) -> None:
 
 
 def test_a_wrong_config_is_not_tried_again() -> None:
-    from fishd.daemon import EX_CONFIG
-
     assert setting("fishd.service", "Restart") == ["on-failure"]
-    assert setting("fishd.service", "RestartPreventExitStatus") == [str(EX_CONFIG)]
+    assert setting("fishd.service", "RestartPreventExitStatus") == [str(os.EX_CONFIG)]
 
 
 def test_the_servo_is_released_however_the_daemon_ends() -> None:
@@ -160,16 +152,12 @@ def test_only_fishd_itself_is_asked_to_stop() -> None:
 
 
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:
-    from fishd.config import Config
-
     priority = int(setting("fishd.service", "LimitRTPRIO")[0])
     assert priority >= Config().realtime.priority
     assert int(setting("pigpiod.service.d/fishd.conf", "CPUSchedulingPriority")[0]) > priority
 
 
 def test_the_config_for_the_pi_is_valid_and_at_rest() -> None:
-    from fishd.config import load
-
     config = load(SYSTEMD.parent / "config/pi.yaml")
     assert config.robot == "pi"
     assert config.start.controller is None
@@ -238,7 +226,7 @@ def test_the_pwm_rule_hands_a_channel_to_the_group(tmp_path: Path) -> None:
 
 
 def test_pigpiod_listens_where_fishd_asks() -> None:
-    from fishd.hardware.settings import PigpioSettings
+    from fishd.hardware.servo.pigpio import PigpioSettings
 
     words = setting("pigpiod.service.d/fishd.conf", "ExecStart")[-1].split()
     assert words[words.index("-n") + 1] == PigpioSettings().host

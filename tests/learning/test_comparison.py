@@ -6,12 +6,12 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from processes import FISHCTL
+from rigs.processes import fishctl
 
 from fishd.config import load
-from fishd.errors import FishdError, ParameterError, UnknownController
-from fishd.learning import comparison
-from fishd.learning.comparison import Trace, compare, parse
+from fishd.core.errors import FishdError, ParameterError, UnknownController
+from fishd.learning.compare import comparison
+from fishd.learning.compare.comparison import Trace, compare, parse
 
 CONFIG = load(None, ["simulation.offset_y=0.005"])
 
@@ -48,13 +48,7 @@ def test_it_is_said_that_another_controller_took_over_from_a_policy() -> None:
     assert "it wanted to reverse sooner than 0.2 s after its last reversal" in policy.fallbacks[0]
     assert (policy.faults, swing.fallbacks) == ([], [])
     words = ["--seconds", "20", "--set", "plant.cable_slack=0.2"]
-    done = subprocess.run(
-        [FISHCTL, "learn", "evaluate", "default-fish", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
+    done = run("default-fish", *words)
     assert done.returncode == 0
     assert f"fishctl: default-fish: another took over: {policy.fallbacks[0]}" in done.stderr
 
@@ -75,16 +69,16 @@ def test_what_is_no_controller_is_taken_for_a_policy() -> None:
     assert parse("default-fish") == ("default-fish", "ppo", {"policy": "default-fish"})
     assert parse("C:/a.onnx").parameters == {"policy": "C:/a.onnx"}
     for text, hint in (("sqare:frequency=2", "square"), ("defaultfish", "default-fish")):
-        with pytest.raises(ParameterError, match=f"is no controller, named .* '{hint}'"):
+        with pytest.raises(ParameterError, match=f"is not a controller, named .* '{hint}'"):
             parse(text)
 
 
-def test_nobody_swims_before_everybody_is_known_to_be_able_to() -> None:
-    done: list[None] = []
-    contestants = [parse("swing"), parse("square:frequency=99")]
+def test_nobody_swims_before_everybody_is_known_to_be_able_to(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(comparison, "judge", lambda *_: pytest.fail("somebody swam"))
     with pytest.raises(ParameterError, match="frequency"):
-        compare(CONFIG, contestants, 20.0, 5.0, done=lambda: done.append(None))
-    assert not done
+        swum("swing", "square:frequency=99")
 
 
 @pytest.mark.parametrize(
@@ -107,7 +101,7 @@ def test_a_trace_is_the_end_of_the_run() -> None:
 
 
 def test_the_picture_begins_with_an_upward_reversal() -> None:
-    figures = pytest.importorskip("fishd.learning.figures")
+    figures = pytest.importorskip("fishd.learning.compare.figures")
     times = [0.05 * k - 5.0 for k in range(101)]
     command = [0.4 if k % 20 >= 10 else -0.4 for k in range(101)]
     shown = figures._from_upward_reversal(Trace(times, command, times, times))
@@ -122,7 +116,7 @@ def letters_of(picture: Path) -> str:
 
 def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path: Path) -> None:
     matplotlib = pytest.importorskip("matplotlib")
-    from fishd.learning.figures import picture
+    from fishd.learning.compare.figures import picture
 
     contestants = [parse("swing"), parse("sine:frequency=1.8")]
     with matplotlib.rc_context({"svg.fonttype": "none"}):
@@ -141,7 +135,7 @@ def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
     pytest.importorskip("matplotlib")
     from matplotlib.figure import Figure
 
-    from fishd.learning.figures import _draw_angles
+    from fishd.learning.compare.figures import _draw_angles
 
     axis = Figure().subplots()
     _draw_angles(axis, Trace([0.0, 0.05, 0.1], [0.4, 0.4, -0.4], [0.0] * 3, [0.0] * 3), 0.42)
@@ -152,7 +146,7 @@ def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
 
 def test_learning_curves_name_their_goal_and_where_the_axis_begins(tmp_path: Path) -> None:
     matplotlib = pytest.importorskip("matplotlib")
-    from fishd.learning.figures import learning_curves
+    from bench.learning_curves import learning_curves
 
     curve = [([200, 400], [0.5, 0.98]), ([200, 400], [0.6, 0.99])]
     trainings = {f"training-{k}": curve for k in range(7)}
@@ -165,8 +159,7 @@ def test_learning_curves_name_their_goal_and_where_the_axis_begins(tmp_path: Pat
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [FISHCTL, "learn", "evaluate", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return fishctl("learn", "evaluate", *arguments)
 
 
 def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
@@ -187,9 +180,19 @@ def test_the_command_prints_json_with_every_run() -> None:
     assert {"efficiency", "thrust", "frequency", "fullness", "squareness"} <= set(first)
 
 
+def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
+    other = ("--set", "amplitude_limit=0.31", "--seconds", "15", "--settle", "5")
+    done = run("swing", "default-fish", *other, "--json")
+    assert [standing["contestant"] for standing in json.loads(done.stdout)] == ["swing"]
+    assert done.stderr.startswith("fishctl: default-fish: refused: ppo: policy: ")
+    assert "0.42 rad" in done.stderr
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
+
+
 def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from fishd.learning.figures import picture
+    from fishd.learning.compare.figures import picture
 
     standings, traces = compare(CONFIG, [parse("hold")], 6.0, 1.0)
     with pytest.raises(FishdError, match=r"no/such\.png: the picture cannot be written"):

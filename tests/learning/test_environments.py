@@ -2,23 +2,20 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
-
-gymnasium = pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-
 from gymnasium.utils.env_checker import check_env
-from processes import Daemon, running
+from rigs.processes import Daemon, running
+from rigs.swimming import BRIEF, Resting, brief_job
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
-from swimming import BRIEF, Resting, brief_job
 
 import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.client import Fish
 from fishd.config import load
-from fishd.errors import ConfigError, NoDaemon
-from fishd.learning.environment import SwimEnv
-from fishd.learning.in_process import InProcess
+from fishd.core.errors import ConfigError, NoDaemon
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)
@@ -134,7 +131,7 @@ def test_the_pause_asked_for_follows_the_longest_so_far(monkeypatch: pytest.Monk
     asked: list[float] = []
     now = 1000.0
 
-    class Asked(InProcess):
+    class Asked(SimulatedLink):
         def pause(self, seconds: float) -> None:
             asked.append(seconds)
 

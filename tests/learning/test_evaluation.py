@@ -9,13 +9,24 @@ import pytest
 from msgspec.structs import replace
 
 from fishd.config import load
-from fishd.errors import ParameterError
-from fishd.learning.evaluation import best_on_grid, judge
-from fishd.learning.settings import EvaluationSettings, Randomisation, TrainingSettings
-from fishd.learning.variation import at_edge, drawn
-from fishd.plant.optimum import best_square_wave, square_wave
-from fishd.signals import Observation
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Observation
+from fishd.learning.compare.comparison import best_on_grid
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.evaluation import in_simulation, judge, on_link, worst_of_others
+from fishd.learning.env.link import StepResult
+from fishd.learning.env.randomisation import at_edge, drawn
+from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.settings import (
+    EnvironmentSettings,
+    EvaluationSettings,
+    Randomisation,
+    TrainingSettings,
+)
+from fishd.learning.train.jobs import Job
+from fishd.learning.train.training import train
 from fishd.simulation import simulate
+from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
 CONFIG = load(None, ["simulation.offset_y=0.005"])
 
@@ -83,9 +94,6 @@ def test_no_square_wave_of_whole_ticks_beats_the_best_on_the_grid(amplitude: flo
 
 
 def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
-    pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
-    from fishd.learning.trials import worst_of_others
-
     weak = Randomisation(coupling=0.5)
     settings = TrainingSettings(randomisation=weak, evaluation=EvaluationSettings(others=6))
     others = [at_edge(CONFIG, weak, seed) for seed in range(6)]
@@ -95,9 +103,6 @@ def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
 
 
 def test_a_policy_that_stays_in_rapid_reversals_once_it_is_there_is_worth_nothing() -> None:
-    pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
-    from fishd.learning.trials import worst_of_others
-
     def stuck(observation: Observation) -> float:
         """Goes on with what it finds when it is first asked."""
         found.append(observation.previous_angle * observation.instruction_angle < 0.0)
@@ -123,11 +128,6 @@ def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
 
 
 def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Path) -> None:
-    pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-    pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
-    from fishd.learning.jobs import Job
-    from fishd.learning.training import train
-
     settings = TrainingSettings(
         steps=640,
         randomisation=Randomisation(omega0=0.2, coupling=0.2),
@@ -156,9 +156,6 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
 def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
     decide: Callable[[Observation], float], stalls: bool
 ) -> None:
-    pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
-    from fishd.learning.trials import in_simulation
-
     assert in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
 
 
@@ -166,15 +163,9 @@ def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
 def test_on_a_robot_the_force_at_rest_is_taken_for_zero(
     tmp_path: Path, rest: float, drifted: float
 ) -> None:
-    pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-    from fishd.learning.environment import SwimEnv
-    from fishd.learning.in_process import InProcess
-    from fishd.learning.settings import EnvironmentSettings
-    from fishd.learning.trials import on_link
-
     def thrust(offset: float) -> float:
         config = load(None, [f"simulation.offset_x={offset}"])
-        env = SwimEnv(InProcess(config), config, EnvironmentSettings())
+        env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings())
         env.reset(seed=1)
         trial = on_link(env, square_of_six_ticks, EvaluationSettings(rest=rest), lambda: False)
         assert trial
@@ -184,20 +175,13 @@ def test_on_a_robot_the_force_at_rest_is_taken_for_zero(
 
 
 def test_a_steady_drift_during_an_evaluation_is_taken_off(tmp_path: Path) -> None:
-    pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-    from fishd.learning.environment import SwimEnv
-    from fishd.learning.in_process import InProcess
-    from fishd.learning.link import Sensed
-    from fishd.learning.settings import EnvironmentSettings
-    from fishd.learning.trials import on_link
-
-    class Drifting(InProcess):
+    class Drifting(SimulatedLink):
         slope = 0.0  # N/s
 
-        def step(self, angle: float) -> Sensed:
+        def step(self, angle: float) -> StepResult:
             sensed = super().step(angle)
             seen = sensed.observation
-            return Sensed(replace(seen, fx=seen.fx + self.slope * seen.time))
+            return StepResult(replace(seen, fx=seen.fx + self.slope * seen.time))
 
     def thrust(slope: float, rest: float) -> float:
         link = Drifting(CONFIG)

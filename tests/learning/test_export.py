@@ -1,37 +1,31 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
-
-gymnasium = pytest.importorskip("gymnasium", reason="the extra 'learn' is not installed")
-torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
-pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
-pytest.importorskip("onnx", reason="the extra 'policy' is not installed")
-
+import torch
 from click.testing import CliRunner
-from harness import Rig, observe
 from msgspec.structs import replace
+from rigs.harness import Rig, observe
+from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from swimming import NOISY, brief_job
 
 from fishd.cli.main import fishctl
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.chatter import ChatterSettings
-from fishd.errors import ParameterError, PolicyError
-from fishd.learning import checkpoints
-from fishd.learning.checkpoints import CheckpointError
+from fishd.controllers.policy.card import Layout
+from fishd.controllers.policy.file import read
+from fishd.core.errors import ParameterError, PolicyError
 from fishd.learning.export import export, export_model
-from fishd.learning.jobs import Outcome
-from fishd.learning.ppo import Deterministic
+from fishd.learning.ppo.model import DeterministicPolicy
+from fishd.learning.run_folder import checkpoints
+from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
-from fishd.learning.training import train
-from fishd.policies.card import Layout
-from fishd.policies.file import read
+from fishd.learning.train.jobs import Outcome
+from fishd.learning.train.training import train
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +52,7 @@ def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
         "ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, chatter=ChatterSettings(dwell=0.0))
     )
     policy = checkpoints.load_policy(trained.best)
-    decide = Deterministic(policy, found.card.observation, 0.42)
+    decide = DeterministicPolicy(policy, found.card.observation, 0.42)
     draw = np.random.default_rng(1)
     for _ in range(200):
         fy, rate, velocity, angle = draw.normal(0.0, (0.4, 5.0, 0.03, 0.42)).tolist()
@@ -74,7 +68,7 @@ def test_it_swims_on_the_loop_of_the_robot(tmp_path: Path, trained: Outcome) -> 
     rig.run_for(5.0)
     thrust = float(np.mean([tick.fx for tick in rig.run_for(10.0)]))
     assert rig.mode == "running"
-    assert thrust == pytest.approx(found.trial.thrust, rel=0.05)
+    assert thrust == pytest.approx(found.evaluation.thrust, rel=0.05)
 
 
 def test_the_card_says_how_it_swims_and_carries_the_note(tmp_path: Path, trained: Outcome) -> None:
@@ -94,7 +88,7 @@ def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
     with pytest.raises(PolicyError, match=r"this policy stalls .* all the same with --force"):
         export(stalled.checkpoint, target)
     assert list(tmp_path.iterdir()) == []
-    assert export(stalled.checkpoint, target, force=True).trial.stalled
+    assert export(stalled.checkpoint, target, force=True).evaluation.stalled
     assert target.exists()
 
 
@@ -108,7 +102,7 @@ def test_a_file_that_would_say_something_else_is_never_put_in_place(
         exporting, "to_onnx", lambda layers, activation, card: whole(layers, "relu", card)
     )
     assert trained.best
-    with pytest.raises(PolicyError, match="would say something else than the policy"):
+    with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):
         export(trained.best, tmp_path / "policy.onnx")
     assert list(tmp_path.iterdir()) == []
 
@@ -152,7 +146,7 @@ def test_the_verb_takes_the_best_of_a_run_or_a_checkpoint(
     assert f"from {trained.best}" in output
     assert "it swims with" in output
     assert "fishctl set-controller ppo --policy run.onnx" in output
-    assert f"from {trained.checkpoint}" in written(str(trained.folder), "--newest")
+    assert f"from {trained.checkpoint}" in written(str(trained.folder), "--newest", "--force")
     assert f"from {trained.checkpoint}" in written(str(trained.checkpoint), "--to", "a/b.onnx")
     assert (tmp_path / "a" / "b.onnx").exists()
 
@@ -186,10 +180,10 @@ def test_a_model_that_sees_more_than_a_policy_file_can_say_is_refused(tmp_path: 
     for model in (normalised, elsewhere):
         with pytest.raises(PolicyError, match="is not a SwimEnv alone"):
             export_model(model, tmp_path / "a.onnx")
-    with pytest.raises(PolicyError, match="is no MlpPolicy of PPO or A2C"):
+    with pytest.raises(PolicyError, match="is not an MlpPolicy of PPO or A2C"):
         export_model(SAC("MlpPolicy", own_env(), device="cpu"), tmp_path / "a.onnx")
     elu = PPO("MlpPolicy", own_env(), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu")
-    with pytest.raises(PolicyError, match="ELU is no activation of a policy file"):
+    with pytest.raises(PolicyError, match="activation ELU cannot be exported"):
         export_model(elu, tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
 
@@ -198,9 +192,9 @@ def test_a_model_that_sees_more_than_a_policy_file_can_say_is_refused(tmp_path: 
     ("name", "message"),
     [
         ("nowhere", "no such folder; the run folder of a training is needed"),
-        ("model.zip", "is no folder; the run folder of a training is needed"),
+        ("model.zip", "not a folder; the run folder of a training is needed"),
         ("several", "holds several trainings, seed-0 to seed-10; name one of them"),
-        ("empty", "no checkpoint is in there"),
+        ("empty", "there is no checkpoint in it"),
     ],
 )
 def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -> None:
@@ -210,3 +204,19 @@ def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -
         (tmp_path / "several" / f"seed-{seed}").mkdir(parents=True)
     with pytest.raises(CheckpointError, match=f"{name}:? {message}"):
         checkpoints.find(tmp_path / name)
+
+
+def test_the_command_overwrites_a_file_only_when_it_is_forced_to(
+    tmp_path: Path, trained: Outcome
+) -> None:
+    target = tmp_path / "mine.onnx"
+    target.write_text("precious")
+    words = ["learn", "export", str(trained.best), "--to", str(target)]
+    refused = CliRunner().invoke(fishctl, words)
+    assert isinstance(refused.exception, PolicyError)
+    assert str(refused.exception) == (
+        f"{target}: exists already; --force overwrites it, --to names another"
+    )
+    assert target.read_text() == "precious"
+    assert CliRunner().invoke(fishctl, [*words, "--force"]).exit_code == 0
+    assert read(target).card.amplitude == 0.42

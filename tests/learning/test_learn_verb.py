@@ -1,30 +1,26 @@
+import contextlib
 import os
 import pty
 import re
 import signal
 import subprocess
-import sys
-import threading
-import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
+from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running
+from rigs.swimming import brief_job, rows, wait_for, while_it_trains
 
-pytest.importorskip("torch", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
-
-from click.testing import CliRunner, Result
-from processes import FISHCTL, PATIENCE, Daemon, running
-from swimming import brief_job, rows
-
-from fishd.cli.learn_ppo import report
-from fishd.cli.main import fishctl
+from fishd.cli.learn.ppo import report
+from fishd.cli.main import fishctl as commands
 from fishd.client import Fish
-from fishd.console import run
-from fishd.learning import checkpoints, runs
-from fishd.learning.checkpoints import Evaluation
-from fishd.learning.jobs import Outcome
+from fishd.config import load
+from fishd.learning.env import fishd_link
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.run_folder import checkpoints, runs
+from fishd.learning.train.jobs import Outcome
 
 SETTINGS = """\
 steps: 128
@@ -40,32 +36,23 @@ def settings(tmp_path: Path) -> str:
     return str(path)
 
 
-def learn(*arguments: str) -> Result:
-    return CliRunner().invoke(fishctl, ["learn", *arguments], standalone_mode=False)
+def learn(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return fishctl("learn", *arguments)
 
 
-def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+def complaint(*arguments: str) -> tuple[int, str]:
     """Exit status and the one line on standard error."""
-    sys.argv[1:] = ["learn", *arguments]
-    with pytest.raises(SystemExit) as caught:
-        sys.exit(run(fishctl, "fishctl"))
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1, error
-    return int(caught.value.code or 0), error
-
-
-@pytest.fixture(autouse=True)
-def _arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["fishctl"])
+    done = learn(*arguments)
+    return done.returncode, one_line(done)
 
 
 def test_it_trains_and_says_how_it_went(tmp_path: Path, settings: str) -> None:
     folder = tmp_path / "run"
     found = learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "768")
-    assert found.exit_code == 0, found.output
-    assert "768 steps in 0:3" in found.output
-    assert f"fishctl learn export {folder}" in found.output
-    assert found.output.count(" in the tank: ") >= 2  # a line for each evaluation
+    assert found.returncode == 0, found.stderr
+    assert "768 steps in 0:3" in found.stdout
+    assert f"fishctl learn export {folder}" in found.stdout
+    assert found.stdout.count(" in the tank: ") >= 2  # a line for each evaluation
     assert runs.read(folder)[1].steps == 768
 
 
@@ -73,8 +60,8 @@ def test_it_goes_on_with_more_steps(tmp_path: Path, settings: str) -> None:
     folder = tmp_path / "run"
     learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "64")
     found = learn("ppo", "--resume", str(folder), "--steps", "128")
-    assert found.exit_code == 0, found.output
-    assert f"on from {folder}/step-000064" in found.output
+    assert found.returncode == 0, found.stderr
+    assert f"resumed from {folder}/step-000064" in found.stdout
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["64", "128"]
 
 
@@ -84,7 +71,7 @@ def test_a_new_run_can_begin_with_the_networks_and_settings_of_another(
     first, second = tmp_path / "first", tmp_path / "second"
     learn("ppo", "--settings", settings, "--folder", str(first), "--steps", "64")
     found = learn("ppo", "--from", str(first), "--folder", str(second), "--steps", "128")
-    assert found.exit_code == 0, found.output
+    assert found.returncode == 0, found.stderr
     assert runs.read(second)[1].ppo == runs.read(first)[1].ppo
     note = checkpoints.read_card(checkpoints.newest(second)).provenance.note
     assert note.startswith("began with first/")
@@ -94,44 +81,42 @@ def test_the_folder_is_named_after_the_moment_by_default(
     tmp_path: Path, settings: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert learn("ppo", "--settings", settings, "--steps", "64").exit_code == 0
+    assert learn("ppo", "--settings", settings, "--steps", "64").returncode == 0
     (folder,) = (tmp_path / "runs").iterdir()
     assert folder.name.startswith("ppo-20")
 
 
-def test_mistakes_are_one_line(
-    tmp_path: Path, settings: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(tmp_path: Path, settings: str) -> None:
     folder = str(tmp_path / "run")
     (tmp_path / "wrong.yaml").write_text("ppo:\n  gama: 0.9\n", encoding="utf-8")
-    status, line = complaint(capsys, "ppo", "--settings", str(tmp_path / "wrong.yaml"))
+    status, line = complaint("ppo", "--settings", str(tmp_path / "wrong.yaml"))
     assert status == 78
     assert "wrong.yaml:2: ppo.gama: unknown key; did you mean 'gamma'?" in line
-    assert learn("ppo", "--settings", settings, "--folder", folder).exit_code == 0
-    assert complaint(capsys, "ppo", "--folder", folder)[0] == 78
-    status, line = complaint(capsys, "ppo", "--resume", folder)
+    assert learn("ppo", "--settings", settings, "--folder", folder).returncode == 0
+    assert complaint("ppo", "--folder", folder)[0] == 78
+    status, line = complaint("ppo", "--resume", folder)
     assert status == 78
-    assert "is finished, with 128 steps; to train it for longer, give more in all" in line
-    status, line = complaint(capsys, "ppo", "--resume", folder, "--seed", "2")
+    assert "is finished, with 128 steps; to train it for longer, give a larger total" in line
+    status, line = complaint("ppo", "--resume", folder, "--seed", "2")
     assert status == 2
     assert "--seed cannot be given here" in line
-    status, line = complaint(capsys, "ppo", "--resume", str(tmp_path))
+    status, line = complaint("ppo", "--resume", str(tmp_path))
     assert status == 78
     assert "it holds no settings.yaml" not in line  # there is one, but nothing else of a run
-    for name, what in (("a.onnx", "of a policy file the value network is gone"), ("b", "no such")):
+    for name, what in (("a.onnx", "a policy file has no value network"), ("b", "no such")):
         (tmp_path / "a.onnx").touch()
-        status, line = complaint(capsys, "ppo", "--from", str(tmp_path / name))
+        status, line = complaint("ppo", "--from", str(tmp_path / name))
         assert status == 78
         assert what in line
-    status, line = complaint(capsys, "ppo", "--seeds", "2", "--on", "robot")
+    status, line = complaint("ppo", "--seeds", "2", "--on", "robot")
     assert status == 2
     assert "there is only one robot" in line
 
 
 def test_it_says_that_it_learns_from_whole_rollouts(tmp_path: Path, settings: str) -> None:
     found = learn("ppo", "--settings", settings, "--folder", str(tmp_path / "a"), "--steps", "65")
-    assert "128 steps, in whole rollouts of 64 on simulation" in found.output
-    assert "\n128 steps in " in found.output
+    assert "128 steps, in whole rollouts of 64 on simulation" in found.stdout
+    assert "\n128 steps in " in found.stdout
 
 
 def test_a_policy_that_never_swam_is_not_for_a_file(tmp_path: Path) -> None:
@@ -142,29 +127,18 @@ def test_a_policy_that_never_swam_is_not_for_a_file(tmp_path: Path) -> None:
     found = learn(
         "ppo", "--settings", str(idle), "--folder", str(tmp_path / "run"), "--steps", "64"
     )
-    assert found.exit_code == 0, found.output
-    assert "it stalled in every evaluation; train it for longer" in found.output
-    assert "learn export" not in found.output
+    assert found.returncode == 0, found.stderr
+    assert "it stalled in every evaluation; train it for longer" in found.stdout
+    assert "learn export" not in found.stdout
 
 
-def start(folder: Path, *arguments: str) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [FISHCTL, "learn", "ppo", "--folder", str(folder), "--steps", "1000000", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+ENDLESS = ("--steps", "1000000")
 
 
-def wait_for_rows(process: "subprocess.Popen[str]", folder: Path, number: int) -> None:
+def updates(folder: Path) -> int:
+    """How many updates the run has."""
     table = folder / "progress.csv"
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline and process.poll() is None:
-        if table.exists() and len(rows(table)) >= number:
-            return
-        time.sleep(0.05)
-    process.kill()
-    raise AssertionError(f"it did not come to {number} updates: {process.communicate()}")
+    return len(rows(table)) if table.exists() else 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -172,79 +146,85 @@ def test_a_signal_leaves_a_checkpoint_to_go_on_from(
     tmp_path: Path, settings: str, number: int
 ) -> None:
     folder = tmp_path / "run"
-    process = start(folder, "--settings", settings)
-    wait_for_rows(process, folder, 2)
-    process.send_signal(number)
-    _, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130, err
+    found = while_it_trains(
+        lambda: updates(folder) >= 2,
+        lambda: os.kill(os.getpid(), number),
+        *("learn", "ppo", "--folder", str(folder), *ENDLESS, "--settings", settings),
+    )
+    assert found.returncode == 130, found.stderr
     done = checkpoints.read_state(checkpoints.newest(folder)).steps
     dropped = r"(, \d+ of an unfinished rollout dropped)?"
     go_on = re.escape(f"to go on: fishctl learn ppo --resume {folder}\n")
-    assert re.fullmatch(f"fishctl: stopped after {done} steps{dropped}; {go_on}", err)
+    assert re.fullmatch(f"fishctl: stopped after {done} steps{dropped}; {go_on}", found.stderr)
     assert int(rows(folder / "progress.csv")[-1]["steps"]) == done
     found = learn("ppo", "--resume", str(folder), "--steps", str(done + 64))
-    assert found.exit_code == 0, found.output
+    assert found.returncode == 0, found.stderr
 
 
 def test_whatever_kills_it_the_checkpoints_are_whole(tmp_path: Path, settings: str) -> None:
     text = SETTINGS.replace("steps: 128", "steps: 128\ncheckpoint_every: 64")
     Path(settings).write_text(text, encoding="utf-8")
     folder = tmp_path / "run"
-    process = start(folder, "--settings", settings)
-    wait_for_rows(process, folder, 3)
-    process.kill()
-    process.communicate(timeout=PATIENCE)
+    training = Process(
+        *(FISHCTL, "learn", "ppo", "--folder", str(folder), *ENDLESS, "--settings", settings)
+    )
+    try:
+        wait_for(lambda: updates(folder) >= 3)
+    finally:
+        training.end(signal.SIGKILL)
     for checkpoint in folder.glob("step-*"):
         checkpoints.load_policy(checkpoint)
         checkpoints.read_state(checkpoint)
     done = checkpoints.read_state(checkpoints.newest(folder)).steps
     assert done >= 128
-    assert learn("ppo", "--resume", str(folder), "--steps", str(done + 64)).exit_code == 0
+    assert learn("ppo", "--resume", str(folder), "--steps", str(done + 64)).returncode == 0
     steps = [int(row["steps"]) for row in rows(folder / "progress.csv")]
     assert steps == list(range(64, done + 65, 64))
 
 
-def test_on_a_terminal_it_shows_a_bar(tmp_path: Path, settings: str) -> None:
+def test_on_a_terminal_it_shows_a_bar(
+    tmp_path: Path, settings: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
     ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        [FISHCTL, "learn", "ppo", "--settings", settings, "--folder", str(tmp_path / "run")],
-        stdout=theirs,
-        env={**os.environ, "TERM": "xterm", "COLUMNS": "120"},
-    )
-    os.close(theirs)
-    shown = b""
-    while True:
-        try:
-            piece = os.read(ours, 4096)
-        except OSError:  # the other end is closed
-            break
-        if not piece:
-            break
-        shown += piece
-    os.close(ours)
-    assert process.wait(PATIENCE) == 0
-    text = shown.decode()
-    assert "128/128" in text
-    assert "tank 0:0" in text
-    assert "left" in text
+
+    def shown() -> str:
+        pieces = []
+        with contextlib.suppress(OSError):  # the other end is closed
+            while piece := os.read(ours, 4096):
+                pieces.append(piece)
+        os.close(ours)
+        return b"".join(pieces).decode()
+
+    command = ["learn", "ppo", "--settings", settings, "--folder", str(tmp_path / "run")]
+    with ThreadPoolExecutor(1) as reader:
+        text = reader.submit(shown)
+        with os.fdopen(theirs, "w") as terminal, contextlib.redirect_stdout(terminal):
+            assert commands.main(command, standalone_mode=False) == 0
+    assert "128/128" in text.result()
+    assert "tank 0:0" in text.result()
+    assert "left" in text.result()
 
 
 @pytest.fixture
 def daemon(tmp_path: Path):  # type: ignore[no-untyped-def]
     folder = tmp_path / "daemon"
     folder.mkdir()
-    with running(folder, "--set", "simulation.noise=0.001", "--set", "tick=0.01") as found:
+    with running(folder, "--set", "simulation.noise=0.001", "--set", "tick=0.05") as found:
         yield found
 
 
 @pytest.fixture
 def hasty(settings: str) -> str:
-    """Settings with evaluations that take little time in the tank."""
+    """Settings with rollouts and evaluations that take little time in the tank."""
     text = SETTINGS.replace("seconds: 4.0, settle: 2.0", "seconds: 1.0, settle: 0.2, rest: 0.3")
+    text = text.replace("n_steps: 64", "n_steps: 16, batch_size: 16").replace("128", "32")
     Path(settings).write_text(text, encoding="utf-8")
     return settings
 
 
+@pytest.mark.realtime
 def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
@@ -253,74 +233,63 @@ def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
         *("ppo", "--on", "robot", "--endpoint", daemon.endpoint),
         *("--settings", hasty, "--folder", str(folder)),
     )
-    assert found.exit_code == 0, found.output
+    assert found.returncode == 0, found.stderr
     config, _ = runs.read(folder)
-    assert (config.tick, config.simulation.noise) == (0.01, 0.001)  # all of it is that of fishd
+    assert (config.tick, config.simulation.noise) == (0.05, 0.001)  # all of it is that of fishd
     assert found.stderr == ""
-    assert [row["steps"] for row in rows(folder / "progress.csv")] == ["64", "128"]
+    assert [row["steps"] for row in rows(folder / "progress.csv")] == ["16", "32"]
     evaluations = rows(folder / "evaluations.csv")
-    assert float(evaluations[0]["tank_time"]) >= 0.64 + 1.0  # those are swum in the tank, too
+    assert float(evaluations[0]["tank_time"]) >= 0.8 + 1.0  # those are swum in the tank, too
     card = checkpoints.read_card(checkpoints.newest(folder))
-    assert (card.provenance.on, card.tick) == ("robot", 0.01)
+    assert (card.provenance.on, card.tick) == ("robot", 0.05)
     with Fish(daemon.endpoint) as fish:
         assert fish.status().mode == "idle"
 
 
-def test_an_estop_ends_it_with_the_reason_and_a_checkpoint(
+def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
     folder = tmp_path / "run"
 
     def press() -> None:
-        while not (folder / "progress.csv").exists() or not rows(folder / "progress.csv"):
-            time.sleep(0.05)
         with Fish(daemon.endpoint) as fish:
             fish.estop("the tail hit the glass")
 
-    thread = threading.Thread(target=press, daemon=True)
-    thread.start()
-    found = learn(
-        *("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--steps", "100000"),
-        *("--settings", hasty, "--folder", str(folder)),
+    on = ("ppo", "--on", "robot", "--endpoint", daemon.endpoint)
+    found = while_it_trains(
+        lambda: updates(folder),
+        press,
+        *("learn", *on, *ENDLESS, "--settings", hasty, "--folder", str(folder)),
     )
-    thread.join()
-    assert found.return_value == 1
-    assert found.stderr == (
-        "fishctl: fishd is in mode estop: the tail hit the glass; "
-        f"to go on: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
-    )
-    assert checkpoints.read_state(checkpoints.newest(folder)).steps >= 64
-
-
-def test_nothing_begins_while_an_emergency_stop_is_latched(tmp_path: Path, daemon: Daemon) -> None:
-    with Fish(daemon.endpoint) as fish:
-        fish.estop("the tail hit the glass")
-    folder = tmp_path / "run"
-    found = learn("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--folder", str(folder))
-    assert "fishd is in mode estop: the tail hit the glass; " in str(found.exception)
-    assert not folder.exists()
+    why = "fishctl: fishd is in mode estop: the tail hit the glass; "
+    go_on = f"to go on: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
+    assert (found.returncode, found.stderr) == (1, why + go_on)
+    assert checkpoints.read_state(checkpoints.newest(folder)).steps >= 16
+    found = learn(*on, "--folder", str(tmp_path / "other"))
+    assert why in found.stderr
+    assert not (tmp_path / "other").exists()
 
 
 def test_another_plant_than_that_of_the_fishd_is_told(
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
     found = learn(
-        *("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--steps", "64"),
+        *("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--steps", "16"),
         *("--settings", hasty, "--folder", str(tmp_path / "run"), "--set", "plant.omega0=11"),
     )
-    assert found.exit_code == 0, found.output
+    assert found.returncode == 0, found.stderr
     assert "another plant than that of the fishd that runs: plant.omega0 is 11.0 here" in (
         found.stderr
     )
 
 
 def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
-    tmp_path: Path, daemon: Daemon, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, daemon: Daemon
 ) -> None:
     file = tmp_path / "fish.yaml"
-    file.write_text("amplitude_limit: 0.3\ntick: 0.01\n", encoding="utf-8")
+    file.write_text("amplitude_limit: 0.3\ntick: 0.05\n", encoding="utf-8")
     status, line = complaint(
-        capsys, "ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--config", str(file)
+        "ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--config", str(file)
     )
     assert status == 78
     assert "amplitude_limit: 0.3 rad in this configuration, 0.42 rad in the fishd" in line
@@ -330,7 +299,9 @@ def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
 def test_more_thrust_than_is_possible_is_said_to_be_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], efficiency: float, careful: bool
 ) -> None:
-    best = Evaluation(128, 32.4, 0.028, efficiency, 1.67, 1.0, stalled=False)
+    best = Evaluation(
+        thrust=0.028, efficiency=efficiency, frequency=1.67, fullness=1.0, stalled=False
+    )
     outcome = Outcome(
         folder=tmp_path / "tank",
         steps=128,
@@ -347,3 +318,22 @@ def test_more_thrust_than_is_possible_is_said_to_be_so(
     said = capsys.readouterr().out
     assert ("careful: that is more than the best square wave" in said) is careful
     assert "learn export" in said
+
+
+@pytest.mark.parametrize("changes", [(), ("--set", "plant.omega0=11")])
+def test_a_training_on_a_robot_asks_fishd_for_its_configuration_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: tuple[str, ...]
+) -> None:
+    asked: list[str | None] = []
+
+    def config_of(endpoint: str | None) -> dict[str, Any]:
+        asked.append(endpoint)
+        config: dict[str, Any] = msgspec.to_builtins(load())
+        return config
+
+    monkeypatch.setattr(fishd_link, "config_of", config_of)
+    endpoint = f"ipc://{tmp_path}/nobody"
+    found = learn("ppo", "--on", "robot", "--endpoint", endpoint, *changes)
+    assert "nobody listens there" in found.stderr
+    assert asked == [endpoint]
+    assert ("plant.omega0 is 11.0 here, 12.5 there" in found.stderr) is bool(changes)

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from fishd.errors import ConfigError
+from fishd.core.errors import ConfigError
 from fishd.learning.settings import TrainingSettings, load, to_yaml
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -37,34 +37,38 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert load(tmp_path / "settings.yaml") == paper
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "steps: 100\nppo:\n  gamma: 2.0\n",
+            "learning.yaml:3: ppo.gamma: 2.0 is not valid: a number in [0, 1] is needed",
+        ),
+        ("ppo:\n  nsteps: 64\n", "did you mean 'n_steps'"),
+        ("randomization:\n  xi: 0.1\n", "learning.yaml:1: randomization"),
+        ("environment:\n  observation: [alpha]\n", "learning.yaml:2: environment.observation"),
+        ("environment:\n  observation: [fy, alpha]\n", "instruction_angle"),
+        (
+            "environment:\n  observation: [fy, fy]\n",
+            "learning.yaml:2: environment.observation: ['fy', 'fy'] is not valid: each may be in "
+            "it once",
+        ),
+        (
+            "ppo:\n  n_steps: 100\n  batch_size: 64\n",
+            "learning.yaml:3: ppo.batch_size: 64 is not valid: n_steps, 100, must be a multiple of "
+            "it",
+        ),
+        ("ppo:\n  hidden: []\n", "learning.yaml:2: ppo.hidden: [] is not valid: "),
+        (
+            "evaluation:\n  seconds: 4.0\n",
+            "evaluation.settle: 5 s is not valid: less than seconds, 4 s, is needed",
+        ),
+    ],
+)
 def test_a_wrong_value_is_one_line_that_names_file_line_key_and_what_is_needed(
-    tmp_path: Path,
+    tmp_path: Path, text: str, message: str
 ) -> None:
-    assert complaint(tmp_path, "steps: 100\nppo:\n  gamma: 2.0\n") == (
-        "learning.yaml:3: ppo.gamma: 2.0 is not valid: a number in [0, 1] is needed"
-    )
-
-
-def test_an_unknown_key_names_the_nearest(tmp_path: Path) -> None:
-    assert "did you mean 'n_steps'" in complaint(tmp_path, "ppo:\n  nsteps: 64\n")
-    assert complaint(tmp_path, "randomization:\n  xi: 0.1\n").startswith("learning.yaml:1:")
-
-
-def test_an_observation_that_does_not_exist_is_named(tmp_path: Path) -> None:
-    found = complaint(tmp_path, "environment:\n  observation: [fy, alpha]\n")
-    assert "environment.observation" in found
-    assert "instruction_angle" in found
-
-
-def test_a_batch_that_does_not_divide_the_rollout_is_refused(tmp_path: Path) -> None:
-    assert complaint(tmp_path, "ppo:\n  n_steps: 100\n  batch_size: 64\n") == (
-        "learning.yaml:3: ppo.batch_size: 64 is not valid: n_steps, 100, must be a multiple of it"
-    )
-
-
-def test_an_evaluation_must_be_longer_than_it_may_settle(tmp_path: Path) -> None:
-    found = complaint(tmp_path, "evaluation:\n  seconds: 4.0\n")
-    assert "evaluation.settle: 5 s is not valid: less than seconds, 4 s, is needed" in found
+    assert message in complaint(tmp_path, text)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -72,13 +76,10 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         load(tmp_path / "none.yaml")
 
 
-def test_a_network_needs_a_hidden_layer(tmp_path: Path) -> None:
-    found = complaint(tmp_path, "ppo:\n  hidden: []\n")
-    assert found.startswith("learning.yaml:2: ppo.hidden: [] is not valid: ")
-
-
-def test_nothing_is_seen_twice(tmp_path: Path) -> None:
-    assert complaint(tmp_path, "environment:\n  observation: [fy, fy]\n") == (
-        "learning.yaml:2: environment.observation: ['fy', 'fy'] is not valid: each may be in it "
-        "once"
-    )
+def test_thrust_which_has_no_sign_to_change_must_not_be_seen(tmp_path: Path) -> None:
+    file = tmp_path / "learning.yaml"
+    file.write_text("environment:\n  observation: [fx, fy]\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"ppo\.symmetric: true is not valid where"):
+        load(file)
+    file.write_text(file.read_text() + "ppo:\n  symmetric: false\n", encoding="utf-8")
+    assert not load(file).ppo.symmetric

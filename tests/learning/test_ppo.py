@@ -1,23 +1,24 @@
+"""The rollout without void steps, the learning rate, and networks with left-right symmetry."""
+
 from typing import Literal
 
 import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
+from rigs.harness import observe
+from stable_baselines3.common.policies import ActorCriticPolicy
 
-torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-
-from harness import observe
-
-from fishd.learning.environment import spaces
-from fishd.learning.ppo import (
-    Deterministic,
+from fishd.controllers.policy.card import Feature, Layout
+from fishd.learning.env.environment import spaces
+from fishd.learning.ppo.model import (
+    DeterministicPolicy,
     Rollout,
     layers_of,
     learning_rate,
     make_policy,
 )
 from fishd.learning.settings import PpoSettings
-from fishd.policies.card import Feature, Layout
 
 FEATURES = (Feature("fy", 0.4), Feature("instruction_angle", 0.42))
 
@@ -73,7 +74,7 @@ def test_the_policy_in_numpy_is_that_of_stable_baselines(
     policy = make_policy(ppo, 2)
     with torch.no_grad():
         policy.action_net.weight *= 100.0  # so that some actions are clipped
-    decide = Deterministic(policy, FEATURES, 0.42)
+    decide = DeterministicPolicy(policy, FEATURES, 0.42)
     layout = Layout(FEATURES)
     found = []
     for angle in np.linspace(-0.42, 0.42, 21):
@@ -89,3 +90,52 @@ def test_the_layers_are_those_from_the_inputs_to_the_mean_of_the_action() -> Non
     assert [weight.shape for weight, _ in layers] == [(16, 2), (8, 16), (1, 8)]
     assert [bias.shape for _, bias in layers] == [(16,), (8,), (1,)]
     assert all(weight.dtype == np.float32 for weight, _ in layers)
+
+
+@pytest.fixture
+def policy() -> ActorCriticPolicy:
+    torch.manual_seed(0)
+    made = make_policy(PpoSettings(hidden=(16, 8), symmetric=True), 4)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            if parameter.requires_grad:  # as if it had learned: biases too
+                parameter.normal_(0.0, 0.7)
+    return made
+
+
+@pytest.fixture
+def seen() -> NDArray[np.float32]:
+    return np.random.default_rng(0).normal(0.0, 1.5, (50, 4)).astype(np.float32)
+
+
+def test_a_mirrored_fish_gets_the_mirrored_action(
+    policy: ActorCriticPolicy, seen: NDArray[np.float32]
+) -> None:
+    there, _ = policy.predict(seen, deterministic=True)
+    mirrored, _ = policy.predict(-seen, deterministic=True)
+    assert np.ptp(there) > 0.5
+    assert mirrored == pytest.approx(-there)
+
+
+def test_a_state_and_its_mirror_image_are_worth_the_same(
+    policy: ActorCriticPolicy, seen: NDArray[np.float32]
+) -> None:
+    with torch.no_grad():
+        there = policy.predict_values(torch.from_numpy(seen)).numpy()
+        mirrored = policy.predict_values(torch.from_numpy(-seen)).numpy()
+    assert np.ptp(there) > 0.5
+    assert mirrored == pytest.approx(there, abs=1e-5)
+
+
+def test_as_plain_layers_it_says_the_same(
+    policy: ActorCriticPolicy, seen: NDArray[np.float32]
+) -> None:
+    *hidden, (last, bias) = layers_of(policy)
+    values = seen
+    for weight, offset in hidden:
+        values = np.tanh(values @ weight.T + offset)
+    with torch.no_grad():
+        wanted = policy.get_distribution(torch.from_numpy(seen)).distribution.mean.numpy()
+    assert values @ last.T + bias == pytest.approx(wanted, abs=1e-4)
+    assert [weight.shape for weight, _ in (*hidden, (last, bias))] == [(32, 4), (16, 32), (1, 16)]
+    assert all(weight.dtype == np.float32 for weight, _ in hidden)

@@ -1,38 +1,152 @@
-"""A run folder through kills, full disks, damage and two trainings at once."""
+"""A run folder through kills, full disks, damage, strange files and two trainings at once."""
 
-import json
 import os
 import shutil
 import subprocess
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import pytest
-
-pytest.importorskip("torch", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
-
 from msgspec.structs import replace
-from swimming import brief_job, rows
+from rigs.swimming import brief_job, rows
 
-from fishd.errors import ConfigError
-from fishd.learning import checkpoints, runs
-from fishd.learning.checkpoints import CheckpointError, Evaluation
-from fishd.learning.progress import Quiet
+from fishd.core.errors import ConfigError, FishdError
+from fishd.learning import settings as training
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.run_folder import checkpoints, runs
+from fishd.learning.run_folder.checkpoints import CheckpointError
+from fishd.learning.run_folder.tables import Table, read_evaluations
 from fishd.learning.settings import EvaluationSettings
-from fishd.learning.training import train
+from fishd.learning.train.jobs import Outcome
+from fishd.learning.train.progress import Display
+from fishd.learning.train.training import train
+
+PATIENCE = 60.0
+STEP = "step-000064"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 64 steps."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    train(brief_job(folder, steps=64))
+    return folder
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be damaged."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def resumed(run: Path, **changes: Any) -> Outcome:
+    """Train it for another 64 steps."""
+    return train(brief_job(run, resume=True, **{"steps": 128, **changes}))
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "config.yaml": lambda run: runs.read(run),
+    "settings.yaml": lambda run: training.load(run / "settings.yaml"),
+    f"{STEP}/card.json": lambda run: checkpoints.load_policy(run / STEP),
+    f"{STEP}/state.json": lambda run: checkpoints.read_state(run / STEP),
+    f"{STEP}/model.zip": lambda run: checkpoints.load_policy(run / STEP),
+    "progress.csv": lambda run: Table(run / "progress.csv", ("steps",)).keep_until(64),
+    "evaluations.csv": read_evaluations,
+}
+
+
+def complaint(read: Callable[[Path], object], run: Path) -> str:
+    """What is said, in time."""
+    found: list[str] = []
+
+    def try_it() -> None:
+        try:
+            read(run)
+        except FishdError as error:
+            found.append(str(error))
+
+    reader = threading.Thread(target=try_it, daemon=True)
+    reader.start()
+    reader.join(PATIENCE)
+    assert found, "it does not end, or accepts it"
+    assert "\n" not in found[0]
+    return found[0]
+
+
+@pytest.mark.parametrize("plant", [pipe, endless])
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_or_a_device_in_place_of_a_file_is_one_line_at_once(
+    run: Path, name: str, plant: Callable[[Path], None]
+) -> None:
+    (run / name).unlink()
+    plant(run / name)
+    said = complaint(READERS[name], run)
+    if name == "progress.csv":  # whatever it is, a new one can be begun
+        assert "not a table of a training; move it away" in said
+    else:
+        kind = "a named pipe" if plant is pipe else "a device"
+        assert said.startswith(f"{run / name}: is {kind}; a regular file is needed")
+
+
+@pytest.mark.parametrize("key", ["on", "x"])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("state.json", "move this checkpoint away"), ("card.json", "nested too deeply")],
+)
+def test_endlessly_nested_json_is_one_line(run: Path, name: str, message: str, key: str) -> None:
+    reader = READERS[f"{STEP}/{name}"]
+    for depth in (60, 900, 9000):
+        text = f'{{"{key}":' * depth + "1" + "}" * depth
+        (run / STEP / name).write_text(text, encoding="utf-8")
+        assert message in complaint(reader, run)
+
+
+def test_an_archive_that_would_fill_the_memory_is_refused(run: Path) -> None:
+    with ZipFile(run / STEP / "model.zip", "w", ZIP_DEFLATED) as archive:
+        for number in range(5):
+            archive.writestr(f"{number}.pth", bytes(64 * 2**20))
+    assert "it unpacks to far more than a checkpoint needs" in complaint(
+        READERS[f"{STEP}/model.zip"], run
+    )
+
+
+def test_a_checkpoint_with_a_strange_number_is_not_the_newest(run: Path) -> None:
+    (run / "step-²").mkdir()
+    assert checkpoints.newest(run).name == STEP
+
+
+def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
+    (run / "evaluations.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+    assert (
+        complaint(read_evaluations, run) == f"{run / 'evaluations.csv'}: not a table of evaluations"
+    )
+
+
+def test_a_resume_with_a_pipe_for_a_state_says_what_to_do(run: Path) -> None:
+    (run / STEP / "state.json").unlink()
+    pipe(run / STEP / "state.json")
+    with pytest.raises(CheckpointError, match=r"is a named pipe; .* move this checkpoint away"):
+        resumed(run)
 
 
 def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> None:
     """Wherever a run is cut off, its newest checkpoint is no newer than its tables."""
     job = brief_job(tmp_path / "run", steps=256)
 
-    class Killed(Quiet):
-        def evaluated(self, evaluation: Evaluation, best: bool) -> None:
+    class Killed(Display):
+        def evaluated(self, evaluation: Evaluation) -> None:
             if evaluation.steps == 192:
                 raise KeyboardInterrupt
 
@@ -60,80 +174,55 @@ def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("until", ["", "plant:", "ppo:"])
-def test_a_file_of_a_run_that_was_cut_off_is_not_made_up_for_by_defaults(
-    tmp_path: Path, until: str
+def test_a_file_of_a_run_that_was_cut_off_is_not_completed_by_defaults(
+    run: Path, until: str
 ) -> None:
-    job = brief_job(tmp_path / "run", steps=64)
-    train(job)
-    file = job.folder / (runs.CONFIG if until == "plant:" else runs.SETTINGS)
+    file = run / (runs.CONFIG if until == "plant:" else runs.SETTINGS)
     text = file.read_text(encoding="utf-8")
     file.write_text(text[: text.index(until)], encoding="utf-8")
-    with pytest.raises(ConfigError, match=f"{file.name}: not the whole file of a run: [a-z_]+ is"):
-        runs.read(job.folder)
+    with pytest.raises(ConfigError, match=f"{file.name}: .*(the key [a-z_]+ is missing|needed)"):
+        runs.read(run)
 
 
-def test_a_resume_with_another_fish_or_other_networks_is_refused(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run", steps=64)
-    train(job)
-    more = replace(job.settings, steps=128)
+def test_a_resume_with_another_fish_or_other_networks_is_refused(run: Path) -> None:
+    job = brief_job(run, resume=True, steps=128)
+    settings = job.settings
     wider = replace(job.config, amplitude_limit=0.3)
-    relu = replace(more, ppo=replace(more.ppo, activation="relu"))
-    blind = replace(more, environment=replace(more.environment, force_scale=2.0))
-    for config, settings, message in (
-        (wider, more, "its observation, with scales, differs"),
+    relu = replace(settings, ppo=replace(settings.ppo, activation="relu"))
+    blind = replace(settings, environment=replace(settings.environment, force_scale=2.0))
+    for config, changed, message in (
+        (wider, settings, "its observation, with scales, differs"),
         (job.config, blind, "its observation, with scales, differs"),
         (job.config, relu, "its ppo.activation is tanh, that of this training is relu"),
     ):
         with pytest.raises(CheckpointError, match=message):
-            train(replace(job, resume=True, config=config, settings=settings))
-    assert train(replace(job, resume=True, settings=more)).ended == "finished"
+            train(replace(job, config=config, settings=changed))
+    assert train(job).ended == "finished"
 
 
 @pytest.mark.parametrize("content", ["", "a,b\n1,2\n", "steps\nmany\n", "\xff\x00"])
-def test_a_table_that_is_none_is_one_line_and_can_be_moved_away(
-    tmp_path: Path, content: str
-) -> None:
-    job = brief_job(tmp_path / "run", steps=64)
-    train(job)
-    more = replace(job, resume=True, settings=replace(job.settings, steps=128))
-    table = job.folder / "progress.csv"
+def test_a_table_that_is_none_is_one_line_and_can_be_moved_away(run: Path, content: str) -> None:
+    table = run / "progress.csv"
     table.write_bytes(content.encode("latin-1"))
-    with pytest.raises(CheckpointError, match="no table of a training; move it away"):
-        train(more)
+    with pytest.raises(CheckpointError, match="not a table of a training; move it away"):
+        resumed(run)
     table.unlink()
-    assert train(more).ended == "finished"
+    assert resumed(run).ended == "finished"
 
 
 @pytest.mark.parametrize("part", ["policy.pth", "policy.optimizer.pth"])
-def test_an_emptied_part_of_a_checkpoint_is_one_line(tmp_path: Path, part: str) -> None:
-    job = brief_job(tmp_path / "run", steps=64)
-    file = train(job).checkpoint
-    assert file
+def test_an_emptied_part_of_a_checkpoint_is_one_line(run: Path, part: str) -> None:
+    file = run / STEP
     with ZipFile(file / "model.zip") as whole:
         parts = {name: whole.read(name) for name in whole.namelist()}
     with ZipFile(file / "model.zip", "w") as damaged:
         for name, content in parts.items():
             damaged.writestr(name, b"" if name == part else content)
-    more = replace(job, resume=True, settings=replace(job.settings, steps=128))
-    with pytest.raises(CheckpointError, match="move this checkpoint away to go on from the one"):
-        train(more)
+    with pytest.raises(CheckpointError, match="move this checkpoint away to resume"):
+        resumed(run)
     shutil.rmtree(file)
-    shutil.rmtree(job.folder / "best-000064", ignore_errors=True)
-    assert train(more).ended == "finished"  # from the one at the start
-
-
-@pytest.mark.parametrize("damage", [{}, {"torch": "00"}, {"numpy": []}, {"environment": 3}])
-def test_a_damaged_state_of_random_numbers_is_one_line(
-    tmp_path: Path, damage: dict[str, Any]
-) -> None:
-    job = brief_job(tmp_path / "run", steps=64)
-    checkpoint = train(job).checkpoint
-    assert checkpoint
-    state = json.loads((checkpoint / "state.json").read_text(encoding="utf-8"))
-    state["random"] = (state["random"] | damage) if damage else {}
-    (checkpoint / "state.json").write_text(json.dumps(state), encoding="utf-8")
-    with pytest.raises(CheckpointError, match="not the state of random numbers"):
-        train(replace(job, resume=True, settings=replace(job.settings, steps=128)))
+    shutil.rmtree(run / "best-000064", ignore_errors=True)
+    assert resumed(run).ended == "finished"  # from the one at the start
 
 
 @contextmanager
@@ -186,12 +275,12 @@ def test_a_disk_that_is_full_before_the_first_checkpoint_advises_to_start_again(
         assert str(caught.value).endswith(
             f"No space left on device; when that is mended, remove {job.folder}, which has no "
             f"checkpoint yet, and start again with 'fishctl learn ppo --folder {job.folder}' and "
-            "what else you gave"
+            "your other options"
         )
         enlarge("50m")
         with pytest.raises(ConfigError, match="or remove it: the training in it ended before its"):
             train(job)
-        with pytest.raises(CheckpointError, match="no checkpoint is in there: its training ended"):
+        with pytest.raises(CheckpointError, match="there is no checkpoint in it: the"):
             train(replace(job, resume=True))
         shutil.rmtree(job.folder)
         assert train(job).ended == "finished"

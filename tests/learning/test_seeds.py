@@ -1,4 +1,7 @@
-"""One training with several seeds: in parallel, on a cluster, and when something goes wrong."""
+"""One training with several seeds: in parallel, on a cluster, and when something goes wrong.
+
+Processes that train take seconds to import torch: those of this process are left for the next test.
+"""
 
 import csv
 import os
@@ -7,21 +10,18 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from joblib.externals.loky import get_reusable_executor
+from rigs.processes import FISHCTL, fishctl
+from rigs.swimming import LONG_ENOUGH, Done, wait_for, while_it_trains
 
-pytest.importorskip("joblib", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
+from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluations, write_summary
+from fishd.learning.train import cluster as dask
 
-from processes import FISHCTL
-
-from fishd.learning.seed_table import COLUMNS, curve, write_summary
-
-PATIENCE = 120.0
 SETTINGS = """\
 steps: {steps}
 checkpoint_every: 128
@@ -35,41 +35,46 @@ def command(folder: Path, *arguments: str, steps: int = 128) -> list[str]:
     settings = folder / "settings.yaml"
     settings.write_text(SETTINGS.format(steps=steps), encoding="utf-8")
     given = ["--settings", str(settings), "--folder", str(folder / "run")]
-    return [FISHCTL, "learn", "ppo", *given, *arguments]
+    return ["learn", "ppo", *given, *arguments]
 
 
-def finished(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(folder, *arguments), capture_output=True, text=True, check=False, timeout=PATIENCE
-    )
+@pytest.fixture(scope="module", autouse=True)
+def _no_trainer_stays() -> Iterator[None]:
+    yield
+    get_reusable_executor(reuse=True).shutdown(kill_workers=True)
 
 
-def wait_for(what: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not what():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Done]:
+    """Two seeds in two processes: the run folder, which must not be changed, and what was said."""
+    folder = tmp_path_factory.mktemp("two")
+    done = fishctl(*command(folder, "--seeds", "2", "--jobs", "2", "--seed", "5"))
+    return folder / "run", done
 
 
 def evaluated(folder: Path) -> bool:
-    return len(curve(folder)) >= 2
+    return len(read_evaluations(folder)) >= 2
 
 
-def members(session: int) -> list[int]:
-    """The processes of a session."""
+def processes(field: int, number: int) -> list[int]:
+    """The processes for which a field of /proc/PID/stat, after the name, is this number."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
-        if int(fields[3]) == session and fields[0] != "Z":
+        if int(fields[field]) == number and fields[0] != "Z":
             found.append(int(entry.name))
     return found
 
 
-def trainers(session: int) -> list[int]:
-    """Those of them that train."""
+def members(session: int) -> list[int]:
+    return processes(3, session)
+
+
+def trainers(parent: int) -> list[int]:
+    """The processes of a parent that train."""
 
     def trains(process: int) -> bool:
         try:
@@ -77,14 +82,14 @@ def trainers(session: int) -> list[int]:
         except OSError:
             return False
 
-    return [process for process in members(session) if trains(process)]
+    return [process for process in processes(1, parent) if trains(process)]
 
 
 @contextmanager
 def started(folder: Path, *arguments: str, steps: int) -> Iterator[subprocess.Popen[str]]:
     """In a session of its own, as from a terminal; nothing of it is left behind."""
     process = subprocess.Popen(
-        command(folder, *arguments, steps=steps),
+        [FISHCTL, *command(folder, *arguments, steps=steps)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -95,37 +100,37 @@ def started(folder: Path, *arguments: str, steps: int) -> Iterator[subprocess.Po
     finally:
         for member in members(process.pid):
             os.kill(member, signal.SIGKILL)
-        process.communicate()
+        process.communicate(timeout=LONG_ENOUGH)
 
 
-def test_every_seed_has_a_folder_and_all_of_them_a_table(tmp_path: Path) -> None:
-    done = finished(tmp_path, "--seeds", "2", "--jobs", "2", "--seed", "5")
+def test_every_seed_has_a_folder_and_all_of_them_a_table(two: tuple[Path, Done]) -> None:
+    run, done = two
     assert (done.returncode, done.stderr) == (0, "")
     assert "seed 5" in done.stdout
     assert "seed 6" in done.stdout
-    run = tmp_path / "run"
+    assert "latest policies of 2 seeds" in done.stdout
     with (run / "seeds.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["steps"] for row in rows] == ["64", "128"]
-    first, second = (curve(run / f"seed-{index}") for index in (0, 1))
+    first, second = (read_evaluations(run / f"seed-{index}") for index in (0, 1))
     assert first != second
     assert float(rows[-1]["lowest"]) == min(first[-1].efficiency, second[-1].efficiency)
-    assert float(rows[-1]["best_highest"]) == max(first[-1].best, second[-1].best)
+    assert float(rows[-1]["best_highest"]) == max(best_so_far(first)[-1], best_so_far(second)[-1])
 
 
 def test_a_seed_that_fails_is_reported_and_the_others_go_on(tmp_path: Path) -> None:
     from fishd.config import load
     from fishd.learning import settings as training
-    from fishd.learning.jobs import Job
-    from fishd.learning.seeds import SeedOutcome, train_seeds
+    from fishd.learning.train.jobs import Job, Outcome
+    from fishd.learning.train.seeds import train_seeds
 
     file = tmp_path / "settings.yaml"
     file.write_text(SETTINGS.format(steps=128), encoding="utf-8")
     folder = tmp_path / "run"
     job = Job(config=load(), settings=training.load(file), folder=folder)
 
-    def put_something_in_the_way(outcome: SeedOutcome) -> None:
-        if outcome.seed == 0:
+    def put_something_in_the_way(seed: int, outcome: Outcome) -> None:
+        if seed == 0:
             (folder / "seed-2").write_text("in the way")
 
     found = train_seeds(job, 4, jobs=1, ended=put_something_in_the_way)
@@ -136,14 +141,19 @@ def test_a_seed_that_fails_is_reported_and_the_others_go_on(tmp_path: Path) -> N
 
 def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG) as process:
-        wait_for(lambda: evaluated(run / "seed-0") and evaluated(run / "seed-1"))
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and children
-        _, errors = process.communicate(timeout=PATIENCE)
-        assert process.returncode == 130
-        wait_for(lambda: not members(process.pid))
-    assert "Traceback" not in errors
-    assert errors.count("interrupted") == 3
+
+    def press() -> None:  # a terminal tells parent and children
+        for process in (*trainers(os.getpid()), os.getpid()):
+            os.kill(process, signal.SIGINT)
+
+    done = while_it_trains(
+        lambda: evaluated(run / "seed-0") and evaluated(run / "seed-1"),
+        press,
+        *command(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG),
+    )
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("interrupted") == 3
     assert all(list((run / f"seed-{index}").glob("step-*")) for index in (0, 1))
     assert not (run / "seed-2").exists()
     assert (run / "seeds.csv").exists()
@@ -154,7 +164,7 @@ def test_ctrl_c_before_any_has_begun_is_heeded_as_well(tmp_path: Path) -> None:
         wait_for(lambda: trainers(process.pid))  # which have all to import as yet
         time.sleep(0.1)
         os.killpg(process.pid, signal.SIGINT)
-        _, errors = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=LONG_ENOUGH)
         assert process.returncode == 130
         wait_for(lambda: not members(process.pid))
     assert "Traceback" not in errors
@@ -163,21 +173,22 @@ def test_ctrl_c_before_any_has_begun_is_heeded_as_well(tmp_path: Path) -> None:
 
 def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    with started(tmp_path, "--seeds", "2", "--jobs", "2", steps=2048) as process:
-        wait_for(lambda: list((run / "seed-0").glob("step-*")))
-        os.kill(trainers(process.pid)[0], signal.SIGKILL)
-        output, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, errors
-    assert "latest policies of 2 seeds" in output
-    assert [point.steps for point in curve(run / "seed-0")] == list(range(64, 2049, 64))
+    done = while_it_trains(
+        lambda: list((run / "seed-0").glob("step-*")),
+        lambda: os.kill(trainers(os.getpid())[0], signal.SIGKILL),
+        *command(tmp_path, "--seeds", "2", "--jobs", "2", steps=1024),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "latest policies of 2 seeds" in done.stdout
+    assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 1025, 64))
 
 
 def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path) -> None:
     kept = tmp_path / "run" / "seed-0" / "policy"
     kept.parent.mkdir(parents=True)
     kept.write_text("of last week")
-    done = finished(tmp_path, "--seeds", "2")
-    assert "is there already; give another --folder" in done.stderr
+    done = fishctl(*command(tmp_path, "--seeds", "2"))
+    assert "exists already; give another --folder" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (78, 1)
     assert kept.read_text() == "of last week"
 
@@ -185,7 +196,7 @@ def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path) -> None:
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[str]:
     """A Dask scheduler and one worker, processes of their own on the loopback interface."""
-    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
@@ -205,44 +216,33 @@ def cluster(tmp_path: Path) -> Iterator[str]:
         for kind, *rest in commands
     ]
     try:
-        wait_for(lambda: has_worker(address))
+        with distributed.Client(address, timeout=LONG_ENOUGH) as client:
+            client.wait_for_workers(1, timeout=LONG_ENOUGH)
         yield address
     finally:
         for process in reversed(processes):
             process.kill()
-            process.wait()
-
-
-def has_worker(address: str) -> bool:
-    """Asked by another process: a client of Dask warns of much, and warnings are errors here."""
-    program = (
-        "import sys; from distributed import Client\n"
-        "with Client(sys.argv[1], timeout=5) as client:\n"
-        "    sys.exit(not client.scheduler_info()['workers'])\n"
-    )
-    asked = subprocess.run([sys.executable, "-c", program, address], capture_output=True)
-    return asked.returncode == 0
+            process.wait(LONG_ENOUGH)
 
 
 def test_a_cluster_trains_what_this_machine_would_and_sends_it_back(
-    tmp_path: Path, cluster: str
+    tmp_path: Path, cluster: str, two: tuple[Path, Done]
 ) -> None:
-    here, there = tmp_path / "here", tmp_path / "there"
-    for folder, options in ((here, ["--jobs", "1"]), (there, ["--cluster", cluster])):
-        folder.mkdir()
-        done = finished(folder, "--seeds", "2", *options)
-        assert (done.returncode, done.stderr) == (0, "")
-    for index in (0, 1):
-        one, other = (folder / "run" / f"seed-{index}" for folder in (here, there))
-        assert curve(one) == curve(other) != []
-        assert (other / "step-000128" / "model.zip").is_file()
-    summaries = [(folder / "run" / "seeds.csv").read_text() for folder in (here, there)]
-    assert summaries[0] == summaries[1]
+    here, there = two[0], tmp_path / "run"
+    done = fishctl(*command(tmp_path, "--seeds", "2", "--seed", "5", "--cluster", cluster))
+    assert (done.returncode, done.stderr) == (0, "")
+    for seed in ("seed-0", "seed-1"):
+        assert read_evaluations(here / seed) == read_evaluations(there / seed) != []
+        assert (there / seed / "step-000128" / "model.zip").is_file()
+    assert (here / "seeds.csv").read_text() == (there / "seeds.csv").read_text()
 
 
-def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path) -> None:
+def test_a_cluster_that_does_not_answer_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    done = finished(tmp_path, "--seeds", "2", "--cluster", "tcp://127.0.0.1:1")
+    monkeypatch.setattr(dask, "CONNECT", 0.2)
+    done = fishctl(*command(tmp_path, "--seeds", "2", "--cluster", "tcp://127.0.0.1:1"))
     assert "no Dask scheduler answers at tcp://127.0.0.1:1" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert not (tmp_path / "run").exists()
@@ -250,4 +250,4 @@ def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path) -> None:
 
 def test_a_summary_of_seeds_that_got_nowhere_is_a_head(tmp_path: Path) -> None:
     write_summary(tmp_path / "seeds.csv", [tmp_path / "seed-0"])
-    assert (tmp_path / "seeds.csv").read_text() == ",".join(COLUMNS) + "\n"
+    assert (tmp_path / "seeds.csv").read_text() == ",".join(SUMMARY) + "\n"

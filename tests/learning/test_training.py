@@ -1,31 +1,32 @@
+import pickle
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="the extra 'learn' is not installed")
-pytest.importorskip("stable_baselines3", reason="the extra 'learn' is not installed")
-pytest.importorskip("tensorboard", reason="the extra 'learn' is not installed")
-
+import torch
 from msgspec.structs import replace
+from rigs.processes import Subscriber, running
+from rigs.swimming import BRIEF, NOISY, Failing, Losing, Resting, brief_job, rows
 from stable_baselines3.common.save_util import load_from_zip_file
-from swimming import BRIEF, Failing, Losing, Resting, brief_job, rows
 
-from fishd.errors import ConfigError
-from fishd.learning import checkpoints, runs
-from fishd.learning.checkpoints import CheckpointError, Evaluation
-from fishd.learning.jobs import Job
-from fishd.learning.progress import Quiet
-from fishd.learning.scales import features, thrust_scale
+from fishd.client import Fish
+from fishd.controllers.policy.card import Layout
+from fishd.core.errors import ConfigError
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.env.scales import features, thrust_scale
+from fishd.learning.run_folder import checkpoints, runs
+from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
-from fishd.learning.training import Training, train
-from fishd.policies.card import Layout
+from fishd.learning.train.jobs import Job, Outcome
+from fishd.learning.train.progress import Display
+from fishd.learning.train.training import Training, train
 
 
 @dataclass
-class Witness(Quiet):
+class Witness(Display):
     """Is told how a training goes on, and remembers."""
 
     evaluations: list[Evaluation] = field(default_factory=list)
@@ -34,7 +35,7 @@ class Witness(Quiet):
     def step(self, tank_time: float) -> None:
         self.steps += 1
 
-    def evaluated(self, evaluation: Evaluation, best: bool) -> None:
+    def evaluated(self, evaluation: Evaluation) -> None:
         self.evaluations.append(evaluation)
 
     def after(self, steps: int) -> bool:
@@ -60,18 +61,36 @@ def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path) -> None:
     assert outcome.best_evaluation.thrust > 3.0 * float(untrained["thrust"])
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_does_not(tmp_path: Path) -> None:
-    runs = [train(brief_job(tmp_path / name)).folder for name in ("a", "b")]
-    runs.append(train(brief_job(tmp_path / "c", seed=1)).folder)
+def test_the_same_seed_gives_the_same_numbers_and_another_does_not(
+    tmp_path: Path, brief: tuple[Job, Outcome]
+) -> None:
+    others = [train(brief_job(tmp_path / str(seed), seed=seed)).folder for seed in (0, 1)]
+    runs = [brief[0].folder, *others]
     for table in ("progress.csv", "evaluations.csv"):
         a, b, c = [(run / table).read_bytes() for run in runs]
         assert a == b
         assert a != c
 
 
-def test_a_run_folder_says_what_was_trained_and_how_it_went(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run")
-    outcome = train(job)
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Outcome]:
+    """A finished training of 128 steps; its folder must not be changed."""
+    job = brief_job(tmp_path_factory.mktemp("brief") / "first")
+    return job, train(job)
+
+
+@pytest.fixture
+def copied(brief: tuple[Job, Outcome], tmp_path: Path) -> Job:
+    """A copy of it."""
+    return replace(brief[0], folder=Path(shutil.copytree(brief[0].folder, tmp_path / "run")))
+
+
+def resumed(job: Job, steps: int) -> Job:
+    return replace(job, resume=True, settings=replace(job.settings, steps=steps))
+
+
+def test_a_run_folder_says_what_was_trained_and_how_it_went(brief: tuple[Job, Outcome]) -> None:
+    job, outcome = brief
     assert runs.read(job.folder) == (job.config, job.settings)
     table = rows(job.folder / "progress.csv")
     assert [row["steps"] for row in table] == ["64", "128"]
@@ -81,11 +100,11 @@ def test_a_run_folder_says_what_was_trained_and_how_it_went(tmp_path: Path) -> N
     assert list((job.folder / "tensorboard").glob("events.out.tfevents.*"))
     assert outcome.checkpoint == job.folder / "step-000128"
     assert outcome.tank_time == pytest.approx(float(table[-1]["tank_time"]))
+    assert pickle.loads(pickle.dumps(brief)) == brief  # they are sent to other processes
 
 
-def test_a_checkpoint_says_what_must_be_known_to_run_the_policy(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run")
-    outcome = train(job)
+def test_a_checkpoint_says_what_must_be_known_to_run_the_policy(brief: tuple[Job, Outcome]) -> None:
+    job, outcome = brief
     assert outcome.checkpoint
     card = checkpoints.read_card(outcome.checkpoint)
     assert card.observation == features(job.config, job.settings.environment)
@@ -131,12 +150,13 @@ def test_a_policy_that_holds_still_is_marked_and_never_the_best(tmp_path: Path) 
     assert outcome.best is None
 
 
-def test_a_resumed_run_goes_on_exactly_where_it_was(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run")
-    first = train(job)
+def test_a_resumed_run_goes_on_exactly_where_it_was(
+    copied: Job, brief: tuple[Job, Outcome]
+) -> None:
+    job, first = copied, brief[1]
     assert first.checkpoint
-    more = replace(job, resume=True, settings=replace(job.settings, steps=256))
-    training = Training(more, Resting(more), Quiet(), lambda: False)
+    more = resumed(job, 256)
+    training = Training(more, Resting(more), Display(), lambda: False)
     model = training._model
     assert same(model.policy.state_dict(), parameters(first.checkpoint))
     updates = BRIEF.ppo.n_epochs * 2 * (64 // BRIEF.ppo.batch_size)
@@ -155,20 +175,19 @@ def test_a_resumed_run_does_not_repeat_its_random_numbers(tmp_path: Path) -> Non
     frozen = PpoSettings(n_steps=64, n_epochs=1, learning_rate=1e-9, final_learning_rate=1e-9)
     job = brief_job(tmp_path / "run", ppo=frozen, steps=64, evaluation=never())
     train(job)
-    train(replace(job, resume=True, settings=replace(job.settings, steps=128)))
+    train(resumed(job, 128))
     first, second = rows(job.folder / "progress.csv")
     assert float(first["fullness"]) != pytest.approx(float(second["fullness"]), abs=1e-4)
 
 
-def test_a_resume_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run")
-    train(job)
+def test_a_resume_goes_on_from_the_newest_complete_checkpoint(copied: Job) -> None:
+    job = copied
     half = job.folder / ".step-000192.part"  # what a kill while one is written leaves
     half.mkdir()
     (half / "model.zip").write_bytes(b"PK")
     with (job.folder / "progress.csv").open("a", encoding="utf-8") as file:
         file.write("192,9.6,0.1\n")
-    train(replace(job, resume=True, settings=replace(job.settings, steps=192)))
+    train(resumed(job, 192))
     assert [row["steps"] for row in rows(job.folder / "progress.csv")] == ["64", "128", "192"]
     assert not half.exists()
 
@@ -191,12 +210,11 @@ def test_a_run_that_was_killed_in_its_first_rollout_goes_on_as_if_it_had_not_bee
     assert table == (whole.folder / "progress.csv").read_bytes()
 
 
-def test_a_run_that_has_all_its_steps_or_no_checkpoint_says_so(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run")
-    train(job)
+def test_a_run_that_has_all_its_steps_or_no_checkpoint_says_so(copied: Job, tmp_path: Path) -> None:
+    job = copied
     with pytest.raises(ConfigError, match="is finished, with 128 steps; to train it for longer"):
         train(replace(job, resume=True))
-    with pytest.raises(CheckpointError, match="no checkpoint is in there"):
+    with pytest.raises(CheckpointError, match="there is no checkpoint in it"):
         train(replace(job, resume=True, folder=tmp_path))
 
 
@@ -204,7 +222,7 @@ def test_a_new_run_never_overwrites_another(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     job.folder.mkdir()
     (job.folder / "notes.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(ConfigError, match="is there already; give another --folder"):
+    with pytest.raises(ConfigError, match="exists already; give another --folder"):
         train(job)
 
 
@@ -219,14 +237,14 @@ def test_when_told_to_stop_it_keeps_what_it_has_learned(tmp_path: Path) -> None:
     saved, _, _ = load_from_zip_file(outcome.checkpoint / "model.zip")
     assert saved
     assert saved["num_timesteps"] == 64
-    again = train(replace(job, resume=True, settings=replace(job.settings, steps=128)))
+    again = train(resumed(job, 128))
     assert (again.ended, again.steps) == ("finished", 128)
 
 
 def test_a_fish_that_is_lost_ends_the_run_with_a_checkpoint_and_the_reason(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     link = Failing(job, 100)
-    outcome = Training(job, link, Quiet(), lambda: False).run()
+    outcome = Training(job, link, Display(), lambda: False).run()
     assert (outcome.ended, outcome.steps) == ("lost", 64)
     assert outcome.message == "fishd is in mode fault: the newest force sample is 150 ms old"
     assert outcome.checkpoint == job.folder / "step-000064"
@@ -237,7 +255,7 @@ def test_a_fish_that_is_lost_ends_the_run_with_a_checkpoint_and_the_reason(tmp_p
 def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=192)
     link = Resting(job)
-    training = Training(job, link, Quiet(), lambda: False)
+    training = Training(job, link, Display(), lambda: False)
     training.run()
     layout = Layout(features(job.config, job.settings.environment))
     per_newton = job.settings.environment.reward_scale / thrust_scale(
@@ -257,7 +275,7 @@ def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
 
 def test_actions_that_came_too_late_are_counted_and_teach_nothing(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
-    training = Training(job, Losing(job), Quiet(), lambda: False)
+    training = Training(job, Losing(job), Display(), lambda: False)
     outcome = training.run()
     assert outcome.ended == "finished"
     lost = [int(row["lost"]) for row in rows(job.folder / "progress.csv")]
@@ -268,7 +286,7 @@ def test_actions_that_came_too_late_are_counted_and_teach_nothing(tmp_path: Path
 
 def test_an_agent_that_is_too_slow_for_the_tick_learns_nothing_and_says_so(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
-    outcome = Training(job, Losing(job, every=1), Quiet(), lambda: False).run()
+    outcome = Training(job, Losing(job, every=1), Display(), lambda: False).run()
     assert (outcome.ended, outcome.steps) == ("lost", 0)
     assert outcome.message.startswith("in most of the last 64 steps the agent's action came too")
 
@@ -276,22 +294,24 @@ def test_an_agent_that_is_too_slow_for_the_tick_learns_nothing_and_says_so(tmp_p
 def test_a_run_that_blows_up_says_so_and_keeps_no_broken_policy(tmp_path: Path) -> None:
     wild = PpoSettings(n_steps=64, learning_rate=1.0, final_learning_rate=1.0, max_grad_norm=100.0)
     job = brief_job(tmp_path / "run", steps=6400, ppo=wild, evaluation=never())
-    training = Training(job, Resting(job), Quiet(), lambda: False)
+    training = Training(job, Resting(job), Display(), lambda: False)
     with torch.no_grad():
         training._model.policy.log_std.fill_(80.0)
     outcome = training.run()
     assert outcome.ended == "diverged"
-    assert "learning blew up in the update after 64 steps; lower ppo.learning" in outcome.message
+    assert "learning diverged in the update after 64 steps; lower ppo.learning" in outcome.message
     assert outcome.checkpoint == job.folder / "step-000000"
     assert all(bool(v.isfinite().all()) for v in parameters(outcome.checkpoint).values())
 
 
-def test_another_run_can_begin_with_its_networks(tmp_path: Path) -> None:
-    first = train(brief_job(tmp_path / "first"))
-    assert first.checkpoint
-    job = brief_job(tmp_path / "second", parent=first.checkpoint, seed=5)
-    training = Training(job, Resting(job), Quiet(), lambda: False)
-    assert same(training._model.policy.state_dict(), parameters(first.checkpoint))
+def test_another_run_can_begin_with_its_networks(
+    tmp_path: Path, brief: tuple[Job, Outcome]
+) -> None:
+    parent = brief[1].checkpoint
+    assert parent
+    job = brief_job(tmp_path / "second", parent=parent, seed=5)
+    training = Training(job, Resting(job), Display(), lambda: False)
+    assert same(training._model.policy.state_dict(), parameters(parent))
     assert not training._model.policy.optimizer.state_dict()["state"]
     outcome = training.run()
     assert outcome.steps == 128
@@ -300,9 +320,10 @@ def test_another_run_can_begin_with_its_networks(tmp_path: Path) -> None:
     assert note == "began with first/step-000128, 128 steps in simulation"
 
 
-def test_networks_with_other_scales_or_sizes_are_refused(tmp_path: Path) -> None:
-    first = train(brief_job(tmp_path / "first"))
-    job = brief_job(tmp_path / "second", parent=first.checkpoint)
+def test_networks_with_other_scales_or_sizes_are_refused(
+    tmp_path: Path, brief: tuple[Job, Outcome]
+) -> None:
+    job = brief_job(tmp_path / "second", parent=brief[1].checkpoint)
     with pytest.raises(CheckpointError, match="its observation, with scales, differs"):
         train(replace(job, config=replace(job.config, amplitude_limit=0.3)))
     narrow = replace(job.settings, ppo=replace(job.settings.ppo, hidden=(8,)))
@@ -313,10 +334,29 @@ def test_networks_with_other_scales_or_sizes_are_refused(tmp_path: Path) -> None
     assert not job.folder.exists()
 
 
-def test_a_job_can_be_sent_to_another_process(tmp_path: Path) -> None:
-    import pickle
+def test_in_lockstep_it_gives_the_numbers_of_a_training_in_process(tmp_path: Path) -> None:
+    here = train(brief_job(tmp_path / "here", steps=1024, evaluation=never()))
+    settings = [
+        "lockstep=true",
+        "start.controller=remote",
+        f"start.parameters.agent=ipc://{tmp_path}/agent",
+        *NOISY,
+    ]
+    with running(tmp_path, *(word for setting in settings for word in ("--set", setting))) as fishd:
+        job = brief_job(tmp_path / "there", steps=1024, evaluation=never())
+        there = train(replace(job, on="robot", endpoint=fishd.endpoint))
+        with Fish(fishd.endpoint) as fish:
+            assert fish.status().mode == "idle"
+    assert (there.steps, there.tank_time) == (1024, here.tank_time)
+    tables = [(outcome.folder / "progress.csv").read_text() for outcome in (here, there)]
+    assert tables[0] == tables[1]
 
-    job = brief_job(tmp_path / "run")
-    assert isinstance(pickle.loads(pickle.dumps(job)), Job)
-    outcome = train(job)
-    assert pickle.loads(pickle.dumps(outcome)) == outcome
+
+def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
+    elsewhere = f"ipc://{tmp_path}/elsewhere"
+    settings = [word for setting in ("lockstep=true", *NOISY) for word in ("--set", setting)]
+    with running(tmp_path, *settings) as fishd, Subscriber(fishd.telemetry, b"event") as events:
+        job = brief_job(tmp_path / "run", steps=128, evaluation=never())
+        train(replace(job, on="robot", endpoint=fishd.endpoint, agent=elsewhere))
+        taken = events.until(kind="controller")["data"]
+    assert (taken["controller"], taken["parameters"]["agent"]) == ("remote", elsewhere)

@@ -1,15 +1,16 @@
 """A bus with one emulated ADS1115, for the tests of chip, bus and driver."""
 
 from collections.abc import Sequence
+from typing import Self
 
 from adafruit_ads1x15 import ADS1115
+from adafruit_extended_bus import ExtendedI2C
 
-from fishd.clock import VirtualClock
-from fishd.emulation.ads1115 import Ads1115Chip
-from fishd.emulation.busio_i2c import BusioI2c
-from fishd.emulation.faults import Faults
-from fishd.emulation.i2c import I2cBus, Message, Read, Write
-from fishd.emulation.linux_i2c import LinuxI2c
+from fishd.core.clock import VirtualClock
+from fishd.virtual.pi.ads1115 import Ads1115Chip
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.i2c import I2cBus, Message, Read, Write
+from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 VOLTS = [0.5, -0.3, 0.1, -0.25, 1.0, 0.7, 0.0, 1.9]
 """The mean voltage of each input, by mux bits."""
@@ -26,22 +27,29 @@ class Enough(Exception):
 
 
 class Board:
-    """A chip on a bus, with what a test wants to look at or change."""
+    """A chip on a bus, with what a test wants to look at or change.
 
-    def __init__(
-        self, speed: float = 400e3, noise: float = 0.0, seed: int = 0, zero_length: bool = True
-    ) -> None:
+    A context manager, while which the bus has a device file.
+    """
+
+    def __init__(self, speed: float = 400e3, noise: float = 0.0, seed: int = 0) -> None:
         self.clock = VirtualClock()
         self.faults = Faults(self.clock)
         self.bus = I2cBus(self.clock, speed, self.faults)
         self.volts = list(VOLTS)
         self.measured: list[tuple[int, float, float]] = []
-        self.chip = Ads1115Chip(
-            self.clock, self.input, self.faults, noise, seed, zero_length_probe=zero_length
-        )
+        self.chip = Ads1115Chip(self.clock, self.input, self.faults, noise, seed)
         self.bus.attach(0x48, self.chip)
         self.transfers = 0
         self.allowed = 10**9
+        self.device = LinuxI2c(self.transfer, {ABSENT_BUS}, self.set_timeout)
+
+    def __enter__(self) -> Self:
+        self.device.install()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.device.remove()
 
     def input(self, mux: int, start: float, end: float) -> float:
         self.measured.append((mux, start, end))
@@ -55,7 +63,7 @@ class Board:
 
     def driver(self, **options: float) -> ADS1115:
         options.setdefault("data_rate", 860)
-        return ADS1115(BusioI2c(self.transfer), **options)
+        return ADS1115(ExtendedI2C(ABSENT_BUS, frequency=None), **options)
 
     def register(self, pointer: int) -> int:
         (word,) = self.bus.transfer(0x48, [Write(bytes([pointer])), Read(2)])
@@ -66,9 +74,6 @@ class Board:
 
     def set_timeout(self, seconds: float) -> None:
         self.bus.timeout = seconds
-
-    def device_file(self, bus: int = ABSENT_BUS) -> LinuxI2c:
-        return LinuxI2c(self.bus.transfer, {bus}, self.set_timeout)
 
     def wait(self, rate: float = 860.0) -> None:
         """Until any conversion at that rate has ended."""

@@ -3,17 +3,18 @@
 from collections.abc import Callable
 from typing import Any
 
-from fishd.clock import SystemClock, VirtualClock
-from fishd.emulation.ads1115 import Ads1115Chip
-from fishd.emulation.faults import Faults
-from fishd.emulation.i2c import I2cBus
-from fishd.emulation.linux_i2c import LinuxI2c
-from fishd.errors import SensorError
-from fishd.hardware.ads1115 import Ads1115Sensor
-from fishd.hardware.calibration import ForceCalibration
-from fishd.hardware.sampler import Pair, Sampler
-from fishd.hardware.settings import ForceSensorSettings
-from fishd.signals import Measurement
+from fishd.core.calibration import ForceCalibration
+from fishd.core.clock import SystemClock, VirtualClock
+from fishd.core.errors import SensorError
+from fishd.core.signals import Measurement
+from fishd.hardware.driver import Pair
+from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+from fishd.hardware.force_sensor.sampler import Sampler
+from fishd.virtual.pi.ads1115 import Ads1115Chip
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.i2c import I2cBus
+from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 TICK = 0.05
 ABSENT_BUS = 201
@@ -48,16 +49,20 @@ class ForceRig:
     def __exit__(self, *_: object) -> None:
         self.device.remove()
 
+    def driver(self, **settings: Any) -> Ads1115:
+        """A driver that somebody else calls."""
+        return Ads1115(Ads1115Settings(**settings), self.clock)
+
     def sampler(self, **settings: Any) -> Sampler:
         """A sampler that somebody else steps."""
-        return Sampler(ForceSensorSettings(**settings), self.clock)
+        return Sampler(self.driver(**settings), self.clock)
 
     def sensor(
         self, calibration: ForceCalibration | None = None, tick: float = TICK, **settings: Any
-    ) -> Ads1115Sensor:
+    ) -> SampledSensor:
         """A sensor that reads step."""
-        return Ads1115Sensor(
-            ForceSensorSettings(**settings),
+        return SampledSensor(
+            self.driver(**settings),
             calibration or ForceCalibration(),
             self.clock,
             threaded=False,
@@ -77,7 +82,7 @@ class ForceRig:
 class Ticks:
     """Reads of a sensor, one per tick."""
 
-    def __init__(self, sensor: Ads1115Sensor, tick: float = TICK) -> None:
+    def __init__(self, sensor: SampledSensor, tick: float = TICK) -> None:
         self.sensor = sensor
         self.tick = tick
         self.index = 0
@@ -118,4 +123,4 @@ def take_pairs(sampler: Sampler, rig: ForceRig, seconds: float) -> list[Pair]:
 
 def volts(pair: Pair) -> tuple[float, float]:
     """Of both channels at the default range."""
-    return pair.x * STEP, pair.y * STEP
+    return pair.vx, pair.vy

@@ -1,17 +1,17 @@
 """What tests are built from: the real loop on a simulated fish and a virtual clock."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
-from fishd.build import build_loop
-from fishd.clock import Slot, VirtualClock
 from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
+from fishd.core.clock import Slot, VirtualClock
+from fishd.core.signals import Event, Measurement, Observation, Tick
 from fishd.hardware.base import Robot
-from fishd.hardware.simulated import SimulatedFish
-from fishd.loop import ControlLoop
-from fishd.signals import Event, Measurement, Observation, Tick
+from fishd.virtual.fish import SimulatedFish
+from fishd.wiring import build_loop
 
 
 class Recorder:
@@ -39,14 +39,24 @@ class Rig:
         *overrides: str,
         wrap: Callable[[Robot], Robot] = lambda robot: robot,
         notify: Callable[[float], None] = lambda now: None,
+        stack: ExitStack | None = None,
     ) -> None:
+        """stack: closes what the robot has opened"""
         self.config: Config = load(None, overrides)
         self.clock = VirtualClock()
-        self.fish = SimulatedFish(self.config.plant, self.config.simulation, self.config.tick)
         self.recorder = Recorder()
-        robot = wrap(self.fish.robot())
-        self.loop: ControlLoop = build_loop(self.config, robot, self.clock, self.recorder, notify)
+        self.robot = wrap(self.open_robot(stack or ExitStack()))
+        self.loop = build_loop(self.config, self.robot, self.clock, self.recorder, notify)
         self.index = 0
+
+    def open_robot(self, stack: ExitStack) -> Robot:
+        self.fish = SimulatedFish(self.config.plant, self.config.simulation, self.config.tick)
+        return self.fish.robot()
+
+    @property
+    def now(self) -> float:
+        """The latest deadline [s]."""
+        return (self.index - 1) * self.config.tick
 
     @property
     def mode(self) -> str:
@@ -67,7 +77,7 @@ class Rig:
 
     def retune(self, **parameters: Any) -> None:
         loop = self.loop
-        loop.retune(registry.merged(loop.controller, loop.controller_name, parameters))
+        loop.active.retune(registry.merged(loop.active.controller, loop.active.name, parameters))
 
     def run(self, ticks: int = 1, *, missed: int = 0, lateness: float = 0.0) -> list[Tick]:
         """Turn the loop; `missed` slots are skipped before the first of these ticks."""
@@ -168,12 +178,15 @@ class Wrapped:
         self.release()
 
 
-def fragile_rig(*overrides: str) -> tuple[Rig, Wrapped]:
-    """A rig whose robot can be made to fail."""
+def fragile_rig(*overrides: str, kind: type[Any] = Wrapped) -> tuple[Rig, Any]:
+    """A rig whose robot can be made to fail.
+
+    kind: a subclass of Wrapped
+    """
     made: list[Wrapped] = []
 
     def wrap(robot: Robot) -> Robot:
-        made.append(Wrapped(robot))
+        made.append(kind(robot))
         return made[0].robot()
 
     return Rig(*overrides, wrap=wrap), made[0]

@@ -7,22 +7,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from multiprocessing.managers import BaseManager
 from pathlib import Path
 from typing import Any
 
-from processes import FISHCTL, PATIENCE, Daemon, running
-
 from fishd.client import Fish
-from fishd.clock import SystemClock
-from fishd.emulation.ads1115 import Ads1115Chip
-from fishd.emulation.i2c import Write
-from fishd.emulation.link_server import LinkServer
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.emulation.virtual_pi import VirtualPi
-from fishd.hardware.imperfections import SimulationSettings
-from fishd.plant.parameters import PlantParameters
-from fishd.protocol import Calibrations
+from fishd.core.clock import SystemClock
+from fishd.core.protocol import Calibrations
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.ads1115 import Ads1115Chip
+from fishd.virtual.pi.i2c import Write
+from fishd.virtual.pi.link_server import LinkServer
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.pi.virtual_pi import VirtualPi
+from fishd.virtual.plant.parameters import PlantParameters
+from rigs.processes import FISHCTL, PATIENCE, Daemon, fishctl, running, sets, wait_until
 
 SENSITIVITY_X, SENSITIVITY_Y = 2.0, 1.5
 """Of the sensor with loads on it [V/N]."""
@@ -114,16 +114,15 @@ class Bench:
     @property
     def settings(self) -> list[str]:
         """Options for a fishd, or a verb, that is to use this virtual Pi."""
-        pairs = {
-            "robot": "virtual-pi",
-            "virtual_pi.socket": self.folder / "virtual-pi",
-            "servo.pigpio.port": self._port,
-            "servo.pigpio.timeout": 0.1,  # machines that run tests may stall
-            "servo.pigpio.countdown": 2.0,
-            "state_folder": self.folder / "state",
-            "force_sensor.tare_limit": 0.5,
-        }
-        return [word for key, value in pairs.items() for word in ("--set", f"{key}={value}")]
+        return sets(
+            "robot=virtual-pi",
+            f"virtual_pi.socket={self.folder}/virtual-pi",
+            f"servo.port={self._port}",
+            "servo.timeout=0.1",  # machines that run tests may stall
+            "servo.countdown=2",
+            f"state_folder={self.folder}/state",
+            "force_sensor.tare_limit=0.5",
+        )
 
     def files(self, kind: str) -> list[Path]:
         """Calibration files, oldest first."""
@@ -131,16 +130,11 @@ class Bench:
 
     def wait_for_pulse(self, lowest: float, highest: float) -> None:
         """Until the pulse is within these [µs]."""
-        deadline = time.monotonic() + PATIENCE
-        while not lowest <= (pulse := self.pi.pulse()) <= highest:
-            assert time.monotonic() < deadline, f"the pulse is {pulse} µs"
-            time.sleep(0.01)
+        wait_until(lambda: lowest <= self.pi.pulse() <= highest)
 
-    @contextlib.contextmanager
-    def daemon(self, *arguments: str) -> Iterator[Daemon]:
+    def daemon(self, *arguments: str) -> AbstractContextManager[Daemon]:
         """A fishd on this virtual Pi."""
-        with running(self.folder, *self.settings, *arguments) as daemon:
-            yield daemon
+        return running(self.folder, *self.settings, *arguments)
 
 
 @contextlib.contextmanager
@@ -242,5 +236,4 @@ def calibrations(daemon: Daemon) -> Calibrations:
 
 def fishctl_alone(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """fishctl where no daemon runs."""
-    command = [FISHCTL, "--endpoint", f"ipc://{folder}/nobody", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return fishctl("--endpoint", f"ipc://{folder}/nobody", *arguments)

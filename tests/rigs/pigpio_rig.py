@@ -1,16 +1,20 @@
 """What tests of the pigpio servo are built from: an emulated pigpiod in virtual time."""
 
 import contextlib
+from functools import partial
 
-from fishd.clock import VirtualClock
-from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod import errors
-from fishd.emulation.pigpiod.daemon import Pigpiod
-from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration
-from fishd.hardware.pigpio import PigpioServo
-from fishd.hardware.pigpio_client import Client, opened
-from fishd.hardware.settings import PigpioSettings, ServoSettings
+import pigpio
+
+from fishd.core.calibration import ServoCalibration
+from fishd.core.clock import VirtualClock
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.calibrated_servo import CalibratedServo
+from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
+from fishd.hardware.servo.pigpio_client import Client, opened
+from fishd.hardware.servo.pigpio_link import PigpioLink
+from fishd.hardware.servo.pigpio_pulses import neutralise
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 
 GPIO = 18
 FRAME = 0.02
@@ -28,16 +32,17 @@ class PigpioBench:
         stack.callback(self.daemon.close)
         self._stack = stack
 
-    def settings(self) -> ServoSettings:
-        return ServoSettings(gpio=GPIO, pigpio=PigpioSettings(port=self.daemon.port))
+    def settings(self) -> PigpioSettings:
+        return PigpioSettings(gpio=GPIO, port=self.daemon.port)
 
     def servo(
         self,
-        settings: ServoSettings | None = None,
+        settings: PigpioSettings | None = None,
         calibration: ServoCalibration | None = None,
         tick: float = TICK,
-    ) -> PigpioServo:
-        servo = PigpioServo(
+    ) -> CalibratedServo:
+        servo = CalibratedServo(
+            partial(Pigpio, standstill=self.daemon.stands_still),
             settings or self.settings(),
             calibration or ServoCalibration(),
             self.clock,
@@ -47,8 +52,13 @@ class PigpioBench:
         self._stack.callback(self._close, servo)
         return servo
 
+    def last_resort(self, neutral: float = 1500.0) -> bool:
+        """What another process does when fishd is dead."""
+        place = {"gpio": GPIO, "host": "127.0.0.1", "port": self.daemon.port}
+        return neutralise(neutral, **place, sleep=self.clock.sleep)  # type: ignore[arg-type]
+
     @staticmethod
-    def _close(servo: PigpioServo) -> None:
+    def _close(servo: CalibratedServo) -> None:
         with contextlib.suppress(ServoError):
             servo.close()
 
@@ -77,7 +87,7 @@ class PigpioBench:
             time: float, number: int, p1: int, p2: int, extension: bytes
         ) -> tuple[int, bytes]:
             if (number, p2) == (command, value):
-                return errors.NOT_PERMITTED, b""
+                return pigpio.PI_NOT_PERMITTED, b""
             return execute(time, number, p1, p2, extension)
 
         commands.execute = refusing  # type: ignore[method-assign]
@@ -98,7 +108,19 @@ class PigpioBench:
         return [(when, width) for when, width in self.daemon.history(GPIO) if when > time]
 
 
-def connect(servo: PigpioServo) -> None:
+def connect(servo: CalibratedServo) -> None:
     """Connect, but neither write nor release."""
-    with servo._link.session():
+    with link_of(servo).session():
         pass
+
+
+def link_of(servo: CalibratedServo) -> PigpioLink:
+    """Its link to pigpiod."""
+    assert isinstance(servo.driver, Pigpio)
+    return servo.driver._link
+
+
+def script_of(servo: CalibratedServo) -> int:
+    """The number of its countdown script."""
+    assert isinstance(servo.driver, Pigpio)
+    return servo.driver._script

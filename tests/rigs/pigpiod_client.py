@@ -1,15 +1,14 @@
 """An emulated pigpiod with the true client on it, for tests of the emulation itself."""
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable, Iterator
 
 import pigpio
 
-from fishd.clock import Clock, VirtualClock
-from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod.daemon import Pigpiod
+from fishd.core.clock import Clock, VirtualClock
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 
 GPIO = 18
 PATIENCE = 20.0
@@ -51,9 +50,9 @@ class PigpiodBench:
         finally:
             pigpio.exceptions = True
 
-    def stored(self, text: str) -> int:
+    def stored(self, script: str | bytes) -> int:
         """Store a script and wait until it is ready."""
-        number = self.pi.store_script(text.encode())
+        number: int = self.pi.store_script(script.encode() if isinstance(script, str) else script)
         self.sleep(0.002)
         return number
 
@@ -87,10 +86,3 @@ def eventually(condition: Callable[[], bool]) -> bool:
             return False
         time.sleep(0.001)
     return True
-
-
-def in_thread(action: Callable[[], object]) -> threading.Thread:
-    """Start what may hang."""
-    thread = threading.Thread(target=action, daemon=True)
-    thread.start()
-    return thread

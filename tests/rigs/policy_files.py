@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.policies.card import Card, Feature, FeatureName, Provenance
-from fishd.policies.network import Layer, to_onnx
+from fishd.controllers.policy.card import Card, Feature, FeatureName, Provenance
+from fishd.controllers.policy.network import Layer, to_onnx
 
 PROVENANCE = Provenance(
     created="2026-11-21T07:00:00+00:00",

@@ -1,18 +1,21 @@
 """Starts and ends the real `fishd` and calls the real `fishctl`, as a user would."""
 
 import contextlib
+import io
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 import zmq
 
+from fishd.cli.main import main
 from fishd.client import Fish, NoDaemon
+from fishd.core.signals import Status
 
 FISHD = str(Path(sys.executable).with_name("fishd"))
 FISHCTL = str(Path(sys.executable).with_name("fishctl"))
@@ -20,39 +23,73 @@ PATIENCE = 20.0
 """How long anything may take before a test gives up on it [s]."""
 
 
-class Daemon:
-    """A running fishd with addresses of its own."""
+def call(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; options: those of `subprocess.run`."""
+    usual = {"capture_output": True, "text": True, "check": False, "timeout": PATIENCE}
+    return subprocess.run(command, **(usual | options))
 
-    def __init__(self, folder: Path, *arguments: str, under: Sequence[str] = ()) -> None:
-        """under: a command that starts the daemon, `setpriv` say."""
-        self.endpoint = f"ipc://{folder}/control"
-        own = [f"control.address={self.endpoint}", "telemetry.address=tcp://127.0.0.1:0"]
-        settings = [word for setting in own for word in ("--set", setting)]
+
+def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """What a command says, and its exit status; it runs in this process, which saves its start.
+
+    Not for what a signal or a terminal is part of: `call(FISHCTL, ...)` is for that.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    argv, sys.argv = sys.argv, ["fishctl", *arguments]
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            main()
+    except SystemExit as ended:
+        status = ended.code
+    finally:
+        sys.argv = argv
+        signal.signal(signal.SIGTERM, handler)  # which `watch` has set
+    assert isinstance(status, int)
+    return subprocess.CompletedProcess(arguments, status, out.getvalue(), err.getvalue())
+
+
+def one_line(done: subprocess.CompletedProcess[str]) -> str:
+    """What a command that failed says: a line on standard error, and nothing else."""
+    assert done.returncode != 0
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1, done.stderr
+    return done.stderr
+
+
+def sets(*pairs: str) -> list[str]:
+    """The words of a command line that override these keys of the configuration."""
+    return [word for pair in pairs for word in ("--set", pair)]
+
+
+def install(site: Path, modules: Mapping[str, str], **controllers: str) -> None:
+    """Put a package of controllers into a folder of PYTHONPATH, as pip would.
+
+    controllers: name to `module:class`
+    """
+    package = next(iter(controllers))
+    info = site / f"{package}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    lines = (f"{name} = {where}\n" for name, where in controllers.items())
+    (info / "entry_points.txt").write_text("[fishd.controllers]\n" + "".join(lines))
+    for name, code in modules.items():
+        (site / f"{name}.py").write_text(code)
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+class Process:
+    """A program that runs beside the test."""
+
+    def __init__(self, *command: str) -> None:
         self.process = subprocess.Popen(
-            [*under, FISHD, *settings, *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def wait_until_up(self) -> "Daemon":
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline and self.process.poll() is None:
-            try:
-                with Fish(self.endpoint, timeout=0.5) as fish:
-                    self.telemetry = fish.status().telemetry
-                return self
-            except NoDaemon:
-                time.sleep(0.02)
-        raise AssertionError(f"fishd did not come up: {self.end()}")
-
-    def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [FISHCTL, "--endpoint", self.endpoint, *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=PATIENCE,
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
 
     def finish(self) -> tuple[int, str, str]:
@@ -65,6 +102,50 @@ class Daemon:
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.finish()
+
+
+class Daemon(Process):
+    """A running fishd with addresses of its own."""
+
+    def __init__(self, folder: Path, *arguments: str, under: Sequence[str] = ()) -> None:
+        """under: a command that starts the daemon, `setpriv` say."""
+        self.endpoint = f"ipc://{folder}/control"
+        own = sets(f"control.address={self.endpoint}", "telemetry.address=tcp://127.0.0.1:0")
+        super().__init__(*under, FISHD, *own, *arguments)
+
+    def wait_until_up(self) -> Self:
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline and self.process.poll() is None:
+            try:
+                self.telemetry = self.status(timeout=0.5).telemetry
+                return self
+            except NoDaemon:
+                time.sleep(0.02)
+        raise AssertionError(f"fishd did not come up: {self.end()}")
+
+    def status(self, timeout: float = PATIENCE) -> Status:
+        with Fish(self.endpoint, timeout=timeout) as fish:
+            return fish.status()
+
+    def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """What fishctl says of this daemon."""
+        return fishctl("--endpoint", self.endpoint, *arguments)
+
+    def fishctl_apart(self, *arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+        """The same in a process of its own, where the environment decides what it finds."""
+        return call(FISHCTL, "--endpoint", self.endpoint, *arguments, **options)
+
+    def socket(self, kind: int = zmq.DEALER) -> "zmq.Socket[bytes]":
+        """A bare ZeroMQ client, as any program in any language would have it."""
+        socket = zmq.Context.instance().socket(kind)
+        socket.set(zmq.LINGER, 0)
+        socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
+        socket.connect(self.endpoint)
+        return socket
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(PATIENCE)
 
 
 @contextlib.contextmanager
@@ -87,11 +168,8 @@ class Subscriber:
         self.socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
         self.socket.connect(address)
 
-    def frames(self) -> list[bytes]:
-        return self.socket.recv_multipart()
-
     def message(self) -> dict[str, Any]:
-        _, payload = self.frames()
+        _, payload = self.socket.recv_multipart()
         message: dict[str, Any] = msgspec.json.decode(payload)
         return message
 
@@ -107,7 +185,7 @@ class Subscriber:
     def close(self) -> None:
         self._context.destroy(linger=0)
 
-    def __enter__(self) -> "Subscriber":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

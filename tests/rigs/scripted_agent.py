@@ -8,7 +8,8 @@ from typing import Any
 
 import msgspec
 import zmq
-from harness import Rig
+
+from rigs.harness import Rig
 
 PATIENCE = 20.0
 Answer = dict[str, Any] | bytes | None

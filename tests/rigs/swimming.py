@@ -1,18 +1,26 @@
 """What tests of learning are built from: short trainings, and links that pause, lose or fail."""
 
 import csv
+import subprocess
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from msgspec.structs import replace
 
 from fishd.config import load
-from fishd.learning.in_process import InProcess
-from fishd.learning.jobs import Job
-from fishd.learning.link import LinkLost, Sensed
+from fishd.core.signals import Observation
+from fishd.learning.env.link import LinkLost, StepResult
+from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
-from fishd.signals import Observation
+from fishd.learning.train.jobs import Job
+from rigs.processes import fishctl
 
+LONG_ENOUGH = 120.0
+"""What a training may take until something comes of it, with the import of torch [s]."""
+Done = subprocess.CompletedProcess[str]
 NOISY = ("simulation.noise=0.001", "simulation.offset_y=0.005")
 BRIEF = TrainingSettings(
     steps=128,
@@ -36,7 +44,30 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-class Resting(InProcess):
+def wait_for(what: Callable[[], object]) -> None:
+    deadline = time.monotonic() + LONG_ENOUGH
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def while_it_trains(what: Callable[[], object], act: Callable[[], None], *words: str) -> Done:
+    """What fishctl says of a training during which we act, once something is the case."""
+
+    def wait_and_act() -> None:
+        try:
+            wait_for(what)
+        finally:
+            act()
+
+    with ThreadPoolExecutor(1) as pool:
+        acted = pool.submit(wait_and_act)
+        done = fishctl(*words)
+        acted.result()
+    return done
+
+
+class Resting(SimulatedLink):
     """A fish that comes to rest while the agent learns, as a real one does."""
 
     def __init__(self, job: Job) -> None:
@@ -44,12 +75,12 @@ class Resting(InProcess):
         self.shown: list[Observation] = []
         """Everything that the agent was shown."""
 
-    def start(self) -> Observation:
-        found = super().start()
+    def resume(self) -> Observation:  # and so does the first reset
+        found = super().resume()
         self.shown.append(found)
         return found
 
-    def step(self, angle: float) -> Sensed:
+    def step(self, angle: float) -> StepResult:
         sensed = super().step(angle)
         self.shown.append(sensed.observation)
         return sensed
@@ -59,7 +90,7 @@ class Resting(InProcess):
             super().step(0.0)
 
 
-class Losing(InProcess):
+class Losing(SimulatedLink):
     """A link over which one action in so many comes a tick too late."""
 
     def __init__(self, job: Job, every: int = 10) -> None:
@@ -67,15 +98,15 @@ class Losing(InProcess):
         self._every = every
         self._steps = 0
 
-    def step(self, angle: float) -> Sensed:
+    def step(self, angle: float) -> StepResult:
         self._steps += 1
         if self._steps % self._every:
             return super().step(angle)
         super().step(0.0)
-        return Sensed(super().step(angle).observation, lost=1)
+        return StepResult(super().step(angle).observation, lost=1)
 
 
-class Failing(InProcess):
+class Failing(SimulatedLink):
     """A fish that is gone after some steps."""
 
     def __init__(self, job: Job, steps: int) -> None:
@@ -83,7 +114,7 @@ class Failing(InProcess):
         self._left = steps
         self.closed = 0
 
-    def step(self, angle: float) -> Sensed:
+    def step(self, angle: float) -> StepResult:
         self._left -= 1
         if self._left < 0:
             raise LinkLost("fishd is in mode fault: the newest force sample is 150 ms old")

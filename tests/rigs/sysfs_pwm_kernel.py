@@ -1,7 +1,8 @@
 """The kernel's PWM class as files in memory: refuses what Linux refuses, with the same errors.
 
-Takes the place of module `os` in `fishd.hardware.pwm_channel`. It is as strict as kernels up to
-6.9: while the period is 0 they refuse everything. They ignore a state that they believe to be set.
+Takes the place of module `os` in `fishd.hardware.servo.pwm_channel`. It is as strict as kernels
+up to 6.9: while the period is 0 they refuse everything. They ignore a state that they believe to
+be set.
 """
 
 import errno
@@ -9,9 +10,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from fishd.clock import Clock
-from fishd.emulation.pulses import PulseTrain
-from fishd.hardware.pwm_channel import PwmChannel
+from fishd.core.clock import Clock
+from fishd.hardware.servo.pwm_channel import PwmChannel
+from fishd.virtual.pi.pulse_train import PulseTrain
 
 
 @dataclass(frozen=True)

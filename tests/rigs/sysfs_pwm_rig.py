@@ -2,13 +2,15 @@
 
 import math
 import os
+from functools import partial
+from typing import Any
 
-from sysfs_pwm_kernel import SysfsPwm
-
-from fishd.clock import VirtualClock
-from fishd.hardware.calibration import ServoCalibration
-from fishd.hardware.settings import ServoSettings
-from fishd.hardware.sysfs_pwm import SysfsPwmServo
+from fishd.core.calibration import ServoCalibration
+from fishd.core.clock import VirtualClock
+from fishd.hardware.servo import pwm_pulses
+from fishd.hardware.servo.calibrated_servo import CalibratedServo
+from fishd.hardware.servo.sysfs_pwm import SysfsPwm, SysfsPwmSettings
+from rigs.sysfs_pwm_kernel import SysfsPwm as SysfsPwmKernel
 
 PI5 = "1f00098000.pwm"
 FAN = "1f0009c000.pwm"
@@ -18,21 +20,39 @@ PI4 = "fe20c000.pwm"
 class Bench:
     """A Pi 5's kernel, or another one's, and servos on it."""
 
-    def __init__(self, chips: dict[str, int] | None = None, udev_delay: float = 0.03) -> None:
+    def __init__(
+        self,
+        chips: dict[str, int] | None = None,
+        udev_delay: float = 0.03,
+        kernel: type[SysfsPwmKernel] = SysfsPwmKernel,
+    ) -> None:
         self.clock = VirtualClock()
-        self.kernel = SysfsPwm(self.clock, chips or {FAN: 4, PI5: 4}, udev_delay=udev_delay)
-
-    def servo(
-        self, settings: ServoSettings | None = None, calibration: ServoCalibration | None = None
-    ) -> SysfsPwmServo:
-        return SysfsPwmServo(
-            settings or ServoSettings(driver="sysfs-pwm"),
-            calibration or ServoCalibration(),
-            self.clock,
-            self.kernel,
+        self.kernel: Any = kernel(
+            self.clock, {FAN: 4, PI5: 4} if chips is None else chips, udev_delay=udev_delay
         )
 
-    def write(self, servo: SysfsPwmServo, angle: float) -> float:
+    def servo(
+        self, settings: SysfsPwmSettings | None = None, calibration: ServoCalibration | None = None
+    ) -> CalibratedServo:
+        return CalibratedServo(
+            partial(SysfsPwm, files=self.kernel),  # type: ignore[arg-type]
+            settings or SysfsPwmSettings(),
+            calibration or ServoCalibration(),
+            self.clock,
+            threaded=False,
+            tick=0.05,
+        )
+
+    def last_resort(
+        self, neutral: float = 1500.0, settings: SysfsPwmSettings | None = None
+    ) -> bool:
+        """What another process does when fishd is dead."""
+        resort = SysfsPwm.last_resort(settings or SysfsPwmSettings())
+        return pwm_pulses.neutralise(
+            neutral, files=self.kernel, clock=self.clock, **resort.arguments
+        )
+
+    def write(self, servo: CalibratedServo, angle: float) -> float:
         """Write and wait for the next frame; the pulse that is sent then [µs]."""
         servo.write(angle)
         self.clock.sleep(0.05)

@@ -6,13 +6,13 @@ from typing import Any, Self
 from adafruit_ads1x15 import ADS1115, AnalogIn
 from adafruit_extended_bus import ExtendedI2C
 
-from fishd.clock import VirtualClock
-from fishd.emulation.linux_i2c import LinuxI2c
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.emulation.virtual_pi import VirtualPi
-from fishd.hardware.imperfections import SimulationSettings
-from fishd.hardware.pigpio_client import Client
-from fishd.plant.parameters import PlantParameters
+from fishd.core.clock import VirtualClock
+from fishd.hardware.servo.pigpio_client import Client
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.linux_i2c import LinuxI2c
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.pi.virtual_pi import VirtualPi
+from fishd.virtual.plant.parameters import PlantParameters
 
 TICK = 0.05
 BUS = 203

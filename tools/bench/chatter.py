@@ -1,27 +1,22 @@
-"""Measures what the shortest dwell is worth: a policy on fish that make it reverse too fast.
-
-    python tools/bench_chatter.py                            the table of docs/policies.md
-    python tools/bench_chatter.py --write docs/policies.md   put it there
-    python tools/bench_chatter.py --policy NAME|FILE         with this one, not default-fish
+"""What the shortest dwell is worth: a policy on fish that make it reverse too fast.
 
 Each fish swims a minute from rest in virtual time, with each seed of the noise: with
 `chatter.dwell: 0`, with the defaults, and with `swing` for comparison. About half a minute.
 """
 
-import argparse
 import statistics
+from argparse import Namespace
 from collections.abc import Iterable
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
-from reports import put, table
-
+from common.report import Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.controllers import registry
-from fishd.signals import Event, Tick
+from fishd.core.signals import Event, Tick
 from fishd.simulation import judge
 
+DOCUMENT = "policies.md"
 RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
 HARSH = {
     "servo delay 30 ms": ("servo_delay=0.03",),
@@ -114,10 +109,23 @@ def swum(changes: Iterable[str], name: str, parameters: dict[str, str], seeds: i
     ]
 
 
-def report(policy: str, seeds: int) -> str:
-    """Markdown."""
+HEAD = (
+    f"fish | no limit [%] | every tick [s] | < {FAST:g} s [s] | limit [%] | every tick [s] | "
+    f"< {FAST:g} s [s] | fell back | `swing` [%]"
+)
+
+
+OPTIONS: Options = {
+    "--policy": {"default": "default-fish", "help": "name or file"},
+    "--seeds": {"type": int, "default": 3, "help": "runs of each (3)"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Every fish."""
+    seeds = options.seeds
     fish = {"as configured": (), **HARSH}
-    ppo = {"policy": policy}
+    ppo = {"policy": options.policy}
     rows, without, limited, swing = [], [], [], []
     for label, parts in fish.items():
         changes = [f"plant.{part}" for part in parts]
@@ -141,23 +149,13 @@ def report(policy: str, seeds: int) -> str:
                 efficiency(other),
             ]
         )
-        print(" | ".join(rows[-1]), flush=True)
-    head = [
-        "fish",
-        "no limit [%]",
-        "every tick [s]",
-        f"< {FAST:g} s [s]",
-        "limit [%]",
-        "every tick [s]",
-        f"< {FAST:g} s [s]",
-        "fell back",
-        "`swing` [%]",
-    ]
-    return (
-        f"{table(head, rows)}\n\nThe {len(HARSH)} harsh fish, {len(without)} runs each, median "
+        progress(*rows[-1])
+    text = (
+        f"{table(HEAD, rows)}\n\nThe {len(HARSH)} harsh fish, {len(without)} runs each, median "
         f"(lowest): without the limit {spread(without)}, with it {spread(limited)}, `swing` "
         f"{spread(swing)}."
     )
+    return Report({"bench chatter": text}, rows)
 
 
 def efficiency(runs: list[Swum]) -> str:
@@ -169,21 +167,3 @@ def spread(runs: list[Swum]) -> str:
     """Median and lowest."""
     lowest = min(run.efficiency for run in runs)
     return f"{efficiency(runs)} % ({lowest * 100:.1f} %)"
-
-
-def main() -> None:
-    """Measure, and print or write."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--policy", default="default-fish", help="name or file")
-    parser.add_argument("--seeds", type=int, default=3, help="runs of each")
-    parser.add_argument("--write", type=Path, help="document with the markers of bench_chatter")
-    options = parser.parse_args()
-    text = report(options.policy, options.seeds)
-    if options.write:
-        put(options.write, "bench_chatter", text)
-    else:
-        print(text)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,46 +1,42 @@
-"""Measures what a policy costs in the tick: one update of the controller `ppo`.
-
-    python tools/bench_policy.py                            the table of docs/policies.md
-    python tools/bench_policy.py --write docs/policies.md   put it there
-    python tools/bench_policy.py --policy NAME|FILE         with this one, not a random 64 × 64 tanh
+"""What a policy costs in the tick: one update of the controller `ppo`.
 
 First the loop on the virtual clock, where one update follows the other, in turn with the controller
 `hold`, whose update does nothing. Then real fishd, whose update comes after 50 ms of sleep: with
-rehearsed ticks as usual, and without.
+warmed-up ticks as usual, and without.
 """
 
-import argparse
 import itertools
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_contestants import Fishd, quantile
-from bench_machine import machine
-from reports import put, table
 
+from common.daemon import Fishd
+from common.machine import machine_in_short
+from common.report import Options, Report, quantile, table
 from fishd import __version__
-from fishd.build import build_loop
-from fishd.clock import VirtualClock, VirtualTicker
 from fishd.config import Config, load
+from fishd.control.loop import ControlLoop
 from fishd.controllers import registry
-from fishd.hardware.simulated import SimulatedFish
-from fishd.loop import ControlLoop
-from fishd.policies.card import Card, Feature, Provenance
-from fishd.policies.network import to_onnx
-from fishd.signals import Event, Observation, Percentiles, Tick
+from fishd.controllers.policy.card import Card, Feature, Provenance
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.clock import VirtualClock, VirtualTicker
+from fishd.core.signals import Event, Observation, Percentiles, Tick
+from fishd.virtual.fish import SimulatedFish
+from fishd.wiring import build_loop
 
+DOCUMENT = "policies.md"
 GOAL = 50.0
 """Longest update that is asked for, at p99 [µs]."""
 BLOCK = 500
 """Updates before the other controller has its turn."""
 RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
-UNITS = {"CPU": "", "Cores": "cores", "SCHED_FIFO": "of SCHED_FIFO"}
-HEAD = ["controller", "where", "updates", "p50 [µs]", "p99 [µs]", "worst [µs]"]
+HEAD = "controller | where | updates | p50 [µs] | p99 [µs] | worst [µs]"
 
 
 class Deaf:
@@ -140,10 +136,12 @@ def in_real_time(policy: str, seconds: float) -> Iterator[list[str]]:
     with ExitStack() as stack:
         started = []
         for name, parameters in (("hold", ()), ("ppo", (f"start.parameters.policy={policy}",))):
-            for rehearse, where in (("true", "fishd"), ("false", "fishd, not rehearsed")):
-                own = (f"start.controller={name}", *parameters, f"realtime.rehearse={rehearse}")
+            for warm_up, where in (("true", "fishd"), ("false", "fishd, not warmed up")):
+                own = (f"start.controller={name}", *parameters, f"realtime.warm_up={warm_up}")
                 fishd = stack.enter_context(Fishd(*RIG, *own))
                 started.append((name, where, fishd))
+        for _, _, fishd in started:
+            fishd.next_tick()
         time.sleep(seconds)
         for name, where, fishd in started:
             status = fishd.status()
@@ -163,32 +161,24 @@ def policy_file(given: str | None) -> Iterator[str]:
     if given:
         yield str(Path(given).absolute()) if "/" in given or given.endswith(".onnx") else given
         return
-    with tempfile.TemporaryDirectory(prefix="bench-policy-") as folder:
+    with tempfile.TemporaryDirectory(prefix="fishd-") as folder:
         path = Path(folder) / "random.onnx"
         path.write_bytes(random_policy())
         yield str(path)
 
 
-def main() -> None:
-    """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--updates", type=int, default=20_000, help="in virtual time (20000)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of real time (60)")
-    parser.add_argument("--policy", metavar="NAME|FILE", help="instead of a random one")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="replace the table in FILE")
-    options = parser.parse_args()
+OPTIONS: Options = {
+    "--updates": {"type": int, "default": 20_000, "help": "in virtual time (20000)"},
+    "--seconds": {"type": float, "default": 60.0, "help": "of real time (60)"},
+    "--policy": {"metavar": "NAME|FILE", "help": "not one of random weights, 64 × 64 tanh"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """In virtual and in real time."""
     with policy_file(options.policy) as policy:
         rows = [*in_virtual_time(policy, options.updates), *in_real_time(policy, options.seconds)]
-    p99 = float(rows[1][4])
-    met = "met" if p99 <= GOAL else "**not met**"
+    met = "met" if float(rows[1][4]) <= GOAL else "**not met**"
     verdict = f"Goal, p99 ≤ {GOAL:g} µs where one update follows the other: {met}."
-    about = machine()
-    on = ", ".join(f"{about[key]} {unit}" for key, unit in UNITS.items())
-    text = f"{table(HEAD, rows)}\n\n{verdict} Machine: {on}."
-    if options.write:
-        put(options.write, "bench_policy", text)
-    print(text)
-
-
-if __name__ == "__main__":
-    main()
+    text = f"{table(HEAD, rows)}\n\n{verdict} {machine_in_short()}"
+    return Report({"bench policy": text}, rows)

@@ -1,46 +1,45 @@
-"""Measures how long the controller `remote` waits for an agent in another process.
-
-    python tools/bench_remote.py                            the table of docs/remote.md
-    python tools/bench_remote.py --write docs/remote.md     put it there
-    python tools/bench_remote.py --quick                    ticks of 5 ms only, half a minute
+"""How long the controller `remote` waits for an agent in another process.
 
 A round trip begins when a tick is about to send its observation, and ends when it has the action.
 The agent is `fishd.client.Agent`, a Python program that answers at once: at normal priority and,
 where that is permitted, under SCHED_FIFO as well.
 """
 
-import argparse
 import asyncio
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from statistics import quantiles
 
-import zmq
-from bench_machine import PRIORITY, fifo_permitted, machine
 from msgspec import Struct
-from reports import put, table
 
-from fishd import realtime
-from fishd.build import build_loop
-from fishd.clock import SystemClock, Ticker
+from common.machine import PRIORITY, fifo_permitted, machine_in_short, priorities, scheduling
+from common.report import Options, Report, progress, table
 from fishd.config import Config, load
-from fishd.hardware.simulated import SimulatedFish
-from fishd.rehearsal import rehearsal
-from fishd.remote.controller import Remote
-from fishd.remote.parameters import RemoteParameters
-from fishd.signals import Observation
-from fishd.telemetry import Telemetry
+from fishd.controllers.remote.controller import Remote
+from fishd.controllers.remote.parameters import RemoteParameters
+from fishd.core.clock import SystemClock, Ticker
+from fishd.core.signals import Observation
+from fishd.daemon import realtime
+from fishd.daemon.telemetry import unheard
+from fishd.daemon.warm_up import mock_ticks
+from fishd.virtual.fish import SimulatedFish
+from fishd.wiring import build_loop
 
+DOCUMENT = "remote.md"
 GOAL = 2e-3
 """Longest round trip that is asked for, at p99 [s]."""
 AGENT_PRIORITY = 40
 """Below that of fishd."""
+HEAD = (
+    "over | tick | agent | trips | p50 [µs] | p99 [µs] | p99.9 [µs] | worst [µs] | late | "
+    "p99 ≤ 2 ms"
+)
 AGENT = """
 import sys
 from fishd.client import Agent
@@ -102,26 +101,23 @@ def agent_process(address: str, priority: int) -> Iterator[str]:
 
 async def swim(controller: TimedRemote, config: Config, trips: int) -> None:
     """Tick as the daemon does until there are so many round trips."""
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
-    publisher = Telemetry(context, f"inproc://{id(controller)}")
-    # As in the daemon: once there is a thread of ZeroMQ, which is to have the priority as well.
     realtime.enter(PRIORITY if fifo_permitted() else 0, lock_memory=False)
     fish = SimulatedFish(config.plant, config.simulation, config.tick)
-    loop = build_loop(config, fish.robot(), SystemClock(), publisher)
+    loop = build_loop(config, fish.robot(), SystemClock(), unheard())
     loop.set_controller("remote", controller)
-    ticker = Ticker(config.tick, rehearsal(config, context))
+    ticker = Ticker(config.tick, mock_ticks(config))
     realtime.quiet_garbage_collector()
     async for slot in ticker:
         loop.tick(slot)
         if loop.supervisor.reason:
-            raise SystemExit(f"bench_remote: {loop.supervisor.reason.message}")
+            raise SystemExit(f"bench remote: {loop.supervisor.reason.message}")
         if len(controller.times) >= trips:
             break
     ticker.close()
     loop.close()
 
 
-def measure(transport: str, tick: float, priority: int, trips: int) -> Trips:
+def round_trips(transport: str, tick: float, priority: int, trips: int) -> Trips:
     """One run over `ipc` or `tcp`, in this process, which is to do nothing else."""
     config = load(None, [f"tick={tick}"])
     with tempfile.TemporaryDirectory() as folder:
@@ -141,7 +137,7 @@ def row(trips: Trips) -> list[str]:
     return [
         trips.transport,
         f"{trips.tick * 1e3:g} ms",
-        f"SCHED_FIFO {trips.priority}" if trips.priority else "normal",
+        scheduling(trips.priority),
         str(len(trips.times)),
         *(f"{value * 1e6:.0f}" for value in figures),
         str(trips.late),
@@ -149,43 +145,19 @@ def row(trips: Trips) -> list[str]:
     ]
 
 
-def main() -> None:
-    """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--trips", type=int, default=2000, help="per run (default: 2000)")
-    parser.add_argument("--quick", action="store_true", help="ticks of 5 ms only")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="replace the table in FILE")
-    options = parser.parse_args()
-    fifo = fifo_permitted()
-    ticks = (0.005,) if options.quick else (0.005, 0.05)
-    priorities = (0, AGENT_PRIORITY) if fifo and shutil.which("chrt") else (0,)
-    rows = [
-        row(measure(transport, tick, priority, options.trips))
-        for priority in priorities
-        for tick in ticks
-        for transport in ("ipc", "tcp")
-    ]
-    head = [
-        "over",
-        "tick",
-        "agent",
-        "trips",
-        "p50 [µs]",
-        "p99 [µs]",
-        "p99.9 [µs]",
-        "worst [µs]",
-        "late",
-        "p99 ≤ 2 ms",
-    ]
-    facts = machine()
-    text = (
-        f"{facts['CPU']}, {facts['Cores']} cores; Python {facts['Python']}; fishd's loop under "
-        f"{f'SCHED_FIFO {PRIORITY}' if fifo else 'normal'} scheduling.\n\n" + table(head, rows)
-    )
-    if options.write:
-        put(options.write, "bench_remote", text)
-    print(text)
+OPTIONS: Options = {
+    "--trips": {"type": int, "default": 2000, "help": "per run (default: 2000)"},
+    "--quick": {"action": "store_true", "help": "ticks of 5 ms only, half a minute"},
+}
 
 
-if __name__ == "__main__":
-    main()
+def measure(options: Namespace) -> Report:
+    """Every tick over every transport, with an agent of every priority."""
+    found = []
+    for priority in priorities(AGENT_PRIORITY) if shutil.which("chrt") else (0,):
+        for tick in (0.005,) if options.quick else (0.005, 0.05):
+            for transport in ("ipc", "tcp"):
+                found.append(round_trips(transport, tick, priority, options.trips))
+                progress(*row(found[-1]))
+    text = f"{machine_in_short()}\n\n{table(HEAD, map(row, found))}"
+    return Report({"bench remote": text}, found)

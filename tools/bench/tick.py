@@ -1,46 +1,38 @@
-"""Measures how punctual, quick and light fishd is, next to other loops on the same busy machine.
-
-    python tools/bench_tick.py                                the tables of docs/performance.md
-    python tools/bench_tick.py --write docs/performance.md    put them there
-    python tools/bench_tick.py --quick                        a rough look, in a minute
+"""How punctual, quick and light fishd is, next to other loops on the same busy machine.
 
 Machines are noisy, so look at ratios: all contestants run at the same time, under the same load.
 Everything stays on this machine and stops by itself.
+
+With --against, two checkouts of fishd take turns instead: is one of them slower?
 """
 
-import argparse
 import json
 import shutil
 import statistics
 import subprocess
-import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
-from bench_contestants import (
-    PLAIN_LOOPS,
-    CyclicTest,
-    Fishd,
-    Lateness,
-    PlainLoop,
-    lateness,
-    quantile,
-)
-from bench_machine import PRIORITY, fifo_permitted, machine, stress
 from msgspec import Struct
-from reports import put, table
 
-from fishd.signals import Percentiles, Tick, Timing
-from fishd.statistics import PHASES
+from bench.compare import compare
+from bench.contestants import PLAIN_LOOPS, CyclicTest, Lateness, PlainLoop, lateness
+from common.daemon import BIN, Fishd
+from common.machine import load, machine, priorities, scheduling, stress
+from common.report import Options, Report, progress, quantile, table
+from fishd.control.statistics import PHASES
+from fishd.core.signals import Percentiles, Tick, Timing
 
+DOCUMENT = "performance.md"
 TICK = 0.05
 """The tick that the robot swims with [s]."""
 FAST = 0.002
 """The shortest tick that fishd can be asked for [s]."""
-FISHCTL = str(Path(sys.executable).with_name("fishctl"))
+FISHCTL = str(BIN / "fishctl")
 
 
 class Figures(Struct, frozen=True):
@@ -120,7 +112,7 @@ def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Rou
             sealed=Percentiles(quantile(busy, 0.5), quantile(busy, 0.99), max(busy), 0),
             timing=fishd.status().timing,
             cpu=cpu,
-            rss=fishd.memory("VmRSS"),
+            rss=fishd.memory(),
             peak=fishd.memory("VmHWM"),
         )
         everyone = [itself, *(other.result() for other in others)]
@@ -171,15 +163,14 @@ def real_time_factor() -> float:
     return max(float(json.loads(report.stdout)["real_time_factor"]) for report in reports)
 
 
-def measure(seconds: float, runs: int) -> Results:
+def measure_all(seconds: float, runs: int) -> Results:
     """The whole benchmark: idle, then under load."""
     factor = real_time_factor()
-    priorities = [0, PRIORITY] if fifo_permitted() else [0]
-    best = priorities[-1]
+    best = priorities()[-1]
     rounds, latencies = [], []
     for stressed in (False, True):
         with stress(stressed, limit=4 * seconds + 30 * runs + 60):
-            for tick, priority in (*((TICK, priority) for priority in priorities), (FAST, best)):
+            for tick, priority in (*((TICK, priority) for priority in priorities()), (FAST, best)):
                 _say(f"{seconds:g} s of {tick * 1e3:g} ms ticks", stressed, priority)
                 rounds.append(run_round(stressed, priority, tick, seconds))
             _say("start-up and fishctl status", stressed, best)
@@ -188,8 +179,7 @@ def measure(seconds: float, runs: int) -> Results:
 
 
 def _say(what: str, stressed: bool, priority: int) -> None:
-    where = f"{_load(stressed)}, {_scheduling(priority)} scheduling"
-    print(f"bench_tick: {what}, {where}", file=sys.stderr)
+    progress(what, load(stressed), f"{scheduling(priority)} scheduling")
 
 
 def markdown(results: Results) -> str:
@@ -220,19 +210,19 @@ def markdown(results: Results) -> str:
         for round_ in rounds
         for f in [round_.fishd]
     ]
-    head = ["tick", "machine", "scheduling"]
+    head = "tick | machine | scheduling"
     sections = {
-        "The machine": (["", ""], [[key, value] for key, value in results.machine.items()]),
-        "Goals": (["goal", "idle", "met", "under load", "met"], goals(results)),
+        "The machine": (" | ", results.machine.items()),
+        "Goals": ("goal | idle | met | under load | met", goals(results)),
         f"Lateness over {results.seconds:g} s [µs]": (
-            [*head, "contestant", "p50", "p99", "worst", "missed", "drift"],
+            f"{head} | contestant | p50 | p99 | worst | missed | drift",
             late,
         ),
         "Time per phase of a fishd tick, p50 / p99 [µs]": (
-            [*head, *PHASES, "whole tick", "until sealed"],
+            " | ".join((head, *PHASES, "whole tick", "until sealed")),
             phases,
         ),
-        "What fishd costs": ([*head, "CPU", "RSS [MB]", "peak RSS [MB]"], costs),
+        "What fishd costs": (f"{head} | CPU | RSS [MB] | peak RSS [MB]", costs),
     }
     return "\n\n".join(f"### {title}\n\n{table(*content)}" for title, content in sections.items())
 
@@ -261,9 +251,7 @@ def goals(results: Results) -> list[list[str]]:
     factor = results.real_time_factor
     return [
         *(
-            judged(
-                f"{late}, {_scheduling(p)} scheduling", 2, "{:.2f} ×", _to_cyclictest, priority=p
-            )
+            judged(f"{late}, {scheduling(p)} scheduling", 2, "{:.2f} ×", _to_cyclictest, priority=p)
             for p in sorted({round_.priority for round_ in results.rounds})
         ),
         judged("no drift: ≤ 100 µs over a round", 100, us, lambda r: abs(r.lateness[0].drift or 0)),
@@ -296,36 +284,26 @@ def _verdict(value: float | None, limit: float, form: str = "{:.2f} s") -> list[
     return [form.format(value), "yes" if value <= limit else "**no**"]
 
 
-def _load(stressed: bool) -> str:
-    return "under load" if stressed else "idle"
-
-
-def _scheduling(priority: int) -> str:
-    return f"SCHED_FIFO {priority}" if priority else "normal"
-
-
 def _conditions(round_: Round) -> list[str]:
-    return [f"{round_.tick * 1e3:g} ms", _load(round_.stressed), _scheduling(round_.priority)]
+    return [f"{round_.tick * 1e3:g} ms", load(round_.stressed), scheduling(round_.priority)]
 
 
 def _percentiles(times: Percentiles) -> str:
     return f"{times.p50:.0f} / {times.p99:.0f}"
 
 
-def main() -> None:
-    """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--seconds", type=float, default=60.0, help="per round (default: 60)")
-    parser.add_argument("--quick", action="store_true", help="5 s per round, for a rough look")
-    parser.add_argument("--json", action="store_true", help="print all figures as JSON")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="replace the tables in FILE")
-    options = parser.parse_args()
-    seconds, runs = (5.0, 3) if options.quick else (options.seconds, 7)
-    results = measure(seconds, runs)
-    if options.write:
-        put(options.write, "bench_tick", markdown(results))
-    print(msgspec.json.encode(results).decode() if options.json else markdown(results))
+OPTIONS: Options = {
+    "--seconds": {"type": float, "help": "per round; default 60, to compare 10"},
+    "--quick": {"action": "store_true", "help": "5 s per round, for a rough look"},
+    "--against": {"type": Path, "metavar": "CHECKOUT", "help": "compare this fishd with that one"},
+    "--rounds": {"type": int, "default": 10, "help": "turns of each, with --against; default 10"},
+}
 
 
-if __name__ == "__main__":
-    main()
+def measure(options: Namespace) -> Report:
+    """Measure this fishd, or compare it with another one."""
+    if options.against:
+        return compare(options.against, options.seconds or 10.0, options.rounds)
+    seconds, runs = (5.0, 3) if options.quick else (options.seconds or 60.0, 7)
+    results = measure_all(seconds, runs)
+    return Report({"bench tick": markdown(results)}, results)

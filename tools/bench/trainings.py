@@ -1,4 +1,4 @@
-"""Trainings for `bench_learning.py`: many at a time, and what their policies do on other fish."""
+"""Trainings for `learning`: many at a time, and what their policies do on other fish."""
 
 import itertools
 import tempfile
@@ -8,18 +8,19 @@ from typing import NamedTuple
 import joblib
 from msgspec.structs import replace
 
+from common.report import DOCS, progress
 from fishd.config import Config, load
 from fishd.learning import settings as training
-from fishd.learning.checkpoints import load_policy
-from fishd.learning.evaluation import judge
-from fishd.learning.jobs import Job
-from fishd.learning.ppo import Deterministic
-from fishd.learning.scales import features
-from fishd.learning.seed_table import Point, curve
+from fishd.learning.env.evaluation import Evaluation, judge
+from fishd.learning.env.scales import features
+from fishd.learning.ppo.model import DeterministicPolicy
+from fishd.learning.run_folder.checkpoints import load_policy
+from fishd.learning.run_folder.tables import best_so_far, read_evaluations
 from fishd.learning.settings import TrainingSettings
-from fishd.learning.training import train
+from fishd.learning.train.jobs import Job
+from fishd.learning.train.training import train
 
-CONFIG = Path(__file__).resolve().parent.parent / "config"
+CONFIG = DOCS.parent / "config"
 OFF = 0.15
 """By this share each of four parameters of a fish is off, up or down."""
 
@@ -27,7 +28,9 @@ OFF = 0.15
 class Trained(NamedTuple):
     """One training."""
 
-    points: list[Point]
+    points: list[Evaluation]
+    best: list[float]
+    """Efficiency of the best policy until each of them."""
     others: list[float]
     """Efficiencies of its best policy on fish that are off, if those were asked for."""
     others_last: list[float]
@@ -54,13 +57,14 @@ def trained(config: Config, settings: TrainingSettings, seed: int, others: bool)
             config=fish, settings=replace(settings, seed=seed), folder=Path(temporary) / "run"
         )
         outcome = train(job)
-        points = curve(job.folder)
+        points = read_evaluations(job.folder)
+        so_far = best_so_far(points)
         if not others:
-            return Trained(points, [], [])
+            return Trained(points, so_far, [], [])
         assert outcome.best
         assert outcome.checkpoint
         best, last = (swum(path, config, settings) for path in (outcome.best, outcome.checkpoint))
-        return Trained(points, best, last)
+        return Trained(points, so_far, best, last)
 
 
 def swum(checkpoint: Path, config: Config, settings: TrainingSettings) -> list[float]:
@@ -74,7 +78,7 @@ def swum(checkpoint: Path, config: Config, settings: TrainingSettings) -> list[f
             value * (1.0 + OFF * sign) for value, sign in zip(values, signs, strict=True)
         )
         off = replace(plant, omega0=omega0, xi=xi, servo_speed=speed, coupling=coupling)
-        decide = Deterministic(load_policy(checkpoint), seen, config.amplitude_limit)
+        decide = DeterministicPolicy(load_policy(checkpoint), seen, config.amplitude_limit)
         fish = replace(config, plant=off, simulation=replace(config.simulation, seed=1000))
         found.append(judge(fish, decide, 60.0, 10.0).efficiency)
     return found
@@ -92,5 +96,5 @@ def several(
         for (row, seed), result in zip(tasks, work, strict=True):
             found[row].append(result)
             last = result.points[-1]
-            print(f"{row}, seed {seed}: {last.efficiency:.1%}, best {last.best:.1%}", flush=True)
+            progress(f"{row}, seed {seed}: {last.efficiency:.1%}, best {result.best[-1]:.1%}")
     return found

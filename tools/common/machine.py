@@ -1,4 +1,4 @@
-"""The machine that benchmarks run on: what it is, what it permits, and how to keep it busy."""
+"""The machine that is measured on: what it is, what it permits, and how to keep it busy."""
 
 import os
 import shutil
@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 PRIORITY = 50
@@ -37,10 +38,33 @@ def machine() -> dict[str, str]:
     }
 
 
+def machine_in_short() -> str:
+    """The same as one sentence."""
+    about = machine()
+    cores, python, fifo = (about[key] for key in ("Cores", "Python", "SCHED_FIFO"))
+    return f"{about['CPU']}, {cores} cores; Python {python}; SCHED_FIFO: {fifo}."
+
+
+@cache
 def fifo_permitted() -> bool:
     """May processes that this one starts ask for real-time scheduling?"""
     ask = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({PRIORITY}))"
     return subprocess.run([sys.executable, "-c", ask], stderr=subprocess.DEVNULL).returncode == 0
+
+
+def priorities(highest: int = PRIORITY) -> tuple[int, ...]:
+    """Those to measure with: 0, the normal scheduler, and a real-time one where permitted."""
+    return (0, highest) if fifo_permitted() else (0,)
+
+
+def scheduling(priority: int) -> str:
+    """A priority in words."""
+    return f"SCHED_FIFO {priority}" if priority else "normal"
+
+
+def load(stressed: bool) -> str:
+    """A load in words."""
+    return "under load" if stressed else "idle"
 
 
 @contextmanager
@@ -49,8 +73,8 @@ def stress(wanted: bool, limit: float) -> Iterator[None]:
     cores = os.cpu_count() or 1
     commands: list[list[str]] = []
     if wanted and shutil.which("stress-ng"):
-        load = ["--cpu", str(cores), "--io", "1", "--vm", "1", "--vm-bytes", "128M"]
-        commands = [["stress-ng", "--quiet", *load, "--timeout", f"{limit:.0f}s"]]
+        words = ["--cpu", str(cores), "--io", "1", "--vm", "1", "--vm-bytes", "128M"]
+        commands = [["stress-ng", "--quiet", *words, "--timeout", f"{limit:.0f}s"]]
     elif wanted:
         spin = f"import time; end = time.monotonic() + {limit}\nwhile time.monotonic() < end: pass"
         commands = [[sys.executable, "-c", spin]] * cores

@@ -1,6 +1,6 @@
 """What hostile or broken neighbours do to fishd's sockets; each ends by itself.
 
-    python tools/attackers.py NAME TELEMETRY CONTROL SECONDS
+    python tools/reliability/attackers.py NAME TELEMETRY CONTROL SECONDS
 
 Only addresses of this machine are attacked: tcp://127.0.0.1:PORT and ipc://PATH.
 """
@@ -11,7 +11,8 @@ import re
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import zmq
 
@@ -90,46 +91,49 @@ def long_frame(telemetry: str, control: str, seconds: float) -> None:
             time.sleep(0.05)
 
 
+@contextmanager
+def clients(control: str, count: int, **options: int) -> Iterator[list["zmq.Socket[bytes]"]]:
+    """So many clients of the control socket, with options of ZeroMQ by name."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    context.set(zmq.MAX_SOCKETS, count + 10)
+    dealers = [context.socket(zmq.DEALER) for _ in range(count)]
+    for dealer in dealers:
+        for name, value in options.items():
+            dealer.set(getattr(zmq, name), value)
+        dealer.connect(control)
+    yield dealers
+    context.destroy(linger=0)
+
+
+def send(dealer: "zmq.Socket[bytes]", payloads: list[bytes], read: bool = True) -> None:
+    """Send as many of these as there is room for, and read all answers that are there."""
+    with suppress(zmq.Again):
+        for payload in payloads:
+            dealer.send(payload, zmq.DONTWAIT)
+        while read:
+            dealer.recv(zmq.DONTWAIT)
+
+
 def silent_dealers(telemetry: str, control: str, seconds: float) -> None:
     """500 clients that ask for `status` all the time and never read an answer."""
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    context.set(zmq.MAX_SOCKETS, 1000)
-    dealers = [context.socket(zmq.DEALER) for _ in range(500)]
-    for dealer in dealers:
-        dealer.set(zmq.RCVHWM, 1)
-        dealer.connect(control)
     end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        for dealer in dealers:
-            try:
-                for _ in range(20):
-                    dealer.send(STATUS, zmq.DONTWAIT)
-            except zmq.Again:
-                pass
-    context.destroy(linger=0)
+    with clients(control, 500, RCVHWM=1) as dealers:
+        while time.monotonic() < end:
+            for dealer in dealers:
+                send(dealer, [STATUS] * 20, read=False)
 
 
 def long_ops(telemetry: str, control: str, seconds: float) -> None:
     """20 clients that read, and ask for ops with names of 16 and of 64 kB."""
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    dealers = [context.socket(zmq.DEALER) for _ in range(20)]
-    for dealer in dealers:
-        dealer.connect(control)
     longest = b'{"v":1,"id":1,"op":"' + b"x" * 65_000 + b'"}'
     long = b'{"v":1,"id":1,"op":"' + b"x" * 16_000 + b'"}'
     key = b'{"v":1,"id":1,"op":"set-controller","args":{"name":"swing","parameters":{"%b":1}}}'
     known = [long, key % (b"y" * 16_000), b'{"v":1,"id":1,"op":"statsu"}', longest]
     end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        for dealer in dealers:
-            try:
-                for payload in known:
-                    dealer.send(payload, zmq.DONTWAIT)
-                while True:
-                    dealer.recv(zmq.DONTWAIT)
-            except zmq.Again:
-                pass
-    context.destroy(linger=0)
+    with clients(control, 20) as dealers:
+        while time.monotonic() < end:
+            for dealer in dealers:
+                send(dealer, known)
 
 
 def fuzz(telemetry: str, control: str, seconds: float) -> None:
@@ -143,53 +147,38 @@ def fuzz(telemetry: str, control: str, seconds: float) -> None:
         b'{"v":1,"id":4,"op":"sample-force","args":{"seconds":0.1}}',
         b'{"v":1,"id":5,"op":"config"}',
     ]
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    dealers = [context.socket(zmq.DEALER) for _ in range(8)]
-    for dealer in dealers:
-        dealer.connect(control)
-    for number in range(100_000):
-        payload = bytearray(chance.choice(seeds))
-        for _ in range(chance.randrange(4)):
-            kind, place = chance.randrange(3), chance.randrange(len(payload))
-            if kind == 0:
-                payload[place] = chance.randrange(256)
-            elif kind == 1:
-                del payload[place : place + chance.randrange(8)]
-            else:
-                payload[place:place] = os.urandom(chance.randrange(20))
-            if not payload:
-                break
-        dealer = dealers[number % 8]
-        try:
-            dealer.send(bytes(payload), zmq.DONTWAIT)
-            while True:
-                dealer.recv(zmq.DONTWAIT)
-        except zmq.Again:
-            pass
-        if number % 50 == 0:
-            time.sleep(50 * seconds / 100_000 * 0.8)
-    context.destroy(linger=0)
+    with clients(control, 8) as dealers:
+        for number in range(100_000):
+            send(dealers[number % 8], [damaged(chance.choice(seeds), chance)])
+            if number % 50 == 0:
+                time.sleep(50 * seconds / 100_000 * 0.8)
+
+
+def damaged(request: bytes, chance: random.Random) -> bytes:
+    """A request of which up to three places are changed, deleted or have bytes put in."""
+    payload = bytearray(request)
+    for _ in range(chance.randrange(4)):
+        kind, place = chance.randrange(3), chance.randrange(len(payload))
+        if kind == 0:
+            payload[place] = chance.randrange(256)
+        elif kind == 1:
+            del payload[place : place + chance.randrange(8)]
+        else:
+            payload[place:place] = os.urandom(chance.randrange(20))
+        if not payload:
+            break
+    return bytes(payload)
 
 
 def flood(telemetry: str, control: str, seconds: float) -> None:
     """10 000 requests a second, from 25 clients that read the answers."""
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    dealers = [context.socket(zmq.DEALER) for _ in range(25)]
-    for dealer in dealers:
-        dealer.connect(control)
     begun, sent = time.monotonic(), 0
-    while (now := time.monotonic()) < begun + seconds:
-        while sent < (now - begun) * 10_000:
-            dealer = dealers[sent % 25]
-            sent += 1
-            try:
-                dealer.send(STATUS, zmq.DONTWAIT)
-                while True:
-                    dealer.recv(zmq.DONTWAIT)
-            except zmq.Again:
-                pass
-        time.sleep(0.001)
-    context.destroy(linger=0)
+    with clients(control, 25) as dealers:
+        while (now := time.monotonic()) < begun + seconds:
+            while sent < (now - begun) * 10_000:
+                send(dealers[sent % 25], [STATUS])
+                sent += 1
+            time.sleep(0.001)
 
 
 ATTACKS: dict[str, Attack] = {

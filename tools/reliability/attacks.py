@@ -1,35 +1,30 @@
 """Attacks the sockets of a fishd, and measures what it costs: ticks, lateness, memory.
 
-    python tools/attacks.py                                  a table on standard output
-    python tools/attacks.py --attack flood --tick 0.005      one of them
-    python tools/attacks.py --write docs/reliability.md
-
 A second fishd swims beside it that nobody attacks. Both share the machine with the attackers, so
 what the attack as such costs is the difference. Everything stays on this machine, and ends.
 """
 
-import argparse
-import os
+import math
 import resource
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
-from pathlib import Path
+from argparse import Namespace
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 
-import msgspec
-from attackers import ATTACKS
-from bench_contestants import Fishd
-from bench_machine import fifo_permitted
 from msgspec import Struct
-from reports import put, table
 
+from common.daemon import Fishd
+from common.machine import priorities
+from common.report import Options, Report, progress, table
 from fishd.client import Fish, FishError
-from fishd.signals import Status
+from fishd.core.signals import Status
+from reliability import attackers
 
+DOCUMENT = "reliability.md"
 SECONDS = 10.0
 SETTLE = 2.0
-ATTACKERS = str(Path(__file__).with_name("attackers.py"))
 TICKS = 0.05, 0.005
 
 
@@ -71,30 +66,24 @@ class Watch:
         self._memory = self._total = self._answer = self._estop = 0.0
 
     def look(self) -> None:
-        """Take its memory, and ask it something."""
-        pids = [self._fishd.pid, *self._fishd.gateways()]
-        self._memory = max(self._memory, size(pids[0], "Rss"))
-        self._total = max(self._total, sum(size(pid, "Pss") for pid in pids))
+        """Take its memory."""
+        self._memory = max(self._memory, self._fishd.memory())
+        self._total = max(self._total, self._fishd.total_memory())
 
     def ask(self) -> None:
         """Ask for its status, as another client."""
-        begun = time.monotonic()
-        try:
-            with Fish(self._fishd.endpoint, timeout=2.0) as fish:
-                fish.status()
-            self._answer = max(self._answer, time.monotonic() - begun)
-        except FishError:
-            self._answer = float("inf")
+        self._answer = max(self._answer, self._time(lambda fish: fish.status()))
 
     def stop(self) -> None:
         """Ask for an emergency stop, as another client."""
+        self._estop = self._time(lambda fish: fish.estop())
+
+    def _time(self, request: Callable[[Fish], object]) -> float:
         begun = time.monotonic()
-        try:
-            with Fish(self._fishd.endpoint, timeout=2.0) as fish:
-                fish.estop()
-            self._estop = time.monotonic() - begun
-        except FishError:
-            self._estop = float("inf")
+        with suppress(FishError), Fish(self._fishd.endpoint, timeout=2.0) as fish:
+            request(fish)
+            return time.monotonic() - begun
+        return math.inf
 
     def result(self) -> Seen:
         """Once the attack is over."""
@@ -111,28 +100,18 @@ class Watch:
         )
 
 
-def size(pid: int, kind: str) -> float:
-    """Memory of a process, Rss or Pss [MB]; 0 once it has ended."""
-    try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0.0
-    return next((int(s.split()[1]) / 1024 for s in lines if s.startswith(f"{kind}:")), 0.0)
-
-
 def attack(name: str, tick: float, seconds: float) -> Outcome:
     """Let one attack happen."""
-    priority = 50 if fifo_permitted() else 0
-    settings = (f"tick={tick}", f"realtime.priority={priority}")
+    settings = (f"tick={tick}", f"realtime.priority={priorities()[-1]}")
     with ExitStack() as stack:
         fishes = [stack.enter_context(Fishd(*settings)) for _ in range(2)]
         for fishd in fishes:
             fishd.next_tick()
         time.sleep(SETTLE)
         watches = [Watch(fishd) for fishd in fishes]
-        target = fishes[0].status().telemetry
+        target = (fishes[0].telemetry, fishes[0].endpoint)
         attacker = subprocess.Popen(
-            [sys.executable, ATTACKERS, name, target, fishes[0].endpoint, str(seconds)]
+            [sys.executable, attackers.__file__, name, *target, str(seconds)]
         )
         next_question, last = 0.0, time.monotonic() + 0.8 * seconds
         while attacker.poll() is None:
@@ -156,7 +135,7 @@ def attack(name: str, tick: float, seconds: float) -> Outcome:
 def row(outcome: Outcome) -> list[str]:
     """A line of the table."""
     a, b = outcome.attacked, outcome.beside
-    what = (ATTACKS[outcome.attack].__doc__ or "").rstrip(".")
+    what = (attackers.ATTACKS[outcome.attack].__doc__ or "").rstrip(".")
     return [
         f"`{outcome.attack}`: {what[0].lower()}{what[1:]}",
         f"{outcome.tick * 1e3:g}",
@@ -169,40 +148,25 @@ def row(outcome: Outcome) -> list[str]:
     ]
 
 
-def main() -> int:
-    """Attack, and print or write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--attack", choices=list(ATTACKS), help="only this one")
-    parser.add_argument("--tick", type=float, help="period of the loop [s]; two if left out")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="how long each attack lasts")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--write", type=Path, help="put the table into this file")
-    options = parser.parse_args()
+OPTIONS: Options = {
+    "--only": {"choices": list(attackers.ATTACKS), "help": "this attack"},
+    "--tick": {"type": float, "help": "period of the loop [s]; two if left out"},
+    "--seconds": {"type": float, "default": SECONDS, "help": "how long each attack lasts"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Every attack, at both ticks; some minutes."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(8192, files[1]), files[1]))
-    os.environ.setdefault("PYTHONUNBUFFERED", "1")
     outcomes = []
-    for name in [options.attack] if options.attack else ATTACKS:
+    for name in [options.only] if options.only else attackers.ATTACKS:
         for tick in [options.tick] if options.tick else TICKS:
             outcomes.append(attack(name, tick, options.seconds))
-            if not options.json:
-                print(" | ".join(row(outcomes[-1])), flush=True)
-    if options.json:
-        print(msgspec.json.encode(outcomes).decode())
-    if options.write:
-        head = [
-            "attack",
-            "tick [ms]",
-            "ticks missed, attacked / beside",
-            "worst lateness [ms]",
-            "memory [MB], fishd (RSS) / with gateways (PSS)",
-            "gateways restarted",
-            "slowest answer to others [ms]",
-            "estop answered after [ms]",
-        ]
-        put(options.write, "attacks", table(head, [row(outcome) for outcome in outcomes]))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            progress(*row(outcomes[-1]))
+    head = (
+        "attack | tick [ms] | ticks missed, attacked / beside | worst lateness [ms] | "
+        "memory [MB], fishd (RSS) / with gateways (PSS) | gateways restarted | "
+        "slowest answer to others [ms] | estop answered after [ms]"
+    )
+    return Report({"reliability attacks": table(head, map(row, outcomes))}, outcomes)

@@ -1,14 +1,10 @@
 """Kills fishd at random microseconds, whatever it is doing, and looks whether its pulses end.
 
-    python tools/random_kills.py --kills 40
-    python tools/random_kills.py --kills 2000 --lanes 8 --write docs/reliability.md
-
 Each lane has a virtual Pi and, one after another, real fishds on it. They are forked from a process
 that has loaded everything, which makes many of them affordable. A kill is stuck when the servo
 still gets pulses 1.5 s later. Ends by itself; exit status 1 when one was stuck.
 """
 
-import argparse
 import asyncio
 import itertools
 import multiprocessing
@@ -20,27 +16,24 @@ import sys
 import tempfile
 import threading
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-import msgspec
 from msgspec import Struct
-from reports import put, table
 
+from common.daemon import virtual_pi
+from common.report import Options, Report, progress, table
 from fishd.client import Fish
-from fishd.clock import SystemClock
 from fishd.config import Config, load
-from fishd.daemon import swim
-from fishd.emulation.link_server import LinkServer
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.emulation.virtual_pi import VirtualPi
-from fishd.ending import Ending
-from fishd.errors import FishdError
-from fishd.hardware.imperfections import SimulationSettings
-from fishd.plant.parameters import PlantParameters
+from fishd.core.errors import FishdError
+from fishd.daemon.main import swim
+from fishd.daemon.shutdown import Shutdown
+from fishd.virtual.pi.virtual_pi import VirtualPi
 
+DOCUMENT = "reliability.md"
 GPIO = 18
 PATIENCE = 120.0
 BEGINNING = 5.0
@@ -83,14 +76,22 @@ class Kill(Struct):
 class Lane:
     """A virtual Pi, and the fishd that swims on it."""
 
-    def __init__(self, folder: Path, zygote: Connection, number: random.Random) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        pi: VirtualPi,
+        on_it: list[str],
+        zygote: Connection,
+        number: random.Random,
+    ) -> None:
+        """on_it: settings of a fishd on this virtual Pi; zygote: forks one for settings"""
         self.folder = folder
+        self.pi = pi
+        self._on_it = on_it
         self.random = number
         self.endpoint = f"ipc://{folder}/control"
         self._zygote = zygote
         self._pidfd = -1
-        settings = VirtualPiSettings(pigpio_port=0)
-        self.pi = VirtualPi(settings, PlantParameters(), SimulationSettings(), 0.05, SystemClock())
 
     def swim(self) -> None:
         """Start a fishd, and wait until its tail beats; again where a busy machine disturbs it."""
@@ -109,20 +110,17 @@ class Lane:
     def start(self) -> None:
         """Start a fishd."""
         pairs = {
-            "robot": "virtual-pi",
-            "virtual_pi.socket": self.folder / "virtual-pi",
             "force_sensor.data_rate": 128,  # light on a busy machine
-            "servo.pigpio.port": self.pi.pigpiod.port,
-            "servo.pigpio.timeout": self.random.choice((0.008, 0.02, 0.1)),
+            "servo.timeout": self.random.choice((0.008, 0.02, 0.1)),
             "state_folder": self.folder / "state",
             "control.address": self.endpoint,
             "telemetry.address": f"ipc://{self.folder}/telemetry",
             "start.controller": "square",
             "realtime.priority": 0,
             "realtime.lock_memory": "false",
-            "realtime.rehearse": "false",
+            "realtime.warm_up": "false",
         }
-        self._zygote.send([f"{key}={value}" for key, value in pairs.items()])
+        self._zygote.send([*self._on_it, *(f"{key}={value}" for key, value in pairs.items())])
         pid = self._zygote.recv()
         with suppress(ProcessLookupError):  # a busy machine: what it was to follow is still there
             self._pidfd = os.pidfd_open(pid)
@@ -269,7 +267,7 @@ def be_fishd(config: Config) -> None:
     """Never returns."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     try:
-        asyncio.run(swim(config, False, Ending()))
+        asyncio.run(swim(config, False, Shutdown()))
     except BaseException as error:
         print(f"fishd: {error!r}", file=sys.stderr, flush=True)
         os._exit(1)
@@ -284,12 +282,14 @@ def lane(folder: Path, seed: int) -> Iterator[Lane]:
         ours.close()
         serve_forks(theirs, folder / "log")
     theirs.close()
-    made = Lane(folder, ours, random.Random(seed))
     try:
-        with LinkServer(made.pi, folder / "virtual-pi"):
-            yield made
+        with virtual_pi(folder) as (pi, on_it):
+            made = Lane(folder, pi, on_it, ours, random.Random(seed))
+            try:
+                yield made
+            finally:
+                made.end()
     finally:
-        made.end()
         ours.close()
         os.wait()
 
@@ -334,7 +334,7 @@ def run(names: list[str], lanes: int, seed: int, limit: float) -> Iterator[Kill]
                     raise SystemExit("a lane has failed, see above") from None
 
 
-def report(kills: list[Kill], seed: int) -> str:
+def summary(kills: list[Kill], seed: int) -> str:
     """What is put into the document."""
     rows = []
     for name, situation in SITUATIONS.items():
@@ -349,48 +349,38 @@ def report(kills: list[Kill], seed: int) -> str:
     stuck = sum(kill.off is None for kill in kills)
     stopped = sum(kill.stopped for kill in kills)
     rows.append(["all", str(len(kills)), str(sum(kill.swimming for kill in kills)), "", str(stuck)])
-    head = ["fishd is killed while", "kills", "with pulses on", "off after, at most [ms]", "stuck"]
+    head = "fishd is killed while | kills | with pulses on | off after, at most [ms] | stuck"
     return f"{table(head, rows)}\n\nSeed {seed}; {stopped} of them by SIGSTOP."
 
 
-def main() -> int:
-    """Kill, and print or write what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--lanes", type=int, default=4, help="how many at a time")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--situation", choices=[*SITUATIONS], help="only this one")
-    parser.add_argument("--limit", type=float, default=3600.0, help="longest time [s]")
-    parser.add_argument("--json", action="store_true", help="print each kill as JSON")
-    parser.add_argument("--write", type=Path, help="put the table into this file")
-    options = parser.parse_args()
+OPTIONS: Options = {
+    "--kills": {"type": int, "default": 200, "help": "how many; default 200"},
+    "--lanes": {"type": int, "default": 4, "help": "how many at a time"},
+    "--seed": {"type": int, "default": 1},
+    "--only": {"choices": [*SITUATIONS], "help": "this situation"},
+    "--limit": {"type": float, "default": 3600.0, "help": "longest time [s]"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Kill, and look; a quarter of an hour for 2000 with 8 lanes."""
     warm_up()
     kills = []
-    names = order(options.kills, options.seed, options.situation)
+    names = order(options.kills, options.seed, options.only)
     for kill in run(names, options.lanes, options.seed, options.limit):
         kills.append(kill)
-        if options.json:
-            print(msgspec.json.encode(kill).decode(), flush=True)
-        elif kill.off is None:
-            print(f"stuck: {kill}", flush=True)
-    text = report(kills, options.seed)
-    if not options.json:
-        print(text)
-    if options.write:
-        put(options.write, "random kills", text)
-    return 1 if any(kill.off is None for kill in kills) else 0
+        if kill.off is None:
+            progress(f"stuck: {kill}")
+    stuck = any(kill.off is None for kill in kills)
+    return Report({"reliability kills": summary(kills, options.seed)}, kills, broken=stuck)
 
 
 def warm_up() -> None:
     """Load what a fishd loads, without a thread: it is forked afterwards."""
-    import fishd.hardware.ads1115
-    import fishd.hardware.pigpio  # noqa: F401
+    import fishd.hardware.force_sensor.sampled_sensor
+    import fishd.hardware.servo.pigpio  # noqa: F401
     from fishd.controllers import registry
-    from fishd.policies.runtime import preload
+    from fishd.controllers.policy.runtime import preload
 
     registry.describe_all()
     preload()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,36 +1,34 @@
-"""Lets the true fishd meet controllers that raise, return and hang whatever they can.
+"""Lets the true fishd meet controllers that raise, return and hang whatever they can."""
 
-`--write docs/reliability.md` puts the table there; `--only` does a part of it.
-"""
-
-import argparse
 import contextlib
 import fcntl
 import os
 import pty
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator
+from functools import partial
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from threading import Thread
 
-import msgspec
+import zmq
 from msgspec import Struct
-from reports import put, table
 
+from common.daemon import BIN, PATIENCE, Fishd
+from common.report import DOCS, Options, Report, progress, table
 from fishd.client import Fish, NoDaemon, Refused
-from fishd.protocol import LOADING
+from fishd.core.protocol import LOADING
+from fishd.daemon.background_calls import MOST_AT_ONCE
 
-ZOO = Path(__file__).parents[1] / "tests" / "zoo"
-FISHD = str(Path(sys.executable).with_name("fishd"))
-PATIENCE = 20.0
+DOCUMENT = "reliability.md"
+ZOO = DOCS.parent / "tests" / "rigs" / "zoo"
 LONGEST_END = 3.0
 """What fishd may take from a signal to its end, whatever hangs [s]."""
-METHODS = ("check", "__init__", "activate", "update", "rehearse", "retune", "close")
+METHODS = ("check", "__init__", "activate", "update", "warm_up", "retune", "close")
 DEAD_LINE = 'raise SystemExit("no")\n'
 HANGING_LINE = "while True:\n    pass\n"
 
@@ -69,74 +67,37 @@ def install(folder: Path, bad_imports: bool = False) -> Path:
     return site
 
 
-class Running:
-    """A fishd with the zoo installed, and a client of it."""
-
-    def __init__(self, folder: Path, *, bad_imports: bool = False, stderr: int | None = None):
-        self.endpoint = f"ipc://{folder}/control"
-        own = (f"control.address={self.endpoint}", f"telemetry.address=ipc://{folder}/telemetry")
-        self.log = folder / "log"
-        environment = {**os.environ, "PYTHONPATH": str(install(folder, bad_imports))}
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [FISHD, *(word for pair in own for word in ("--set", pair)), "--print-status"],
-                env=environment,
-                stdout=log if stderr is None else stderr,
-                stderr=log if stderr is None else stderr,
-            )
-        self.fish = Fish(self.endpoint, timeout=5.0)
-
-    def wait_until_up(self) -> None:
-        """Raises TimeoutError when it does not come up."""
-        deadline = time.monotonic() + PATIENCE + LOADING
-        while time.monotonic() < deadline and self.process.poll() is None:
-            with contextlib.suppress(NoDaemon), Fish(self.endpoint, timeout=0.5) as fish:
-                fish.status()
-                return
-            time.sleep(0.02)
-        raise TimeoutError(f"fishd did not come up: {self.log.read_text()}")
-
-    def await_mode(self, mode: str) -> str:
-        """Wait for a mode; the code of its reason, if it has one."""
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
-            status = self.fish.status()
-            if status.mode == mode:
-                return status.reason.code if status.reason else ""
-            time.sleep(0.01)
-        raise TimeoutError(f"it is not in mode {mode}")
-
-    def end(self, number: signal.Signals) -> float:
-        """Send a signal; how long the process takes to end [s]."""
-        begun = time.monotonic()
-        self.process.send_signal(number)
-        self.process.wait(PATIENCE)
-        return time.monotonic() - begun
-
-
 @contextlib.contextmanager
-def running(bad_imports: bool = False, stderr: int | None = None) -> Iterator[Running]:
-    """A fishd that is up, and gone afterwards whatever happens."""
+def running(bad_imports: bool = False, output: int | None = None) -> Iterator[tuple[Fishd, Fish]]:
+    """A fishd that is up, with the zoo installed, and a client of it."""
     with tempfile.TemporaryDirectory(prefix="fishd-") as folder:
-        daemon = Running(Path(folder), bad_imports=bad_imports, stderr=stderr)
-        try:
-            daemon.wait_until_up()
-            yield daemon
-        finally:
-            daemon.fish.close()
-            daemon.process.kill()
-            daemon.process.wait()
+        fishd = Fishd(
+            command=(str(BIN / "fishd"), "--print-status"),
+            environment={"PYTHONPATH": str(install(Path(folder), bad_imports))},
+            output=output,
+        )
+        with fishd, Fish(fishd.endpoint, timeout=5.0) as fish:
+            fishd.next_tick(PATIENCE + LOADING)
+            yield fishd, fish
 
 
-def survives(daemon: Running, method: str, deed: str) -> bool:
+def await_mode(fish: Fish, mode: str) -> None:
+    """Raises TimeoutError when it does not come to this mode."""
+    deadline = time.monotonic() + PATIENCE
+    while fish.status().mode != mode:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"it is not in mode {mode}")
+        time.sleep(0.01)
+
+
+def survives(fishd: Fishd, fish: Fish, method: str, deed: str) -> bool:
     """Does fishd take it as a fault or a refusal, answer, and go on ticking?"""
-    fish = daemon.fish
     before = fish.status().seq
     try:
         try:
             fish.set_controller("zoo", deed=deed, method=method)
-            if method in ("activate", "update", "rehearse"):
-                daemon.await_mode("fault")
+            if method in ("activate", "update", "warm_up"):
+                await_mode(fish, "fault")
             elif method == "retune":
                 fish.set_parameters(nudge=1)
                 return False
@@ -146,26 +107,26 @@ def survives(daemon: Running, method: str, deed: str) -> bool:
             if refusal.code not in ("controller-error", "bad-parameter") or method in (
                 "activate",
                 "update",
-                "rehearse",
+                "warm_up",
                 "close",
             ):
                 return False
         fish.clear_fault()
         fish.stop()
-        daemon.await_mode("idle")
+        await_mode(fish, "idle")
         while fish.status().seq < before + 2:
             time.sleep(0.01)
     except (NoDaemon, TimeoutError):
         return False
-    return daemon.process.poll() is None
+    return fishd.process.poll() is None
 
 
 def raising() -> Outcome:
     """Every exception in every method."""
     cases = [(method, deed) for method in METHODS for deed in RAISED]
-    with running() as daemon:
-        ended = sum(not survives(daemon, *case) for case in cases)
-        if daemon.log.stat().st_size > 2_000_000:
+    with running() as (fishd, fish):
+        ended = sum(not survives(fishd, fish, *case) for case in cases)
+        if fishd.log.stat().st_size > 2_000_000:
             ended += 1
     does = "fault `controller-error`, or a refusal"
     return Outcome("an exception of any kind, in any method", does, len(cases), ended)
@@ -174,94 +135,81 @@ def raising() -> Outcome:
 def numbers() -> Outcome:
     """Every odd number as an angle."""
     ended = 0
-    with running() as daemon:
+    with running() as (fishd, fish):
         for deed in GOOD:
-            daemon.fish.set_controller("zoo", deed=deed)
+            fish.set_controller("zoo", deed=deed)
             time.sleep(0.2)
-            ended += daemon.fish.status().mode != "running"
-        daemon.fish.stop()
-        ended += sum(not survives(daemon, "update", deed) for deed in BAD)
+            ended += fish.status().mode != "running"
+        fish.stop()
+        ended += sum(not survives(fishd, fish, "update", deed) for deed in BAD)
     does = "a finite real number of any type is applied; else fault `controller-error`"
     return Outcome("odd numbers as an angle", does, len(GOOD) + len(BAD), ended)
 
 
 def loading() -> Outcome:
     """Loads that never end: each is refused, and the next ones find room."""
-    cases = [(method, way) for method in ("check", "__init__") for way in HANGS]
-    ended = 0
-    with running() as daemon:
-        for four in (cases[:4], cases[4:]):
-            refusals: list[str] = []
-            clients = [Fish(daemon.endpoint) for _ in four]
-            threads = [
-                threading_load(client, method, way, refusals)
-                for client, (method, way) in zip(clients, four, strict=True)
-            ]
-            for thread, client in zip(threads, clients, strict=True):
-                thread.join()
-                client.close()
-            ended += sum(code != "too-slow" for code in refusals) + 4 - len(refusals)
-        daemon.fish.set_controller("square")
-        daemon.await_mode("running")
-        took = daemon.end(signal.SIGTERM)
-        status = daemon.process.returncode
+    methods, ways = ("check", "__init__"), list(HANGS)
+    ended, times, statuses = 0, [], []
+    for method in methods:
+        with running() as (fishd, fish):
+            for begin in range(0, len(ways), MOST_AT_ONCE):
+                some = ways[begin : begin + MOST_AT_ONCE]
+                with ThreadPool(len(some)) as pool:
+                    refusals = pool.map(partial(refusal_of_load, fishd.endpoint, method), some)
+                ended += len(some) - refusals.count("too-slow")
+            fish.set_controller("square")
+            await_mode(fish, "running")
+            times.append(fishd.end(signal.SIGTERM))
+            statuses.append(fishd.process.returncode)
     does = f"refusal `too-slow` after {LOADING:g} s; others load"
-    return Outcome("a load that never ends", does, len(cases), ended, took, [status])
+    cases = len(methods) * len(ways)
+    return Outcome("a load that never ends", does, cases, ended, max(times), sorted(set(statuses)))
 
 
-def threading_load(client: Fish, method: str, way: str, refusals: list[str]) -> Thread:
-    """Ask for a controller in a thread, and keep the code of the refusal."""
-
-    def load() -> None:
-        try:
-            client.set_controller("zoo", deed=way, method=method)
-        except Refused as refusal:
-            refusals.append(refusal.code)
-        except NoDaemon:
-            refusals.append("no answer")
-
-    thread = Thread(target=load)
-    thread.start()
-    return thread
+def refusal_of_load(endpoint: str, method: str, way: str) -> str:
+    """Ask for a controller that hangs; the code of the refusal, or what happened instead."""
+    try:
+        with Fish(endpoint) as fish:
+            fish.set_controller("zoo", deed=way, method=method)
+    except Refused as refusal:
+        return refusal.code
+    except NoDaemon:
+        return "no answer"
+    return "loaded"
 
 
 def importing() -> Outcome:
     """Packages that raise or hang when they are imported: the others are there."""
-    with running(bad_imports=True) as daemon:
-        known = {info.name for info in daemon.fish.controllers()}
+    with running(bad_imports=True) as (fishd, fish):
+        known = {info.name for info in fish.controllers()}
         ended = int(not {"zoo", "swing"} <= known)
         for name in ("dead", "hanging"):
             try:
-                daemon.fish.set_controller(name)
+                fish.set_controller(name)
                 ended += 1
             except Refused as refusal:
                 ended += refusal.code not in ("unknown-controller", "too-slow")
-        took = daemon.end(signal.SIGTERM)
-        status = daemon.process.returncode
+        took = fishd.end(signal.SIGTERM)
+        status = fishd.process.returncode
     does = f"left out, after {LOADING:g} s at most"
     return Outcome("an import that raises or never ends", does, 2, ended, took, [status])
 
 
-def ask(daemon: Running, method: str, way: str) -> None:
-    """Let a method hang; whoever asks gets no answer where the loop itself hangs."""
-    with contextlib.suppress(NoDaemon), Fish(daemon.endpoint, timeout=0.5) as fish:
-        identity, request = fish.request(
-            "set-controller", {"name": "zoo", "parameters": {"deed": way, "method": method}}
-        )
-        del identity
-        send(daemon.endpoint, request)
+def ask(endpoint: str, method: str, way: str) -> None:
+    """Let a method hang; nobody waits for answers, as there are none where the loop hangs."""
+    zoo = {"name": "zoo", "parameters": {"deed": way, "method": method}}
+    with contextlib.suppress(NoDaemon), Fish(endpoint, timeout=0.5) as fish:
+        send(endpoint, fish.request("set-controller", zoo)[1])
         if method in ("retune", "close"):
-            daemon.await_mode("running")
-            op, args = ("stop", {}) if method == "close" else ("set-parameter", {"nudge": 1})
-            arguments = {"parameters": args} if args else {}
-            send(daemon.endpoint, fish.request(op, arguments)[1])
+            await_mode(fish, "running")
+            nudge = {"parameters": {"nudge": 1}}
+            retune = ("set-parameter", nudge) if method == "retune" else ("stop", {})
+            send(endpoint, fish.request(*retune)[1])
     time.sleep(0.5)
 
 
 def send(endpoint: str, request: bytes) -> None:
     """Send a request whose answer nobody reads."""
-    import zmq
-
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.set(zmq.LINGER, 1000)
         socket.connect(endpoint)
@@ -274,10 +222,10 @@ def hanging(method: str) -> Callable[[], Outcome]:
     def measure() -> Outcome:
         times, statuses = [], []
         for way in HANGS:
-            with running() as daemon:
-                ask(daemon, method, way)
-                times.append(daemon.end(signal.SIGTERM))
-                statuses.append(daemon.process.returncode)
+            with running() as (fishd, _):
+                ask(fishd.endpoint, method, way)
+                times.append(fishd.end(signal.SIGTERM))
+                statuses.append(fishd.process.returncode)
         load = method in ("check", "__init__")
         does = "goes on ticking" if load else "the countdown ends the pulses; ends when asked to"
         what = f"`{method}` hangs" + (" while it loads" if load else "")
@@ -296,10 +244,10 @@ def unread(number: signal.Signals, terminal: bool) -> Callable[[], Outcome]:
         else:
             reader, writer = os.pipe()
         fill(writer)
-        with running(stderr=writer) as daemon:
+        with running(output=writer) as (fishd, _):
             time.sleep(1.5)  # a status line, which is stuck
-            took = daemon.end(number)
-            status = daemon.process.returncode
+            took = fishd.end(number)
+            status = fishd.process.returncode
         os.close(reader)
         os.close(writer)
         what = f"{number.name}, a {'terminal' if terminal else 'pipe'} that nobody reads"
@@ -341,33 +289,21 @@ def row(outcome: Outcome) -> list[str]:
     return [outcome.what, outcome.does, str(outcome.cases), str(outcome.ended), took, statuses]
 
 
-def main() -> int:
-    """Measure, and print or write the table; 1 if anything ended fishd."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--only", choices=list(KINDS), help="only this one")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--write", type=Path, help="put the table into this file")
-    options = parser.parse_args()
+OPTIONS: Options = {
+    "--only": {"choices": list(KINDS), "help": "this kind"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Every kind of misbehaviour; three minutes."""
     outcomes = {}
     for name in [options.only] if options.only else KINDS:
         outcomes[name] = KINDS[name]()
-        if not options.json:
-            print(" | ".join(row(outcomes[name])), flush=True)
-    if options.json:
-        print(msgspec.json.encode(outcomes).decode())
-    if options.write:
-        head = [
-            "what a controller does",
-            "what fishd does",
-            "cases",
-            "ended it",
-            "longest from SIGTERM to the end [s]",
-            "exit status",
-        ]
-        rows = [row(outcome) for outcome in outcomes.values()]
-        put(options.write, "misbehaviour", table(head, rows))
-    return int(any(outcome.ended for outcome in outcomes.values()))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        progress(*row(outcomes[name]))
+    head = (
+        "what a controller does | what fishd does | cases | ended it | "
+        "longest from SIGTERM to the end [s] | exit status"
+    )
+    rows = map(row, outcomes.values())
+    ended = any(outcome.ended for outcome in outcomes.values())
+    return Report({"reliability misbehaviour": table(head, rows)}, outcomes, broken=ended)

@@ -1,9 +1,8 @@
 """Runs fishd for very long in virtual time while everything around it fails at random.
 
-    python tools/soak.py simulated --ticks 1000000   the loop, with a robot that fails in all ways
-    python tools/soak.py virtual-pi --ticks 20000    the whole hardware path, with injected faults
-    python tools/soak.py channels --reads 1000000    wrong-channel values with 1 % I2C errors
-    python tools/soak.py all --write docs/reliability.md
+    simulated    the loop, with a robot that fails in all ways
+    virtual-pi   the whole hardware path, with injected faults
+    channels     wrong-channel values with 1 % I2C errors
 
 Each ends with a line of figures, and with exit status 1 if a promise was broken: an exception that
 got out of a tick, an angle beyond the limits, pulses that go on in fault or estop, memory that
@@ -15,37 +14,34 @@ ones are too, by the objects that are left behind in every tick, in both halves 
 not find what leaks less than a record per tick.
 """
 
-import argparse
 import itertools
 import logging
 import random
-import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
-from reports import put
-from soak_memory import Memory
-from soak_troubles import BrokenPromise, Counting, Rest, Saboteur, misuse
-
-from fishd.build import build_loop
-from fishd.clock import Slot, VirtualClock, VirtualTicker
+from common.report import BrokenPromise, Options, Report, progress
 from fishd.config import Config, load
-from fishd.emulation.ads1115 import Ads1115Chip
-from fishd.emulation.faults import FAULTS, INSTANTANEOUS, Faults
-from fishd.emulation.i2c import I2cBus
-from fishd.emulation.linux_i2c import LinuxI2c
-from fishd.errors import SensorError
-from fishd.hardware.ads1115 import Ads1115Sensor
-from fishd.hardware.calibration import ForceCalibration
-from fishd.hardware.settings import ForceSensorSettings
-from fishd.hardware.simulated import SimulatedFish
-from fishd.loop import ControlLoop
-from fishd.robots import open_in_virtual_time
+from fishd.control.loop import ControlLoop
+from fishd.core.calibration import ForceCalibration
+from fishd.core.clock import Slot, VirtualClock, VirtualTicker
+from fishd.core.errors import SensorError
+from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+from fishd.virtual.fish import SimulatedFish
+from fishd.virtual.pi.ads1115 import Ads1115Chip
+from fishd.virtual.pi.faults import FAULTS, INSTANTANEOUS, Faults
+from fishd.virtual.pi.i2c import I2cBus
+from fishd.virtual.pi.linux_i2c import LinuxI2c
+from fishd.wiring import build_loop, open_in_virtual_time
+from reliability.soak_memory import Memory
+from reliability.soak_troubles import Counting, Rest, Saboteur, misuse
 
+DOCUMENT = "reliability.md"
 SIMULATED_TICKS = 1_000_000
 VIRTUAL_PI_TICKS = 20_000
 
@@ -80,7 +76,7 @@ def soak_simulated(ticks: int, seed: int) -> str:
         if dice.random() < 0.02:
             misuse(loop, dice)
         memory.after(count + 1)
-    return report(f"simulated fish, {ticks} ticks", publisher, memory)
+    return verdict(f"simulated fish, {ticks} ticks", publisher, memory)
 
 
 def soak_virtual_pi(ticks: int, seed: int) -> str:
@@ -117,7 +113,7 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
         counters = robot.counters()
     spelled = ", ".join(f"{count} {name}" for name, count in sorted(injected.items()))
     survived = ", ".join(f"{count} {name}" for name, count in counters.items())
-    line = report(f"virtual Pi, {ticks} ticks", publisher, memory)
+    line = verdict(f"virtual Pi, {ticks} ticks", publisher, memory)
     return f"{line}; injected: {spelled}; survived: {survived}"
 
 
@@ -133,8 +129,8 @@ def soak_channels(reads: int, seed: int) -> str:
     with ExitStack() as stack:
         i2c.install()
         stack.callback(i2c.remove)
-        settings = ForceSensorSettings(frozen_after=None)
-        sensor = Ads1115Sensor(settings, ForceCalibration(), clock, threaded=False, tick=0.004)
+        driver = Ads1115(Ads1115Settings(frozen_after=None), clock)
+        sensor = SampledSensor(driver, ForceCalibration(), clock, threaded=False, tick=0.004)
         stack.callback(sensor.close)
         pairs = failures = 0
         now = 0.0
@@ -164,7 +160,7 @@ def virtual_pi_config(folder: str, seed: int) -> Config:
     return load(None, [*overrides, f"state_folder={folder}"])
 
 
-def report(what: str, publisher: Counting, memory: Memory) -> str:
+def verdict(what: str, publisher: Counting, memory: Memory) -> str:
     """The figures of a soak as a line; raises `BrokenPromise` when memory grew."""
     grown = memory.verdict(what)
     reasons = ", ".join(f"{count} {code}" for code, count in sorted(publisher.reasons.items()))
@@ -174,19 +170,16 @@ def report(what: str, publisher: Counting, memory: Memory) -> str:
     )
 
 
-def main() -> int:
-    """Run the soaks that are asked for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("soak", choices=("simulated", "virtual-pi", "channels", "all"))
-    parser.add_argument(
-        "--ticks", type=int, help=f"default {SIMULATED_TICKS} and {VIRTUAL_PI_TICKS}"
-    )
-    parser.add_argument("--reads", type=int, default=1_000_000, help="conversions; default 1000000")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--write", type=Path, help="put the figures into this file")
-    options = parser.parse_args()
+OPTIONS: Options = {
+    "soak": {"choices": ("simulated", "virtual-pi", "channels", "all")},
+    "--ticks": {"type": int, "help": f"default {SIMULATED_TICKS} and {VIRTUAL_PI_TICKS}"},
+    "--reads": {"type": int, "default": 1_000_000, "help": "conversions; default 1000000"},
+    "--seed": {"type": int, "default": 1},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """The soaks that are asked for; raises `BrokenPromise`."""
     logging.disable(logging.CRITICAL)  # thousands of faults would be reported
     soaks: dict[str, Callable[[], str]] = {
         "simulated": lambda: soak_simulated(options.ticks or SIMULATED_TICKS, options.seed),
@@ -195,18 +188,7 @@ def main() -> int:
     }
     lines = []
     for name in soaks if options.soak == "all" else (options.soak,):
+        progress(f"soak: {name}")
         begun = time.perf_counter()
-        try:
-            line = soaks[name]()
-        except BrokenPromise as broken:
-            print(f"{name}: BROKEN: {broken}", file=sys.stderr)
-            return 1
-        lines.append(f"- {line} ({time.perf_counter() - begun:.0f} s)")
-        print(lines[-1], flush=True)
-    if options.write:
-        put(options.write, "soak", "\n".join(lines))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        lines.append(f"- {soaks[name]()} ({time.perf_counter() - begun:.0f} s)")
+    return Report({"reliability soak": "\n".join(lines)}, lines)

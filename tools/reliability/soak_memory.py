@@ -5,7 +5,7 @@ import math
 import sys
 from pathlib import Path
 
-from soak_troubles import BrokenPromise
+from common.report import BrokenPromise
 
 PAGE = 4096
 MOST = 1.0

@@ -1,4 +1,4 @@
-"""The trouble that `soak.py` makes: robots, controllers, subscribers and users that misbehave."""
+"""The trouble that `soak` makes: robots, controllers, subscribers and users that misbehave."""
 
 import dataclasses
 import itertools
@@ -8,17 +8,14 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from common.report import BrokenPromise
+from fishd.control.loop import ControlLoop
+from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
-from fishd.errors import FishdError, SensorError, ServoError
+from fishd.core.errors import FishdError, SensorError, ServoError
+from fishd.core.signals import Event, Measurement, Observation, Reason, Tick
 from fishd.hardware.base import Robot
-from fishd.loop import ControlLoop
-from fishd.signals import Event, Measurement, Observation, Reason, Tick
-from fishd.supervisor import Mode
-
-
-class BrokenPromise(BaseException):
-    """What must never happen has happened; nothing in fishd may catch it."""
 
 
 class Counting:
@@ -136,7 +133,7 @@ class Rest:
         self._ticks += 1
         mode = loop.supervisor.mode
         late = self._ticks > self.LIMITS.get(mode, math.inf) + self._patience
-        if late and (servo_on or loop.servo_on):
+        if late and (servo_on or loop.servo.on):
             raise BrokenPromise(f"tick {loop.seq}: {self._ticks} ticks in {mode}, and still pulses")
 
 

@@ -1,22 +1,24 @@
-"""The verbs that make measurements and pulses true: tare, calibrate force, calibrate servo."""
+"""Verbs that calibrate: tare, calibrate force, calibrate servo."""
 
 import click
 
-from fishd import text
-from fishd.cli.calibrate_force import force
-from fishd.cli.calibrate_servo import servo
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, print_json
+from fishd.cli.verbs import Verb, Verbs
 from fishd.client import Fish
+from fishd.core import text
+
+VERBS = {
+    "Verbs": {
+        "force": Verb("calibrate.force", "force", "Calibrate the force sensor with known loads."),
+        "servo": Verb("calibrate.servo", "servo", "Find trim, direction and limits of the servo."),
+    }
+}
 
 
-@click.group()
+@click.group(cls=Verbs, verbs=VERBS)
 def calibrate() -> None:
     """Calibrate the force sensor with known loads, or the servo by small steps."""
-
-
-calibrate.add_command(force)
-calibrate.add_command(servo)
 
 
 @click.command()
@@ -27,8 +29,7 @@ calibrate.add_command(servo)
     show_default=True,
     help="How long to measure.",
 )
-@endpoint_option
-@json_option
+@daemon_options
 def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     """Call the present force zero; the fish must hang still.
 
@@ -41,7 +42,6 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     if as_json:
         print_json(after)
         return
-    now = after.force
-    echo(f"before  x0 {before.x0 * 1e3:+9.2f} mN   y0 {before.y0 * 1e3:+9.2f} mN")
-    echo(f"after   x0 {now.x0 * 1e3:+9.2f} mN   y0 {now.y0 * 1e3:+9.2f} mN")
-    echo(text.line(f"in force, and saved in {after.force_file}"))
+    for when, force in (("before", before), ("after", after.force)):
+        echo(f"{when:<7} x0 {force.x0 * 1e3:+9.2f} mN   y0 {force.y0 * 1e3:+9.2f} mN")
+    echo(text.line(f"in use, and saved in {after.force_file}"))

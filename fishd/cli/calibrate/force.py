@@ -1,21 +1,26 @@
-"""`fishctl calibrate force`: known loads, measured now or earlier, their fit, and consent."""
+"""`fishctl calibrate force`: measure known loads or read them, fit, and ask before saving."""
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from fishd import text
-from fishd.cli import load_files
-from fishd.cli.load_dialogue import Dialogue
-from fishd.cli.load_files import NEWTONS
+from fishd.cli.calibrate import load_files
+from fishd.cli.calibrate.force_dialogue import Dialogue
+from fishd.cli.calibrate.load_files import NEWTONS
 from fishd.cli.options import endpoint_option
 from fishd.cli.output import echo
 from fishd.client import Fish
-
-if TYPE_CHECKING:
-    from fishd.calibrating import Fit, Load
+from fishd.core import text
+from fishd.hardware.force_sensor.calibration_fit import (
+    Fit,
+    Load,
+    PoorLoads,
+    check,
+    fit,
+    missing_loads,
+    worst,
+)
 
 _POOR_FIT = 0.02
 """A residual beyond this share of the largest load is worth a warning."""
@@ -58,18 +63,16 @@ def force(
     yes: bool,
     endpoint: str | None,
 ) -> int:
-    """Calibrate the force sensor with known loads: no load, and loads along ±x and ±y.
+    """Calibrate the force sensor with known loads.
 
-    F_x is positive forward, F_y to the fish's left. The daemon measures; nothing is changed before
-    the fit is shown and you say yes.
+    You hang them: none at first, then one each along +x, -x, +y and -y. F_x is positive forward,
+    F_y to the fish's left. The daemon measures. Nothing changes before you have seen the fit and
+    said yes.
     """
-    from fishd.calibrating import PoorLoads, missing_loads
-
     steps = load_files.read(plan, unit) if plan else []
-    missing = missing_loads([(step.fx, step.fy) for step in steps])
-    if steps and missing:
+    if steps and (missing := missing_loads([(step.fx, step.fy) for step in steps])):
         raise PoorLoads(f"{plan}: {', '.join(missing)}")
-    measured = any(step.volts for step in steps)
+    measured = [Load(step.fx, step.fy, *step.volts) for step in steps if step.volts]
     if measured and record:
         raise click.UsageError(
             f"--record keeps what is measured now, but {plan} holds loads measured earlier; give "
@@ -80,13 +83,12 @@ def force(
         load_files.check_limit(steps, limit)
         try:
             if measured:
-                names = [f"load {n}" for n in range(1, len(steps) + 1)]
-                fitted = _fitted(names, [(s.fx, s.fy, *(s.volts or ())) for s in steps])
+                fitted = _fitted([f"load {n}" for n in range(1, len(steps) + 1)], measured)
             else:
                 dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
                 fitted = _fitted_with_help(dialogue)
-            good = yes or click.confirm("Put this calibration in force, and save it?")
+            good = yes or click.confirm("Use this calibration from now on, and save it?")
         except (click.Abort, KeyboardInterrupt):
             echo("\nnothing was changed", err=True)
             raise
@@ -94,26 +96,28 @@ def force(
             echo("nothing was changed", err=True)
             return 1
         saved = fish.calibrate_force(fitted.calibration)
-    echo(text.line(f"in force, and saved in {saved.force_file}"))
+    echo(text.line(f"in use, and saved in {saved.force_file}"))
     return 0
 
 
-def _fitted(names: list[str], loads: list[tuple[float, ...]]) -> "Fit":
+def _fitted(names: list[str], loads: list[Load]) -> Fit:
     """Fit the loads and show how well that went; raises `PoorLoads`."""
-    from fishd.calibrating import Load, check, fit
-
-    known = [Load(*load) for load in loads]
-    fitted = fit(known)
-    _show(names, known, fitted)
-    check(fitted, known, names)
-    _warn(names, known, fitted)
+    fitted = fit(loads)
+    _show(names, loads, fitted)
+    check(fitted, loads, names)
+    largest = max(math.hypot(load.fx, load.fy) for load in loads)
+    residual = fitted.calibration.residual
+    if residual > _POOR_FIT * largest:
+        echo(
+            f"warning: the residual is {residual / largest:.0%} of the largest load; look at "
+            f"{worst(fitted, names)} first",
+            err=True,
+        )
     return fitted
 
 
-def _fitted_with_help(dialogue: Dialogue) -> "Fit":
-    """Fit what was measured; while that is no good, ask for more, and keep what there is."""
-    from fishd.calibrating import PoorLoads
-
+def _fitted_with_help(dialogue: Dialogue) -> Fit:
+    """Fit what was measured. While the fit is refused, ask for more loads; none is lost."""
     while True:
         dialogue.amend()
         try:
@@ -122,7 +126,7 @@ def _fitted_with_help(dialogue: Dialogue) -> "Fit":
             echo(f"\n{error}", err=True)
 
 
-def _show(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
+def _show(names: list[str], loads: list[Load], fitted: Fit) -> None:
     wide = max(len("load"), *map(len, names))
     echo(f"\n{'load':<{wide}}   F_x [mN]   F_y [mN]     V_x [V]     V_y [V]   errors [mN]")
     for name, load, (ex, ey) in zip(names, loads, fitted.errors, strict=True):
@@ -137,16 +141,3 @@ def _show(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
         f"residual {found.residual * 1e3:.3f} mN rms over {found.loads} loads, "
         f"condition number {found.condition:.3g}"
     )
-
-
-def _warn(names: list[str], loads: "list[Load]", fitted: "Fit") -> None:
-    from fishd.calibrating import worst
-
-    largest = max(math.hypot(load.fx, load.fy) for load in loads)
-    residual = fitted.calibration.residual
-    if residual > _POOR_FIT * largest:
-        echo(
-            f"warning: the residual is {residual / largest:.0%} of the largest load; look at "
-            f"{worst(fitted, names)} first",
-            err=True,
-        )

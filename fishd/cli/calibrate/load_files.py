@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import click
 
-from fishd import files
-from fishd.hardware.calibration import ForceSample
+from fishd.core import files
+from fishd.core.calibration import ForceSample
 
 G0 = 9.80665
 """Standard gravity [m/s²]: the weight of a gram is G0 millinewtons."""
@@ -63,7 +63,7 @@ def read(path: Path, unit: str) -> list[Step]:
     except csv.Error as error:
         raise click.ClickException(f"{path}: not a CSV file: {error}") from None
     if not steps:
-        raise click.ClickException(f"{path}: there is no load in it")
+        raise click.ClickException(f"{path}: no loads below the header")
     return steps
 
 

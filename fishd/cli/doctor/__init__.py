@@ -4,27 +4,16 @@ from collections import Counter
 from pathlib import Path
 
 import click
-from msgspec import Struct
 
-from fishd import text
-from fishd.cli.checks import examine
-from fishd.cli.checks.base import Context
 from fishd.cli.config import load_service, service_option, set_option
+from fishd.cli.doctor.checks import examine
+from fishd.cli.doctor.checks.base import Context
 from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import counted, echo, print_json
+from fishd.core import text
+from fishd.hardware.checks import Result
 
 _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "bright_black"}
-
-
-class Finding(Struct, frozen=True):
-    """One line of the report."""
-
-    check: str
-    level: str
-    """ok, warning, FAIL or skipped."""
-    message: str
-    mend: str
-    """How to mend it; empty where nothing is to be mended."""
 
 
 @click.command()
@@ -44,12 +33,12 @@ def doctor(
     config, found = load_service(file, overrides)
     context = Context(config, found, endpoint or config.control.address)
     findings = []
-    for name, (level, message, mend) in examine(context):
-        finding = Finding(name, level, text.line(message), mend)
-        findings.append(finding)
+    for name, result in examine(context):
+        result = result._replace(message=text.line(result.message))
+        findings.append({"check": name, **result._asdict()})
         if not as_json:
-            _print(finding)
-    counts = Counter(finding.level for finding in findings)
+            _print(name, result)
+    counts = Counter(finding["level"] for finding in findings)
     if as_json:
         print_json(findings)
     else:
@@ -62,8 +51,8 @@ def doctor(
     return 1 if counts["FAIL"] else 0
 
 
-def _print(finding: Finding) -> None:
-    level = click.style(f"{finding.level:<8}", fg=_COLOURS[finding.level])
-    click.echo(f"{level} {finding.check:<14} {finding.message}")
-    if finding.mend:
-        echo(f"{'':<24}{finding.mend}")
+def _print(name: str, result: Result) -> None:
+    level = click.style(f"{result.level:<8}", fg=_COLOURS[result.level])
+    click.echo(f"{level} {name:<14} {result.message}")
+    if result.mend:
+        echo(f"{'':<24}{result.mend}")

@@ -3,12 +3,14 @@
 import click
 
 from fishd.cli.verbs import Verb, Verbs
-from fishd.console import complain
+from fishd.core.console import complain
 
 VERBS = {
-    "ppo": Verb("learn_ppo", "ppo", "Train a policy, in simulation or on the robot."),
-    "export": Verb("learn_export", "export", "Write a trained policy to one .onnx file."),
-    "evaluate": Verb("learn_evaluate", "evaluate", "Compare policies and controllers on one fish."),
+    "Verbs": {
+        "ppo": Verb("learn.ppo", "ppo", "Train a policy, in simulation or on the robot."),
+        "export": Verb("learn.export", "export", "Write a trained policy to one .onnx file."),
+        "evaluate": Verb("learn.evaluate", "evaluate", "Compare policies and controllers."),
+    }
 }
 
 _EXTRA = {
@@ -25,10 +27,10 @@ _EXTRA = {
 
 
 class LearnVerbs(Verbs):
-    """Names the extra that is missing."""
+    """A package of an extra that is missing is one line."""
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a verb; a package of an extra that is missing is one line."""
+        """Run a verb."""
         try:
             return super().invoke(ctx)
         except ModuleNotFoundError as error:

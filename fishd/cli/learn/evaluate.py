@@ -6,36 +6,28 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fishd.cli.config import load_or_exit, set_option
-from fishd.cli.options import json_option
-from fishd.cli.output import print_json
+from fishd.cli.completion import complete_contestant
+from fishd.cli.output import echo, print_json
+from fishd.cli.simulate import run_options
+from fishd.config import load
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from fishd.learning.comparison import Standing
+    from fishd.learning.compare.comparison import Standing
 
 WIDE = 1000
 _HEADS = ("mN", "Hz", "|φ_c|/Φ", "square")
 
 
 @click.command()
-@click.argument("contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...")
-@click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path),
-    help="YAML file of the fish; without it, the defaults.",
+@click.argument(
+    "contestants",
+    nargs=-1,
+    metavar="[POLICY|CONTROLLER]...",
+    shell_complete=complete_contestant,
 )
-@set_option
-@click.option("--seconds", type=float, default=60.0, show_default=True, help="Length of each run.")
-@click.option(
-    "--settle",
-    type=float,
-    default=10.0,
-    show_default=True,
-    help="Time before figures are taken [s].",
-)
+@run_options
 @click.option(
     "--seeds",
     type=click.IntRange(1, 1000),
@@ -48,7 +40,6 @@ _HEADS = ("mN", "Hz", "|φ_c|/Φ", "square")
     type=click.Path(path_type=Path, dir_okay=False),
     help="Draw command, fin, force and efficiency into this file.",
 )
-@json_option
 def evaluate(
     contestants: tuple[str, ...],
     file: Path | None,
@@ -66,16 +57,20 @@ def evaluate(
     best square wave, swing, and the named policies that are made for this fish.
 
     Efficiency is the thrust over that of the best square wave. |φ_c|/Φ is the mean size of the
-    command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866.
+    command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866. Exit
+    status 1 when one is refused on this fish, such as a policy for another amplitude, or ends in
+    mode fault; the others swim all the same.
     """
-    from fishd.learning import comparison
+    from fishd.learning.compare import comparison
 
-    config = load_or_exit(file, overrides)
+    config = load(file, overrides)
     chosen = [comparison.parse(text) for text in contestants]
     chosen = chosen or comparison.default_contestants(config)
-    standings, traces = comparison.compare(config, chosen, seconds, settle, seeds)
+    refused = [(one, why) for one in chosen if (why := comparison.refusal(config, one))]
+    able = [one for one in chosen if one not in (out for out, _ in refused)]
+    standings, traces = comparison.compare(config, able or chosen, seconds, settle, seeds)
     if png:
-        from fishd.learning.figures import picture
+        from fishd.learning.compare.figures import picture
 
         picture(png, standings, traces, config.amplitude_limit)
     if as_json:
@@ -85,13 +80,15 @@ def evaluate(
 
         # In a file or a pipe nothing is wrapped.
         Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings))
+    for one, why in refused:
+        echo(f"fishctl: {one.label}: refused: {why}", err=True)
     for standing in standings:
-        for why in standing.fallbacks:
-            click.echo(f"fishctl: {standing.contestant}: another took over: {why}", err=True)
+        for took_over in standing.fallbacks:
+            echo(f"fishctl: {standing.contestant}: another took over: {took_over}", err=True)
     faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
     for contestant, fault in faults:
-        click.echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
-    return 1 if faults else 0
+        echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
+    return 1 if faults or refused else 0
 
 
 def _table(standings: "list[Standing]") -> "Table":

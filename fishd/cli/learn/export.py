@@ -5,6 +5,8 @@ from pathlib import Path
 
 import click
 
+from fishd.core.errors import PolicyError
+
 
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path), metavar="RUN")
@@ -16,30 +18,28 @@ import click
     help="The file to write. [default: the name of the run and .onnx, in this folder]",
 )
 @click.option("--newest", is_flag=True, help="The newest checkpoint rather than the best.")
-@click.option("--force", is_flag=True, help="Even if the policy stalls.")
+@click.option("--force", is_flag=True, help="Overwrite FILE; and export a policy that stalls, too.")
 @click.option("--note", default="", help="A remark for people, kept in the file.")
 def export(run: Path, target: Path | None, newest: bool, force: bool, note: str) -> None:
     """Write the policy of RUN, a run folder or one of its checkpoints, to one .onnx file."""
-    from fishd.learning import checkpoints
     from fishd.learning.export import export as write
-    from fishd.learning.progress import figures
+    from fishd.learning.run_folder import checkpoints
+    from fishd.learning.train.progress import summary
 
     checkpoint = checkpoints.find(run, latest=newest)
     whole = run if checkpoint != run else run.resolve().parent
-    found = write(
-        checkpoint, target or Path(f"{whole.resolve().name}.onnx"), force=force, note=note
-    )
+    target = target or Path(f"{whole.resolve().name}.onnx")
+    if target.is_file() and not force:
+        raise PolicyError(f"{target}: exists already; --force overwrites it, --to names another")
+    found = write(checkpoint, target, force=force, note=note)
     past = found.card.provenance
     click.echo(
         f"{found.path}: {found.size / 1024:.0f} kB from {found.checkpoint}, {past.steps} steps "
         f"in {past.on}"
     )
-    if found.trial.stalled:
+    if found.evaluation.stalled:
         click.echo("careful: it stalls without exploration")
     else:
-        assert past.efficiency is not None
-        click.echo(
-            "it swims with " + figures(found.trial.thrust, past.efficiency, found.trial.frequency)
-        )
+        click.echo(f"it swims with {summary(found.evaluation)}")
     path = shlex.quote(str(found.path))
     click.echo(f"to let it swim: fishctl set-controller ppo --policy {path}")

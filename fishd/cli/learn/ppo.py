@@ -7,19 +7,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 from msgspec.structs import replace
 
-from fishd.cli.config import EX_CONFIG, load_or_exit, set_option
+from fishd.cli.config import set_option
 from fishd.cli.options import endpoint_option
-from fishd.config import Config
-from fishd.console import complain
-from fishd.errors import ConfigError
+from fishd.config import adopt, load
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from fishd.learning.settings import TrainingSettings
-    from fishd.learning.training import Job, Outcome
+    from fishd.learning.train.jobs import Job, Outcome
 
-INTERRUPTED = 130
 IMPLAUSIBLE = 1.03
-"""No policy does better than the best square wave, but for noise."""
+"""Efficiencies above this are an error of measurement: the best square wave is the optimum."""
 
 
 @click.command()
@@ -111,18 +109,16 @@ def ppo(
     elif on == "robot":
         raise click.UsageError("--seeds is for simulated fish: there is only one robot")
     if resume:
-        job = _resumed(resume, on, endpoint, steps)
+        job = _resumed(resume, on, endpoint)
     else:
-        config, settings = _chosen(on, file, overrides, settings_file, endpoint, parent)
-        settings = _changed(settings, steps=steps, seed=seed)
-        job = _new(config, settings, folder, on, endpoint, parent)
+        job = _new(on, file, overrides, settings_file, folder, parent, endpoint)
     if job.on == "simulation":
         _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
-    else:
-        _warn_of_other_plant(job)
-    job = replace(job, agent=agent)
+    given = {"steps": steps, "seed": seed}
+    changed = {name: value for name, value in given.items() if value is not None}
+    job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     if seeds is not None:
-        from fishd.cli.learn_seeds import train_seeds
+        from fishd.cli.learn.seeds import train_seeds
 
         return train_seeds(job, seeds, jobs, cluster)
     return _train(job)
@@ -134,34 +130,65 @@ def _refuse(why: str, options: dict[str, Any]) -> None:
         raise click.UsageError(f"{given[0]} cannot be given here: this {why}")
 
 
-def _chosen(
-    on: str | None,
+def _new(
+    on: Literal["simulation", "robot"] | None,
     file: Path | None,
     overrides: tuple[str, ...],
     settings_file: Path | None,
-    endpoint: str | None,
+    folder: Path | None,
     parent: Path | None,
-) -> tuple[Config, "TrainingSettings"]:
-    """Configuration and settings of a new run; those of its parent where none are given."""
-    from fishd.learning import runs
+    endpoint: str | None,
+) -> "Job":
+    """A new run, with the settings of its parent where none are given; raises `ConfigError`."""
     from fishd.learning import settings as training
-    from fishd.learning.links import daemon_config
+    from fishd.learning.env.fishd_link import config_of
+    from fishd.learning.run_folder import checkpoints, runs
+    from fishd.learning.train.jobs import Job
 
-    try:
-        of_parent = runs.read(_run_of(parent))[1] if parent else None
-        settings = of_parent if of_parent and not settings_file else training.load(settings_file)
-        if on == "robot":
-            return daemon_config(endpoint, file, overrides), settings
-    except ConfigError as error:
-        complain("fishctl", str(error), EX_CONFIG)
-    return load_or_exit(file, overrides), settings
+    of_parent = runs.read(_run_of(parent))[1] if parent else None
+    settings = of_parent if of_parent and not settings_file else training.load(settings_file)
+    if on == "robot":
+        running = config_of(endpoint)
+        plant = dict(running["plant"])
+        config = load(file, overrides) if file else adopt(running, overrides)
+    else:
+        config = load(file, overrides)
+    job = Job(
+        config=config,
+        settings=settings,
+        folder=folder or runs.default_folder(),
+        on=on or "simulation",
+        endpoint=endpoint,
+        parent=checkpoints.find(parent) if parent else None,
+    )
+    if job.on == "robot":
+        _warn_of_other_plant(job, plant)
+    return job
 
 
-def _warn_of_other_plant(job: "Job") -> None:
-    """What the network sees is scaled by the plant, so that of fishd is most likely meant."""
-    from fishd.learning.links import other_plant
+def _resumed(
+    folder: Path, on: Literal["simulation", "robot"] | None, endpoint: str | None
+) -> "Job":
+    """The run in a folder; raises `ConfigError` and `CheckpointError`."""
+    from fishd.learning.env.fishd_link import config_of
+    from fishd.learning.run_folder import checkpoints, runs
+    from fishd.learning.train.jobs import Job
 
-    other = other_plant(job.endpoint, job.config)
+    config, settings = runs.read(folder)
+    on = on or checkpoints.read_state(checkpoints.newest(folder)).on
+    job = Job(
+        config=config, settings=settings, folder=folder, on=on, endpoint=endpoint, resume=True
+    )
+    if job.on == "robot":
+        _warn_of_other_plant(job, config_of(endpoint)["plant"])
+    return job
+
+
+def _warn_of_other_plant(job: "Job", plant: dict[str, Any]) -> None:
+    """The inputs are scaled by the plant, and fishd's is most likely meant; plant: of fishd"""
+    from fishd.learning.env.fishd_link import other_plant
+
+    other = other_plant(job.config, plant)
     if other:
         click.echo(
             "fishctl: careful: scales and efficiency are made for another plant than that of the "
@@ -170,68 +197,19 @@ def _warn_of_other_plant(job: "Job") -> None:
         )
 
 
-def _new(
-    config: Config,
-    settings: "TrainingSettings",
-    folder: Path | None,
-    on: Literal["simulation", "robot"] | None,
-    endpoint: str | None,
-    parent: Path | None,
-) -> "Job":
-    from fishd.learning import checkpoints, runs
-    from fishd.learning.training import Job
-
-    return Job(
-        config=config,
-        settings=settings,
-        folder=folder or runs.default_folder(),
-        on=on or "simulation",
-        endpoint=endpoint,
-        parent=checkpoints.find(parent) if parent else None,
-    )
-
-
-def _resumed(
-    folder: Path,
-    on: Literal["simulation", "robot"] | None,
-    endpoint: str | None,
-    steps: int | None,
-) -> "Job":
-    from fishd.learning import checkpoints, runs
-    from fishd.learning.training import Job
-
-    try:
-        config, settings = runs.read(folder)
-    except ConfigError as error:
-        complain("fishctl", str(error), EX_CONFIG)
-    before = checkpoints.read_state(checkpoints.newest(folder)).on
-    return Job(
-        config=config,
-        settings=_changed(settings, steps=steps),
-        folder=folder,
-        on=on or before,
-        endpoint=endpoint,
-        resume=True,
-    )
-
-
 def _train(job: "Job") -> int:
-    from fishd.learning.progress import on_terminal
-    from fishd.learning.stopping import on_signal
-    from fishd.learning.training import train
+    from fishd.learning.train.progress import on_terminal
+    from fishd.learning.train.training import on_signal, train
 
     asked = threading.Event()
-    try:
-        with on_signal(asked.set), on_terminal() as show:
-            outcome = train(job, show, asked.is_set)
-    except ConfigError as error:
-        complain("fishctl", str(error), EX_CONFIG)
+    with on_signal(asked.set), on_terminal() as display:
+        outcome = train(job, display, asked.is_set)
     return report(outcome, job)
 
 
 def report(outcome: "Outcome", job: "Job") -> int:
     """Say how it ended; the exit status."""
-    from fishd.learning.progress import described, minutes
+    from fishd.learning.train.progress import described, minutes
 
     again = f"fishctl learn ppo --resume {outcome.folder}"
     for option, address in (("--endpoint", job.endpoint), ("--agent", job.agent)):
@@ -265,19 +243,11 @@ def report(outcome: "Outcome", job: "Job") -> int:
     return 0
 
 
-def _changed(settings: "TrainingSettings", **given: int | None) -> "TrainingSettings":
-    return replace(settings, **{name: value for name, value in given.items() if value is not None})
-
-
 def _run_of(path: Path) -> Path:
     """The run folder of a run or of one of its checkpoints; raises `ConfigError`."""
-    from fishd.learning.runs import SETTINGS
+    from fishd.learning.run_folder.runs import SETTINGS
 
     if not path.is_dir():
-        what = (
-            "no folder: of a policy file the value network is gone"
-            if path.exists()
-            else ("no such folder")
-        )
+        what = "a policy file has no value network" if path.exists() else "no such folder"
         raise ConfigError(f"--from {path}: {what}; give a run folder or one of its checkpoints")
     return path if (path / SETTINGS).exists() else path.parent

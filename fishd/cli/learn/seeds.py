@@ -5,32 +5,24 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fishd.cli.config import EX_CONFIG
-from fishd.console import complain
-from fishd.errors import ConfigError
+from fishd.core.console import INTERRUPTED
 
 if TYPE_CHECKING:
-    from fishd.learning.jobs import Job
-    from fishd.learning.seeds import SeedOutcome
-
-INTERRUPTED = 130
+    from fishd.learning.train.jobs import Job, Outcome
 
 
 def train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) -> int:
     """Train them all, a line as each ends, and a summary; the exit status."""
-    from fishd.learning import seeds as learning
+    from fishd.learning.train import seeds as training
 
     click.echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps")
-    try:
-        outcomes = learning.train_seeds(job, seeds, jobs, cluster, _tell)
-    except ConfigError as error:
-        complain("fishctl", str(error), EX_CONFIG)
-    for name, found in (
-        ("latest", [outcome.latest for outcome in outcomes if outcome.latest]),
-        ("best", [outcome.best for outcome in outcomes if outcome.best]),
+    outcomes = training.train_seeds(job, seeds, jobs, cluster, _print)
+    for name, evaluations in (
+        ("latest", [outcome.latest_evaluation for outcome in outcomes]),
+        ("best", [outcome.best_evaluation for outcome in outcomes]),
     ):
-        if found:
-            shares = [evaluation.efficiency for evaluation in found]
+        shares = [evaluation.efficiency for evaluation in evaluations if evaluation]
+        if shares:
             click.echo(
                 f"{name} policies of {len(shares)} seeds: median {statistics.median(shares):.1%} "
                 f"[{min(shares):.1%} – {max(shares):.1%}]"
@@ -42,12 +34,12 @@ def train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) -
     return INTERRUPTED if "interrupted" in ends else 0
 
 
-def _tell(outcome: "SeedOutcome") -> None:
-    from fishd.learning.progress import described
+def _print(seed: int, outcome: "Outcome") -> None:
+    from fishd.learning.train.progress import described
 
-    swims = f": {described(outcome.latest).strip()}" if outcome.latest else ""
-    if outcome.ended == "finished":
-        click.echo(f"seed {outcome.seed}{swims}")
-        return
+    latest = outcome.latest_evaluation
+    swims = f": {described(latest).strip()}" if latest else ""
+    is_finished = outcome.ended == "finished"
+    ended = "" if is_finished else f" {outcome.ended}"
     why = f" ({outcome.message})" if outcome.message else ""
-    click.echo(f"seed {outcome.seed} {outcome.ended}{why}{swims}", err=True)
+    click.echo(f"seed {seed}{ended}{why}{swims}", err=not is_finished)

@@ -8,10 +8,11 @@ sensor would integrate to a lie; a slow average of the force finds it and takes 
 import math
 from typing import Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from fishd.estimators.tail_beat import TailBeat
-from fishd.signals import Measurement, Observation
+from fishd.control.estimators.tail_beat import TailBeat
+from fishd.core.schema import unit
+from fishd.core.signals import Measurement, Observation
 
 
 class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -19,20 +20,17 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     leak: Annotated[
         float,
-        Meta(
-            gt=0,
-            le=100,
-            description="Time constant by which the integral of the lateral force forgets.",
-            extra_json_schema={"unit": "s"},
+        unit(
+            "s", "Time constant by which the integral of the lateral force forgets.", gt=0, le=100
         ),
     ] = 0.3
     bias_time: Annotated[
         float,
-        Meta(
+        unit(
+            "s",
+            "Time constant of the average that tracks the offset of the lateral force.",
             gt=0,
             le=1000,
-            description="Time constant of the average that tracks the offset of the lateral force.",
-            extra_json_schema={"unit": "s"},
         ),
     ] = 2.0
 
@@ -57,7 +55,7 @@ class LateralForceEstimator:
     ) -> Observation:
         """The observation for the tick at `time`.
 
-        instruction_angle: in force since the previous tick [rad]
+        instruction_angle: applied since the previous tick [rad]
         time: start of the tick [s, monotonic]
         dt: time since the previous tick [s]
         """

@@ -32,7 +32,7 @@ class TailBeat:
     def update(self, angle: float, force: float, duration: float) -> None:
         """Add a window.
 
-        angle: instruction angle in force during the window [rad]
+        angle: instruction angle applied during the window [rad]
         force: mean longitudinal force of the window [N]
         duration: its length [s]
         """

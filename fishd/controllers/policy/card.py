@@ -1,4 +1,4 @@
-"""What a policy file says about itself, and how an observation becomes the network's input.
+"""The card of a policy file, and how an observation becomes the network's input.
 
 The card travels inside the ONNX file, so that a network is never run without its normalisation, at
 another tick or for another amplitude than it was trained for.
@@ -12,19 +12,19 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from fishd.errors import PolicyError
-from fishd.files import SETTINGS
-from fishd.schema import Problem, convert, nested_too_deeply, spelled
-from fishd.signals import Observation
+from fishd.core.errors import PolicyError
+from fishd.core.files import SETTINGS
+from fishd.core.schema import Problem, convert, nested_too_deeply, spelled
+from fishd.core.signals import Observation
 
 KEY = "fishd.card"
-"""Under which the card is in the metadata of an ONNX file."""
+"""Key of the card in the metadata of an ONNX file."""
 
 FORMAT = 2
 """Version of the card; a file with another one is refused."""
 
 LONGEST = SETTINGS
-"""Of a card as text; that of a training has some two thousand letters."""
+"""Of a card as text; that of a training has some two thousand [characters]."""
 
 SAME_TICK = 1e-9
 """Largest difference between two ticks that are the same [s]."""
@@ -35,7 +35,7 @@ FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle"
 _TOO_DEEP = "its card is JSON that is nested too deeply"
 
 Positive = Annotated[float, Meta(ge=1e-30, le=1e30)]
-"""What a float32 can hold, and its inverse too."""
+"""In the range of a float32, as its inverse is."""
 
 
 class Feature(Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,13 +63,13 @@ class Layout:
         return row
 
     def write(self, observation: Observation, row: NDArray[np.float32]) -> None:
-        """The same into an array that is there already, where microseconds count."""
+        """The same into an existing array, which is faster."""
         for place, value, factor in self._inputs:
             row[place] = value(observation) * factor
 
 
 class Provenance(Struct, frozen=True, kw_only=True):
-    """Where a policy comes from; for people, nothing is decided by it."""
+    """Where a policy comes from; for people only."""
 
     created: str
     """ISO 8601."""
@@ -134,17 +134,15 @@ def decode(text: str) -> Card:
     except RecursionError:
         raise PolicyError(_TOO_DEEP) from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise PolicyError(f"its card is no JSON: {error}") from None
+        raise PolicyError(f"its card is not JSON: {error}") from None
     if not isinstance(data, dict):
-        raise PolicyError("its card is no JSON object")
+        raise PolicyError("its card is not a JSON object")
     if nested_too_deeply(data):
         raise PolicyError(_TOO_DEEP)
     found = data.get("format")
     if found != FORMAT:
         older = isinstance(found, int) and found < FORMAT
-        advice = (
-            ": it is of an older fishd; train and export it again, 'fishctl learn'" if older else ""
-        )
+        advice = ": it was written by an older fishd; train and export it again" if older else ""
         raise PolicyError(
             f"its card has format {spelled(found)[:60]}; this fishd reads format {FORMAT}{advice}"
         )

@@ -1,38 +1,37 @@
-"""The checksum of a policy file: a damaged one is refused, whichever of its bytes is another."""
+"""The checksum of a policy file: a file of which any byte was changed is refused."""
 
 import hashlib
 from typing import TYPE_CHECKING
 
-from fishd.errors import PolicyError
+from fishd.core.errors import PolicyError
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
 KEY = "fishd.sha256"
-"""Under which it is in the metadata of an ONNX file."""
+"""Its key in the metadata of an ONNX file."""
 
 _BLANK = "0" * 64
 
 
 def sealed(model: "ModelProto") -> bytes:
-    """The file of a model, with its checksum; one that the model has already is replaced."""
+    """The file of a model, with its checksum, which replaces an existing one."""
     kept = [(entry.key, entry.value) for entry in model.metadata_props if entry.key != KEY]
     del model.metadata_props[:]
     for key, value in kept:
         model.metadata_props.add(key=key, value=value)
-    place = hashlib.sha256(model.SerializeToString()).hexdigest()  # a text that is nowhere in it
+    place = hashlib.sha256(model.SerializeToString()).hexdigest()  # does not occur in it
     model.metadata_props.add(key=KEY, value=place)
     content: bytes = model.SerializeToString()
     return content.replace(place.encode(), _digest(content, place).encode())
 
 
 def check(content: bytes, model: "ModelProto") -> None:
-    """Raises `PolicyError` unless the content of a file is the one that was written."""
+    """Raises `PolicyError` unless the content of a file fits its checksum."""
     found = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if not found:
         raise PolicyError(
-            f"its metadata lacks {KEY}, the checksum that tells a damaged file; export it again "
-            "with 'fishctl learn export'"
+            f"its metadata lacks {KEY}, the checksum; export it again with 'fishctl learn export'"
         )
     if len(found) > 1 or len(found[0]) != len(_BLANK) or found[0] != _digest(content, found[0]):
         raise PolicyError(
@@ -42,7 +41,7 @@ def check(content: bytes, model: "ModelProto") -> None:
 
 
 def is_there(model: "ModelProto") -> bool:
-    """Does the file say what its checksum should be?"""
+    """Does the model have a checksum?"""
     return any(entry.key == KEY for entry in model.metadata_props)
 
 

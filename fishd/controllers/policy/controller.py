@@ -1,21 +1,22 @@
-"""`ppo`: a learned policy, from a policy file, in the tick."""
+"""`ppo`: a learned policy from a policy file."""
 
 import math
 from typing import TYPE_CHECKING, Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.dwell import DwellLimit
-from fishd.errors import ParameterError, PolicyError
-from fishd.policies import library
-from fishd.signals import Observation
+from fishd.controllers.policy import library
+from fishd.core.errors import ParameterError, PolicyError
+from fishd.core.schema import PRINTABLE, unit
+from fishd.core.signals import Observation
 
 if TYPE_CHECKING:  # numbers and onnxruntime are loaded with the first policy
-    from fishd.policies.card import Card
-    from fishd.policies.runtime import Network
+    from fishd.controllers.policy.card import Card
+    from fishd.controllers.policy.runtime import Network
 
-_REHEARSALS = 3
+_WARM_UPS = 3
 
 
 class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -23,12 +24,13 @@ class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     policy: Annotated[
         str,
-        Meta(
+        unit(
+            "1",
+            "What to follow; 'fishctl policies' lists those that have a name.",
             min_length=1,
             max_length=4096,
-            pattern="^[^\x00-\x1f\x7f-\x9f]*$",
-            description="What to follow; 'fishctl policies' lists those that have a name.",
-            extra_json_schema={"unit": "1", "file": library.SUFFIX},
+            pattern=PRINTABLE,
+            file=library.SUFFIX,
         ),
     ]
 
@@ -38,14 +40,14 @@ class Ppo(Controller[PpoParameters]):
 
     It is what `fishctl learn export` writes: an ONNX model with the card that says what it must be
     shown, at which tick, and what its output means. Reversals that come sooner than `chatter.dwell`
-    are held back; a policy that insists on them loses command.
+    are held back; a policy that insists on them is replaced by another controller.
     """
 
     Parameters = PpoParameters
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Reads, checks and warms up the policy."""
-        from fishd.policies.card import Layout
+        from fishd.controllers.policy.card import Layout
 
         self.parameters = parameters  # without super(), which would do all of it twice
         self.limits = limits
@@ -57,7 +59,7 @@ class Ppo(Controller[PpoParameters]):
 
     @classmethod
     def check(cls, parameters: PpoParameters, limits: Limits) -> None:
-        """Refuse what is no policy, or none for this tick and amplitude."""
+        """Refuse a file that is not a policy, or one for another tick or amplitude."""
         _open(parameters, limits)
 
     def activate(self, observation: Observation) -> None:
@@ -65,21 +67,21 @@ class Ppo(Controller[PpoParameters]):
         self._limit.activate(observation.instruction_angle)
 
     def retune(self, parameters: PpoParameters) -> None:
-        """Refuse: another policy is loaded and warmed up outside the loop."""
+        """Refuse: another policy must be loaded and warmed up outside the loop."""
         if parameters != self.parameters:
             raise ParameterError(
                 "policy: it cannot change in flight; start the controller again, with another one"
             )
 
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Choose as in the latest tick, a few times: the first brings the network to the caches."""
-        for _ in range(_REHEARSALS):
+        for _ in range(_WARM_UPS):
             self._choose(self._latest)
 
     def update(self, observation: Observation) -> float:
         """Φ times the network's output, which is cut to ±1 [rad].
 
-        An output that is not finite stays what it is, and ends in the fault `controller-error`.
+        An output that is not finite is returned as it is, which is the fault `controller-error`.
         Raises `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
@@ -96,8 +98,8 @@ class Ppo(Controller[PpoParameters]):
 
 
 def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
-    from fishd.policies import file
-    from fishd.policies.runtime import Network
+    from fishd.controllers.policy import file
+    from fishd.controllers.policy.runtime import Network
 
     try:
         path = library.find(parameters.policy)

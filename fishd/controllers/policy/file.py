@@ -1,7 +1,7 @@
-"""Reads a policy file, and refuses what is none, is damaged, or would run code or for ever.
+"""Reads a policy file; refuses other files, damaged ones, and those that could run code or hang.
 
-A policy file is an ONNX model with a card (`fishd.policies.card`) in its metadata. Messages are for
-the person who named the file: why it is refused, and what to do.
+A policy file is an ONNX model with a card (`card.Card`) in its metadata. Messages are for the
+person who named the file: why it is refused, and what to do.
 """
 
 import os
@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fishd import files
-from fishd.errors import PolicyError
-from fishd.policies import bulk, checksum, operators
-from fishd.policies.card import KEY, Card, decode
-from fishd.text import named, quoted
+from fishd.controllers.policy import checksum, operators, size_check
+from fishd.controllers.policy.card import KEY, Card, decode
+from fishd.core import files
+from fishd.core.errors import PolicyError
+from fishd.core.text import named, quoted
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
@@ -33,7 +33,7 @@ _HIDDEN = ("/home/", "/root/", "/run/user/")
 
 
 class PolicyFile(NamedTuple):
-    """A file that was read and found good; whether it fits a robot is another question."""
+    """A valid policy file; whether it fits a robot is checked separately."""
 
     path: Path
     content: bytes
@@ -50,27 +50,27 @@ def read(path: Path) -> PolicyFile:
 
 
 def parse(content: bytes) -> Card:
-    """The card of a policy whose whole content is good; raises `PolicyError`."""
+    """The card of a policy file whose content is valid; raises `PolicyError`."""
     _refuse_pickles(content)
     try:
-        bulk.check(content)
-    except bulk.TooMuch:
+        size_check.check(content)
+    except size_check.TooMuch:
         raise PolicyError(
-            f"more than {bulk.MOST // 2**10} kB of it are no raw weights, far more than a policy "
-            "needs; save weights as raw data"
+            f"more than {size_check.MOST // 2**10} kB of it are not raw weights, far more than a "
+            "policy needs; save weights as raw data"
         ) from None
-    except bulk.Broken:
-        raise PolicyError(f"this is no ONNX model; {_EXPORT}") from None
+    except size_check.Broken:
+        raise PolicyError(f"this is not an ONNX model; {_EXPORT}") from None
     model = _model(content)
     try:
         return _checked(content, model)
     except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 comes as bytes
-        raise PolicyError(f"this is no whole ONNX model; {_EXPORT}") from None
+        raise PolicyError(f"this is not a complete ONNX model; {_EXPORT}") from None
 
 
 def _checked(content: bytes, model: "ModelProto") -> Card:
     text = _card(model)
-    if checksum.is_there(model):  # a damaged card would be blamed for what it says
+    if checksum.is_there(model):  # else a damaged card would be blamed
         checksum.check(content, model)
     card = decode(text)
     checksum.check(content, model)
@@ -94,8 +94,8 @@ def _why_hidden(path: Path) -> str:
     if not (state and str(path).startswith(_HIDDEN)):
         return ""
     return (
-        f" that this fishd could see: it is a service, put the file into {state}/policies and give "
-        "its name"
+        f": this fishd is a service that sees no home folders; put the file into {state}/policies "
+        "and give its name"
     )
 
 
@@ -120,7 +120,7 @@ def _model(content: bytes) -> "ModelProto":
         model = None
     # Almost any bytes are some message of protobuf, with fields that nobody knows.
     if model is None or not (model.ir_version and model.opset_import and model.graph.node):
-        raise PolicyError(f"this is no ONNX model; {_EXPORT}")
+        raise PolicyError(f"this is not an ONNX model; {_EXPORT}")
     return model
 
 
@@ -128,8 +128,8 @@ def _card(model: "ModelProto") -> str:
     cards = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if not cards:
         raise PolicyError(
-            "this ONNX file says nothing about observation, tick and Φ, without which it cannot be "
-            f"run: its metadata lacks {KEY}; {_EXPORT}"
+            "this ONNX file does not say for which observation, tick and Φ it was trained: its "
+            f"metadata lacks {KEY}; {_EXPORT}"
         )
     if len(cards) > 1:
         raise PolicyError(f"it has {len(cards)} cards that may contradict one another")

@@ -1,4 +1,4 @@
-"""Named policies: which there are, and what a name stands for.
+"""Named policies: which exist, and which file a name stands for.
 
 `swim42` is the file `swim42.onnx` in the first of these folders that has one: those of
 $FISHD_POLICIES, `policies` in the state folder, /etc/fishd/policies, and what comes with fishd.
@@ -7,9 +7,9 @@ $FISHD_POLICIES, `policies` in the state folder, /etc/fishd/policies, and what c
 import os
 from pathlib import Path
 
-from fishd.errors import PolicyError
-from fishd.policies.info import PolicyInfo
-from fishd.schema import names_file, nearest
+from fishd.core.errors import PolicyError
+from fishd.core.protocol import PolicyInfo
+from fishd.core.schema import names_file, nearest
 
 SUFFIX = ".onnx"
 FOLDERS_VARIABLE = "FISHD_POLICIES"
@@ -18,7 +18,7 @@ _SYSTEM = Path("/etc/fishd/policies")
 
 
 def folders() -> list[Path]:
-    """Where policies are looked for, in this order; not all need be there."""
+    """Where policies are looked for, in this order; some may not exist."""
     given = os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)
     return [
         *(Path(folder).expanduser().absolute() for folder in given if folder),
@@ -36,7 +36,7 @@ def names() -> list[str]:
 def find(text: str) -> Path:
     """The file of a policy: `text` is its name, or a path, as it has a slash or ends in .onnx.
 
-    Raises `PolicyError` for a name that is none; whether a path leads anywhere, reading tells.
+    Raises `PolicyError` for an unknown name; a path is not checked here.
     """
     if names_file(text, SUFFIX):
         return Path(text).expanduser()
@@ -47,19 +47,19 @@ def find(text: str) -> Path:
 
 
 def describe_all(tick: float | None = None, amplitude: float | None = None) -> list[PolicyInfo]:
-    """What there is to know about each named policy; arguments as for `describe`."""
+    """`describe` each named policy."""
     return [describe(name, tick, amplitude) for name in names()]
 
 
 def describe(name: str, tick: float | None = None, amplitude: float | None = None) -> PolicyInfo:
-    """What there is to know about a policy, by name or path.
+    """Describe a policy, by name or path.
 
     tick, amplitude: those of the robot [s], [rad]; a policy that does not fit them has a problem
-    Raises `PolicyError` for a name that is none.
+    Raises `PolicyError` for an unknown name.
     """
     import msgspec
 
-    from fishd.policies import file
+    from fishd.controllers.policy import file
 
     path, card, problem = find(name), None, ""
     try:
@@ -82,7 +82,7 @@ def _files() -> dict[str, Path]:
     for folder in folders():
         try:
             paths = sorted(folder.glob("*" + SUFFIX))
-        except OSError:  # one folder that is not for us must not hide the others
+        except OSError:  # one that this user may not read must not hide the others
             continue
         for path in paths:
             if path.stem and not path.stem.startswith(".") and path.stem.isprintable():
@@ -91,10 +91,10 @@ def _files() -> dict[str, Path]:
 
 
 def unknown(name: str, known: list[str]) -> str:
-    """What to say about a name that is none of those that are known."""
+    """The message about a name that is not among the known ones."""
     if not known:
         return (
-            f"no policy is named '{name}', there are none at all; put one into {folders()[0]}, or "
+            f"no policy is named '{name}', and no other was found; put one into {folders()[0]}, or "
             f"give the path of a {SUFFIX} file"
         )
     hint = nearest(name, known)
@@ -113,4 +113,4 @@ def _shipped() -> Path:
     """In the package once it is installed, else in the checkout."""
     package = Path(__file__).parent
     installed = package / "shipped"
-    return installed if installed.is_dir() else package.parents[1] / "config" / "policies"
+    return installed if installed.is_dir() else package.parents[2] / "config" / "policies"

@@ -6,10 +6,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.errors import PolicyError
-from fishd.policies import file
-from fishd.policies.card import KEY, Card, encode
-from fishd.policies.checksum import sealed
+from fishd.controllers.policy import file
+from fishd.controllers.policy.card import KEY, Card, encode
+from fishd.controllers.policy.checksum import sealed
+from fishd.core.errors import PolicyError
 
 Layer = tuple[NDArray[Any], NDArray[Any]]
 """Weights, shape (outputs, inputs), and biases, shape (outputs,)."""
@@ -21,7 +21,7 @@ _OPERATORS = {"tanh": "Tanh", "relu": "Relu"}
 
 
 def to_onnx(layers: Sequence[Layer], activation: Literal["tanh", "relu"], card: Card) -> bytes:
-    """The file: layers with the activation between them, and the last one's output cut to [-1, 1].
+    """The file: layers with the activation between them, and the last output clipped to [-1, 1].
 
     Input `observation` (float32, 1 × features), output `action` (float32, 1 × 1). Raises
     `PolicyError` where the layers do not fit one another or the card, or are not finite.
@@ -35,7 +35,7 @@ def to_onnx(layers: Sequence[Layer], activation: Literal["tanh", "relu"], card: 
     for number, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
             raise PolicyError(
-                f"layer {number}: weights {weight.shape} and biases {bias.shape} do not go with "
+                f"layer {number}: weights {weight.shape} and biases {bias.shape} do not fit "
                 f"{width} inputs"
             )
         width = weight.shape[0]

@@ -1,15 +1,15 @@
-"""What the network of a policy may do: a list of operators, none of which can run for ever.
+"""The operators that the network of a policy may use; none of them can run for ever.
 
-Each answers in a time and a memory that follow from the shapes, and both are bounded before
-onnxruntime sees the model.
+Time and memory of each follow from the shapes, and both are bounded before onnxruntime loads the
+model.
 """
 
 from collections.abc import Mapping
 from math import prod
 from typing import TYPE_CHECKING
 
-from fishd.errors import PolicyError
-from fishd.text import quoted, said
+from fishd.core.errors import PolicyError
+from fishd.core.text import quoted, said
 
 if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto, ValueInfoProto
@@ -35,27 +35,27 @@ PERMITTED: Mapping[str, tuple[str, ...]] = {
         *("Identity", "Reshape", "Shape", "Slice", "Split", "Squeeze", "Transpose", "Unsqueeze"),
     ),
 }
-"""Those of ONNX itself, by what they are for."""
+"""Operators of ONNX itself, by purpose."""
 
 OPSETS = range(11, 27)
-"""Versions of these operators that are known."""
+"""Supported versions of these operators."""
 LARGEST_NODES = 1000
 LARGEST_VALUES = 4 * 2**20
-"""Numbers that all operators together may give in one run."""
+"""Numbers that all operators together may output in one run."""
 LARGEST_WORK = 10**8
 """Multiplications in one run, more or less: 0.1 s on a slow robot."""
 
 _NAMES = frozenset(name for names in PERMITTED.values() for name in names)
 _OWN = ("", "ai.onnx")
 _COUNTS = ("dilations", "group", "kernel_shape", "strides")
-"""Attributes that are divided by somewhere."""
+"""Attributes that must not be 0: some operator divides by them."""
 
 Shapes = Mapping[str, tuple[int, ...] | None]
 """Of each value in a model; None where it is left open."""
 
 
 def check(model: "ModelProto") -> None:
-    """Raises `PolicyError` for a model that does anything else, or too much."""
+    """Raises `PolicyError` for a model with other operators, or one that computes too much."""
     if model.functions:
         raise PolicyError(f"it defines an operator of its own, {quoted(model.functions[0].name)}")
     if model.training_info:
@@ -100,8 +100,8 @@ def _check_size(model: "ModelProto") -> None:
         taken = [shapes.get(name) for name in node.input if name]
         if None in given or None in taken:
             raise PolicyError(
-                f"how much its {node.op_type} computes cannot be told before it runs; export it "
-                "with fixed shapes"
+                f"the shapes of its {node.op_type} are not fixed, so what it costs is not known "
+                "before it runs; export it with fixed shapes"
             )
         out = sum(prod(shape) for shape in given if shape is not None)
         sizes = [shape for shape in taken if shape is not None]
@@ -119,14 +119,14 @@ def _check_size(model: "ModelProto") -> None:
 
 
 def _factor(node: "NodeProto", taken: list[tuple[int, ...]]) -> int:
-    """Multiplications for each number that a node gives; 0 where all inputs are looked at once."""
+    """Multiplications for each output number; 0 where a node reads each input once."""
     if node.op_type in ("Gemm", "MatMul"):
         return max(taken[0], default=1)
     return prod(taken[1][1:]) if node.op_type == "Conv" else 0
 
 
 def _shapes(model: "ModelProto") -> Shapes:
-    """As they follow from inputs and weights, whatever else the model says about them."""
+    """Inferred from inputs and weights; shapes that the model itself states are ignored."""
     import onnx
     from onnx import TensorProto
 

@@ -1,4 +1,4 @@
-"""Runs the network of a policy file with onnxruntime: one input, one thread, on the spot."""
+"""Runs the network of a policy file with onnxruntime, in the calling thread."""
 
 import contextlib
 import math
@@ -9,38 +9,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.errors import PolicyError
-from fishd.policies.file import INPUT, MISSING, OUTPUT, PolicyFile
-from fishd.text import named
+from fishd.controllers.policy.file import INPUT, MISSING, OUTPUT, PolicyFile
+from fishd.core.errors import PolicyError
+from fishd.core.text import named
 
 _PROBES = 64
 """Inputs on which a network is tried, which warms it up as well."""
 _LARGEST_PROBE = 1e3
 """In units of a feature's scale."""
 _TIMED = 8
-"""After so many probes the fastest must have been fast enough."""
+"""Number of probes, of which the fastest must be fast enough."""
 _SHARE = 0.5
-"""Of the tick, that one run may take."""
+"""Share of the tick that one run may take."""
 
 
 def load() -> Any:
     """The package onnxruntime, quiet; raises ImportError.
 
-    By itself, newer versions keep an identifier of the device in the user's folder and report to
-    their maker.
+    Without that, newer versions store an identifier of the device and send telemetry.
     """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime
 
-    onnxruntime.set_default_logger_severity(4)  # what is wrong comes as an exception as well
+    onnxruntime.set_default_logger_severity(4)  # errors are raised as exceptions, too
     return onnxruntime
 
 
 def preload() -> None:
     """Load onnxruntime, where it is installed.
 
-    Its import holds the interpreter for longer than a tick, in whatever thread, and so belongs
-    before the first one.
+    Its import blocks all threads for longer than a tick, so do it before the first one.
     """
     with contextlib.suppress(ImportError):
         load()
@@ -71,7 +69,7 @@ class Network:
         return float(self._output[0, 0])
 
     def _bound(self, inputs: NDArray[np.float32]) -> Any:
-        """Input and output stay where they are: half the time of an ordinary run."""
+        """Input and output in fixed places, which takes half the time of an ordinary run."""
         value = load().OrtValue.ortvalue_from_numpy
         binding = self._session.io_binding()
         binding.bind_ortvalue_input(INPUT, value(inputs))
@@ -79,10 +77,10 @@ class Network:
         return binding
 
     def _try(self, tick: float) -> None:
-        """Run on inputs of every size; raises `PolicyError` where an output is not finite.
+        """Raise `PolicyError` where an output is not finite, or all of several runs are too slow.
 
-        Or where the fastest of several runs takes too much of a tick [s]. What counts is the
-        processor's time of this thread, in which all is computed: a busy machine adds nothing.
+        Inputs of every size are tried. The time is the processor's in this thread, so a busy
+        machine refuses nothing; tick: [s]
         """
         probes = np.random.default_rng(0).normal(size=(_PROBES, len(self.row)))
         sizes = np.geomspace(1e-3, _LARGEST_PROBE, _PROBES)
@@ -99,8 +97,8 @@ class Network:
                 )
             if number == _TIMED and fastest > _SHARE * tick:
                 raise PolicyError(
-                    f"this machine takes {fastest * 1e3:.3g} ms for one answer of it, more than "
-                    f"half of its tick of {tick * 1e3:g} ms; train a smaller network"
+                    f"this machine takes {fastest * 1e3:.3g} ms to run it once, more than half of "
+                    f"its tick of {tick * 1e3:g} ms; train a smaller network"
                 )
 
 

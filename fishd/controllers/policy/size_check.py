@@ -1,14 +1,14 @@
-"""How much of a policy file is anything but the weights of its network, told without protobuf.
+"""How much of a policy file is anything but the weights of its network, measured without protobuf.
 
-protobuf makes some ninety bytes of each message, however short, and lets nothing else run
-meanwhile: a file of the permitted length could take gigabytes. Weights, as raw data, take what they
-have.
+protobuf allocates some ninety bytes for each message, however short, and blocks all other threads
+meanwhile: parsing a file of the permitted length could take gigabytes. Weights, as raw data, take
+only their own size.
 """
 
 from collections.abc import Iterator
 
 MOST = 256 * 2**10
-"""Of all that is no weight: the card, the names, the layers [bytes]."""
+"""Largest size of everything but weights: the card, the names, the layers [bytes]."""
 
 _GRAPH, _INITIALIZER, _RAW_DATA = 7, 5, 9
 """Numbers of the fields that lead to the weights: of a model, of a graph, of a tensor."""
@@ -17,42 +17,35 @@ _FIXED = {_FIXED64: 8, _FIXED32: 4}
 
 
 class TooMuch(Exception):
-    """More than MOST is no weight."""
+    """More than MOST is not weights."""
 
 
 class Broken(Exception):
-    """This is not how protobuf writes."""
+    """The content is not a protobuf message."""
 
 
 def check(content: bytes) -> None:
     """Raises `TooMuch` or `Broken`."""
     left = MOST
-    for number, begin, end, size in _fields(content, 0, len(content)):
-        left -= size - (end - begin) * (number == _GRAPH)
-        for inner, first, last, inner_size in _inside(number == _GRAPH, content, begin, end):
-            left -= inner_size - (last - first) * (inner == _INITIALIZER)
-            for part, start, stop, part_size in _inside(
-                inner == _INITIALIZER, content, first, last
-            ):
-                left -= part_size - (stop - start) * (part == _RAW_DATA)
-                _enough(left)
-            _enough(left)
-        _enough(left)
+    for size in _overheads(content, 0, len(content), (_GRAPH, _INITIALIZER, _RAW_DATA)):
+        left -= size
+        if left < 0:
+            raise TooMuch
 
 
-def _enough(left: int) -> None:
-    if left < 0:
-        raise TooMuch
-
-
-def _inside(
-    wanted: bool, content: bytes, begin: int, end: int
-) -> Iterator[tuple[int, int, int, int]]:
-    return _fields(content, begin, end) if wanted else iter(())
+def _overheads(content: bytes, begin: int, end: int, path: tuple[int, ...]) -> Iterator[int]:
+    """Size of each field of a message, without what the field numbers in `path` lead to [bytes]."""
+    for number, first, last, size in _fields(content, begin, end):
+        if number != path[0]:
+            yield size
+            continue
+        yield size - (last - first)
+        if path[1:]:
+            yield from _overheads(content, first, last, path[1:])
 
 
 def _fields(content: bytes, begin: int, end: int) -> Iterator[tuple[int, int, int, int]]:
-    """Number, begin and end of the value, and whole size of each field of a message."""
+    """Number, begin and end of the value, and total size of each field of a message."""
     at = begin
     while at < end:
         key, value = _varint(content, at, end)

@@ -4,31 +4,33 @@ import secrets
 import time
 from typing import Any
 
+from msgspec.structs import astuple
+
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.dwell import DwellLimit
-from fishd.errors import ControllerFault, ParameterError
-from fishd.remote.messages import Ended, FromAgent, Observed, Pause, encode
-from fishd.remote.parameters import RemoteParameters
-from fishd.remote.wire import Wire
-from fishd.signals import Observation
-from fishd.zmq_address import why_not_connected
+from fishd.controllers.remote.messages import Ended, FromAgent, Observed, Pause, encode
+from fishd.controllers.remote.parameters import RemoteParameters
+from fishd.controllers.remote.wire import Wire
+from fishd.core.addresses import why_not_connected
+from fishd.core.errors import ControllerFault, ParameterError
+from fishd.core.signals import Observation
 
 DEADLINE = 0.4
-"""Time that the agent has by default, as a share of the tick."""
+"""Time for the agent's action by default, as a share of the tick."""
 LONGEST_DEADLINE = 0.45
-"""Of the half tick that a controller may take, the rest is for its own work."""
+"""Share of the tick; the rest of the half tick that a controller may take is for its own work."""
 LONGEST_WAIT = 60.0
 """How long a run in virtual time waits for its agent, pauses not counted [s, real]."""
 MOST_AT_ONCE = 200
-"""Messages that are read before time is looked at."""
+"""Messages that are read before the time is checked."""
 
 
 class Remote(Controller[RemoteParameters]):
     """Let an agent choose: a program in another process, on another machine perhaps.
 
     Each tick sends it the observation and waits for its action until the deadline. A tick without
-    one is spent at neutral. An action is for the tick whose observation it answers, or for none.
-    Virtual time stands still meanwhile, so there the agent has as long as it needs.
+    one is spent at neutral. An action applies only to the tick whose observation it answers. In
+    virtual time a tick lasts until the agent has answered.
     """
 
     Parameters = RemoteParameters
@@ -47,7 +49,7 @@ class Remote(Controller[RemoteParameters]):
         """The observation whose action is waited for; 0 for none."""
         self._command: float | None = None
         self._resting = False
-        """Is the agent in a pause in this tick?"""
+        """Is this tick part of a pause?"""
         self._pause = 0.0
         """What is left of it; in virtual time, how long it may take [s]."""
         self._answered = 0
@@ -88,7 +90,7 @@ class Remote(Controller[RemoteParameters]):
         """Take another deadline or limit; another agent has to take over properly."""
         if parameters.agent != self.parameters.agent:
             raise ParameterError(
-                "agent: cannot be changed in command; to change agents, use "
+                "agent: cannot be changed while remote is active; to change agents, use "
                 f"'fishctl set-controller remote --agent {parameters.agent}'"
             )
         super().retune(parameters)
@@ -128,7 +130,7 @@ class Remote(Controller[RemoteParameters]):
         return self._limit.apply(self._decide(observation), observation.dt)
 
     def close(self) -> None:
-        """Tell the agent that it is no longer in command."""
+        """Tell the agent that `remote` is no longer active."""
         self._wire.close(encode(Ended(session=self._session)))
 
     @property
@@ -141,11 +143,11 @@ class Remote(Controller[RemoteParameters]):
 
     @property
     def _settled(self) -> bool:
-        """Is it clear what this tick will command?"""
+        """Is the command of this tick known?"""
         return self._resting or self._command is not None
 
     def _begin(self, o: Observation) -> None:
-        """Begin a tick: what has come since the last one answers none, but may be a pause."""
+        """Begin a tick; actions that came since the last one are too late, a pause is not."""
         self._observation, self._command, self._unsent, self._open = o, None, False, 0
         self._exchange()
         if not self.limits.virtual:
@@ -155,20 +157,11 @@ class Remote(Controller[RemoteParameters]):
                 return
         self._question = encode(
             Observed(
+                *astuple(o),
                 session=self._session,
                 seq=self._seq + 1,
                 answered=self._answered,
                 lost=self._lost,
-                time=o.time,
-                dt=o.dt,
-                fx=o.fx,
-                fy=o.fy,
-                fy_rate=o.fy_rate,
-                fin_velocity=o.fin_velocity,
-                instruction_angle=o.instruction_angle,
-                previous_angle=o.previous_angle,
-                thrust=o.thrust,
-                frequency=o.frequency,
                 tick=self.limits.tick,
                 amplitude=self.limits.amplitude,
             )
@@ -217,7 +210,7 @@ class Remote(Controller[RemoteParameters]):
             self._late += 1
 
     def _decide(self, observation: Observation) -> float:
-        """What the tick has come to, and how long that may go on."""
+        """The command of this tick; raises `ControllerFault` after too many without an action."""
         if self._command is not None:
             self._answered = self._open
             self._silent = self._late = self._foreign = 0
@@ -247,7 +240,7 @@ class Remote(Controller[RemoteParameters]):
 
     @property
     def _wrong(self) -> str:
-        """What came instead of actions in time."""
+        """What the agent sent instead of actions in time."""
         foreign = f", {self._foreign} named another session" if self._foreign else ""
         return f"{self._late} answers came too late{foreign}"
 

@@ -1,7 +1,7 @@
-"""What fishd and an agent say to each other, one JSON object a message; see docs/remote.md.
+"""The messages between fishd and an agent, one JSON object each; see docs/remote.md.
 
 fishd connects to the agent. Each observation is numbered within its session, and an action names
-the observation that it answers: one that comes too late is for no other tick.
+the observation that it answers: one that comes too late is dropped.
 """
 
 from typing import Annotated
@@ -9,35 +9,25 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta, Struct
 
+from fishd.core.signals import Observation
+
 VERSION = 1
 MAX_MESSAGE = 65536
-"""Longer messages are not even received [bytes]."""
+"""Of a message; ZeroMQ closes the connection of whoever sends more [bytes]."""
 
 
-class Observed(Struct, frozen=True, tag="observation", tag_field="kind", kw_only=True):
+class Observed(Observation, frozen=True, tag="observation", tag_field="kind", kw_only=True):
     """fishd → agent: what was observed in a tick; an action is wanted."""
 
     v: int = VERSION
     session: str
-    """Names one take-over of the controller `remote`; a new one each time."""
+    """Names one activation of the controller `remote`; a new one each time."""
     seq: int
     """Number of this observation in the session, from 1; ticks in a pause are not numbered."""
     answered: int
-    """Number of the latest observation whose action was put in command; 0 for none."""
+    """Number of the latest observation whose action was applied; 0 for none."""
     lost: int
-    """Ticks since the observation before this one in which no action was put in command."""
-    time: float
-    """Start of the tick [s, monotonic]."""
-    dt: float
-    """Time since the previous tick [s]."""
-    fx: float
-    fy: float
-    fy_rate: float
-    fin_velocity: float
-    instruction_angle: float
-    previous_angle: float
-    thrust: float
-    frequency: float
+    """Ticks since the previous observation in which no action was applied."""
     tick: float
     """Period of the loop [s]."""
     amplitude: float
@@ -45,7 +35,7 @@ class Observed(Struct, frozen=True, tag="observation", tag_field="kind", kw_only
 
 
 class Ended(Struct, frozen=True, tag="ended", tag_field="kind", kw_only=True):
-    """fishd → agent: another controller is in command now, or none; no action is wanted."""
+    """fishd → agent: `remote` is no longer the active controller; no action is wanted."""
 
     v: int = VERSION
     session: str
@@ -67,7 +57,7 @@ class Action(
 class Pause(
     Struct, frozen=True, tag="pause", tag_field="kind", kw_only=True, forbid_unknown_fields=True
 ):
-    """Agent → fishd, in place of an action: no observations, neutral, for a while; 0 ends it."""
+    """Agent → fishd, instead of an action: stay at neutral, send no observations; 0 ends it."""
 
     v: int = VERSION
     session: str

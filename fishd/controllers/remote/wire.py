@@ -1,4 +1,4 @@
-"""The socket between the controller `remote` and its agent; nothing here waits but `wait`."""
+"""The socket between the controller `remote` and its agent; only `wait` blocks."""
 
 import re
 import select
@@ -7,8 +7,9 @@ from contextlib import ExitStack
 import msgspec
 import zmq
 
-from fishd.errors import ControllerFault, ParameterError
-from fishd.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
+from fishd.controllers.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
+from fishd.core.addresses import FORM
+from fishd.core.errors import ControllerFault, ParameterError
 
 _QUEUE = 100
 """Messages kept in either direction; an agent that does not read gets no more than these."""
@@ -19,10 +20,9 @@ _SHOWN = 200
 
 
 def start_context(stack: ExitStack) -> None:
-    """Start ZeroMQ's thread of this process now; leaving `stack` ends it, with every socket.
+    """Start ZeroMQ's thread of this process; leaving `stack` ends it, and every socket.
 
-    So it is there when threads get their priority. To start and end one of its own with each wire
-    would take time, in a tick.
+    Done at start, it gets its priority with the other threads, and no tick has to wait for it.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
     stack.callback(context.destroy, linger=_FAREWELL)
@@ -39,7 +39,7 @@ class Wire:
     """A DEALER socket that connects to the agent, and connects again when it was lost."""
 
     def __init__(self, address: str) -> None:
-        """Raises `ParameterError` where ZeroMQ takes the address for none."""
+        """Raises `ParameterError` where ZeroMQ refuses the address."""
         self._address = address
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self._socket = context.socket(zmq.DEALER)
@@ -52,8 +52,7 @@ class Wire:
         except zmq.ZMQError as error:
             self._socket.close(linger=0)
             raise ParameterError(
-                f"agent: cannot connect to '{address}': {zmq.strerror(error.errno or 0)}; "
-                "tcp://HOST:PORT or ipc://PATH is needed",
+                f"agent: cannot connect to '{address}': {zmq.strerror(error.errno or 0)}; {FORM}",
                 ("agent",),
             ) from None
 
@@ -73,7 +72,7 @@ class Wire:
     def receive(self) -> FromAgent:
         """A message, where `state` says that there is one.
 
-        Raises `ControllerFault` when it is none that an agent may send.
+        Raises `ControllerFault` when it is not a message that an agent may send.
         """
         frames = self._socket.recv_multipart(zmq.DONTWAIT)
         if len(frames) != 1:
@@ -110,7 +109,7 @@ def _why(payload: bytes, error: msgspec.DecodeError) -> str:
         version = VERSION
     if version != VERSION:
         return _other_version(version)
-    return f"{_excerpt(payload, str(error))!r}, which is no action or pause: {error}"
+    return f"{_excerpt(payload, str(error))!r}, which is neither an action nor a pause: {error}"
 
 
 def _excerpt(payload: bytes, error: str) -> str:

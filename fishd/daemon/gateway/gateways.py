@@ -1,4 +1,4 @@
-"""A gateway as fishd sees it: a process that is started again when it ends, and the link to it."""
+"""The gateways as fishd sees them: processes that are started again when they end, and links."""
 
 import asyncio
 import os
@@ -7,30 +7,34 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 
-from fishd.errors import StartupError
-from fishd.gateway.link import END, LONGEST, NOTICE, TELEMETRY, pair
+from fishd.control.reporting import Reporter
+from fishd.core import addresses
+from fishd.core.errors import StartupError
+from fishd.daemon.control_server import ControlServer
+from fishd.daemon.gateway.link import CONTROL, END, LONGEST, NOTICE, TELEMETRY, pair
 
 PAUSES = 0.05, 2.0
 """Shortest and longest pause before a gateway is started again [s]."""
 HEALTHY = 10.0
-"""One that has lived for so long is started again after the shortest pause [s]."""
+"""A gateway that ran for so long is started again after the shortest pause [s]."""
 RETURN = 1.0
 """How long clients may take to connect again [s]."""
 FAREWELL = 0.5
 """How long it may take to pass on the last messages when fishd ends [s]."""
 
-# What a flood took, malloc gives back to the system.
+# Memory that a flood took goes back to the system.
 _ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "MALLOC_TRIM_THRESHOLD_": "1048576"}
 
 
 class Gateway:
-    """The process of one socket; every method is for the thread of the asyncio loop."""
+    """The process of one socket and the link to it; for the thread of the asyncio loop only."""
 
     def __init__(self, kind: str, listener: socket.socket, address: str) -> None:
         """Start it; must be made inside a running asyncio loop.
 
-        kind: `link.TELEMETRY` or `link.CONTROL`
+        kind: TELEMETRY or CONTROL
         listener: what clients connect to; it stays open while the process is started again
         address: the ZeroMQ address of the listener
         Raises `StartupError`.
@@ -38,7 +42,7 @@ class Gateway:
         self.kind = kind
         self.address = address
         self.take: Callable[[bytes], None] = lambda message: None
-        """Called with every message that comes, once `read` wants them."""
+        """Called with every message that comes, once `read` was told to take them."""
         self.restarts = 0
         """How often it was started again."""
         self.lost = 0
@@ -48,7 +52,7 @@ class Gateway:
         self._listener = listener
         self._events = asyncio.get_running_loop()
         self._link: socket.socket | None = None
-        self._wanted = kind == TELEMETRY  # whose only message is why it ends
+        self._wanted = kind == TELEMETRY  # its only message is why it ends
         self._reading = False
         self._pause = PAUSES[0]
         self._why = ""
@@ -112,7 +116,7 @@ class Gateway:
             numbers = [theirs.fileno(), self._listener.fileno()]
             self._process = subprocess.Popen(
                 # -P: not what lies in the working directory.
-                [sys.executable, "-P", "-m", "fishd.gateway", self.kind]
+                [sys.executable, "-P", "-m", "fishd.daemon.gateway", self.kind]
                 + [str(number) for number in numbers]
                 + [self.address],
                 pass_fds=numbers,
@@ -185,3 +189,46 @@ class Gateway:
             else:
                 self._events.remove_reader(self._link)
             self._reading = wanted
+
+
+class Gateways:
+    """Listens at both addresses from now on, until `stack` is closed."""
+
+    def __init__(self, control: str, telemetry: str, stack: ExitStack) -> None:
+        """Must be made inside a running asyncio loop.
+
+        control, telemetry: addresses, which must be `claimed`
+        Raises `StartupError`.
+        """
+        self.control = _open(CONTROL, control, stack)
+        self.telemetry = _open(TELEMETRY, telemetry, stack)
+        stack.callback(self.control.end)  # so that both end at the same time
+
+    def serve(self, server: ControlServer, reporter: Reporter) -> None:
+        """Let requests come in and replies go out, and tell when a gateway was started again."""
+        server.send, server.read = self.control.send, self.control.read
+        self.control.take = server.take
+        self.control.read(True)
+        for gateway in (self.control, self.telemetry):
+            gateway.on_restart = partial(_tell_restart, reporter, gateway.kind)
+
+    def counters(self) -> dict[str, int]:
+        """What was survived, since start."""
+        return {
+            "telemetry_lost": self.telemetry.lost,
+            "telemetry_restarts": self.telemetry.restarts,
+            "control_restarts": self.control.restarts,
+        }
+
+
+def _open(kind: str, address: str, stack: ExitStack) -> Gateway:
+    listener = addresses.listen(address, f"{kind}.address", group=kind == CONTROL)
+    stack.callback(listener.close)
+    gateway = Gateway(kind, listener, addresses.served(address, listener))
+    stack.callback(gateway.close)
+    return gateway
+
+
+def _tell_restart(reporter: Reporter, kind: str, why: str) -> None:
+    message = f"the gateway of {kind} was started again: {why}"
+    reporter.event("gateway", message, "warning", gateway=kind)

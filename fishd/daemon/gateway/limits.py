@@ -1,4 +1,4 @@
-"""What a gateway may use. It ends when that is not enough: a new one begins with nothing."""
+"""Limits of a gateway's process. When it exceeds one, it ends, and a new process begins."""
 
 import ctypes
 import os

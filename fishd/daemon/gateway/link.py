@@ -1,4 +1,4 @@
-"""The form of the messages between fishd and its gateways, over a socket that keeps them apart."""
+"""The messages between fishd and its gateways, over a SOCK_SEQPACKET socket."""
 
 import socket
 from collections.abc import Iterator

@@ -5,9 +5,10 @@ import socket
 
 import zmq
 
-from fishd.gateway.limits import ResourceLimits
-from fishd.gateway.link import END, frames
+from fishd.daemon.gateway.limits import ResourceLimits
+from fishd.daemon.gateway.link import END, frames
 
+SOCKET = zmq.PUB
 MEMORY = 16 * 2**20
 """Beyond what it starts with [bytes]."""
 CONNECTIONS = 200
@@ -19,7 +20,7 @@ LONGEST = 512
 """Of what a subscriber sends: a topic, or the greeting of its connection [bytes]."""
 GREETING = 2000
 """How long a connection may take for it [ms]."""
-_GLANCE = 100
+_LOOK = 100
 """Longest time between two looks at the limits [ms]."""
 
 
@@ -28,7 +29,7 @@ def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
     waiting = select.poll()
     waiting.register(link, select.POLLIN)
     while not (why := limits.exceeded()):
-        if not waiting.poll(_GLANCE):
+        if not waiting.poll(_LOOK):
             continue
         try:
             message = link.recv(2**20)

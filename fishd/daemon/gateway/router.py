@@ -6,11 +6,12 @@ from collections import deque
 
 import zmq
 
-from fishd import protocol
-from fishd.errors import Refused
-from fishd.gateway.limits import ResourceLimits
-from fishd.gateway.link import END, LONGEST, Replies, request
+from fishd.core import protocol
+from fishd.core.errors import Refused
+from fishd.daemon.gateway.limits import ResourceLimits
+from fishd.daemon.gateway.link import END, LONGEST, Replies, request
 
+SOCKET = zmq.ROUTER
 MEMORY = 48 * 2**20
 """Beyond what it starts with [bytes]."""
 CONNECTIONS = 1500
@@ -30,7 +31,7 @@ REFUSALS, REFUSALS_AT_ONCE = 20.0, 50.0
 """Requests of one client per second, and at once, that are refused; others get no reply."""
 GREETING = 2000
 """How long a connection may take until it speaks ZeroMQ [ms]."""
-_GLANCE = 100
+_LOOK = 100
 """Longest time between two looks at the limits [ms]."""
 _AT_ONCE = 20
 """Requests that are taken before replies are looked at."""
@@ -38,7 +39,7 @@ _FORGET = 10.0
 """A client that was silent for so long is forgotten [s]."""
 
 
-class Client:
+class _Client:
     """A client's requests that wait, and how many may still be refused."""
 
     def __init__(self, now: float) -> None:
@@ -49,7 +50,7 @@ class Client:
         self._refused = now
 
     def may_refuse(self, now: float) -> bool:
-        """Is a refusal worth its while? Not for one that takes no notice of them."""
+        """Is this refusal answered? Not where the client goes on whatever it is told."""
         gained = (now - self._refused) * REFUSALS
         self._refusals = min(REFUSALS_AT_ONCE, self._refusals + gained)
         self._refused = now
@@ -59,8 +60,8 @@ class Client:
         return True
 
 
-class Requests:
-    """Between a ROUTER socket and the link to fishd: clients take turns."""
+class Router:
+    """Passes requests from a ROUTER socket to the link to fishd; clients take turns."""
 
     def __init__(
         self, link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
@@ -68,9 +69,9 @@ class Requests:
         self._link = link
         self._server = server
         self._limits = limits
-        self._clients: dict[bytes, Client] = {}
+        self._clients: dict[bytes, _Client] = {}
         self._urgent: deque[bytes] = deque()
-        self._turns: deque[Client] = deque()
+        self._turns: deque[_Client] = deque()
         """Clients with requests that wait, the next one first."""
         self._envelopes: dict[int, list[bytes]] = {}
         """What the reply to a request needs, by its number."""
@@ -86,7 +87,7 @@ class Requests:
         poller.register(self._link, zmq.POLLIN)
         poller.register(self._server, zmq.POLLIN)
         while not (self._ended or (why := self._limits.exceeded())):
-            ready = dict(poller.poll(_GLANCE))
+            ready = dict(poller.poll(_LOOK))
             if self._link.fileno() in ready:
                 self._take_replies()
             if self._server in ready:
@@ -128,7 +129,7 @@ class Requests:
         now = time.monotonic()
         client = self._clients.get(envelope[0])
         if client is None:
-            client = self._clients[envelope[0]] = Client(now)
+            client = self._clients[envelope[0]] = _Client(now)
         client.seen = now
         try:
             urgent = protocol.decode_request(payload).op in URGENT
@@ -190,3 +191,8 @@ def configure(server: "zmq.Socket[bytes]") -> None:
     server.set(zmq.SNDHWM, QUEUE_OUT)
     server.set(zmq.MAXMSGSIZE, protocol.MAX_MESSAGE)
     server.set(zmq.HANDSHAKE_IVL, GREETING)
+
+
+def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits) -> str:
+    """Pass requests and replies on until fishd ends; returns which limit was exceeded."""
+    return Router(link, server, limits).run()

@@ -1,21 +1,14 @@
-"""The ADS1115 through its Adafruit driver, with what makes single-shot mode safe and cheap.
+"""The ADS1115 through its Adafruit driver, with what makes single-shot mode safe and cheap."""
 
-The sampler imports this only when it is made: the driver is no part of fishd's core.
-"""
-
-import errno
-import logging
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adafruit_ads1x15 import ADS1115, AnalogIn, ads1x15
-from adafruit_extended_bus import ExtendedI2C
-from Adafruit_PureIO import smbus
 
-from fishd.clock import Clock
-from fishd.hardware.settings import Channel, ForceSensorSettings
+from fishd.core.clock import Clock
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from fishd.hardware.force_sensor.ads1115 import Ads1115Settings, Channel
 
 SLOWEST, TOO_SLOW = 1.1, 1.25
 """Times of a conversion, as multiples of 1/data rate: the chip's tolerance, and what is wrong."""
@@ -24,59 +17,12 @@ _CONFIG = 1
 _IDLE_BIT = 0x8000
 _WAKE_UP = 25e-6  # of the chip, before a conversion [s]
 _GAINS = {6.144: 2 / 3, 4.096: 1, 2.048: 2, 1.024: 4, 0.512: 8, 0.256: 16}
-_I2C_TIMEOUT = 0x0702
-_TIMEOUT = 2  # [10 ms]; the kernel's own is 1 s
-
-
-def open_bus(number: int) -> Any:
-    """Open /dev/i2c-`number`; raises OSError."""
-    try:
-        bus = ExtendedI2C(number, frequency=None)
-    except (ValueError, RuntimeError):
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)) from None
-    driver = bus._i2c._i2c_bus
-    smbus.ioctl(driver._device.fileno(), _I2C_TIMEOUT, _TIMEOUT)
-    driver._device = _StrictFile(driver._device)
-    return bus
-
-
-def close_bus(bus: Any) -> None:
-    """Close it now; the library would leave that to the garbage collector. Raises no OSError."""
-    driver = bus._i2c._i2c_bus
-    try:
-        driver.close()
-    except OSError as error:  # Linux has closed it all the same
-        log.warning("closing an I2C bus failed: %s", error)
-        driver._device = None  # else it would be closed once more
-    bus.deinit()
-
-
-class _StrictFile:
-    """A device file on which a lost transfer is an error.
-
-    A raw file of Python returns None for EAGAIN, and the driver takes that for success.
-    """
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self.fileno = file.fileno
-        self.close = file.close
-
-    def read(self, length: int) -> bytes:
-        content: bytes | None = self._file.read(length)
-        if content is None:
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-        return content
-
-    def write(self, data: bytes) -> None:
-        if self._file.write(data) is None:
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
 
 class SingleShot(ADS1115):  # type: ignore[misc]
     """The driver, except that it sleeps while the chip converts and does not wait for ever."""
 
-    def __init__(self, bus: Any, settings: ForceSensorSettings, clock: Clock) -> None:
+    def __init__(self, bus: Any, settings: "Ads1115Settings", clock: Clock) -> None:
         """Find the chip on a bus and set it up; raises OSError."""
         self._clock = clock
         self._sleep = _WAKE_UP + SLOWEST / settings.data_rate
@@ -100,7 +46,7 @@ class SingleShot(ADS1115):  # type: ignore[misc]
                 raise
             raise OSError(number, os.strerror(number)) from None
 
-    def input(self, channel: Channel) -> Any:
+    def input(self, channel: "Channel") -> Any:
         """One input, whose `value` is converted when it is asked for."""
         return AnalogIn(self, *(int(pin[1]) for pin in channel.split("-")))
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.errors import FishdError
-from fishd.hardware.calibration import ForceCalibration
+from fishd.core.calibration import ForceCalibration
+from fishd.core.errors import FishdError
 
 FEWEST_LOADS = 5
 WORST_CONDITION = 100.0

@@ -1,20 +1,21 @@
-"""The dual force sensor on an ADS1115: a thread samples it, the tick takes what has come in.
+"""The dual force sensor, whatever its driver: a thread samples it, the tick takes what came in.
 
 In virtual time there is no thread: a read samples until its clock has come to the tick.
 """
 
 import math
 import threading
+from typing import Any
 
 from msgspec.structs import replace
 
-from fishd.clock import Clock
-from fishd.errors import SensorError
-from fishd.hardware.calibration import ForceCalibration
-from fishd.hardware.sampler import Pair, Sampler
-from fishd.hardware.settings import ForceSensorSettings
-from fishd.hardware.window import Evaluation, VoltageWatch
-from fishd.signals import Measurement
+from fishd.core.calibration import ForceCalibration
+from fishd.core.clock import Clock
+from fishd.core.errors import SensorError
+from fishd.core.signals import Measurement
+from fishd.hardware.driver import ForceSensorDriver, Pair
+from fishd.hardware.force_sensor.sampler import Sampler
+from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
 
 HOLD = 2.2e-3
 """How long before a read all conversions have ended, at most an eighth of a tick [s].
@@ -25,7 +26,7 @@ CLOSE_LIMIT = 0.5
 """How long to wait for the thread to end [s]."""
 
 
-class Ads1115Sensor:
+class SampledSensor:
     """A force sensor that measures voltages, and can be calibrated.
 
     What is read, watched and calibrated is for one thread, the one that ticks.
@@ -33,20 +34,18 @@ class Ads1115Sensor:
 
     def __init__(
         self,
-        settings: ForceSensorSettings,
+        driver: ForceSensorDriver[Any],
         calibration: ForceCalibration,
         clock: Clock,
         *,
         threaded: bool,
         tick: float,
     ) -> None:
-        """Begin to sample; a bus or a chip that is missing may come later.
+        """Begin to sample; hardware that is missing may come later.
 
-        clock: of the bus; in virtual time one of its own, which reads move on
+        clock: of the driver; in virtual time one of its own, which reads move on
         threaded: sample in a thread, which needs a clock that moves by itself
         tick: time between two reads [s]
-
-        Raises `StartupError` where the driver is not installed.
         """
         self.calibration = calibration
         """What turns voltages into forces."""
@@ -54,9 +53,10 @@ class Ads1115Sensor:
         self._tick = tick
         self._hold = min(HOLD, 0.125 * tick)
         self._step_time = 0.0
-        self._place = f"the ADS1115 at {settings.address:#04x} on /dev/i2c-{settings.bus}"
-        self._sampler = Sampler(settings, clock)
-        self._evaluation = Evaluation(settings)
+        self._place = driver.place
+        self._transport = driver.transport
+        self._sampler = Sampler(driver, clock)
+        self._evaluation = WindowEvaluation(driver.settings, driver.names)
         self._latest: Measurement | None = None
         self._watches: list[VoltageWatch] = []
         self._next_read = math.inf
@@ -74,7 +74,7 @@ class Ads1115Sensor:
         """What was measured since the previous read; in real time it waits for nothing.
 
         Without a new pair of samples it is the previous measurement, its time included, of no
-        samples and under no suspicion. Raises `SensorError`, with what to check, while the chip
+        samples and under no suspicion. Raises `SensorError`, with what to check, while the hardware
         cannot be read, before the first pair, and once closed.
         """
         if self._closing.is_set():
@@ -100,16 +100,20 @@ class Ads1115Sensor:
 
     def watch(self) -> VoltageWatch:
         """Begin to add up the voltages of every pair that is sampled from now on."""
-        watch = VoltageWatch(self._clock.monotonic(), self._evaluation.step, self.calibration)
+        watch = VoltageWatch(self._clock.monotonic(), self.calibration)
         self._watches.append(watch)
         return watch
 
     def counters(self) -> dict[str, int]:
         """Errors that were survived, since start."""
-        return {"i2c_errors": self._sampler.errors, "i2c_reconnects": self._sampler.reconnects}
+        sampler, transport = self._sampler, self._transport
+        return {
+            f"{transport}_errors": sampler.errors,
+            f"{transport}_reconnects": sampler.reconnects,
+        }
 
     def close(self) -> None:
-        """Stop to sample and let go of the bus; may be called twice, and never hangs.
+        """Stop to sample and let go of the hardware; may be called twice, and never hangs.
 
         A thread that is stuck in a transfer is left to end by itself.
         """
@@ -122,7 +126,7 @@ class Ads1115Sensor:
     def _take(self, now: float) -> list[Pair]:
         """All that has come in; a deque needs no lock for that, so the tick waits for nobody.
 
-        In virtual time the bus may have run ahead: what ended after `now` is for the next read.
+        In virtual time the driver may have run ahead: what ended after `now` is for the next read.
         """
         pairs = self._sampler.pairs
         count = len(pairs)
@@ -138,9 +142,9 @@ class Ads1115Sensor:
         clock.sleep(now - clock.monotonic())
 
     def _step(self) -> None:
-        """Convert once, and learn how long that takes here: the longest of late, slowly forgotten.
+        """Make one attempt, and learn how long that takes: the longest of late, slowly forgotten.
 
-        What takes longer than an eighth of a tick is no conversion but an error.
+        What takes longer than an eighth of a tick is no sample but an error.
         """
         begun = self._clock.monotonic()
         self._sampler.step()

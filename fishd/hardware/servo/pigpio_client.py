@@ -5,12 +5,12 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import pigpio
 
-from fishd.errors import ServoError
+from fishd.core.errors import ServoError
 
 ANSWER = 1.0
 """How long pigpiod may take to answer outside of a tick [s]."""
@@ -21,6 +21,9 @@ FAILURES = (OSError, pigpio.error, UnicodeError)
 
 SCRIPTS, PARAMETERS = 32, 10
 
+_LOOK = 5e-3
+"""How often somebody who waits in virtual time looks whether pigpiod stands still [s]."""
+
 _UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
 _TAKEN_AWAY = "somebody else took fishd's script away, as 'fishctl release' does"
 _SCRIPT_STATUS = 45
@@ -28,7 +31,7 @@ _ANSWER = struct.Struct("<3Ii")
 
 
 class Place(Protocol):
-    """Where a pigpiod is; `servo.pigpio` of the configuration is one."""
+    """Where a pigpiod is; the driver's settings are one."""
 
     @property
     def host(self) -> str:
@@ -46,10 +49,16 @@ class TimedSocket:
     then on, and is left out before the one to a later command: none is taken for that of another.
     """
 
-    def __init__(self, host: str, port: int, limit: float) -> None:
+    def __init__(
+        self, host: str, port: int, limit: float, standstill: Callable[[], bool] | None = None
+    ) -> None:
+        """standstill: in virtual time, whether no answer can come before time moves on; nobody
+        waits for one then
+        """
         self._socket = socket.create_connection((host, port), limit)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.deadline = time.monotonic() + limit
+        self._standstill = standstill
         self.owed: deque[int] = deque()
         """Numbers of the commands that are not answered yet."""
         self._received = bytearray()
@@ -115,17 +124,25 @@ class TimedSocket:
     def _fill(self, size: int) -> None:
         """Wait until so many bytes have come; what is there already is taken at any time."""
         while len(self._received) < size:
-            self._socket.settimeout(max(0.0, self.deadline - time.monotonic()))
-            try:
-                data = self._socket.recv(4096)
-            except BlockingIOError:
-                raise TimeoutError from None
+            data = self._receive()
             if not data:
                 within = 0 < len(self._received) < _ANSWER.size
                 raise ConnectionResetError(
                     "it broke off in mid-answer" if within else "it closed the connection"
                 )
             self._received += data
+
+    def _receive(self) -> bytes:
+        """What comes next before the deadline; empty where the connection is closed."""
+        while True:
+            still = self._standstill is not None and self._standstill()
+            remaining = 0.0 if still else max(0.0, self.deadline - time.monotonic())
+            self._socket.settimeout(min(remaining, _LOOK) if self._standstill else remaining)
+            try:
+                return self._socket.recv(4096)
+            except (BlockingIOError, TimeoutError):
+                if not self._standstill or not remaining:
+                    raise TimeoutError from None
 
 
 class Client(pigpio.pi):  # type: ignore[misc]
@@ -135,11 +152,16 @@ class Client(pigpio.pi):  # type: ignore[misc]
     connection whose thread spins once pigpiod is gone. fishd needs no notifications.
     """
 
-    def __init__(self, host: str, port: int, limit: float) -> None:
-        """Connect within `limit` [s]; raises OSError."""
+    refusal = pigpio.error
+    """Raised where pigpiod does not do what a command asks for."""
+
+    def __init__(
+        self, host: str, port: int, limit: float, standstill: Callable[[], bool] | None = None
+    ) -> None:
+        """Connect within `limit` [s]; raises OSError. `standstill`: as for `TimedSocket`."""
         self._host, self._port = host, port
         self._notify = None
-        self._socket = TimedSocket(host, port, limit)
+        self._socket = TimedSocket(host, port, limit, standstill)
         self.sl = pigpio._socklock()
         self.sl.s = self._socket
         self.connected = True

@@ -4,11 +4,14 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
-from fishd.clock import Clock
-from fishd.errors import ServoError
-from fishd.hardware.pigpio_client import ANSWER, FAILURES, Client, reason, where
-from fishd.hardware.settings import PigpioSettings
+from fishd.core.clock import Clock
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.pigpio_client import ANSWER, FAILURES, Client, reason, where
+
+if TYPE_CHECKING:
+    from fishd.hardware.servo.pigpio import PigpioSettings
 
 START = 2.0
 """How long a new link waits for its first connection [s]."""
@@ -19,10 +22,15 @@ PAUSES = 0.2, 1.0
 LATE_STREAK = 3
 """Ticks in a row without an answer that end a connection."""
 
-# In virtual time nothing waits for a tick: a busy machine must not pass for a frozen pigpiod.
-VIRTUAL_ANSWER = 0.25
-VIRTUAL_CONNECT = 0.05
 VIRTUAL_PAUSE = 0.5
+"""Virtual time between two attempts to connect [s]."""
+
+VIRTUAL_PATIENCE = 20.0
+"""In virtual time, how long everything may take on this machine [s].
+
+No tick waits there, and a busy machine must not pass for a frozen pigpiod: whether that answers
+in time is asked of pigpiod itself.
+"""
 
 
 class PigpioLink:
@@ -30,18 +38,21 @@ class PigpioLink:
 
     def __init__(
         self,
-        settings: PigpioSettings,
+        settings: "PigpioSettings",
         clock: Clock,
         prepare: Callable[[Client], None],
         *,
         threaded: bool,
+        standstill: Callable[[], bool] | None = None,
     ) -> None:
         """Wait up to 2 s for the first connection; without one, go on trying.
 
         prepare: called with every new client before anyone else has it; if it raises, the client
             is thrown away
         threaded: connect in a thread of its own. Otherwise within `session`, at most once per
-            0.5 s of `clock`, and with time limits that suit virtual time
+            0.5 s of `clock`
+        standstill: in virtual time, whether pigpiod answers nothing before time moves on: then
+            nobody waits, and no answer is late because the machine is busy
         """
         self.reconnects = 0
         """How often a connection was made again."""
@@ -50,6 +61,7 @@ class PigpioLink:
         self._settings = settings
         self._clock = clock
         self._prepare = prepare
+        self._standstill = standstill
         self._client: Client | None = None
         self._opening: Client | None = None
         self._reason = "no answer yet"
@@ -82,16 +94,15 @@ class PigpioLink:
         command fails. That ends the connection, unless an answer is merely late, up to twice in a
         row.
         """
-        limit = self._settings.timeout if self._thread else VIRTUAL_ANSWER
-        if last:
-            limit = ANSWER
+        limit = ANSWER if last else self._settings.timeout
         outlook = "" if last else "; reconnecting"
-        deadline = time.monotonic() + limit
-        if not self._lock.acquire(timeout=limit):
+        patience = self._patience(limit)
+        deadline = time.monotonic() + patience
+        if not self._lock.acquire(timeout=patience):
             raise ServoError(f"{where(self._settings)}: busy for more than {limit * 1e3:g} ms")
         try:
             client = self._current(outlook)
-            client.within(deadline - time.monotonic() if self._thread else limit)
+            client.within(deadline - time.monotonic())
             try:
                 yield client
                 self._late = 0
@@ -127,13 +138,17 @@ class PigpioLink:
         if self._thread:
             self._thread.join(ANSWER)
 
+    def _patience(self, limit: float) -> float:
+        """How long to wait by the clock of this machine for what has a limit [s]."""
+        return VIRTUAL_PATIENCE if self._standstill else limit
+
     def _current(self, outlook: str) -> Client:
         if self._closed.is_set():
             raise ServoError(f"{where(self._settings)}: closed")
         now = self._clock.monotonic()
         if not self._client and not self._thread and now >= self._next_attempt:
             self._next_attempt = now + VIRTUAL_PAUSE
-            self._connect(VIRTUAL_CONNECT, VIRTUAL_ANSWER)
+            self._connect(ANSWER, 2.0 * ANSWER)
         if not self._client:
             raise ServoError(f"{where(self._settings)}: not connected: {self._reason}{outlook}")
         return self._client
@@ -148,10 +163,12 @@ class PigpioLink:
         client = None
         allowed = limit
         try:
-            client = self._opening = Client(self._settings.host, self._settings.port, limit)
+            client = self._opening = Client(
+                self._settings.host, self._settings.port, self._patience(limit), self._standstill
+            )
             client.get_pigpio_version()
             allowed = preparation
-            client.within(preparation)
+            client.within(self._patience(preparation))
             self._prepare(client)
         except BaseException as error:
             self._reason = reason(error, allowed)

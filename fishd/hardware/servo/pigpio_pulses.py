@@ -6,14 +6,16 @@ client dies at, a running script is armed, or there are no pulses. Armed with OF
 """
 
 import math
+import time
 from collections.abc import Callable
 from contextlib import suppress
+from types import SimpleNamespace
 
 import pigpio
 
-from fishd.errors import ServoError
-from fishd.hardware.pigpio_client import ANSWER, PARAMETERS, SCRIPTS, Client, Place, opened
-from fishd.hardware.pulses import REST
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.pigpio_client import ANSWER, PARAMETERS, SCRIPTS, Client, opened
+from fishd.hardware.servo.pulses import REST
 
 OFF = 0
 """A pulse width that stands for no pulses."""
@@ -109,13 +111,16 @@ def pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
     return False
 
 
-def neutralise(place: Place, gpio: int, neutral: float, sleep: Sleep) -> bool:
+def neutralise(
+    neutral: float, *, gpio: int, host: str, port: int, sleep: Sleep = time.sleep
+) -> bool:
     """Last resort, from another process than fishd: neutral [µs] for 0.3 s, then off.
 
     False if there are no pulses: then nothing moves. Removes fishd's scripts, so that a fishd that
     still lives gets a fault. Raises `ServoError` when a step fails; the pulses are stopped all the
     same, if they can be.
     """
+    place = SimpleNamespace(host=host, port=port)
     try:
         with opened(place) as client:
             return _neutralise(client, gpio, neutral, sleep)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from fishd.errors import ServoError
+from fishd.core.errors import ServoError
 
 if TYPE_CHECKING:  # the last resort has no time to load it
     from fishd.hardware.settings import ServoSettings

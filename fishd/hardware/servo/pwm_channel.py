@@ -3,9 +3,9 @@
 import errno
 import os
 from contextlib import suppress
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from fishd.errors import ServoError
+from fishd.core.errors import ServoError
 
 _BROADCOM = {12: 0, 18: 0, 13: 1, 19: 1}
 
@@ -45,32 +45,16 @@ class Files(Protocol):
         """As os.readlink."""
 
 
-class Sysfs(Protocol):
-    """Where the channel is; `servo.sysfs` of the configuration is one."""
+class Wires(NamedTuple):
+    """What a servo is wired to."""
 
-    @property
-    def root(self) -> str:
-        """Folder of the PWM chips."""
-
-    @property
-    def chip(self) -> str | None:
-        """Device of the chip; None for that of the Pi's header."""
-
-    @property
-    def channel(self) -> int | None:
-        """Its channel; None for the one that the pin is wired to."""
-
-
-class Wiring(Protocol):
-    """What a servo is wired to; `servo` of the configuration is one."""
-
-    @property
-    def gpio(self) -> int:
-        """Its pin."""
-
-    @property
-    def sysfs(self) -> Sysfs:
-        """Its channel."""
+    gpio: int
+    root: str
+    """Folder of the PWM chips."""
+    chip: str | None
+    """Device of the chip; None for that of the Pi's header."""
+    channel: int | None
+    """Its channel; None for the one that the pin is wired to."""
 
 
 class Clock(Protocol):
@@ -89,7 +73,7 @@ class PwmChannel:
     NAMES = ("period", "duty_cycle", "enable")
     """Its files with a number: two times [ns], and 1 for on."""
 
-    def __init__(self, servo: Wiring, clock: Clock, files: Files = os) -> None:
+    def __init__(self, servo: Wires, clock: Clock, files: Files = os) -> None:
         """Nothing is looked for before `open`."""
         self._servo = servo
         self._files = files
@@ -182,8 +166,8 @@ class PwmChannel:
 
     def _find_chip(self) -> tuple[str, str]:
         """The chip's folder and its device."""
-        servo, root = self._servo, self._servo.sysfs.root
-        wanted = [servo.sysfs.chip] if servo.sysfs.chip else list(HEADER_CHIPS)
+        servo, root = self._servo, self._servo.root
+        wanted = [servo.chip] if servo.chip else list(HEADER_CHIPS)
         chips = {}
         try:
             for name in self._files.listdir(root):
@@ -201,7 +185,7 @@ class PwmChannel:
         raise ServoError(
             f"no PWM chip {' or '.join(wanted)} in {root}, which has "
             f"{', '.join(sorted(chips)) or 'none'}: add dtoverlay={overlay} to "
-            "/boot/firmware/config.txt and reboot, or name the chip in servo.sysfs.chip"
+            "/boot/firmware/config.txt and reboot, or name the chip in servo.chip"
         )
 
     def _is_exported(self) -> bool:
@@ -231,22 +215,22 @@ class PwmChannel:
         except OSError as error:
             if error.errno in (errno.ENODEV, errno.EINVAL) and name == "export":
                 raise ServoError(
-                    f"servo.sysfs.channel: {self._chip} has no channel {self._number}"
+                    f"servo.channel: {self._chip} has no channel {self._number}"
                 ) from None
             if error.errno == errno.EBUSY:
                 raise ServoError(
                     f"channel {self._number} of {self._chip} is in use by a driver of the kernel: "
-                    "choose another pin with servo.gpio, or channel with servo.sysfs.channel"
+                    "choose another pin with servo.gpio, or channel with servo.channel"
                 ) from None
             raise _explained(path, error) from None
 
 
-def _channel_number(servo: Wiring, device: str) -> int:
-    if servo.sysfs.channel is not None:
-        return servo.sysfs.channel
+def _channel_number(servo: Wires, device: str) -> int:
+    if servo.channel is not None:
+        return servo.channel
     if device not in HEADER_CHIPS:
         raise ServoError(
-            f"servo.sysfs.channel is missing: for chip {device} it is not known which channel "
+            f"servo.channel is missing: for chip {device} it is not known which channel "
             f"drives GPIO {servo.gpio}"
         )
     channels = HEADER_CHIPS[device]

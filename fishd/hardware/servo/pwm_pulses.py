@@ -4,12 +4,15 @@ releases it.
 The hardware makes them, so they outlive their process. Needs nothing but the standard library.
 """
 
+import os
+import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
-from fishd.errors import ServoError
-from fishd.hardware.pulses import REST
-from fishd.hardware.pwm_channel import PwmChannel
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.pulses import REST
+from fishd.hardware.servo.pwm_channel import Clock, Files, PwmChannel, Wires
 
 PATIENCE = 2.0
 """How long udev may take to hand over the files of a new channel [s]; ticks do not wait for it."""
@@ -53,12 +56,33 @@ def switch_off(channel: PwmChannel, period: float, sleep: Callable[[float], None
 
 
 def neutralise(
-    channel: PwmChannel, neutral: float, period: float, sleep: Callable[[float], None]
+    neutral: float,
+    *,
+    frequency: float,
+    files: Files = os,
+    clock: Clock = time,
+    **wires: Any,
 ) -> bool:
     """Send a servo that gets pulses to neutral [µs] and stop them; False where there are none.
 
-    Raises `ServoError` when a step fails; the pulses are stopped all the same, if they can be.
+    The last resort when fishd is dead. Should it be alive, its next write fails, because its pulses
+    are off. Raises `ServoError` when a step fails; the pulses are stopped all the same, if they can
+    be. A channel that was not exported is not left so.
+
+    wires: those of `Wires`
     """
+    channel = PwmChannel(Wires(**wires), clock, files)
+    try:
+        return _neutralise(channel, neutral, 1.0 / frequency, clock.sleep)
+    finally:
+        channel.close()
+        if channel.exported:
+            channel.unexport()
+
+
+def _neutralise(
+    channel: PwmChannel, neutral: float, period: float, sleep: Callable[[float], None]
+) -> bool:
     channel.open(PATIENCE)
     if not on(channel):
         return False

@@ -1,71 +1,60 @@
 """The servo on software PWM of RPi.GPIO or rpi-lgpio: a last resort, whose pulses jitter."""
 
-import math
 from contextlib import suppress
-from typing import Any
+from typing import Annotated, Any
 
-from fishd.clock import Clock
-from fishd.errors import ServoError
+from fishd.core.errors import ServoError
+from fishd.core.schema import note, unit
 from fishd.hardware import header
-from fishd.hardware.calibration import ServoCalibration, calibrated
-from fishd.hardware.pulses import pulse_width
-from fishd.hardware.settings import ServoSettings
+from fishd.hardware.driver import Claim, LastResort, ServoDriver, pin
+from fishd.hardware.settings import Gpio, ServoSettings
 
 
-class RpiGpioServo:
+class RpiGpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which pin of the header drives the servo."""
+
+    gpio: Annotated[Gpio, note("Pin of the servo's signal, Broadcom number.")] = 18
+    frequency: Annotated[
+        float,
+        unit("Hz", "Pulses per second; more than 50 for digital servos only.", ge=40, le=333),
+    ] = 50.0
+
+
+class RpiGpio(ServoDriver[RpiGpioSettings]):
     """A servo on any pin of the header."""
 
-    countdown = math.inf
+    Settings = RpiGpioSettings
+    packages = (header.PACKAGE,)
+    degraded = ("software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",)
 
-    degraded: tuple[str, ...] = (
-        "software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",
-    )
-
-    def __init__(
-        self, settings: ServoSettings, calibration: ServoCalibration, clock: Clock
-    ) -> None:
+    def open(self) -> None:
         """Claim the pin, or go on without and try again in each write.
 
-        Raises `StartupError` where the library cannot be used, and `ServoError` for a calibration
-        whose neutral is no pulse for a servo.
+        Raises `StartupError` where the library cannot be used.
         """
-        self._settings = settings
-        self._clock = clock
         self._pwm: Any = None
         self._started = False
         self._usable = False
         self._opened = 0
         self._closed = False
-        self.recalibrate(calibration)
         self._gpio = header.load()
         with suppress(ServoError):  # each write says so
             self._open()
-
-    def recalibrate(self, calibration: ServoCalibration) -> None:
-        """Use another calibration from the next write on.
-
-        Raises `ServoError`, and keeps the old one, if its neutral is no pulse for a servo.
-        """
-        servo = calibrated(self._settings, calibration)
-        pulse_width(servo, 0.0)
-        self._servo = servo
-        self.calibration = calibration
 
     def counters(self) -> dict[str, int]:
         """How often the pin was claimed again since start."""
         return {"servo_reconnects": max(0, self._opened - 1)}
 
-    def write(self, angle: float) -> None:
-        """Send an instruction angle [rad], and with it pulses if there were none.
+    def write(self, pulse: float) -> None:
+        """Send a pulse [µs], and begin where there were none.
 
         Raises `ServoError`; after that, each write tries to claim the pin again.
         """
-        width = pulse_width(self._servo, angle)
         if not self._usable:
             self._open()
-        self._send(1e-4 * width * self._settings.frequency)
+        self._send(1e-4 * pulse * self.settings.frequency)
 
-    def release(self) -> None:
+    def off(self) -> None:
         """Stop the pulses once the present one has ended; may be called twice.
 
         Raises `ServoError` when the pin cannot be driven.
@@ -74,7 +63,7 @@ class RpiGpioServo:
             self._send(0.0)
 
     def close(self) -> None:
-        """Release the servo and make its pin an input; may be called twice.
+        """End the pulses and make its pin an input; may be called twice.
 
         Raises `ServoError` when the pulses cannot be stopped; the pin is given back all the same.
         """
@@ -84,26 +73,22 @@ class RpiGpioServo:
         try:
             if self._started:
                 self._send(0.0)
-                self._clock.sleep(1.0 / self._settings.frequency)  # lets the last pulse end
+                self.clock.sleep(1.0 / self.settings.frequency)  # lets the last pulse end
         finally:
             self._give_back()
 
-    def neutralise(self) -> bool:
-        """Leave the pin low, where a killed process may have left it high; always False.
+    @classmethod
+    def claims(cls, settings: RpiGpioSettings) -> tuple[Claim, ...]:
+        """Its pin."""
+        return (pin(settings.gpio, "servo"),)
 
-        Software PWM ends with its process, so there is nothing to move to neutral. Raises
-        `ServoError`, as when rpi-lgpio says that another process holds the pin.
-        """
-        if not self._usable:
-            self._open()
-        try:
-            self._gpio.output(self._settings.gpio, self._gpio.LOW)
-        except Exception as error:
-            raise self._failure(error) from None
-        return False
+    @classmethod
+    def last_resort(cls, settings: RpiGpioSettings) -> LastResort:
+        """Nothing pulses any more, but the pin may have been left high."""
+        return LastResort(f"{__name__}:pull_low", {"gpio": settings.gpio})
 
     def _open(self) -> None:
-        gpio = self._settings.gpio
+        gpio = self.settings.gpio
         try:
             # Again each time: another part of the program may have called GPIO.cleanup().
             self._gpio.setmode(self._gpio.BCM)
@@ -111,7 +96,7 @@ class RpiGpioServo:
             # One that failed must go first, as a pin takes only one, and only now: it writes to
             # the pin when it goes.
             self._pwm = None
-            self._pwm = self._gpio.PWM(gpio, self._settings.frequency)
+            self._pwm = self._gpio.PWM(gpio, self.settings.frequency)
         except Exception as error:
             raise self._failure(error) from None
         self._started = False
@@ -135,7 +120,7 @@ class RpiGpioServo:
 
     def _failure(self, error: Exception) -> ServoError:
         self._usable = False
-        return ServoError(f"servo on GPIO {self._settings.gpio}: {header.one_line(error)}")
+        return ServoError(f"servo on GPIO {self.settings.gpio}: {header.one_line(error)}")
 
     def _give_back(self) -> None:
         """Only the own pin: cleanup() without one takes those of everybody."""
@@ -145,6 +130,21 @@ class RpiGpioServo:
                     self._pwm.stop()
             finally:
                 self._pwm = None  # while it may still write to the pin
-                self._gpio.cleanup(self._settings.gpio)
+                self._gpio.cleanup(self.settings.gpio)
         except Exception as error:
             raise self._failure(error) from None
+
+
+def pull_low(neutral: float, *, gpio: int) -> bool:
+    """Leave the pin low, where a killed process may have left it high; always False.
+
+    Software PWM ends with its process, so there is nothing to move to neutral. Raises
+    `ServoError`, as when rpi-lgpio says that another process holds the pin.
+    """
+    module = header.load()
+    try:
+        header.claim(module, gpio, module.OUT, initial=module.LOW)
+        module.output(gpio, module.LOW)
+    except Exception as error:  # lgpio.error is a bare Exception
+        raise ServoError(f"servo on GPIO {gpio}: {header.one_line(error)}") from None
+    return False

@@ -2,26 +2,28 @@
 
 import statistics
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd import strict_yaml
 from fishd.config import Config, Start
 from fishd.controllers import registry
-from fishd.errors import ParameterError, PolicyError
-from fishd.learning.evaluation import best_on_grid
-from fishd.policies import library
-from fishd.schema import names_file, nearest
-from fishd.signals import Event, Tick
+from fishd.controllers.policy import library
+from fishd.core import strict_yaml
+from fishd.core.errors import FishdError, ParameterError, PolicyError, UnknownController
+from fishd.core.schema import names_file, nearest
+from fishd.core.signals import Event, Tick
 from fishd.simulation import Report, judge
+from fishd.virtual.plant.optimum import SteadyState, square_wave
 
 TRACE = 3.0
 """How much of the end of a run a picture shows [s]."""
 _BEAT = 2.0
-"""So much more is kept, that there is an upward reversal to begin with [s]."""
+"""How much more is kept, so that there is an upward reversal to begin with [s]."""
+_GRID_HZ = (0.2, 10.0)
+"""Whole-tick square waves are sought between these frequencies."""
 
 
 class Contestant(NamedTuple):
@@ -36,7 +38,7 @@ class Trace(NamedTuple):
     """The end of a run, tick by tick."""
 
     time: list[float]  # s, 0 at the end
-    command: list[float]  # φ_c in force from `time` on, rad
+    command: list[float]  # φ_c applied from `time` on, rad
     thrust: list[float]  # F_x as measured, mean over the tick before `time`, N
     fin: list[float]  # true α at `time`, rad
 
@@ -74,13 +76,13 @@ def parse(text: str) -> Contestant:
     name, _, values = text.partition(":")
     if name == "remote":
         raise ParameterError(
-            "remote: its agent is another program; let that one swim a fishd and watch it there"
+            "remote: its agent is another program, which can swim a fishd but not be compared here"
         )
     if name not in registry.names():
         if not (names_file(text, library.SUFFIX) or text in library.names()):
             hint = nearest(name, [*registry.names(), *library.names()])
             raise ParameterError(
-                f"'{name}' is no controller, named policy or {library.SUFFIX} file; {hint}"
+                f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"
             )
         return Contestant(text, "ppo", {"policy": text})
     parameters = {}
@@ -95,6 +97,21 @@ def parse(text: str) -> Contestant:
     return Contestant(text, name, parameters)
 
 
+def best_on_grid(config: Config) -> SteadyState:
+    """The best square wave whose half periods are whole ticks.
+
+    No waveform in a loop does better, but for waves that alternate between two half periods.
+    """
+    lowest, highest = _GRID_HZ
+    fewest = max(1, round(0.5 / highest / config.tick))
+    most = max(fewest, round(0.5 / lowest / config.tick))
+    waves = (
+        square_wave(config.plant, config.amplitude_limit, 0.5 / (ticks * config.tick))
+        for ticks in range(fewest, most + 1)
+    )
+    return max(waves, key=lambda wave: wave.thrust)
+
+
 def default_contestants(config: Config) -> list[Contestant]:
     """The best square wave on the grid of ticks, `swing`, and the named policies that fit."""
     best = best_on_grid(config).frequency
@@ -102,14 +119,19 @@ def default_contestants(config: Config) -> list[Contestant]:
         Contestant(f"square {best:.3f} Hz", "square", {"frequency": best}),
         Contestant("swing", "swing", {}),
     ]
-    for name in library.names():
-        try:
-            controller = registry.create("ppo", {"policy": name}, config.limits)
-        except (ParameterError, PolicyError):  # made for another amplitude or tick
-            continue
-        controller.close()
-        found.append(Contestant(name, "ppo", {"policy": name}))
+    policies = (Contestant(name, "ppo", {"policy": name}) for name in library.names())
+    found += [policy for policy in policies if not refusal(config, policy)]
     return found
+
+
+def refusal(config: Config, contestant: Contestant) -> FishdError | None:
+    """Why one cannot swim the fish of `config`, such as a policy for another amplitude, or None."""
+    limits = replace(config.limits, virtual=True)
+    try:
+        registry.create(contestant.controller, contestant.parameters, limits).close()
+    except (ParameterError, PolicyError, UnknownController) as error:
+        return error
+    return None
 
 
 def compare(
@@ -118,18 +140,18 @@ def compare(
     seconds: float,
     settle: float,
     runs: int = 1,
-    done: Callable[[], None] = lambda: None,
 ) -> tuple[list[Standing], list[Trace]]:
     """Let each swim the fish of `config`; standings and last traces, in the order given.
 
     runs: each contestant swims so many times, with noise of seed, seed + 1, ...
     done: called after every run
-    Raises `ParameterError` (`PolicyError` for a file that is no policy for this fish) and
+    Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
     `UnknownController`, before anything swims.
     """
+    for contestant in contestants:
+        if error := refusal(config, contestant):
+            raise error
     limits = replace(config.limits, virtual=True)
-    for _, name, parameters in contestants:
-        registry.create(name, parameters, limits).close()
     standings, traces = [], []
     for label, name, parameters in contestants:
         reports = []
@@ -139,7 +161,6 @@ def compare(
             fish = replace(config, simulation=noise, start=Start())
             controller = registry.create(name, parameters, limits)
             reports.append(judge(fish, name, controller, seconds, settle, end))
-            done()
         standings.append(_standing(label, reports))
         traces.append(end.trace())
     return standings, traces

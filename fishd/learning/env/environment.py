@@ -3,7 +3,7 @@
 | | | |
 |---|---|---|
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`scales`) |
-| action | φ_c/Φ in [-1, 1] | in force from the tick that it answers until the next |
+| action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
 | reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
 
 An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
@@ -19,11 +19,12 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from fishd.config import Config
-from fishd.learning.link import Link
-from fishd.learning.scales import features, thrust_scale
+from fishd.controllers.policy.card import Layout
+from fishd.core.errors import ConfigError
+from fishd.core.signals import Observation
+from fishd.learning.env.link import Link
+from fishd.learning.env.scales import best_thrust, features, thrust_scale
 from fishd.learning.settings import EnvironmentSettings
-from fishd.policies.card import Layout
-from fishd.signals import Observation
 
 Vector = NDArray[np.float32]
 
@@ -46,17 +47,20 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     """One fish that swims for thrust.
 
     `info` of each step holds `thrust` (mean F_x in the tick that followed [N]), `lost` (ticks in
-    which another angle than the action's was in force: such an episode is truncated) and `paused`
-    (how long the fish has waited at neutral since the step before [s], mostly 0).
+    which another angle than the action was applied: such an episode is truncated) and `paused`
+    (how long the fish has waited at neutral since the previous step [s], mostly 0).
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
 
     def __init__(self, link: Link, config: Config, settings: EnvironmentSettings) -> None:
         """
-        link: to what swims
+        link: to the fish
         config: the fish that the scales are made for
+
+        Raises `ConfigError` where the fish has another tick or Φ than `config`.
         """
+        _check_agreement(link, config)
         self.link = link
         self.config = config
         self.features = features(config, settings)
@@ -64,14 +68,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._layout = Layout(self.features)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
         self.observation_space, self.action_space = spaces(len(self.features))
+        self.best_thrust = best_thrust(config)
+        """Mean thrust of the best square wave of the configured fish [N]."""
         self._steps = 0
         self._begun = self._closed = False
         self.latest: Observation
-        """What was observed last, once an episode has begun."""
+        """The latest observation, once an episode has begun."""
         self.tank_time = 0.0
-        """How long the agent has been in command of a fish, pauses included [s]."""
+        """How long the agent has controlled a fish, pauses included [s]."""
         self.lost = 0
-        """Ticks in which another angle than the agent's was in force."""
+        """Ticks in which another angle than the agent's was applied."""
         self._paused = 0.0
         self._pause_began = 0.0
         self._longest_pause: float | None = None
@@ -82,31 +88,27 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     ) -> tuple[Vector, dict[str, Any]]:
         """Begin an episode: up to `longest_start` ticks at a random angle come first.
 
-        With a seed, and where episodes differ by their randomisation, a new fish begins at rest, if
-        the link can do that. Otherwise the fish swims on from where it is; command of it is taken
-        again where it was lost. Raises `LinkLost`.
+        With a seed, or with a randomisation, a simulated fish begins anew, at rest. Any other one
+        swims on from where it is; control of it is re-acquired where it was lost. Raises
+        `LinkLost`.
         """
         self._check_open()
         super().reset(seed=seed)
-        link, draw = self.link, self.np_random
-        fish = int(draw.integers(2**31))
-        if link.restartable and (seed is not None or link.varies):
-            self.latest = link.restart(fish)
-        else:
-            self.latest = link.start()
+        draw = self.np_random
+        self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
         self._begun = True
         self._steps = 0
-        angle = link.amplitude * float(draw.uniform(-1.0, 1.0))
+        angle = self.link.amplitude * float(draw.uniform(-1.0, 1.0))
         lost = sum(
             self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
         )
         return self._layout.vector(self.latest), self._info(lost)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Put an instruction angle in force for one tick.
+        """Apply an instruction angle for one tick.
 
-        Raises `LinkLost`, ValueError for an action that is none, `ResetNeeded` before the first
-        episode and RuntimeError after `close`.
+        Raises `LinkLost`, ValueError for an invalid action, `ResetNeeded` before the first episode
+        and RuntimeError after `close`.
         """
         self._check_open()
         if not self._begun:
@@ -120,7 +122,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         return self._layout.vector(self.latest), reward, False, truncated, info
 
     def advance(self, angle: float) -> int:
-        """Swim one tick at an angle [rad], outside of any episode; how many were lost on the way.
+        """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
 
         Raises `LinkLost`.
         """
@@ -133,7 +135,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     def pause(self, seconds: float | None = None) -> None:
         """Let the fish wait at neutral while the agent learns.
 
-        seconds: at most so long; None: some times as long as pauses have taken so far
+        seconds: at most; None: a multiple of the longest pause so far
         """
         if seconds is None:
             seconds = LONGEST_PAUSE
@@ -145,8 +147,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     def resume(self) -> Vector:
         """End the pause; the observation that the next action answers.
 
-        The one before the pause is void: an action in answer to it would be judged by a fish that
-        has come to rest meanwhile.
+        The one before the pause must not be answered: the fish has come to rest meanwhile.
         """
         before = self.latest.time
         took = time.monotonic() - self._pause_began
@@ -168,6 +169,20 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
     def _info(self, lost: int) -> dict[str, Any]:
         return {"thrust": self.latest.fx, "lost": lost, "paused": self._paused}
+
+
+def _check_agreement(link: Link, config: Config) -> None:
+    """Raise `ConfigError` where the fish has another tick or Φ than the scales are made for."""
+    for key, here, there, unit in (
+        ("tick", config.tick, link.tick, "s"),
+        ("amplitude_limit", config.amplitude_limit, link.amplitude, "rad"),
+    ):
+        if not math.isclose(here, there, rel_tol=1e-9):
+            raise ConfigError(
+                f"{key}: {here:g} {unit} in this configuration, {there:g} {unit} in the fishd that "
+                "runs; what the network sees is scaled by it, so give the file that fishd was "
+                "started with, or none"
+            )
 
 
 def _share(action: Vector) -> float:

@@ -2,27 +2,44 @@
 
 import contextlib
 import time
+from typing import Any
+
+import msgspec
 
 from fishd.client import Fish
 from fishd.client.agent import Agent
-from fishd.errors import FishError, NoDaemon, Refused
-from fishd.learning.link import LinkLost, Sensed
-from fishd.remote.messages import Observed
-from fishd.signals import Observation, Status
+from fishd.config import Config
+from fishd.controllers.remote.messages import Observed
+from fishd.core.errors import FishError, NoDaemon, Refused
+from fishd.core.signals import Observation, Status
+from fishd.learning.env.link import LinkLost, StepResult
 
 SILENCE = 1.0
-"""After so long without an observation fishd is asked what is the matter [s]."""
+"""After so long without an observation, fishd is asked for its status [s]."""
 
 
-class OnDaemon:
-    """Puts `remote` in command of a fishd, and answers for it.
+def config_of(endpoint: str | None) -> dict[str, Any]:
+    """The configuration of a running fishd, for `adopt`; raises `FishError`."""
+    with Fish(endpoint) as fish:
+        return fish.config()
+
+
+def other_plant(config: Config, theirs: dict[str, Any]) -> str:
+    """How the plant of a configuration differs from that of fishd; empty where it does not."""
+    ours: dict[str, Any] = msgspec.to_builtins(config.plant)
+    return ", ".join(
+        f"plant.{key} is {value!r} here, {theirs.get(key)!r} there"
+        for key, value in ours.items()
+        if theirs.get(key) != value
+    )
+
+
+class FishdLink:
+    """Makes `remote` the active controller of a fishd, and is its agent.
 
     With `lockstep: true` and `start.controller: remote` fishd waits for its agent from its first
-    tick on: then everything comes out as it does in process, bit by bit.
+    tick on: then all numbers are those of a `SimulatedLink`, bit by bit.
     """
-
-    restartable = False
-    varies = False
 
     def __init__(
         self,
@@ -59,23 +76,24 @@ class OnDaemon:
         self._deadline = deadline
         self._begun = self._paused = self._closed = False
         self._known = status
-        """What fishd said when command was taken."""
+        """Status of fishd when control was acquired."""
         self._taken = 0.0
         """When the latest observation came [s, monotonic]."""
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
 
-    def start(self) -> Observation:
-        """The observation that the next action answers.
+    def reset(self, seed: int = 0, new: bool = False) -> Observation:
+        """The observation that the next action answers; the fish swims on from where it is.
 
-        Takes command where fishd does not wait for this agent already, the first time from another
-        controller too. Raises `LinkLost`: after that, it begins anew once fishd is idle.
+        Makes `remote` the active controller where fishd does not wait for this agent already; only
+        the first time is it taken from another controller. Raises `LinkLost`; once fishd is idle,
+        another reset begins anew.
         """
         self._check_open()
         if self._paused and self._agent.in_command:
             return self.resume()
         if self._begun and self._is_fresh():
-            return _observation(self._asked())
+            return self._asked()
         self._paused = False
         try:
             status = self._fish.status()
@@ -88,24 +106,20 @@ class OnDaemon:
                 self._agent.in_command = False
             elif self._agent.latest and (self._agent.poll(SILENCE) or self._agent.in_command):
                 self._begun, self._known, self._taken = True, status, time.monotonic()
-                return _observation(self._agent.latest)  # for which fishd still waits, in lockstep
+                return self._agent.latest  # for which fishd still waits, in lockstep
         except (NoDaemon, Refused) as error:
             raise LinkLost(str(error)) from None
         self._begun, self._known = True, status
-        return _observation(self._next(begun=False))
+        return self._next(begun=False)
 
-    def restart(self, seed: int) -> Observation:
-        """Not here: raises RuntimeError."""
-        raise RuntimeError("the fish of a running fishd cannot begin anew; it swims on")
-
-    def step(self, angle: float) -> Sensed:
-        """Answer the latest observation; what comes of it. Raises `LinkLost`."""
+    def step(self, angle: float) -> StepResult:
+        """Answer the latest observation, and wait for the next one; raises `LinkLost`."""
         asked = self._asked()
         self._agent.act(angle)
         found = self._next()
-        # What was lost in a pause is not counted there, but no action was in force either.
-        in_force = found.answered == asked.seq
-        return Sensed(_observation(found), max(self._agent.lost, 0 if in_force else 1))
+        # A tick of a pause is not counted as lost there, but no action was applied in it either.
+        applied = found.answered == asked.seq
+        return StepResult(found, max(self._agent.lost, 0 if applied else 1))
 
     def pause(self, seconds: float) -> None:
         """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""
@@ -118,10 +132,10 @@ class OnDaemon:
         self._paused = False
         self._asked()
         self._agent.resume()
-        return _observation(self._next())
+        return self._next()
 
     def close(self) -> None:
-        """Leave the fish at neutral, where this agent is still in command; may be called twice."""
+        """Leave the fish at neutral, where this agent still controls it; may be called twice."""
         if self._closed:
             return
         self._closed = True
@@ -137,7 +151,7 @@ class OnDaemon:
             raise LinkLost("this link to fishd is closed; make another one")
 
     def _asked(self) -> Observed:
-        """The observation to be answered, while this agent is in command of it."""
+        """The observation to be answered, while this agent controls the fish."""
         self._check_open()
         if self._agent.latest is None or not self._agent.in_command:
             raise self._lost()
@@ -158,7 +172,9 @@ class OnDaemon:
             if found:
                 self._taken = time.monotonic()
             if found and begun and before and found.session != before.session:
-                raise LinkLost("fishd has put the agent in command anew: it was restarted, perhaps")
+                raise LinkLost(
+                    "fishd has begun a new session with this agent: perhaps it was restarted"
+                )
             if found:
                 return found
             if begun and not self._agent.in_command:
@@ -167,7 +183,7 @@ class OnDaemon:
         raise self._lost()
 
     def _check(self) -> None:
-        """Raises `LinkLost` where fishd itself says that this agent is not in command."""
+        """Raises `LinkLost` where fishd says that this agent is not the one of its `remote`."""
         try:
             status = self._fish.status()
         except NoDaemon as error:
@@ -177,19 +193,19 @@ class OnDaemon:
             raise self._lost(status)
 
     def _is_ours(self, status: Status) -> bool:
-        """Is this agent in command, or waited for?"""
+        """Is this the agent that fishd asks, or waits for?"""
         return _waits_for_an_agent(status) and (
             (self._agent.in_command and not self._is_another(status))
             or status.parameters["agent"] == self._agent.address
         )
 
     def _is_another(self, status: Status) -> bool:
-        """Is that fishd not the one of which command was taken?"""
+        """Is that another fishd than the one whose fish was controlled?"""
         known = self._known
         return status.pid != known.pid or status.uptime < known.uptime
 
     def _lost(self, status: Status | None = None) -> LinkLost:
-        """Why, in fishd's own words."""
+        """Why control was lost, in fishd's own words where it says so."""
         self._agent.in_command = False
         try:
             status = status or self._fish.status()
@@ -224,18 +240,3 @@ def _agent(address: str | None, status: Status) -> Agent:
         with contextlib.suppress(FishError):  # another agent is there, or that is another machine
             return Agent(status.parameters["agent"])
     return Agent()
-
-
-def _observation(message: Observed) -> Observation:
-    return Observation(
-        time=message.time,
-        dt=message.dt,
-        fx=message.fx,
-        fy=message.fy,
-        fy_rate=message.fy_rate,
-        fin_velocity=message.fin_velocity,
-        instruction_angle=message.instruction_angle,
-        previous_angle=message.previous_angle,
-        thrust=message.thrust,
-        frequency=message.frequency,
-    )

@@ -1,7 +1,6 @@
-"""Fish other than the configured one: in the range of a randomisation, or at its edges.
+"""Fish other than the configured one: anywhere in the range of a randomisation, or at its edges.
 
-A policy that is to swim a fish that nobody has measured learns on the former, and is judged on the
-latter.
+A policy that is to swim an unknown fish is trained on the former and evaluated on the latter.
 """
 
 import math
@@ -13,6 +12,9 @@ from msgspec.structs import replace
 from fishd.config import Config
 from fishd.learning.settings import Randomisation
 
+_VARIED = ("omega0", "xi", "servo_speed", "coupling")
+"""Parameters of the plant that a randomisation has a share for."""
+
 
 def drawn(config: Config, spread: Randomisation, seed: int) -> Config:
     """A fish and a rig from anywhere in the range."""
@@ -21,7 +23,7 @@ def drawn(config: Config, spread: Randomisation, seed: int) -> Config:
 
 
 def at_edge(config: Config, spread: Randomisation, seed: int) -> Config:
-    """A fish and a rig of which everything that varies is at one end of its range or the other."""
+    """A fish and a rig with every varied parameter at one end of its range or the other."""
     draw = np.random.default_rng(seed)
     return _varied(config, spread, lambda: float(draw.choice((-1.0, 1.0))), config.simulation.seed)
 
@@ -29,25 +31,17 @@ def at_edge(config: Config, spread: Randomisation, seed: int) -> Config:
 def _varied(
     config: Config, spread: Randomisation, place: Callable[[], float], noise_seed: int
 ) -> Config:
-    """place: says for each parameter where in its range it is, from -1 to 1."""
+    """place: draws for one parameter its place in the range, from -1 to 1"""
 
     def varied(value: float, share: float) -> float:
         return value * math.exp(place() * math.log1p(share))
 
     plant, rig = config.plant, config.simulation
+    changed = {name: varied(getattr(plant, name), getattr(spread, name)) for name in _VARIED}
+    noise = varied(rig.noise, spread.noise)
+    offset_y = rig.offset_y + spread.offset * place()
     return replace(
         config,
-        plant=replace(
-            plant,
-            omega0=varied(plant.omega0, spread.omega0),
-            xi=varied(plant.xi, spread.xi),
-            servo_speed=varied(plant.servo_speed, spread.servo_speed),
-            coupling=varied(plant.coupling, spread.coupling),
-        ),
-        simulation=replace(
-            rig,
-            noise=varied(rig.noise, spread.noise),
-            offset_y=rig.offset_y + spread.offset * place(),
-            seed=noise_seed,
-        ),
+        plant=replace(plant, **changed),
+        simulation=replace(rig, noise=noise, offset_y=offset_y, seed=noise_seed),
     )

@@ -4,16 +4,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fishd.config import load
+from fishd.config import adopt, load
 from fishd.learning import settings as training
-from fishd.learning.settings import EnvironmentSettings
 
 if TYPE_CHECKING:
-    from fishd.learning.environment import SwimEnv
+    from fishd.learning.env.environment import SwimEnv
 
 
 def register() -> None:
-    """Tell Gymnasium; without it, there is nobody to tell, and controllers can still be judged."""
+    """Register both with Gymnasium, where it is installed: comparing controllers needs it not."""
     try:
         import gymnasium
     except ModuleNotFoundError:
@@ -37,12 +36,12 @@ def swim(
 
     Raises `ConfigError`.
     """
-    from fishd.learning.environment import SwimEnv
-    from fishd.learning.links import in_process
+    from fishd.learning.env.environment import SwimEnv
+    from fishd.learning.env.simulated_link import SimulatedLink
 
-    fish = load(_path(config), overrides)
-    chosen = training.load(_path(settings))
-    return SwimEnv(in_process(fish, chosen), fish, chosen.environment)
+    fish = load(config, overrides)
+    chosen = training.load(settings)
+    return SwimEnv(SimulatedLink(fish, chosen.randomisation), fish, chosen.environment)
 
 
 def swim_on_daemon(
@@ -52,29 +51,24 @@ def swim_on_daemon(
     overrides: Iterable[str] = (),
     agent: str | None = None,
 ) -> "SwimEnv":
-    """The fish of a running fishd; this process takes command of it when an episode begins.
+    """The fish of a running fishd; this process acquires control of it when an episode begins.
 
     endpoint: control socket of the daemon; None looks for the one on this machine
-    config, overrides: what the daemon was given, for the scales; without a file, tick and Φ are
-        those of the daemon
+    config, overrides: the configuration that the scales are made for; without a file, that of the
+        daemon
     agent: where the daemon can reach this process, as for `Agent`; None: any free port of this
         machine
 
     Raises `ConfigError`, also where tick or Φ are not the daemon's, and `FishError`.
     """
-    from fishd.learning.environment import SwimEnv
-    from fishd.learning.links import check_agreement, daemon_config, on_daemon
+    from fishd.learning.env.environment import SwimEnv
+    from fishd.learning.env.fishd_link import FishdLink, config_of
 
-    chosen: EnvironmentSettings = training.load(_path(settings)).environment
-    fish = daemon_config(endpoint, _path(config), overrides)
-    link = on_daemon(endpoint, agent)
+    chosen = training.load(settings).environment
+    fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)
+    link = FishdLink(endpoint, address=agent)
     try:
-        check_agreement(link, fish)
         return SwimEnv(link, fish, chosen)
     except BaseException:
         link.close()
         raise
-
-
-def _path(path: str | Path | None) -> Path | None:
-    return None if path is None else Path(path)

@@ -1,13 +1,23 @@
-"""What the agent's numbers mean: inputs and reward near 1 for the configured fish.
+"""Scales that bring the agent's inputs and reward near 1 for the configured fish.
 
-The scales come from the physics, not from running averages: nothing drifts during training, and a
-policy file carries a few numbers that a person can check.
+They come from the physics, not from running averages: nothing drifts during training, and a policy
+file carries a few numbers that a person can check.
 """
 
 from fishd.config import Config
+from fishd.controllers.policy.card import Feature, FeatureName
 from fishd.learning.settings import EnvironmentSettings
-from fishd.plant.optimum import best_square_wave
-from fishd.policies.card import Feature, FeatureName
+from fishd.virtual.plant.optimum import best_square_wave
+
+
+def best_thrust(config: Config) -> float:
+    """Mean thrust of the best square wave of the configured fish [N]."""
+    return float(best_square_wave(config.plant, config.amplitude_limit).thrust)
+
+
+def thrust_scale(config: Config, settings: EnvironmentSettings) -> float:
+    """The thrust that is rewarded with `reward_scale` [N]."""
+    return settings.thrust_scale or best_thrust(config)
 
 
 def force_scale(config: Config) -> float:
@@ -29,10 +39,3 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
         "previous_angle": config.amplitude_limit,
     }
     return tuple(Feature(name, scales[name]) for name in settings.observation)
-
-
-def thrust_scale(config: Config, settings: EnvironmentSettings) -> float:
-    """The thrust that is rewarded with `reward_scale` [N]."""
-    if settings.thrust_scale is not None:
-        return settings.thrust_scale
-    return float(best_square_wave(config.plant, config.amplitude_limit).thrust)

@@ -1,4 +1,4 @@
-"""The learner: PPO of stable-baselines3, and its policy as plain layers."""
+"""PPO of stable-baselines3 as fishd trains it, and its policy as plain layers."""
 
 from collections.abc import Generator
 from typing import Any, Literal, cast
@@ -14,12 +14,12 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
-from fishd.errors import PolicyError
-from fishd.learning.environment import spaces
-from fishd.learning.mirror import Layers, MirrorPolicy, plain_layers
+from fishd.controllers.policy.card import Feature, Layout
+from fishd.core.errors import PolicyError
+from fishd.core.signals import Observation
+from fishd.learning.env.environment import spaces
+from fishd.learning.ppo.symmetric_policy import Layers, SymmetricPolicy, plain_layers
 from fishd.learning.settings import PpoSettings, TrainingSettings
-from fishd.policies.card import Feature, Layout
-from fishd.signals import Observation
 
 _ACTIVATIONS: dict[Literal["tanh", "relu"], type[torch.nn.Module]] = {
     "tanh": torch.nn.Tanh,
@@ -28,29 +28,29 @@ _ACTIVATIONS: dict[Literal["tanh", "relu"], type[torch.nn.Module]] = {
 
 
 class Rollout(RolloutBuffer):
-    """The steps of one update, less those that teach nothing.
+    """The steps of one update, without the void ones.
 
-    A step is void where something else than the agent's action was in force: what came of it is
-    nobody's merit. Neither it nor, through the advantages, the steps before it learn from that.
+    A step is void where another angle than the agent's action was applied: its outcome must not be
+    credited to the action, nor, through the advantages, to those before it.
     """
 
     def reset(self) -> None:
         """Forget all steps."""
         super().reset()
         self.void = np.zeros(self.buffer_size, dtype=bool)
-        """True for each step that teaches nothing."""
+        """True for each void step."""
 
     def compute_returns_and_advantage(
         self, last_values: torch.Tensor, dones: NDArray[np.bool_]
     ) -> None:
-        """As in PPO; a void step turns out just as expected, and ends its episode."""
+        """As in PPO; the outcome of a void step equals its value, and it ends its episode."""
         self.rewards[self.void] = self.values[self.void]
         super().compute_returns_and_advantage(last_values, dones)
 
     def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
-        """Minibatches in random order, of the steps that teach something."""
+        """Minibatches in random order, of all steps but the void ones."""
         for batch in super().get(batch_size):
-            if len(batch.advantages) > 1:  # of fewer no spread can be taken
+            if len(batch.advantages) > 1:  # PPO divides by their standard deviation
                 yield batch
 
     def _get_samples(self, batch_inds: NDArray[np.int64], env: Any = None) -> RolloutBufferSamples:
@@ -58,10 +58,10 @@ class Rollout(RolloutBuffer):
 
 
 def make_learner(settings: TrainingSettings, env: VecEnv) -> PPO:
-    """A new PPO with a policy that knows nothing; seeds torch, numpy and the environment."""
+    """A new PPO with an untrained policy; seeds torch, numpy and the environment."""
     ppo = settings.ppo
     return PPO(
-        MirrorPolicy if ppo.symmetric else ActorCriticPolicy,
+        SymmetricPolicy if ppo.symmetric else ActorCriticPolicy,
         env,
         learning_rate=ppo.learning_rate,
         n_steps=ppo.n_steps,
@@ -82,9 +82,9 @@ def make_learner(settings: TrainingSettings, env: VecEnv) -> PPO:
 
 
 def make_policy(ppo: PpoSettings, features: int) -> ActorCriticPolicy:
-    """The networks alone, as `make_learner` makes them, for an agent that sees so many features."""
+    """The networks alone, as `make_learner` makes them; features: number of inputs"""
     observation, action = spaces(features)
-    kind = MirrorPolicy if ppo.symmetric else ActorCriticPolicy
+    kind = SymmetricPolicy if ppo.symmetric else ActorCriticPolicy
     return kind(observation, action, lambda _: ppo.learning_rate, **_shape(ppo))
 
 
@@ -97,13 +97,13 @@ def _shape(ppo: PpoSettings) -> dict[str, Any]:
 
 
 def learning_rate(ppo: PpoSettings, steps: int) -> float:
-    """The rate for the update that comes after so many steps since the training began."""
+    """The rate of the update that comes `steps` control steps after the start of the training."""
     share = min(1.0, steps / ppo.decay_steps)
     return ppo.learning_rate + share * (ppo.final_learning_rate - ppo.learning_rate)
 
 
 def set_learning_rate(model: PPO, rate: float) -> None:
-    """The rate of the next updates, whatever share of the training is done."""
+    """Set the rate of the next updates, whatever share of the training is done."""
     model.lr_schedule = FloatSchedule(rate)
 
 
@@ -118,28 +118,28 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
         )
         for linear in (*hidden, last)
     ]
-    return plain_layers(layers) if isinstance(policy, MirrorPolicy) else layers
+    return plain_layers(layers) if isinstance(policy, SymmetricPolicy) else layers
 
 
 def activation_of(policy: ActorCriticPolicy) -> Literal["tanh", "relu"]:
-    """What is between its layers; raises `PolicyError` for anything else."""
+    """Its activation function; raises `PolicyError` for any other than these two."""
     for name, kind in _ACTIVATIONS.items():
         if policy.activation_fn is kind:
             return name
     raise PolicyError(
-        f"{policy.activation_fn.__name__} is no activation of a policy file; Tanh or ReLU is needed"
+        f"activation {policy.activation_fn.__name__} cannot be exported; Tanh or ReLU is needed"
     )
 
 
 def is_finite(model: PPO) -> bool:
-    """False once learning has blown up."""
+    """False once the training has diverged."""
     return all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())
 
 
-class Deterministic:
-    """The policy as it stands, without exploration: observation in, instruction angle out [rad].
+class DeterministicPolicy:
+    """A copy of a policy, without exploration: observation in, instruction angle out [rad].
 
-    A copy: training goes on without it. In numpy, several times as fast as torch for one input.
+    In numpy, which for a single input is several times as fast as torch.
     """
 
     def __init__(

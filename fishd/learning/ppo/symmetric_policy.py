@@ -1,9 +1,9 @@
-"""A policy that knows that left and right are alike: a mirrored fish gets the mirrored answer.
+"""A policy with left-right symmetry: a mirrored fish gets the mirrored action.
 
-All that it sees (F_y, its rate, the fin velocity, φ_c) changes sign when left and right are
-swapped, and so does what it does; what a state is worth does not. Built into the networks, half of
-what PPO would have to try is known beforehand, and no policy can favour one side. F_x, which has no
-sign to change, must not be among what it sees.
+All inputs (F_y, its rate, the fin velocity, φ_c) change sign when left and right are swapped, and
+so does the action; the value of a state does not. The networks are built that way, so the symmetry
+need not be learned, and no policy can favour one side. F_x, whose sign does not change, must not be
+among the inputs.
 """
 
 import math
@@ -15,14 +15,14 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 
 _HALF = math.sqrt(0.5)
-"""Keeps the spread of an untrained network's output what it is without a mirror image."""
+"""Gives an untrained network's output the same spread as without symmetry."""
 
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Weights, shape (outputs, inputs), and biases of each layer."""
 
 
-class MirrorExtractor(MlpExtractor):
-    """Hidden layers seen from both sides: odd in their input for the policy, even for the value."""
+class SymmetricExtractor(MlpExtractor):
+    """Hidden layers that are odd in their input for the policy, even for the value."""
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """f(x) − f(−x), over √2."""
@@ -35,11 +35,11 @@ class MirrorExtractor(MlpExtractor):
         return 0.5 * even
 
 
-class MirrorPolicy(ActorCriticPolicy):
-    """PPO's networks with a mirror; the last layer of the policy has a bias that stays zero."""
+class SymmetricPolicy(ActorCriticPolicy):
+    """PPO's networks, symmetric; the bias of the policy's last layer stays zero."""
 
     def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = MirrorExtractor(
+        self.mlp_extractor = SymmetricExtractor(
             self.features_dim,
             net_arch=self.net_arch,
             activation_fn=self.activation_fn,
@@ -52,13 +52,13 @@ class MirrorPolicy(ActorCriticPolicy):
 
 
 def plain_layers(layers: Layers) -> Layers:
-    """The layers of a `MirrorPolicy` as those of an ordinary network of twice the width.
+    """The layers of a `SymmetricPolicy` as those of an ordinary network of twice the width.
 
-    Its upper half sees what there is, its lower half the mirror image.
+    Its upper half gets the input, its lower half the mirrored input.
     """
     (first, bias), *inner, (last, last_bias) = layers
     doubled = [(np.vstack((first, -first)), np.tile(bias, 2))]
     for weight, bias in inner:
-        none = np.zeros_like(weight)
-        doubled.append((np.block([[weight, none], [none, weight]]), np.tile(bias, 2)))
+        zero = np.zeros_like(weight)
+        doubled.append((np.block([[weight, zero], [zero, weight]]), np.tile(bias, 2)))
     return [*doubled, (np.float32(_HALF) * np.hstack((last, -last)), last_bias)]

@@ -1,4 +1,4 @@
-"""The card of a policy in training: what must be known to run it, and where it comes from."""
+"""The card of a policy in training: what is needed to run it, and where it comes from."""
 
 import platform
 from datetime import UTC, datetime
@@ -8,9 +8,9 @@ import msgspec
 
 from fishd import __version__
 from fishd.config import Config
-from fishd.learning.checkpoints import Evaluation
+from fishd.controllers.policy.card import Card, Feature, Provenance
+from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.settings import TrainingSettings
-from fishd.policies.card import Card, Feature, Provenance
 
 _LIBRARIES = ("torch", "stable-baselines3", "gymnasium", "numpy")
 
@@ -25,8 +25,8 @@ def make_card(
     note: str,
 ) -> Card:
     """
-    on: what swam
-    steps: how many it has learned from
+    on: simulation, robot or another word for what swam
+    steps: control steps that it has learned from
     evaluation: the latest
     """
     libraries = {name: version(name) for name in _LIBRARIES}

@@ -1,75 +1,42 @@
-"""What happens during a rollout, besides PPO's own business: figures, void steps, pause, stop."""
+"""What happens in each rollout besides PPO: void steps, figures for the log, pause and stop."""
 
 from collections.abc import Callable
 
 import numpy as np
-from msgspec import Struct
 from stable_baselines3.common.callbacks import BaseCallback
 
-from fishd.learning.environment import SwimEnv
-from fishd.learning.link import LinkLost
-from fishd.learning.ppo import Rollout
-from fishd.learning.trials import beat_frequency
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.evaluation import beat_frequency
+from fishd.learning.env.link import LinkLost
+from fishd.learning.ppo.model import Rollout
+from fishd.learning.train.progress import Display
 
 
-class Figures(Struct, frozen=True):
-    """How the fish swam in a rollout, exploration included; means over its steps."""
+class RolloutCallback(BaseCallback):
+    """Follows each rollout step by step, pauses the fish at its end, and logs how it swam."""
 
-    reward: float
-    thrust: float
-    """[N]"""
-    frequency: float
-    """Tail beats per second, from the actions' changes of side [Hz]."""
-    fullness: float
-    """|φ_c|/Φ"""
-    lost: int
-    """Ticks since the rollout before in which another angle than the agent's was in force."""
-    paused: float
-    """How long the fish waited at neutral before it [s]."""
-
-
-class Watch(BaseCallback):
-    """Follows each rollout, step by step, and pauses the fish at its end."""
-
-    def __init__(self, env: SwimEnv, stop: Callable[[], bool], moved: Callable[[], None]) -> None:
-        """
-        stop: asked after each step whether to stop there
-        moved: called after each step
-        """
+    def __init__(self, env: SwimEnv, display: Display, stop: Callable[[], bool]) -> None:
+        """stop: called after each step; True ends the rollout there"""
         super().__init__()
         self._env = env
+        self._display = display
         self._stop = stop
-        self._moved = moved
         self.stopped = False
-        """Was the latest rollout ended early? Nothing was learned from it then."""
-        self._lost = self._counted = 0
-        self._forget()
+        """Was the latest rollout stopped early? Then nothing was learned from it."""
+        self._lost = 0
+        """Ticks that the environment had lost until the previous rollout ended."""
+        self._on_rollout_start()
 
     @property
-    def moves(self) -> int:
+    def steps(self) -> int:
         """Steps of the latest rollout so far."""
         return len(self._actions)
 
-    def figures(self) -> Figures:
-        """Those of the rollout that has just ended."""
-        actions = np.array(self._actions)
-        return Figures(
-            reward=float(np.mean(self._rewards)),
-            thrust=float(np.mean(self._thrusts)),
-            frequency=beat_frequency(actions, self._env.link.tick),
-            fullness=float(np.mean(np.abs(actions))),
-            lost=self._lost,
-            paused=self._paused,
-        )
-
-    def _forget(self) -> None:
+    def _on_rollout_start(self) -> None:
         self._rewards: list[float] = []
         self._thrusts: list[float] = []
         self._actions: list[float] = []
         self._paused = 0.0
-
-    def _on_rollout_start(self) -> None:
-        self._forget()
 
     def _on_step(self) -> bool:
         buffer, info = self._buffer, self.locals["infos"][0]
@@ -77,20 +44,34 @@ class Watch(BaseCallback):
         self._thrusts.append(info["thrust"])
         self._actions.append(float(self.locals["clipped_actions"][0, 0]))
         self._paused += info["paused"]
-        buffer.void[buffer.pos] = info["lost"] > 0  # where this step is going to be kept
-        self._moved()
+        buffer.void[buffer.pos] = info["lost"] > 0  # the index that this step will be stored at
+        self._display.step(self._env.tank_time)
         self.stopped = self._stop()
         return not self.stopped
 
     def _on_rollout_end(self) -> None:
         self._env.pause()
-        self._lost, self._counted = self._env.lost - self._counted, self._env.lost
         steps = len(self._buffer.void)
         if np.count_nonzero(self._buffer.void) > steps // 2:
             raise LinkLost(
                 f"in most of the last {steps} steps the agent's action came too late for its tick; "
                 "run it on a faster or less busy machine, nearer to fishd"
             )
+        actions, thrust = np.array(self._actions), float(np.mean(self._thrusts))
+        efficiency = thrust / self._env.best_thrust
+        frequency = beat_frequency(actions, self._env.link.tick)
+        for name, value in (
+            ("tank/lost", self._env.lost - self._lost),
+            ("tank/paused", self._paused),
+            ("rollout/reward", float(np.mean(self._rewards))),
+            ("rollout/thrust", thrust),
+            ("rollout/efficiency", efficiency),
+            ("rollout/frequency", frequency),
+            ("rollout/fullness", float(np.mean(np.abs(actions)))),
+        ):
+            self.logger.record(name, value)
+        self._lost = self._env.lost
+        self._display.explored(thrust, efficiency, frequency)
 
     @property
     def _buffer(self) -> Rollout:

@@ -1,4 +1,4 @@
-"""What training on a Dask cluster takes: a scheduler, a way to say stop, folders that travel."""
+"""For trainings on a Dask cluster: its scheduler, a way to stop them, folders sent as bytes."""
 
 import io
 import time
@@ -9,22 +9,24 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from fishd.errors import FishdError
+from fishd.core.errors import FishdError
 
+CONNECT = 10.0
+"""How long to wait for a scheduler that does not answer [s]."""
 _POLL = 1.0
-"""Time between two questions to the scheduler whether to stop [s]."""
+"""How often a worker asks the scheduler whether to stop [s]."""
 
 
 @contextmanager
 def scheduler(address: str | None) -> Iterator[Any]:
-    """A connection to the scheduler, and an event there that says stop; None without address."""
+    """A connection to the scheduler, and an event there that means stop; None without address."""
     if address is None:
         yield None
         return
     from distributed import Client, Event
 
     try:
-        client = Client(address, timeout=10, name="fishctl learn")
+        client = Client(address, timeout=CONNECT, name="fishctl learn")
     except (OSError, ValueError, TypeError, TimeoutError) as error:
         raise FishdError(f"no Dask scheduler answers at {address}: {error}") from None
     with client:
@@ -33,24 +35,24 @@ def scheduler(address: str | None) -> Iterator[Any]:
         yield Event(f"fishd-stop-{uuid4().hex}", client=client)
 
 
-def asked(name: str) -> Callable[[], bool]:
-    """Has the one who waits for the outcome said stop? On a Dask worker."""
+def stop_requested(name: str) -> Callable[[], bool]:
+    """A function, for use on a Dask worker, that tells whether an event of this name was set."""
     from distributed import Event, get_client
 
     event = Event(name, client=get_client())
-    was_asked, next_look = False, 0.0
+    was_set, next_look = False, 0.0
 
     def stop() -> bool:
-        nonlocal was_asked, next_look
-        if not was_asked and time.monotonic() >= next_look:
-            was_asked = event.is_set()
+        nonlocal was_set, next_look
+        if not was_set and time.monotonic() >= next_look:
+            was_set = event.is_set()
             next_look = time.monotonic() + _POLL
-        return was_asked
+        return was_set
 
     return stop
 
 
-def packed(folder: Path) -> bytes:
+def pack(folder: Path) -> bytes:
     """All files of a folder as one zip archive."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -1,4 +1,4 @@
-"""What a training is asked for, and what it comes to."""
+"""What a training is asked to do, and how it ended."""
 
 import math
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Literal
 from msgspec import Struct
 
 from fishd.config import Config
-from fishd.learning.checkpoints import Evaluation
+from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.settings import TrainingSettings
 
 On = Literal["simulation", "robot"]
-Ended = Literal["finished", "interrupted", "lost", "diverged"]
+Ended = Literal["finished", "interrupted", "lost", "diverged", "failed"]
 
 
 class Job(Struct, frozen=True, kw_only=True):
@@ -43,18 +43,19 @@ class Outcome(Struct, frozen=True, kw_only=True):
     """How a training ended."""
 
     folder: Path
-    steps: int
+    steps: int = 0
     """Control steps that were learned from."""
-    dropped: int
+    dropped: int = 0
     """Steps of a rollout that was stopped midway: nothing was learned from them."""
-    tank_time: float
+    tank_time: float = 0.0
     """[s]"""
     ended: Ended
-    message: str
-    """Why, where it was lost or diverged."""
-    checkpoint: Path | None
+    """failed: one of several seeds raised an exception."""
+    message: str = ""
+    """Why, where it is neither finished nor interrupted by the user."""
+    checkpoint: Path | None = None
     """The newest."""
-    best: Path | None
+    best: Path | None = None
     """The checkpoint of `best_evaluation`."""
-    latest_evaluation: Evaluation | None
-    best_evaluation: Evaluation | None
+    latest_evaluation: Evaluation | None = None
+    best_evaluation: Evaluation | None = None

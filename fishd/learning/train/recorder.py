@@ -5,32 +5,32 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+from msgspec.structs import replace
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-from fishd.errors import ConfigError
-from fishd.learning import checkpoints, runs
-from fishd.learning.callbacks import Figures
-from fishd.learning.checkpoints import CheckpointError, Evaluation, State
-from fishd.learning.environment import SwimEnv
-from fishd.learning.jobs import Job
-from fishd.learning.provenance import make_card
-from fishd.learning.tables import Progress, Table
-from fishd.lockfile import Taken, locked
-from fishd.policies.card import Card
+from fishd.controllers.policy.card import Card
+from fishd.core.errors import ConfigError
+from fishd.core.lockfile import Taken, locked
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.run_folder import checkpoints, runs
+from fishd.learning.run_folder.checkpoints import CheckpointError, State
+from fishd.learning.run_folder.provenance import make_card
+from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, ProgressWriter, Table
+from fishd.learning.train.jobs import Job
 
 
-class Keeper:
-    """Counts what is done, and keeps it on disk."""
+class RunRecorder:
+    """Opens or makes the run folder, loads what the run begins with, and records its progress."""
 
-    def __init__(self, job: Job, env: SwimEnv, model: PPO, yardstick: float) -> None:
+    def __init__(self, job: Job, env: SwimEnv, model: PPO) -> None:
         """
-        model: takes over the networks of the checkpoint that the job begins with
-        yardstick: thrust of the best square wave [N]
+        model: gets the networks of the checkpoint that the job begins with
 
         Raises `ConfigError` and `CheckpointError`.
         """
-        self._job, self._env, self._model, self._yardstick = job, env, model, yardstick
+        self._job, self._env, self._model = job, env, model
         self.steps = 0
         """Control steps that were learned from."""
         self.rollouts = 0
@@ -38,73 +38,61 @@ class Keeper:
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
         self.checkpoint: Path | None = None
-        """The newest, but for those of best evaluations."""
-        self.resumed: State | None = None
-        """Where a resumed run goes on."""
-        self._best_kept = -1
+        """The newest `step` checkpoint, or that which the run was resumed from."""
         self._note = ""
         with ExitStack() as lock:
             if job.resume:
                 self._lock_folder(lock)
-                self.checkpoint = checkpoints.newest(job.folder)
-                self.resumed = checkpoints.read_state(self.checkpoint)
-                self._go_on(self.checkpoint, self.resumed)
-            elif job.parent:
-                self._begin_with(job.parent)
-            self._open(self.resumed, lock)
-            self.keep()  # whatever happens from now on, there is something to resume
+                self._resume()
+            else:
+                if job.parent:
+                    self._begin_with(job.parent)
+                runs.create(job.folder, job.config, job.settings)
+                self._lock_folder(lock)
+            progress = self._open_table("progress.csv", tuple(PROGRESS))
+            self._evaluations = self._open_table(EVALUATIONS, Evaluation.__struct_fields__)
+            board = TensorBoardOutputFormat(str(job.folder / "tensorboard"))
+            model.set_logger(Logger(None, [board, ProgressWriter(progress)]))
+            self.save()  # whatever happens from now on, there is something to resume
             self._lock = lock.pop_all()
 
-    def log(self, figures: Figures) -> None:
-        """One row about the latest rollout and update."""
-        logger, settings = self._model.logger, self._job.settings
-        for name, value in (
-            ("tank/steps", self.steps),
-            ("tank/time", self._env.tank_time),
-            ("tank/lost", figures.lost),
-            ("tank/paused", figures.paused),
-            ("rollout/reward", figures.reward),
-            ("rollout/thrust", figures.thrust),
-            ("rollout/efficiency", figures.thrust / self._yardstick),
-            ("rollout/frequency", figures.frequency),
-            ("rollout/fullness", figures.fullness),
-        ):
-            logger.record(name, value)
-        if settings.evaluation.every and self.latest:
+    def log(self) -> None:
+        """Write one row of progress.csv, and what TensorBoard shows, about the latest update."""
+        logger = self._model.logger
+        logger.record("tank/steps", self.steps)
+        logger.record("tank/time", self._env.tank_time)
+        if self._job.settings.evaluation.every and self.latest:
             for name in ("thrust", "efficiency", "frequency", "fullness", "stalled"):
                 logger.record(f"evaluation/{name}", float(getattr(self.latest, name)))
         logger.dump(self.steps)
 
-    def evaluated(self, evaluation: Evaluation) -> bool:
-        """One row about a deterministic evaluation; was it the best so far?
-
-        Then `keep` writes a checkpoint of it.
-        """
+    def add(self, evaluation: Evaluation) -> Evaluation:
+        """Write one row of evaluations.csv; returns the evaluation with `best` set."""
+        is_best = self.best is None or evaluation.merit >= self.best.merit
+        evaluation = replace(evaluation, best=is_best and not evaluation.stalled)
+        self._evaluations.add(msgspec.structs.asdict(evaluation))
         self.latest = evaluation
-        best = not evaluation.stalled and (self.best is None or evaluation.merit >= self.best.merit)
-        self._evaluations.add(msgspec.structs.asdict(evaluation) | {"best": best})
-        if best:
+        if evaluation.best:
             self.best = evaluation
-        return best
+        return evaluation
 
-    def keep(self, *, due: bool = True) -> None:
+    def save(self, *, due: bool = True) -> None:
         """Write a checkpoint where the policy is the best so far.
 
         due: write one in any case, if the newest is not of this step
 
-        After the rows of the tables: those that are newer than the newest checkpoint are dropped
-        when a run is resumed, but none is ever made up for.
+        To be called after the rows of the tables are written: a resume drops rows that are newer
+        than the checkpoint, but could not add missing ones.
         """
-        if self.best and self.best.steps == self.steps and self._best_kept != self.steps:
+        name = f"{self.steps:06d}"
+        is_best = self.best is not None and self.best.steps == self.steps
+        if is_best and not (self._job.folder / f"best-{name}").exists():
             self._save("best")
-            self._best_kept = self.steps
-        if not due:
-            return
-        if self.checkpoint is None or self.checkpoint.name != f"step-{self.steps:06d}":
+        if due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}"):
             self.checkpoint = self._save("step")
 
     def close(self) -> None:
-        """Close the logs, and leave the folder to others."""
+        """Close the logs and unlock the folder."""
         self._model.logger.close()
         self._lock.close()
 
@@ -125,88 +113,71 @@ class Keeper:
             rollouts=self.rollouts,
             latest=self.latest,
             best=self.best,
-            random=checkpoints.random_state(self._env.np_random),
         )
         return checkpoints.save(self._job.folder, kind, self._model, self._card(), state)
 
     def _card(self) -> Card:
-        job = self._job
+        job, seen = self._job, self._env.features
         return make_card(
-            job.config,
-            job.settings,
-            self._env.features,
-            job.on,
-            self.steps,
-            self.latest,
-            self._note,
+            job.config, job.settings, seen, job.on, self.steps, self.latest, self._note
         )
 
     def _begin_with(self, parent: Path) -> None:
-        card = self._check_same(parent)
+        """Take over the networks of another run; raises `CheckpointError`."""
+        past = self._checked_card(parent).provenance
         checkpoints.load_parameters(self._model, parent, optimiser=False)
-        past = card.provenance
-        self._note = (
-            f"began with {parent.resolve().parent.name}/{parent.name}, {past.steps} steps in "
-            f"{past.on}"
-        )
+        name = f"{parent.resolve().parent.name}/{parent.name}"
+        self._note = f"began with {name}, {past.steps} steps in {past.on}"
 
-    def _check_same(self, start: Path) -> Card:
-        """The card of a checkpoint that sees and does what this training does.
+    def _checked_card(self, checkpoint: Path) -> Card:
+        """The card of a checkpoint, whose inputs, actions and networks are those of this training.
 
         Raises `CheckpointError`.
         """
-        card, own = checkpoints.read_card(start), self._card()
+        card, own = checkpoints.read_card(checkpoint), self._card()
         for what in ("observation", "tick", "amplitude"):
             if getattr(card, what) != getattr(own, what):
                 raise CheckpointError(
-                    f"{start}: its {what}, with scales, differs from that of this training; use "
-                    "the configuration and the environment settings that it was trained with"
+                    f"{checkpoint}: its {what}, with scales, differs from that of this training; "
+                    "use the configuration and the environment settings that it was trained with"
                 )
         theirs = card.provenance.settings.get("ppo", {})
         ours = msgspec.json.decode(msgspec.json.encode(self._job.settings.ppo))  # lists, as theirs
         for key in ("hidden", "activation", "symmetric"):
             if theirs.get(key) != ours.get(key):
                 raise CheckpointError(
-                    f"{start}: its ppo.{key} is {theirs.get(key)}, that of this training is "
+                    f"{checkpoint}: its ppo.{key} is {theirs.get(key)}, that of this training is "
                     f"{ours.get(key)}; the networks must be alike"
                 )
         return card
 
-    def _go_on(self, start: Path, state: State) -> None:
-        job = self._job
+    def _resume(self) -> None:
+        """Go on from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
+        job, model = self._job, self._model
+        self.checkpoint = checkpoints.newest(job.folder)
+        state = checkpoints.read_state(self.checkpoint)
         if state.on != job.on:
             raise ConfigError(
                 f"{job.folder} was trained on {state.on}; to go on with its networks on another "
                 f"fish, begin a new run: --on {job.on} --from {job.folder}"
             )
-        card = self._check_same(start)
+        card = self._checked_card(self.checkpoint)
         if state.steps >= job.settings.steps:
             raise ConfigError(
                 f"{job.folder} is finished, with {state.steps} steps; to train it for longer, give "
-                f"more in all, such as --steps {state.steps + job.settings.steps}"
+                f"a larger total, such as --steps {state.steps + job.settings.steps}"
             )
-        checkpoints.load_parameters(self._model, start)
+        checkpoints.load_parameters(model, self.checkpoint)
         self._note = card.provenance.note
-        self.steps = self._model.num_timesteps = state.steps
-        self._model._n_updates = state.updates
-        self.rollouts = state.rollouts
+        self.steps = model.num_timesteps = state.steps
+        self.rollouts, model._n_updates = state.rollouts, state.updates
         self.latest, self.best = state.latest, state.best
-        self._best_kept = state.best.steps if state.best else -1
         self._env.tank_time = state.tank_time
+        checkpoints.sweep(job.folder)
+        runs.write_settings(job.folder, job.settings)
 
-    def _open(self, resumed: State | None, lock: ExitStack) -> None:
-        folder = self._job.folder
-        if resumed is None:
-            runs.create(folder, self._job.config, self._job.settings)
-            self._lock_folder(lock)
-        else:
-            checkpoints.sweep(folder)
-            runs.keep_settings(folder, self._job.settings)
-        progress = Progress(folder / "progress.csv")
-        columns = (*Evaluation.__struct_fields__, "best")
-        self._evaluations = Table(folder / "evaluations.csv", columns)
-        if resumed:
-            progress.table.keep_until(resumed.steps)
-            self._evaluations.keep_until(resumed.steps)
-        board = TensorBoardOutputFormat(str(folder / "tensorboard"))
-        self._model.set_logger(Logger(None, [board, progress]))
+    def _open_table(self, name: str, columns: tuple[str, ...]) -> Table:
+        table = Table(self._job.folder / name, columns)
+        if self._job.resume:
+            table.keep_until(self.steps)
+        return table

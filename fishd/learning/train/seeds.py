@@ -1,7 +1,7 @@
 """The same training with several seeds at once: on the cores of this machine, or on a Dask cluster.
 
-Each has the folder seed-0, seed-1, ... of the run folder. A seed that fails is reported and costs
-the others nothing; one whose process was killed goes on from its newest checkpoint in another.
+Each seed trains in a folder seed-0, seed-1, ... of the run folder. A seed that fails is reported
+and does not affect the others; one whose process was killed is resumed in another.
 """
 
 import shutil
@@ -15,17 +15,15 @@ from typing import Any, NamedTuple
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
-from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.errors import FishdError
-from fishd.learning.checkpoints import Evaluation
-from fishd.learning.cluster import asked, packed, scheduler, unpack
-from fishd.learning.jobs import Job
-from fishd.learning.runs import make_folder
-from fishd.learning.seed_table import write_summary
-from fishd.learning.stopping import on_signal
-from fishd.learning.training import train
+from fishd.core.errors import FishdError
+from fishd.learning.run_folder import checkpoints
+from fishd.learning.run_folder.runs import make_folder
+from fishd.learning.run_folder.tables import write_summary
+from fishd.learning.train.cluster import pack, scheduler, stop_requested, unpack
+from fishd.learning.train.jobs import Job, Outcome
+from fishd.learning.train.training import on_signal, train
 
 STOP = "stop"
 """A file of this name in the run folder ends the trainings in it."""
@@ -33,26 +31,13 @@ STOP = "stop"
 _ATTEMPTS = 3
 
 
-class SeedOutcome(Struct, frozen=True):
-    """How the training of one seed ended."""
-
-    seed: int
-    ended: str
-    """finished, interrupted, lost or diverged, as in `Outcome`; or failed."""
-    message: str
-    """Why, where it is not finished."""
-    steps: int
-    latest: Evaluation | None
-    best: Evaluation | None
-
-
 class _Task(NamedTuple):
-    """What travels to a worker."""
+    """What is sent to a worker."""
 
     number: int
     job: Job
     stop: str
-    """Path of the file, or name of the Dask event, that says stop."""
+    """Path of the file, or name of the Dask event, that tells it to stop."""
 
 
 def train_seeds(
@@ -60,33 +45,31 @@ def train_seeds(
     seeds: int,
     jobs: int | None = None,
     cluster: str | None = None,
-    ended: Callable[[SeedOutcome], None] = lambda outcome: None,
-) -> list[SeedOutcome]:
-    """Train `seeds` times; the seeds count up from that of the job, so does that of its noise.
+    ended: Callable[[int, Outcome], None] = lambda seed, outcome: None,
+) -> list[Outcome]:
+    """Train with several seeds, which count up from that of the job, as that of its noise does.
 
     jobs: processes at a time; None is one per core
     cluster: address of a Dask scheduler, whose workers train instead; they need fishd and its
         extra `learn`, but no folder in common with this machine
-    ended: called with each outcome as it comes
+    ended: called with each seed and its outcome as soon as it is known
 
     SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
     the folder is in use, and `FishdError` where there is no scheduler.
     """
     folder = job.folder.absolute()
-    waiting = {index: _job_of(job, folder, index) for index in range(seeds)}
-    outcomes: dict[int, SeedOutcome] = {}
+    waiting = [_job_of(job, folder, index) for index in range(seeds)]
+    outcomes: dict[int, Outcome] = {}
 
-    def keep(index: int, outcome: SeedOutcome) -> None:
+    def keep(index: int, outcome: Outcome) -> None:
         outcomes[index] = outcome
-        ended(outcome)
+        ended(waiting[index].settings.seed, outcome)
 
-    with scheduler(cluster) as event, _ask_to_stop(folder / STOP, event):
+    with scheduler(cluster) as event, _stop_on_signal(folder / STOP, event):
         make_folder(folder)
         name = event.name if event else str(folder / STOP)
         for attempt in range(_ATTEMPTS):
-            tasks = [
-                _Task(index, job, name) for index, job in waiting.items() if index not in outcomes
-            ]
+            tasks = [_Task(n, job, name) for n, job in enumerate(waiting) if n not in outcomes]
             try:
                 for index, outcome, files in _run(tasks, jobs, cluster):
                     if files:
@@ -94,12 +77,12 @@ def train_seeds(
                     keep(index, outcome)
             except TerminatedWorkerError:
                 if attempt + 1 < _ATTEMPTS:
-                    continue  # whose it was, nobody knows: all that are left go on
+                    continue  # which process was killed is not known: all that are left are resumed
                 for task in tasks:
                     if task.number not in outcomes:
                         keep(task.number, _failed(task.job, "its process was killed"))
             break
-    write_summary(folder / "seeds.csv", [waiting[index].folder for index in range(seeds)])
+    write_summary(folder / "seeds.csv", [job.folder for job in waiting])
     return [outcomes[index] for index in range(seeds)]
 
 
@@ -116,8 +99,8 @@ def _job_of(job: Job, folder: Path, index: int) -> Job:
 
 def _run(
     tasks: list[_Task], jobs: int | None, cluster: str | None
-) -> Iterator[tuple[int, SeedOutcome, bytes]]:
-    """Outcomes as they come, where the backend can do that; else in the end."""
+) -> Iterator[tuple[int, Outcome, bytes]]:
+    """Index, outcome and packed folder of each task: as they end, on a cluster all at the end."""
     if cluster:
         with joblib.parallel_config(backend="dask", scheduler_host=cluster):
             try:
@@ -132,21 +115,20 @@ def _run(
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         workers = min(jobs or joblib.cpu_count(), len(tasks))
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-        with _spared_by_the_terminal():
+        with _ignoring_the_terminal():
             outcomes = parallel(joblib.delayed(_train_here)(task) for task in tasks)
         yield from outcomes
 
 
 @contextmanager
-def _spared_by_the_terminal() -> Iterator[None]:
-    """Processes that begin in here never hear Ctrl-C or the terminal's end: this one says stop."""
+def _ignoring_the_terminal() -> Iterator[None]:
+    """Processes that are started in here ignore Ctrl-C and hang-up: this one tells them to stop."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    # What is ignored stays so in a child, unlike what is handled.
-    former = {
-        number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGHUP)
-    }
+    # A child inherits that a signal is ignored, unlike its handlers.
+    signals = (signal.SIGINT, signal.SIGHUP)
+    former = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
     try:
         yield
     finally:
@@ -154,46 +136,48 @@ def _spared_by_the_terminal() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _train_here(task: _Task) -> tuple[int, SeedOutcome, bytes]:
+def _train_here(task: _Task) -> tuple[int, Outcome, bytes]:
     """In a process of its own on this machine."""
-    stop = Path(task.stop)
-    return task.number, _train(task.job, stop.exists), b""
+    return task.number, _train(task.job, Path(task.stop).exists), b""
 
 
-def _train_remotely(task: _Task) -> tuple[int, SeedOutcome, bytes]:
+def _train_remotely(task: _Task) -> tuple[int, Outcome, bytes]:
     """On a Dask worker, in a temporary folder whose files are sent back."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / task.job.folder.name
-        outcome = _train(replace(task.job, folder=folder), asked(task.stop))
-        return task.number, outcome, packed(folder)
+        outcome = _train(replace(task.job, folder=folder), stop_requested(task.stop))
+        home = task.job.folder
+        outcome = replace(
+            outcome,
+            folder=home,
+            checkpoint=outcome.checkpoint and home / outcome.checkpoint.name,
+            best=outcome.best and home / outcome.best.name,
+        )
+        return task.number, outcome, pack(folder)
 
 
-def _train(job: Job, stop: Callable[[], bool]) -> SeedOutcome:
-    """Train, or go on where a process before this one was killed; whatever is raised is kept."""
-    seed = job.settings.seed
+def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
+    """Train, or resume what a killed process has begun; an exception is an outcome, too."""
     if stop():
-        return SeedOutcome(seed, "interrupted", "it had not begun", 0, None, None)
+        return Outcome(folder=job.folder, ended="interrupted", message="it had not begun")
     try:
-        if job.folder.exists():
-            if any(job.folder.glob("step-*")):
-                job = replace(job, resume=True, parent=None)
-            else:
-                shutil.rmtree(job.folder)
-        found = train(job, stop=stop)
+        if checkpoints.all_in(job.folder):
+            job = replace(job, resume=True, parent=None)
+        elif job.folder.exists():
+            shutil.rmtree(job.folder)
+        return train(job, stop=stop)
     except Exception as error:
         text = str(error) if isinstance(error, FishdError) else f"{type(error).__name__}: {error}"
         return _failed(job, text)
-    latest, best = found.latest_evaluation, found.best_evaluation
-    return SeedOutcome(seed, found.ended, found.message, found.steps, latest, best)
 
 
-def _failed(job: Job, message: str) -> SeedOutcome:
-    return SeedOutcome(job.settings.seed, "failed", message, 0, None, None)
+def _failed(job: Job, message: str) -> Outcome:
+    return Outcome(folder=job.folder, ended="failed", message=message)
 
 
 @contextmanager
-def _ask_to_stop(file: Path, event: Any) -> Iterator[None]:
-    """While this lasts, signals say stop to all of them."""
+def _stop_on_signal(file: Path, event: Any) -> Iterator[None]:
+    """While this lasts, signals tell all of them to stop."""
 
     def ask() -> None:
         if event:

@@ -1,218 +1,229 @@
-"""The whole loop of learning: swim, update, evaluate, keep; in simulation or on a robot.
+"""The training loop, in simulation or on a robot.
 
 rollout    n_steps of exploration; the fish then waits at neutral
 update     PPO learns from them
 evaluate   without exploration: a simulated fish of its own, or the robot itself
-keep       a row in the tables, a checkpoint where one is due, another where it is the best yet
+record     a row in the tables, a checkpoint where one is due, another where it is the best so far
 """
 
 import shlex
-from collections.abc import Callable
-from contextlib import closing
-from typing import cast
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any, cast
 
 import numpy as np
 import torch
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from fishd.errors import FishdError
-from fishd.learning import checkpoints, runs
-from fishd.learning.callbacks import Watch
-from fishd.learning.checkpoints import CheckpointError, Evaluation
-from fishd.learning.environment import SwimEnv
-from fishd.learning.jobs import Ended, Job, Outcome
-from fishd.learning.keeping import Keeper
-from fishd.learning.link import Link, LinkLost
-from fishd.learning.links import check_agreement, in_process, on_daemon
-from fishd.learning.ppo import (
-    Deterministic,
+from fishd.core.errors import FishdError
+from fishd.learning.env import evaluation
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.fishd_link import FishdLink
+from fishd.learning.env.link import Link, LinkLost
+from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.ppo.model import (
+    DeterministicPolicy,
     is_finite,
     learning_rate,
     make_learner,
     set_learning_rate,
 )
-from fishd.learning.progress import Quiet, Show, minutes
-from fishd.learning.trials import in_simulation, on_link, worst_of_others
-from fishd.plant.optimum import best_square_wave
-
-__all__ = ["Job", "Outcome", "train"]
+from fishd.learning.run_folder import checkpoints
+from fishd.learning.run_folder.checkpoints import CheckpointError
+from fishd.learning.train.callbacks import RolloutCallback
+from fishd.learning.train.jobs import Ended, Job, Outcome
+from fishd.learning.train.progress import Display, minutes
+from fishd.learning.train.recorder import RunRecorder
 
 _NEVER = 10**9
 """Updates after which stable-baselines3 logs by itself."""
 
 
-def train(job: Job, show: Show | None = None, stop: Callable[[], bool] = lambda: False) -> Outcome:
+def train(
+    job: Job, display: Display | None = None, stop: Callable[[], bool] = lambda: False
+) -> Outcome:
     """Train; whatever ends it, the fish is at neutral afterwards.
 
-    stop: asked after each step whether to end here; what the present rollout has seen is then lost
+    stop: called after each step; True ends the training there, and drops the current rollout
 
     Raises `ConfigError`, `CheckpointError` and `FishError` before anything has moved, and
-    `CheckpointError` where the run folder cannot be written any more.
+    `CheckpointError` where the run folder can no longer be written.
     """
     torch.set_num_threads(1)
+    link: Link
     if job.on == "robot":
-        link = on_daemon(job.endpoint, job.agent)
+        link = FishdLink(job.endpoint, address=job.agent)
     else:
-        link = in_process(job.config, job.settings)
+        link = SimulatedLink(job.config, job.settings.randomisation)
     try:
-        check_agreement(link, job.config)
-        return Training(job, link, show or Quiet(), stop).run()
+        return Training(job, link, display or Display(), stop).run()
     except OSError as error:
         if isinstance(error, FishdError):
             raise
         raise CheckpointError(
             f"{error.filename or job.folder}: cannot be written: {error.strerror}; when that is "
-            f"mended, {_way_on(job)}"
+            f"mended, {_advice(job)}"
         ) from error
     finally:
         link.close()
 
 
-def _way_on(job: Job) -> str:
-    """What to do after the run folder could not be written."""
-    folder = shlex.quote(str(job.folder))
-    if runs.has_checkpoint(job.folder):
-        return f"go on from the newest checkpoint with --resume {folder}"
-    robot = " --on robot" if job.on == "robot" else ""
-    return (
-        f"remove {job.folder}, which has no checkpoint yet, and start again with 'fishctl learn "
-        f"ppo{robot} --folder {folder}' and what else you gave"
-    )
+@contextmanager
+def on_signal(ask: Callable[[], object]) -> Iterator[None]:
+    """While this lasts, SIGINT, SIGTERM and SIGHUP call `ask`; the second of a kind acts as before.
+
+    Only the main thread receives signals; in any other nothing happens.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def heard(number: int, _: object) -> None:
+        signal.signal(number, former[number])
+        ask()
+
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    former: dict[int, Any] = {number: signal.signal(number, heard) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 class Training:
     """One training on one link, which it leaves at neutral."""
 
-    def __init__(self, job: Job, link: Link, show: Show, stop: Callable[[], bool]) -> None:
+    def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Makes or opens the run folder; nothing moves yet. Raises as `train` does."""
-        self._job, self._show, self._stop = job, show, stop
+        self._job, self._display, self._stop = job, display, stop
         self._env = SwimEnv(link, job.config, job.settings.environment)
         self._vec_env = DummyVecEnv([lambda: self._env])
         self._model = make_learner(job.settings, self._vec_env)
-        self._watch = Watch(self._env, stop, lambda: show.step(self._env.tank_time))
-        self._yardstick = float(best_square_wave(job.config.plant, link.amplitude).thrust)
-        self._keeper = Keeper(job, self._env, self._model, self._yardstick)
+        self._callback = RolloutCallback(self._env, display, stop)
+        self._recorder = RunRecorder(job, self._env, self._model)
         self._paused = False
 
     def run(self) -> Outcome:
         """Learn until all steps are done, or something ends it."""
-        with closing(self._keeper):
+        with closing(self._recorder):
             return self._run()
 
     def _run(self) -> Outcome:
-        keeper, job = self._keeper, self._job
+        recorder, job = self._recorder, self._job
         self._introduce()
         ended: Ended = "finished"
         message = ""
         try:
             self._reset()
-            while keeper.steps < job.settings.steps and ended == "finished":
+            while recorder.steps < job.settings.steps and ended == "finished":
                 ended, message = self._update()
         except LinkLost as error:
             ended, message = "lost", str(error)
         finally:
             self._env.close()  # neutral first, then all that takes time
         if ended != "diverged":
-            keeper.keep()
+            recorder.save()
         return Outcome(
             folder=job.folder,
-            steps=keeper.steps,
-            dropped=self._watch.moves if self._watch.stopped else 0,
+            steps=recorder.steps,
+            dropped=self._callback.steps if self._callback.stopped else 0,
             tank_time=self._env.tank_time,
             ended=ended,
             message=message,
-            checkpoint=keeper.checkpoint,
+            checkpoint=recorder.checkpoint,
             best=checkpoints.best(job.folder),
-            latest_evaluation=keeper.latest,
-            best_evaluation=keeper.best,
+            latest_evaluation=recorder.latest,
+            best_evaluation=recorder.best,
         )
 
     def _introduce(self) -> None:
-        keeper, job = self._keeper, self._job
-        last, rollout = job.last_step(keeper.steps), job.settings.ppo.n_steps
+        recorder, job = self._recorder, self._job
+        last, rollout = job.last_step(recorder.steps), job.settings.ppo.n_steps
         whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
-        where = f"{job.folder}: {last} steps{whole} on {job.on}"
-        if keeper.resumed:
-            where += (
-                f", on from {keeper.checkpoint}, {minutes(keeper.resumed.tank_time)} in the tank"
-            )
-        self._show.begin(keeper.steps, last, where)
+        text = f"{job.folder}: {last} steps{whole} on {job.on}"
+        if job.resume:
+            tank = minutes(self._env.tank_time)
+            text += f", resumed from {recorder.checkpoint}, {tank} in the tank"
+        self._display.begin(recorder.steps, last, text)
 
     def _reset(self) -> None:
-        """Let the first episode begin; of a resumed run, with random numbers that go on."""
+        """Begin the first episode; that of a resumed run with other random numbers."""
+        if self._recorder.steps:
+            mixed = np.random.SeedSequence([self._job.settings.seed, self._recorder.steps])
+            self._model.set_random_seed(int(mixed.generate_state(1)[0]))
         self._start_with(cast(NDArray[np.float32], self._vec_env.reset()))
-        if self._keeper.resumed and self._keeper.steps:  # else it begins as it did before
-            checkpoints.restore_random_state(self._keeper.resumed.random, self._env.np_random)
 
     def _start_with(self, observations: NDArray[np.float32]) -> None:
-        """What the next rollout begins with: nothing links it to the one before."""
+        """The observation of the next step, which begins an episode."""
         self._model._last_obs = observations
         self._model._last_episode_starts = np.ones(1, dtype=bool)
 
     def _update(self) -> tuple[Ended, str]:
-        """One rollout and what follows from it; how it ended."""
-        model, settings, keeper = self._model, self._job.settings, self._keeper
+        """One rollout, its update and evaluation; how it ended, and why."""
+        model, settings, recorder = self._model, self._job.settings, self._recorder
         if self._paused:
             self._start_with(self._env.resume()[np.newaxis])
             self._paused = False
-        before = keeper.steps
+        before = recorder.steps
         set_learning_rate(model, learning_rate(settings.ppo, before + settings.ppo.n_steps))
         try:
             model.learn(
-                settings.ppo.n_steps, self._watch, log_interval=_NEVER, reset_num_timesteps=False
+                settings.ppo.n_steps, self._callback, log_interval=_NEVER, reset_num_timesteps=False
             )
-        except ValueError:  # so torch calls a distribution without a mean
+        except ValueError:  # torch refuses a distribution whose mean is NaN
             if is_finite(model):
                 raise
-        if self._watch.stopped:
-            model.num_timesteps = before  # the policy is still the one of then
+        if self._callback.stopped:
+            model.num_timesteps = before  # the policy has not changed since
             return "interrupted", ""
         self._paused = True
         if not is_finite(model):
             return "diverged", (
-                f"learning blew up in the update after {model.num_timesteps} steps; "
+                f"learning diverged in the update after {model.num_timesteps} steps; "
                 "lower ppo.learning_rate or ppo.clip_range"
             )
-        keeper.steps = model.num_timesteps
-        keeper.rollouts += 1
-        figures = self._watch.figures()
-        self._show.update(
-            keeper.steps, figures.thrust, figures.thrust / self._yardstick, figures.frequency
-        )
-        every, last = settings.evaluation.every, keeper.steps >= settings.steps
-        if every and (last or keeper.rollouts % every == 0):
+        recorder.steps = model.num_timesteps
+        recorder.rollouts += 1
+        every, last = settings.evaluation.every, recorder.steps >= settings.steps
+        if every and (last or recorder.rollouts % every == 0):
             self._evaluate()
-        keeper.log(figures)
+        recorder.log()
         every = settings.checkpoint_every
-        keeper.keep(due=last or before // every < keeper.steps // every)
+        recorder.save(due=last or before // every < recorder.steps // every)
         return ("interrupted" if self._stop() and not last else "finished"), ""
 
     def _evaluate(self) -> None:
-        """Judge the policy without exploration."""
+        """Evaluate the policy without exploration."""
         job, env = self._job, self._env
-        worst = None
-        decide = Deterministic(self._model.policy, env.features, env.link.amplitude)
+        policy = DeterministicPolicy(self._model.policy, env.features, env.link.amplitude)
         if job.on == "simulation":
-            trial = in_simulation(job.config, decide, job.settings.evaluation)
+            found = evaluation.in_simulation(job.config, policy, job.settings.evaluation)
             if job.settings.evaluation.others:
-                others = worst_of_others(job.config, decide, job.settings)
-                worst = min(others, trial.thrust / self._yardstick)
+                others = evaluation.worst_of_others(job.config, policy, job.settings)
+                found = replace(found, worst=min(others, found.efficiency))
         else:
             env.resume()
-            found = on_link(env, decide, job.settings.evaluation, self._stop)
+            on_robot = evaluation.on_link(env, policy, job.settings.evaluation, self._stop)
             env.pause()
-            if found is None:
+            if on_robot is None:
                 return
-            trial = found
-        evaluation = Evaluation(
-            steps=self._keeper.steps,
-            tank_time=env.tank_time,
-            thrust=trial.thrust,
-            efficiency=trial.thrust / self._yardstick,
-            frequency=trial.frequency,
-            fullness=trial.fullness,
-            stalled=trial.stalled,
-            worst=worst,
-        )
-        self._show.evaluated(evaluation, best=self._keeper.evaluated(evaluation))
+            found = on_robot
+        found = replace(found, steps=self._recorder.steps, tank_time=env.tank_time)
+        self._display.evaluated(self._recorder.add(found))
+
+
+def _advice(job: Job) -> str:
+    """What to do after the run folder could not be written."""
+    folder = shlex.quote(str(job.folder))
+    if checkpoints.all_in(job.folder):
+        return f"go on from the newest checkpoint with --resume {folder}"
+    robot = " --on robot" if job.on == "robot" else ""
+    return (
+        f"remove {job.folder}, which has no checkpoint yet, and start again with 'fishctl learn "
+        f"ppo{robot} --folder {folder}' and your other options"
+    )

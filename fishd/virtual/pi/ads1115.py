@@ -1,19 +1,21 @@
 """An ADS1115 at the level of its registers, on which the real driver runs unchanged.
 
-Nothing ticks: at each access the chip works out what it has converted since the last one.
+Nothing ticks: at each access the chip works out what it has converted since the last one. Only
+single-shot mode is emulated, and no comparator: the ALERT pin is not connected.
 """
 
 import errno
-import math
+import logging
 import random
 import threading
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fishd.clock import Clock
-from fishd.emulation.ads1115_comparator import QUEUES, READY_PULSE, Comparator
-from fishd.emulation.faults import Faults
-from fishd.emulation.i2c import kernel_error
+from fishd.core.clock import Clock
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.i2c import kernel_error
+
+log = logging.getLogger(__name__)
 
 CONVERSION, CONFIG, LOW_THRESHOLD, HIGH_THRESHOLD = range(4)
 """What the pointer points at."""
@@ -30,8 +32,7 @@ DATA_RATES = (8, 16, 32, 64, 128, 250, 475, 860)
 POWER_UP = 25e-6
 """Time to wake up before a conversion [s]."""
 
-_IDLE_BIT, _SINGLE_SHOT = 0x8000, 0x0100
-_REMEMBERED = 4  # conversions made up for in continuous mode: the longest queue of the comparator
+_IDLE_BIT, _SINGLE_SHOT, _COMPARATOR_OFF = 0x8000, 0x0100, 0x0003
 
 
 class _Conversion(NamedTuple):
@@ -52,69 +53,42 @@ class Ads1115Chip:
         faults: Faults,
         noise: float = 1.0,
         seed: int = 0,
-        zero_length_probe: bool = True,
     ) -> None:
         """What the chip is and what it measures.
 
         volts: (mux bits 0..7, start, end [s]) to the mean voltage of that input in that time [V]
         noise: of a conversion, rms, in steps of the ADC
         seed: of the noise, and of how far this chip's data rate is off, within ±10 %
-        zero_length_probe: whether it acknowledges a write without data, as some adapters refuse to
         """
         self._clock = clock
         self._volts = volts
         self._faults = faults
         self._noise = noise
-        self._zero_length_probe = zero_length_probe
         self._random = random.Random(seed)
         self.rate_factor = self._random.uniform(0.9, 1.1)
         self._lock = threading.RLock()
         self._last_codes: dict[int, int] = {}
+        self._told: set[str] = set()
         self.reset()
         faults.listen("brown-out", self.reset)
         faults.listen("unplugged", self.reset)
-
-    @property
-    def alert(self) -> bool:
-        """Level of the ALERT/RDY pin with its pull-up; True is high."""
-        with self._lock:
-            now = self._catch_up()
-            if not QUEUES[self._config & 3]:
-                return True
-            active_high = bool(self._config & 0x08)
-            if not self._comparator.ready_pin:
-                return self._comparator.asserted == active_high
-            if self._config & _SINGLE_SHOT:
-                return (self._conversion is None) == active_high
-            return (0.0 <= now - self._completed < READY_PULSE) == active_high
 
     def reset(self) -> None:
         """Go back to the state after power-up; a conversion under way is lost."""
         with self._lock:
             self._pointer = CONVERSION
-            self._config = RESET_CONFIG
-            self._code = 0
-            self._comparator = Comparator()
+            self._registers = [0, RESET_CONFIG, 0x8000, 0x7FFF]
             self._conversion: _Conversion | None = None
-            self._completed = -math.inf
-
-    def general_call(self, data: bytes) -> None:
-        """Reset on 06."""
-        self._need_power()
-        if data[:1] == b"\x06":
-            self.reset()
 
     def write(self, data: bytes) -> None:
         """Take [pointer] or [pointer, high byte, low byte]; OSError EREMOTEIO: no ack."""
         self._need_power()
         if not data:
-            if not self._zero_length_probe:
-                raise kernel_error(errno.EREMOTEIO)
             return
         with self._lock:
             now = self._catch_up()
             self._pointer = data[0] & 3
-            if len(data) >= 3:
+            if len(data) >= 3 and self._pointer != CONVERSION:
                 self._store(int.from_bytes(data[1:3], "big"), now)
 
     def read(self, length: int) -> bytes:
@@ -122,71 +96,57 @@ class Ads1115Chip:
         self._need_power()
         with self._lock:
             self._catch_up()
-            return (self._register().to_bytes(2, "big") + b"\xff" * length)[:length]
+            word = self._registers[self._pointer]
+            busy = self._conversion is not None or self._faults.active("stuck-busy")
+            if self._pointer == CONFIG and not busy:
+                word |= _IDLE_BIT
+            return (word.to_bytes(2, "big") + b"\xff" * length)[:length]
 
     def _need_power(self) -> None:
         if self._faults.active("unplugged"):
             raise kernel_error(errno.EREMOTEIO)
 
-    def _register(self) -> int:
-        if self._pointer == CONVERSION:
-            self._comparator.result_read(self._config)
-            return self._code & 0xFFFF
-        if self._pointer == CONFIG:
-            busy = self._conversion is not None or self._faults.active("stuck-busy")
-            return self._config | (0 if busy else _IDLE_BIT)
-        compare = self._comparator
-        return (compare.low if self._pointer == LOW_THRESHOLD else compare.high) & 0xFFFF
-
     def _store(self, word: int, now: float) -> None:
-        signed = word - 0x10000 if word & 0x8000 else word
-        if self._pointer == LOW_THRESHOLD:
-            self._comparator.low = signed
-        elif self._pointer == HIGH_THRESHOLD:
-            self._comparator.high = signed
-        elif self._pointer == CONFIG:
-            self._config = word & 0x7FFF
-            wanted = word & _IDLE_BIT or not word & _SINGLE_SHOT
-            # A chip that is busy ignores the start, but keeps the new config for the next one.
-            if wanted and self._conversion is None and not self._faults.active("stuck-busy"):
-                self._begin(now + POWER_UP)
+        if self._pointer != CONFIG:
+            self._registers[self._pointer] = word
+            return
+        self._registers[CONFIG] = config = word & ~_IDLE_BIT
+        if not config & _SINGLE_SHOT:
+            self._tell("continuous mode is not emulated: it converts nothing")
+        elif config & _COMPARATOR_OFF != _COMPARATOR_OFF:
+            self._tell("the comparator is not emulated: ALERT stays silent")
+        # A chip that is busy ignores the start, but keeps the new config for the next one.
+        idle = self._conversion is None and not self._faults.active("stuck-busy")
+        if word & _IDLE_BIT and config & _SINGLE_SHOT and idle:
+            start = now + POWER_UP
+            rate = DATA_RATES[config >> 5 & 7] * self.rate_factor
+            self._conversion = _Conversion(start, start + 1.0 / rate, config)
 
-    def _begin(self, start: float) -> None:
-        rate = DATA_RATES[self._config >> 5 & 7] * self.rate_factor
-        self._conversion = _Conversion(start, start + 1.0 / rate, self._config)
+    def _tell(self, what: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            log.warning("emulated ADS1115: %s", what)
 
     def _catch_up(self) -> float:
         """Complete what should be complete by now; the time [s]."""
         now = self._clock.monotonic()
-        if self._faults.active("stuck-busy"):
-            return now
-        while (current := self._conversion) is not None and current.end <= now:
-            self._complete(current)
+        current = self._conversion
+        if current and current.end <= now and not self._faults.active("stuck-busy"):
             self._conversion = None
-            if not self._config & _SINGLE_SHOT:
-                self._begin(current.end)
-                self._skip(now)
+            self._registers[CONVERSION] = self._code(current) & 0xFFFF
         return now
 
-    def _skip(self, now: float) -> None:
-        """Leave out conversions of continuous mode that nobody has seen, save the last few."""
-        if (current := self._conversion) is not None:
-            period = current.end - current.start
-            unseen = math.floor((now - current.start) / period) - _REMEMBERED
-            if unseen > 0:
-                self._begin(current.start + unseen * period)
-
-    def _complete(self, conversion: _Conversion) -> None:
+    def _code(self, conversion: _Conversion) -> int:
+        """The result of a conversion."""
         start, end, config = conversion
         mux = config >> 12 & 7
         if self._faults.active("clipped"):
             code = 0x7FFF
         elif self._faults.active("frozen-code"):
-            code = self._last_codes.get(mux, self._code)
+            code = self._last_codes.get(mux, self._registers[CONVERSION])
         else:
             steps = self._volts(mux, start, end) / FULL_SCALE[config >> 9 & 7] * 0x8000
             noisy = self._random.gauss(steps, self._noise) if self._noise else steps
             code = round(min(max(noisy, -0x8000), 0x7FFF))
-        self._code = self._last_codes[mux] = code
-        self._completed = end
-        self._comparator.compare(code, config)
+        self._last_codes[mux] = code
+        return code

@@ -8,8 +8,8 @@ import math
 import random
 from collections.abc import Callable
 
-from fishd.clock import Clock
-from fishd.schema import nearest
+from fishd.core.clock import Clock
+from fishd.core.schema import nearest
 
 FAULTS: dict[str, str] = {
     "nack": "I2C: nobody acknowledges (error 121)",
@@ -44,26 +44,14 @@ TRANSFER_ERRORS = {
 class Faults:
     """The faults of one virtual Pi; safe to use from several threads."""
 
-    names = tuple(FAULTS)
-
     def __init__(self, clock: Clock, seed: int = 0) -> None:
         """`seed`: of the random errors of I2C transfers."""
         self._clock = clock
         self._until = dict.fromkeys(FAULTS, -math.inf)
         self._listeners: dict[str, list[Callable[[], None]]] = {name: [] for name in FAULTS}
-        self._error_rate = 0.0
-        self.random = random.Random(seed)
-
-    @property
-    def error_rate(self) -> float:
+        self.error_rate = 0.0
         """Share of the I2C transfers that fail with an error chosen at random, 0 to 1."""
-        return self._error_rate
-
-    @error_rate.setter
-    def error_rate(self, share: float) -> None:
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(f"error rate {share:g} is not valid: a number in [0, 1] is needed")
-        self._error_rate = share
+        self.random = random.Random(seed)
 
     def inject(self, name: str, seconds: float | None = None) -> None:
         """Let a fault begin, for `seconds` or until it is cleared.
@@ -85,7 +73,7 @@ class Faults:
         """End one fault, or all of them and the random errors too; ValueError: unknown name."""
         if name is None:
             self._until.update(dict.fromkeys(FAULTS, -math.inf))
-            self._error_rate = 0.0
+            self.error_rate = 0.0
         else:
             self._check(name)
             self._until[name] = -math.inf
@@ -114,7 +102,7 @@ class Faults:
         for name in TRANSFER_ERRORS:
             if self.active(name):
                 return name
-        if self._error_rate and self.random.random() < self._error_rate:
+        if self.error_rate and self.random.random() < self.error_rate:
             return self.random.choice(tuple(TRANSFER_ERRORS))
         return None
 

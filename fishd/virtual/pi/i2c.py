@@ -1,6 +1,6 @@
 """An I2C bus: carries transfers to the emulated chips, takes as long as a real one, and fails.
 
-Both front ends, `linux_i2c` and `busio_i2c`, end in `I2cBus.transfer`.
+What drivers do with its device file, `linux_i2c`, ends in `I2cBus.transfer`.
 """
 
 import errno
@@ -9,8 +9,11 @@ import threading
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from fishd.clock import Clock
-from fishd.emulation.faults import TRANSFER_ERRORS, Faults
+from fishd.core.clock import Clock
+from fishd.virtual.pi.faults import TRANSFER_ERRORS, Faults
+
+KERNEL_TIMEOUT = 1.0
+"""How long the kernel waits for a hanging bus, until told otherwise [s]."""
 
 
 class Write(NamedTuple):
@@ -37,9 +40,6 @@ class I2cDevice(Protocol):
     def read(self, length: int) -> bytes:
         """Give `length` bytes."""
 
-    def general_call(self, data: bytes) -> None:
-        """Take what a master writes to all chips at once."""
-
 
 def kernel_error(number: int) -> OSError:
     """An error as the kernel gives it; EREMOTEIO is a missing acknowledge."""
@@ -58,11 +58,10 @@ class I2cBus:
     WAY_BACK = 50e-6
     """Time that an answer takes to reach another process [s]."""
 
-    def __init__(
-        self, clock: Clock, speed: float, faults: Faults, kernel_timeout: float = 1.0
-    ) -> None:
-        """`speed` in bit/s; `kernel_timeout` [s]: how long the kernel waits for a hanging bus."""
-        self.timeout = kernel_timeout
+    def __init__(self, clock: Clock, speed: float, faults: Faults) -> None:
+        """`speed` in bit/s."""
+        self.timeout = KERNEL_TIMEOUT
+        """How long the kernel waits for a hanging bus [s]."""
         self._clock = clock
         self._speed = speed
         self._faults = faults
@@ -70,9 +69,7 @@ class I2cBus:
         self._lock = threading.Lock()
 
     def attach(self, address: int, device: I2cDevice) -> None:
-        """Put a chip on the bus; ValueError if the address is taken or is none of a chip."""
-        if not 0x08 <= address <= 0x77:
-            raise ValueError(f"address {address:#04x} is not valid: 0x08 to 0x77 is needed")
+        """Put a chip on the bus; ValueError if the address is taken."""
         if address in self._devices:
             raise ValueError(f"address {address:#04x} is taken by another chip on the bus")
         self._devices[address] = device
@@ -121,10 +118,6 @@ class I2cBus:
         return bits / self._speed
 
     def _carry_out(self, address: int, message: Message) -> bytes | None:
-        if address == 0 and isinstance(message, Write) and self._devices:
-            for device in self._devices.values():
-                device.general_call(message.data)
-            return None
         if address not in self._devices:
             raise kernel_error(errno.EREMOTEIO)
         if isinstance(message, Read):

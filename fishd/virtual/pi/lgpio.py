@@ -6,10 +6,10 @@ one process: a line that somebody else holds is busy.
 
 import os
 import sys
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Self
 
-from fishd.emulation.pins import (
+from fishd.virtual.pi.pins import (
     ALERT,
     INPUT,
     LINES,
@@ -28,15 +28,6 @@ REVISION = "c03114"
 
 _KERNEL_OUTPUT = 2
 _EDGE_SHIFT = 17
-_CONSTANTS = {
-    "SET_PULL_UP": PULL_UP,
-    "SET_PULL_DOWN": PULL_DOWN,
-    "SET_PULL_NONE": PULL_NONE,
-    "RISING_EDGE": 1,
-    "FALLING_EDGE": 2,
-    "BOTH_EDGES": 3,
-    "GPIO_BUSY": -79,
-}
 _ERRORS = {
     -5: "unknown handle",
     -72: "bad event request",
@@ -53,27 +44,29 @@ _ERRORS = {
 class Error(Exception):
     """As lgpio.error: no kind of OSError, and its text in quotes."""
 
+    def __init__(self, number: int) -> None:
+        super().__init__(_ERRORS[number])
+
     def __str__(self) -> str:
         return repr(self.args[0])
 
 
 class EmulatedLgpio:
-    """Puts the stand-in in place of lgpio until it is removed; a context manager, too."""
+    """A context manager, while which an import of RPi.GPIO finds these pins, and a Pi 4 B."""
 
     def __init__(self, pins: Pins) -> None:
         self._pins = pins
         self._modules: dict[str, ModuleType] = {}
         self._revision: str | None = None
 
-    def install(self) -> None:
-        """From now on an import of RPi.GPIO finds the emulated pins, and a Pi 4 B around it."""
+    def __enter__(self) -> Self:
         self._modules = _forget_modules()
-        sys.modules["lgpio"] = self._module()
+        sys.modules["lgpio"] = _Lgpio(self._pins)
         self._revision = os.environ.get("RPI_LGPIO_REVISION")
         os.environ["RPI_LGPIO_REVISION"] = REVISION
+        return self
 
-    def remove(self) -> None:
-        """Everything as before."""
+    def __exit__(self, *_: object) -> None:
         _forget_modules()
         sys.modules.update(self._modules)
         if self._revision is None:
@@ -81,40 +74,23 @@ class EmulatedLgpio:
         else:
             os.environ["RPI_LGPIO_REVISION"] = self._revision
 
-    def __enter__(self) -> Self:
-        self.install()
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.remove()
+class _Lgpio(ModuleType):
+    """The module, with what RPi.GPIO uses of it."""
 
-    def _module(self) -> ModuleType:
-        module = ModuleType("lgpio")
-        for name, value in _CONSTANTS.items():
-            setattr(module, name, value)
-        chip = _Chip(self._pins)
-        for name in dir(chip):
-            if not name.startswith("_"):
-                setattr(module, name, getattr(chip, name))
-        vars(module).update(error=Error, error_text=_ERRORS.get)
-        return module
-
-
-class _Chip:
-    """The functions of the module that RPi.GPIO uses."""
+    SET_PULL_UP, SET_PULL_DOWN, SET_PULL_NONE = PULL_UP, PULL_DOWN, PULL_NONE
+    RISING_EDGE, FALLING_EDGE, BOTH_EDGES = 1, 2, 3
+    GPIO_BUSY = -79
+    error, error_text = Error, _ERRORS.get
 
     def __init__(self, pins: Pins) -> None:
+        super().__init__("lgpio")
         self._pins = pins
         self._open = False
 
     def gpiochip_open(self, _number: int) -> int:
         if not self._pins.present:
-            raise Error(_ERRORS[-78])
+            raise Error(-78)
         self._open = True
         return 0
 
@@ -145,7 +121,7 @@ class _Chip:
 
     def gpio_claim_alert(self, handle: int, gpio: int, edges: int, flags: int = 0) -> int:
         if not self._pins.reports_edges:
-            raise Error(_ERRORS[-72])
+            raise Error(-72)
         line = self._claim(self._line(handle, gpio), ALERT)
         line.pull, line.edges = flags, edges
         return 0
@@ -153,7 +129,7 @@ class _Chip:
     def gpio_free(self, handle: int, gpio: int) -> int:
         line = self._line(handle, gpio)
         if not line.mode:
-            raise Error(_ERRORS[-80])
+            raise Error(-80)
         self._free(line)
         return 0
 
@@ -173,7 +149,7 @@ class _Chip:
     def gpio_set_debounce_micros(self, handle: int, gpio: int, micros: int) -> int:
         self._line(handle, gpio)
         if not 0 <= micros <= 5_000_000:
-            raise Error(_ERRORS[-98])
+            raise Error(-98)
         return 0
 
     def tx_pwm(self, handle: int, gpio: int, frequency: float, duty_cycle: float) -> int:
@@ -182,9 +158,9 @@ class _Chip:
             line.pwm = None
             return 0
         if not 0.1 <= frequency <= 10_000.0:
-            raise Error(_ERRORS[-102])
+            raise Error(-102)
         if not 0.0 <= duty_cycle <= 100.0:
-            raise Error(_ERRORS[-103])
+            raise Error(-103)
         if not line.mode & OUTPUT:
             self._claim(line, OUTPUT)
         line.pwm = (frequency, duty_cycle)
@@ -195,14 +171,14 @@ class _Chip:
 
     def _line(self, handle: int, gpio: int) -> Line:
         if handle != 0 or not self._open:
-            raise Error(_ERRORS[-5])
+            raise Error(-5)
         if not 0 <= gpio < LINES:
-            raise Error(_ERRORS[-73])
+            raise Error(-73)
         return self._pins.lines[gpio]
 
     def _claim(self, line: Line, mode: int) -> Line:
         if line.busy:
-            raise Error(_ERRORS[-79])
+            raise Error(-79)
         self._free(line)
         line.mode = mode
         return line

@@ -1,4 +1,4 @@
-"""The link to a virtual Pi in another process: what is said over its socket, and the client.
+"""The link to a virtual Pi in another process: the messages on its socket, and the client.
 
 Each message is one packet of a Unix socket, msgpack inside; each request gets one reply.
 """
@@ -15,16 +15,14 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from fishd.emulation.i2c import Message, Write
-from fishd.emulation.virtual_pi import PiState
-from fishd.errors import StartupError
+from fishd.core.errors import StartupError
+from fishd.virtual.pi.i2c import KERNEL_TIMEOUT, Message, Write
+from fishd.virtual.pi.virtual_pi import PiState
 
 LONG_POLL = 0.5
 """How long a request for a change waits for one [s]."""
 PACKET = 65536
 """Longest message [bytes]; an I2C transfer of the kernel is shorter."""
-KERNEL_TIMEOUT = 1.0
-"""How long the kernel waits for a bus that hangs, until told otherwise [s]."""
 PATIENCE = 1.0
 """How much longer than the bus may take the client waits for an answer [s]."""
 
@@ -80,13 +78,13 @@ class GetState(Request, frozen=True):
 
 
 class Done(Struct, frozen=True, tag=True, array_like=True):
-    """The reply to what was done."""
+    """The reply to a request that was carried out."""
 
     value: Any = None
 
 
 class Failed(Struct, frozen=True, tag=True, array_like=True):
-    """The reply to what failed: an error of the kernel, or a request that makes no sense."""
+    """The reply to a request that failed: an error of the kernel, or 0 for a bad request."""
 
     errno: int
     message: str

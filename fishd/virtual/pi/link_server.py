@@ -11,8 +11,10 @@ from typing import Any
 
 import msgspec
 
-from fishd.emulation.i2c import Message, Read, Write
-from fishd.emulation.link import (
+from fishd.core.errors import StartupError
+from fishd.core.unix_sockets import bind, claimed
+from fishd.virtual.pi.i2c import Message, Read, Write
+from fishd.virtual.pi.link import (
     LONG_POLL,
     PACKET,
     AnyRequest,
@@ -25,9 +27,7 @@ from fishd.emulation.link import (
     SetTimeout,
     Transfer,
 )
-from fishd.emulation.virtual_pi import VirtualPi
-from fishd.errors import StartupError
-from fishd.lockfile import NotALock, Taken, locked
+from fishd.virtual.pi.virtual_pi import VirtualPi
 
 
 class LinkServer:
@@ -43,39 +43,21 @@ class LinkServer:
     def start(self) -> None:
         """Start the virtual Pi and listen.
 
-        Raises `StartupError` when another one does already, or an address is no good.
+        Raises `StartupError` when another virtual Pi listens there or the place cannot be used.
         """
-        path = self._path.resolve()  # another name of a virtual Pi that runs is no other one
+        path = self._path.resolve()  # a symbolic link leads to the same virtual Pi
+        advice = "stop it, or give this one another virtual_pi.socket"
         with ExitStack() as stack:
+            stack.enter_context(claimed(path, str(path), "another virtual Pi", advice))
+            stack.enter_context(self._pi)
+            listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
             try:
-                if path.exists() and not path.is_socket():
-                    what = f"{path} is there already and is no socket"
-                    raise StartupError(f"{what}; choose another path")
-                stack.enter_context(locked(path))
-                stack.enter_context(self._pi)
-                path.unlink(missing_ok=True)  # of one that was killed
-                listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-                mask = os.umask(0o177)  # for this user alone, from the first moment
-                try:
-                    listener.bind(str(path))
-                finally:
-                    os.umask(mask)
-                stack.callback(path.unlink, missing_ok=True)
+                bind(listener, path, 0o177)  # for this user alone, from the first moment
                 listener.listen()
-            except Taken as taken:
-                raise StartupError(
-                    f"another virtual Pi (pid {taken.pid}) already listens on {path}; "
-                    "stop it, or give this one another virtual_pi.socket"
-                ) from None
-            except NotALock as error:
-                raise StartupError(
-                    f"virtual_pi.socket: {error.filename} {error.strerror}; remove it, or choose a "
-                    "path in a folder of your own"
-                ) from None
             except OSError as error:
                 raise StartupError(
-                    f"virtual_pi.socket: cannot listen on {path}: "
-                    f"{error.strerror or error}; choose a path in a folder that exists"
+                    f"virtual_pi.socket: cannot listen on {path}: {error.strerror or error}; "
+                    "choose another path"
                 ) from None
             acceptor = threading.Thread(target=self._accept, args=(listener,), daemon=True)
             acceptor.start()
@@ -119,7 +101,7 @@ class LinkServer:
         with connection:
             try:
                 while packet := connection.recv(PACKET):
-                    if _has_hung_up(connection):  # what it asked for, it was told is not done
+                    if _has_hung_up(connection):  # it has given this request up
                         break
                     connection.send(encode(self._answer(decode, packet)))
             except OSError:  # the client went away before it had its reply

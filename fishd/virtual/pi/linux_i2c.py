@@ -13,11 +13,10 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from fishd.emulation.i2c import Message, Read, Write, kernel_error
+from fishd.virtual.pi.i2c import Message, Read, Write, kernel_error
 
 I2C_TIMEOUT = 0x0702
 I2C_SLAVE = 0x0703
-I2C_SLAVE_FORCE = 0x0706
 I2C_RDWR = 0x0707
 I2C_M_RD = 0x0001
 """Requests and the flag of linux/i2c-dev.h that drivers use."""
@@ -105,7 +104,7 @@ class _Device(io.FileIO):
 
     def control(self, request: int, argument: Any) -> int:
         """Carry out an ioctl."""
-        if request in (I2C_SLAVE, I2C_SLAVE_FORCE):
+        if request == I2C_SLAVE:
             if not 0 <= argument <= 0x7F:
                 raise kernel_error(errno.EINVAL)
             self._address = argument

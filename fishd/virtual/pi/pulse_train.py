@@ -69,16 +69,6 @@ class PulseTrain:
             return 1
         return int(time - _frame_start(time, now.frame) < now.width * 1e-6 - _EDGE)
 
-    def next_edge(self, time: float) -> float:
-        """When the level changes next, after a time [s]; infinity if it is not known to change."""
-        now = self.at(time)
-        change = next((entry.time for entry in self._log if entry.time > time), math.inf)
-        if not 0.0 < now.width < now.frame * 1e6:
-            return change
-        start = _frame_start(time, now.frame)
-        fall = start + now.width * 1e-6
-        return min(change, fall if fall > time + _EDGE else start + now.frame)
-
     def _forget_after(self, time: float) -> None:
         while self._log and self._log[-1].time >= time:
             self._log.pop()

@@ -1,22 +1,23 @@
 """The fish on its force sensor, between the pulses of a pigpiod and the inputs of an ADS1115.
 
-It swims lazily: only when the chip converts, or someone asks, does it catch up with the time.
+It swims lazily: it catches up with the time when the chip converts, or when someone asks.
 """
 
 import math
 import threading
 from collections.abc import Callable
 
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.hardware.imperfections import Imperfections, SimulationSettings
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import REST, TetheredFish, TrueWindow
-from fishd.signals import Truth
+from fishd.core.signals import Truth
+from fishd.virtual.imperfections import Imperfections, SimulationSettings
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import REST, TetheredFish, TrueWindow
 
 STEP = 1e-4
-"""Time moves in whole multiples of this [s], so that a few lengths of time come again and again."""
+"""Time moves in whole multiples of this [s], so that few different lengths of time occur: the fish
+remembers what it computed for each."""
 _PIECE = 200  # longest stretch swum at once, in steps: one servo frame
-_REHEARSED = 40  # stretches up to this many steps are met all the time
+_WARMED_UP = 40  # stretches up to this many steps are met all the time
 _ROUNDING = 1e-7  # a frame that begins with a step has begun by then [s]
 _INPUTS = ("A0-A1", "A0-A3", "A1-A3", "A2-A3", "A0", "A1", "A2", "A3")  # by MUX code
 
@@ -43,9 +44,10 @@ class Tank:
         self._imperfections = Imperfections(imperfections, tick)
         self._weights = tuple(_weights(name, settings) for name in _INPUTS)
         self._fish = TetheredFish(plant)
-        for steps in range(1, _REHEARSED + 1):
+        for steps in range(1, _WARMED_UP + 1):
             self._fish.advance(None, steps * STEP, 1)
         self._fish.state = REST
+        self._start = start
         self._now = _steps(start)
         self._conversion = (0.0, 0.0)
         self._steps = 0
@@ -63,7 +65,9 @@ class Tank:
                 x, y = self._swim(last)
                 span = (last - first) * STEP
                 self._conversion = (x / span, y / span)
-            fx, fy = self._imperfections.apply(*self._conversion, end, max(end - begin, STEP))
+            fx, fy = self._imperfections.apply(
+                *self._conversion, end - self._start, max(end - begin, STEP)
+            )
         settings = self._settings
         vx = settings.sensitivity * (fx + settings.crosstalk * fy) + settings.zero_x
         vy = settings.sensitivity * (fy + settings.crosstalk * fx) + settings.zero_y

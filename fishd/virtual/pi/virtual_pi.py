@@ -1,25 +1,47 @@
 """A Raspberry Pi with its sensor, servo and fish, put together from the emulated parts."""
 
 import threading
+import time
 from collections.abc import Mapping
 from functools import partial
 
 from msgspec import Struct
 
-from fishd.clock import Clock
-from fishd.emulation.ads1115 import Ads1115Chip
-from fishd.emulation.faults import Faults
-from fishd.emulation.i2c import I2cBus
-from fishd.emulation.pigpiod.daemon import Pigpiod
-from fishd.emulation.pins import Pins
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.emulation.tank import Tank
-from fishd.errors import StartupError
-from fishd.hardware.imperfections import SimulationSettings
-from fishd.plant.parameters import PlantParameters
-from fishd.signals import Truth
+from fishd.core.clock import Clock
+from fishd.core.errors import StartupError
+from fishd.core.signals import Truth
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.ads1115 import Ads1115Chip
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.i2c import I2cBus
+from fishd.virtual.pi.pigpiod.daemon import Pigpiod
+from fishd.virtual.pi.pins import Pins
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.pi.tank import Tank
+from fishd.virtual.plant.parameters import PlantParameters
 
 _LONGEST_CONVERSION = 0.2  # of the slowest data rate, and a little more [s]
+
+
+class PunctualClock:
+    """The machine's clock, with sleeps that are right on average, even very short ones.
+
+    It wakes up early by as much as the machine lately woke it up late, tens of microseconds.
+    """
+
+    monotonic = staticmethod(time.monotonic)
+    wall = staticmethod(time.time)
+
+    def __init__(self) -> None:
+        self._lateness = 0.0
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        asked = max(0.0, seconds - self._lateness)
+        begun = time.monotonic()
+        time.sleep(asked)
+        late = min(time.monotonic() - begun - asked, 2e-4)
+        self._lateness += 0.05 * (late - self._lateness)
 
 
 class PiState(Struct, frozen=True):

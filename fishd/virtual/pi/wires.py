@@ -4,8 +4,8 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from fishd.emulation.link import RemotePi
-from fishd.errors import StartupError
+from fishd.core.errors import StartupError
+from fishd.virtual.pi.link import RemotePi
 
 _PAUSE = 0.2
 """Between attempts to find the virtual Pi again [s]."""

@@ -1,4 +1,4 @@
-"""The tethered robotic fish as equations: what the simulated hardware and the theory commands run.
+"""The tethered robotic fish as equations, for the simulated hardware and the theory.
 
 Nothing is imported here, so reading the parameters costs no numpy.
 """

@@ -11,12 +11,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import PlantParameters
 
 Vector: TypeAlias = NDArray[np.float64]  # shape (n,)
 Matrix: TypeAlias = NDArray[np.float64]  # shape (m, n)
 
-N = 12  # a panel one servo time constant long is then right to about 1e-10
+N = 12  # a segment one servo time constant long is then right to about 1e-10
 
 _X, _W = np.polynomial.legendre.leggauss(N)  # on −1 … 1
 NODES: Vector = 0.5 * (_X + 1.0)
@@ -34,7 +34,7 @@ _POWER_INTEGRALS: Matrix = 0.5 * (_X[:, None] ** _DEGREES - (-1.0) ** _DEGREES) 
 _ONCE: Matrix = _POWER_INTEGRALS @ _COEFFICIENTS  # (N, N), from 0 to each node
 _IDENTITY: Matrix = np.eye(N)
 
-# From α̈ at the nodes of a panel of unit length to [α, α̇, α̈ at the nodes; α, α̇ at the end], from
+# From α̈ at the nodes of a segment of unit length to [α, α̇, α̈ at the nodes; α, α̇ at the end], from
 # rest; each row is an integral of the order below, so it grows as that power of the length.
 _INTEGRALS: Matrix = np.vstack((_ONCE @ _ONCE, _ONCE, _IDENTITY, WEIGHTS * (1.0 - NODES), WEIGHTS))
 _ORDERS: Vector = np.repeat([2.0, 1.0, 0.0, 2.0, 1.0], [N, N, N, 1, 1])
@@ -53,7 +53,7 @@ _FINE: Vector = np.linspace(0.0, 1.0, 129)
 _TO_FINE: Matrix = _interpolation(_FINE).T
 
 
-class Panel:
+class Segment:
     """What the fin makes of a drive during `length` seconds, for one set of parameters.
 
     Attributes:
@@ -71,7 +71,7 @@ class Panel:
     def __init__(
         self, parameters: PlantParameters, length: float, instants: Sequence[float]
     ) -> None:
-        """Prepare a panel of `length` s, to be sampled at `instants` (s, from its start)."""
+        """Prepare a segment of `length` s, to be sampled at `instants` (s, from its start)."""
         friction = parameters.xi * parameters.omega0
         stiffness = parameters.omega0**2
         servo_rate = parameters.servo_speed / parameters.servo_lag
@@ -103,7 +103,7 @@ class Panel:
         return self.response[3 * N : 3 * N + 2, :2]
 
     def peak(self, response: Vector) -> float:
-        """Return the largest |α| (rad) within the panel, given the product `self.response @ …`."""
+        """Return the largest |α| (rad) within it, given the product `self.response @ …`."""
         angle, rate, acceleration = response[: 3 * N].reshape(3, N) @ _TO_FINE
         k = int(np.argmax(np.abs(angle)))
         if acceleration[k] == 0.0:

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.servo import lag_after_reversal
-from fishd.plant.tethered import PlantState, TetheredFish, Window
+from fishd.virtual.plant.drive_train import lag_after_reversal
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import PlantState, TetheredFish, Window
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _PRECISION = 1e-4  # of the best frequency, relative; the thrust is flat there
@@ -103,8 +103,8 @@ def _half_period(parameters: PlantParameters, amplitude: float, frequency: float
     from_rest = fish.advance(amplitude, half_period, samples=1)
     forced = (fish.state.alpha, fish.state.alpha_rate)
     free = np.eye(2)
-    for panel, _ in from_rest.course:
-        free = panel.free_motion @ free
+    for segment, _ in from_rest.course:
+        free = segment.free_motion @ free
     alpha, rate = np.linalg.solve(free + np.eye(2), np.negative(forced)).tolist()
     fish.state = PlantState(swing - lag, alpha, rate)
     fish.cables.tail = tail

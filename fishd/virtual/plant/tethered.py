@@ -1,7 +1,7 @@
 """The fish on its force sensor, advanced by whole windows of constant instruction angle.
 
 The simulated hardware and the theory of optimum controls both drive it. A window is integrated to
-about 1e-9 in one step: the servo in closed form, the fin by collocation on a few panels.
+about 1e-9 in one step: the servo in closed form, the fin by collocation on a few segments.
 """
 
 import math
@@ -14,19 +14,17 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from fishd.plant.cables import Cables
-from fishd.plant.delay import DelayLine
-from fishd.plant.panel import NODES, WEIGHTS, N, Panel, Vector
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.servo import log_sinh, relax, time_between
+from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
+from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
+from fishd.virtual.plant.parameters import PlantParameters
 
 # Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
-# the last it stands, both to the last digit; in between, panels shorten towards the transition.
+# the last it stands, both to the last digit; in between, segments shorten towards the transition.
 _TRANSITION = (-20, -10, -6, -4, -2.5, -1.5, -0.5, 0.5, 1.5, 3, 5, 8, 12, 20, 37)
-_GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer panels graded than equal
-_FIN_REACH = 3.0  # panel length, in units of the fin's shortest time, that N nodes resolve
-_LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all panel long
-_ROUNDING = 1e-9  # a window of exactly one servo time constant stays one panel
+_GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer segments graded than equal
+_FIN_REACH = 3.0  # segment length, in units of the fin's shortest time, that N nodes resolve
+_LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all segment long
+_ROUNDING = 1e-9  # a window of exactly one servo time constant stays one segment
 _REACTION_TIME = 0.01  # of the mount that passes the servo's reaction on to the sensor, s
 
 
@@ -50,7 +48,7 @@ class Window(Struct, frozen=True, eq=False):
         lateral_force: mean of F_y over the window, N.
         sampled_thrust: mean of F_x at the midpoints of equal parts of the window, N.
         sampled_lateral_force: mean of F_y at the same instants, N.
-        course: the panels of the window and the fin's response in each, for `fin_peak`.
+        course: the segments of the window and the fin's response in each, for `fin_peak`.
     """
 
     duration: float
@@ -58,12 +56,12 @@ class Window(Struct, frozen=True, eq=False):
     lateral_force: float
     sampled_thrust: float
     sampled_lateral_force: float
-    course: Sequence[tuple[Panel, Vector]]
+    course: Sequence[tuple[Segment, Vector]]
 
     @property
     def fin_peak(self) -> float:
         """Largest |α| within the window, rad; worked out when asked for."""
-        return max(panel.peak(response) for panel, response in self.course)
+        return max(segment.peak(response) for segment, response in self.course)
 
 
 class TrueWindow(NamedTuple):
@@ -91,9 +89,9 @@ class TetheredFish:
         self.state = state
         self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
         self._servo_time = parameters.servo_lag / parameters.servo_speed
-        self._fin_panel = _FIN_REACH / (parameters.omega0 * max(1.0, parameters.xi))
-        self._panel = lru_cache(maxsize=512)(lambda *key: Panel(parameters, *key))
-        self._equal_panels = lru_cache(maxsize=64)(self._panels)
+        self._fin_segment = _FIN_REACH / (parameters.omega0 * max(1.0, parameters.xi))
+        self._segment = lru_cache(maxsize=512)(lambda *key: Segment(parameters, *key))
+        self._equal_segments = lru_cache(maxsize=64)(self._segments)
         self._cause: Vector = np.zeros(N + 3)
         self._line = DelayLine(parameters.servo_delay) if parameters.servo_delay else None
         self._momentum = 0.0
@@ -125,7 +123,7 @@ class TetheredFish:
             sum(w.lateral_force * w.duration for w in windows) / duration,
             sum(w.sampled_thrust for w in windows),
             sum(w.sampled_lateral_force for w in windows),
-            [panel for w in windows for panel in w.course],
+            [segment for w in windows for segment in w.course],
         )
 
     def _swim(
@@ -142,22 +140,22 @@ class TetheredFish:
         command = phi if angle is None else self._reached(angle, phi)
         lag = (command - phi) / p.servo_lag
         cuts = self._cuts(command, phi, lag, duration) if lag else ()
-        panels = (
-            self._panels(whole, samples, part, cuts)
+        segments = (
+            self._segments(whole, samples, part, cuts)
             if cuts
-            else self._equal_panels(whole, samples, part)
+            else self._equal_segments(whole, samples, part)
         )
 
         cause = self._cause
         course = []
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
         momentum = self._momentum
-        for panel in panels:
+        for segment in segments:
             cause[0], cause[1] = alpha, rate
-            lag = self._drive(panel, command, lag)
-            response = panel.response.dot(cause)  # half the overhead of @
-            course.append((panel, response))
-            integral, total = panel.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
+            lag = self._drive(segment, command, lag)
+            response = segment.response.dot(cause)  # half the overhead of @
+            course.append((segment, response))
+            integral, total = segment.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
             alpha, rate, total_acceleration, total_rate = response[3 * N :].tolist()
             thrust -= integral
             sampled_thrust -= total
@@ -184,30 +182,30 @@ class TetheredFish:
             return angle
         return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
-    def _drive(self, panel: Panel, command: float, lag: float) -> float:
-        """Write what drives the fin during the panel into the cause; return the lag at its end."""
+    def _drive(self, segment: Segment, command: float, lag: float) -> float:
+        """Put what drives the fin meanwhile into the cause; return the lag at its end."""
         p = self.parameters
         cause = self._cause
         nodes = cause[3:]
         if abs(lag) < _LINEAR_LAG:
             sinh = math.sinh(lag)
-            np.multiply(panel.node_decay, sinh, out=nodes)
+            np.multiply(segment.node_decay, sinh, out=nodes)
             np.arcsinh(nodes, out=nodes)
-            later = math.asinh(panel.decay * sinh)
+            later = math.asinh(segment.decay * sinh)
         else:
-            np.subtract(lag, math.copysign(1.0, lag) * panel.node_times, out=nodes)
-            later = relax(lag, panel.length / self._servo_time)
+            np.subtract(lag, math.copysign(1.0, lag) * segment.node_times, out=nodes)
+            later = relax(lag, segment.length / self._servo_time)
         if p.servo_reaction:
-            self._react(panel, nodes)
+            self._react(segment, nodes)
         cause[2] = p.coupling * command
         if not self.cables.taut:
-            self._pull(panel, command, lag, later)
+            self._pull(segment, command, lag, later)
         return later
 
-    def _pull(self, panel: Panel, command: float, lag: float, later: float) -> None:
-        """Take backlash and slack off what the wheel does to the fin during the panel."""
+    def _pull(self, segment: Segment, command: float, lag: float, later: float) -> None:
+        """Take backlash and slack off what the wheel does to the fin during the segment."""
         p, cause = self.parameters, self._cause
-        halfway = relax(lag, 0.5 * panel.length / self._servo_time)
+        halfway = relax(lag, 0.5 * segment.length / self._servo_time)
         moves, angle = self.cables.pull(
             command - p.servo_lag * halfway, command - p.servo_lag * later
         )
@@ -216,16 +214,16 @@ class TetheredFish:
         else:
             cause[2], cause[3:] = p.coupling * angle, 0.0
 
-    def _react(self, panel: Panel, lags: Vector) -> None:
-        """Add what the wheel's acceleration passes on during the panel; lags: at its nodes."""
+    def _react(self, segment: Segment, lags: Vector) -> None:
+        """Add what the wheel's acceleration passes on during the segment; lags: at its nodes."""
         p = self.parameters
-        left = np.exp((NODES - 1.0) * (panel.length / _REACTION_TIME))
-        pushed = float((WEIGHTS * left).dot(np.tanh(lags))) * panel.length / _REACTION_TIME
-        self._momentum *= math.exp(-panel.length / _REACTION_TIME)
+        left = np.exp((NODES - 1.0) * (segment.length / _REACTION_TIME))
+        pushed = float((WEIGHTS * left).dot(np.tanh(lags))) * segment.length / _REACTION_TIME
+        self._momentum *= math.exp(-segment.length / _REACTION_TIME)
         self._momentum -= p.servo_reaction * p.servo_speed * pushed
 
     def _cuts(self, command: float, phi: float, lag: float, duration: float) -> list[float]:
-        """Return the times (s) within the part at which no panel may go on."""
+        """Return the times (s) within the part at which no segment may go on."""
         p, unit = self.parameters, self._servo_time
         cuts = []
         if duration > _GRADED_FROM * unit:
@@ -237,18 +235,18 @@ class TetheredFish:
                     cuts.append(unit * time_between(lag, (command - edge) / p.servo_lag))
         return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
 
-    def _panels(
+    def _segments(
         self, whole: float, samples: int, part: tuple[float, float], cuts: Sequence[float] = ()
-    ) -> tuple[Panel, ...]:
-        """Return the panels of a part of a window, each with the sample instants in it."""
+    ) -> tuple[Segment, ...]:
+        """Return the segments of a part of a window, each with the sample instants in it."""
         duration = part[1] - part[0]
-        longest = self._fin_panel
+        longest = self._fin_segment
         if duration <= _GRADED_FROM * self._servo_time:
             longest = min(longest, self._servo_time)
         if self.parameters.servo_reaction:
             longest = min(longest, 5.0 * _REACTION_TIME)
         instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]
-        panels: list[Panel] = []
+        segments: list[Segment] = []
         taken = bisect_left(instants, 0.0)
         for start, end in pairwise((0.0, *cuts, duration)):
             count = max(1, math.ceil((end - start) / longest - _ROUNDING))
@@ -256,6 +254,6 @@ class TetheredFish:
             for k in range(count):
                 upto = bisect_left(instants, start + (k + 1) * length if k + 1 < count else end)
                 inside = tuple(t - (start + k * length) for t in instants[taken:upto])
-                panels.append(self._panel(length, inside))
+                segments.append(self._segment(length, inside))
                 taken = upto
-        return tuple(panels)
+        return tuple(segments)

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import Rig
-from policy_files import write
+from rigs.harness import Rig
+from rigs.policy_files import write
 
 from fishd.config import load
 from fishd.controllers.swing import Swing
-from fishd.signals import Tick
+from fishd.core.signals import Tick
 from fishd.simulation import simulate
 
 HARSH = {
@@ -67,12 +67,12 @@ def test_a_policy_that_insists_loses_command_to_swing_within_two_seconds(
         "chatter",
     )
     assert event.message == (
-        "swing takes over with C=0.6, amplitude=0.42, longest_half_period=1.0: ppo lost command: "
+        "swing takes over with C=0.6, amplitude=0.42, longest_half_period=1.0: ppo gave up: "
         "in 30 of the last 40 ticks it wanted to reverse sooner than 0.2 s after its last reversal"
     )
     assert event.message in caplog.text
-    assert rig.loop.fallback
-    assert rig.loop.fallback.code == "chatter"
+    assert rig.loop.active.fallback
+    assert rig.loop.active.fallback.code == "chatter"
     assert rig.loop.observation
     assert rig.loop.observation.frequency == pytest.approx(1.7, abs=0.2)  # and it swims
 
@@ -80,7 +80,7 @@ def test_a_policy_that_insists_loses_command_to_swing_within_two_seconds(
 def test_it_is_a_fault_where_that_is_configured(tmp_path: Path) -> None:
     rig = flipping(tmp_path, "chatter.fallback=fault")
     rig.run_for(3.0)
-    assert (rig.mode, rig.reason, rig.loop.controller_name) == ("fault", "chatter", "hold")
+    assert (rig.mode, rig.reason, rig.loop.active.name) == ("fault", "chatter", "hold")
     assert rig.loop.supervisor.reason
     assert rig.loop.supervisor.reason.message.startswith("controller ppo gave up: in 30 of the ")
 
@@ -95,13 +95,13 @@ def test_patience_and_dwell_are_those_of_the_configuration(tmp_path: Path) -> No
 def test_who_is_put_in_command_again_starts_anew(tmp_path: Path) -> None:
     rig = flipping(tmp_path)
     rig.run_for(5.0)
-    assert rig.loop.controller_name == "swing"
+    assert rig.loop.active.name == "swing"
     rig.start("ppo", policy=str(write(tmp_path)))
     assert {tick.controller for tick in rig.run_for(1.9)} == {"ppo"}
-    assert rig.loop.fallback is None
+    assert rig.loop.active.fallback is None
     assert rig.run_for(0.2)[-1].controller == "swing"
     rig.loop.stop()
-    assert rig.loop.fallback is None
+    assert rig.loop.active.fallback is None
 
 
 def test_the_tick_of_the_take_over_builds_nothing(
@@ -114,13 +114,13 @@ def test_the_tick_of_the_take_over_builds_nothing(
 
     monkeypatch.setattr(Swing, "__init__", never)
     rig.run_for(3.0)
-    assert (rig.mode, rig.loop.controller_name) == ("running", "swing")
+    assert (rig.mode, rig.loop.active.name) == ("running", "swing")
 
 
-def test_rehearsals_are_no_reversals(tmp_path: Path) -> None:
+def test_warm_ups_are_no_reversals(tmp_path: Path) -> None:
     rig = flipping(tmp_path)
     for _ in range(100):
-        rig.loop.rehearse()
+        rig.loop.warm_up()
     assert [tick.phi_c for tick in rig.run(5)] == [0.42] * 4 + [-0.42]
 
 
@@ -143,6 +143,7 @@ def test_controllers_that_know_when_to_reverse_are_not_limited(name: str) -> Non
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fish", HARSH.values(), ids=HARSH)
 def test_the_shipped_policy_does_not_shake_the_servo_of_a_harsh_fish(fish: tuple[str, ...]) -> None:
     rig = Rig(*NOISY, *fish)
@@ -169,4 +170,4 @@ def test_the_shipped_policy_loses_nothing_on_its_own_fish() -> None:
 def test_a_report_says_that_another_controller_took_over(tmp_path: Path) -> None:
     report = simulate(load(), "ppo", {"policy": str(write(tmp_path))})
     assert report.fallback
-    assert report.fallback.message.startswith("ppo lost command: in 30 of the last 40 ticks")
+    assert report.fallback.message.startswith("ppo gave up: in 30 of the last 40 ticks")

@@ -5,11 +5,11 @@ import random
 import onnx
 import pytest
 from onnx import helper
-from policy_files import FLIP, card, random_layers
+from rigs.policy_files import FLIP, card, random_layers
 
-from fishd.errors import PolicyError
-from fishd.policies import checksum, file, library
-from fishd.policies.network import to_onnx
+from fishd.controllers.policy import checksum, file, library
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import PolicyError
 
 DEFAULT = library.find("default-fish").read_bytes()
 

@@ -1,10 +1,10 @@
 """docs/policies.md against the program."""
 
-from documents import ROOT, first_cells, text_of
+from rigs.documents import ROOT, first_cells, text_of
 
-from fishd.policies import checksum, file, library, operators
-from fishd.policies.card import FORMAT, KEY, Card, Provenance
-from fishd.schema import fields_of
+from fishd.controllers.policy import checksum, file, library, operators
+from fishd.controllers.policy.card import FORMAT, KEY, Card, Provenance
+from fishd.core.schema import fields_of
 
 DOCUMENT = ROOT / "docs" / "policies.md"
 

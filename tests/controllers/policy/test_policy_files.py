@@ -14,13 +14,13 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from policy_files import FLIP, card, random_layers, write
+from rigs.policy_files import FLIP, card, random_layers, write
 
-from fishd.errors import PolicyError
-from fishd.policies import file
-from fishd.policies.card import KEY, encode
-from fishd.policies.checksum import sealed
-from fishd.policies.network import to_onnx
+from fishd.controllers.policy import file
+from fishd.controllers.policy.card import KEY, encode
+from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import PolicyError
 
 Change = Callable[[Any], None]
 
@@ -59,7 +59,9 @@ class Trap:
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) -> None:
     path = write(tmp_path, pickle.dumps(Trap(tmp_path / "trace"), protocol))
-    expected = "this is a pickle, which could run any code" if protocol >= 2 else "no ONNX model"
+    expected = (
+        "this is a pickle, which could run any code" if protocol >= 2 else "not an ONNX model"
+    )
     with pytest.raises(PolicyError, match=expected):
         file.read(path)
     assert not (tmp_path / "trace").exists()
@@ -84,7 +86,7 @@ def test_an_archive_of_torch_or_stable_baselines_is_refused_and_never_unpickled(
 @pytest.mark.parametrize("content", [b"", b"\x00", b"hello fish", b"\x08\x07" * 9, os.urandom(999)])
 def test_what_is_no_onnx_is_refused(content: bytes) -> None:
     assert refusal(b"\x01" + content) == (
-        "this is no ONNX model; export it with 'fishctl learn export'"
+        "this is not an ONNX model; export it with 'fishctl learn export'"
     )
 
 
@@ -98,8 +100,8 @@ def test_a_file_without_a_card_is_refused() -> None:
         del model.metadata_props[:]
 
     assert refusal(changed(strip)) == (
-        "this ONNX file says nothing about observation, tick and Φ, without which it cannot be "
-        "run: its metadata lacks fishd.card; export it with 'fishctl learn export'"
+        "this ONNX file does not say for which observation, tick and Φ it was trained: its "
+        "metadata lacks fishd.card; export it with 'fishctl learn export'"
     )
 
 
@@ -116,8 +118,8 @@ def test_two_cards_are_refused() -> None:
         ({"format": 3}, "its card has format 3; this fishd reads format 2"),
         (
             {"format": 1},
-            "its card has format 1; this fishd reads format 2: it is of an older fishd; train and "
-            "export it again",
+            "its card has format 1; this fishd reads format 2: it was written by an older fishd; "
+            "train and export it again",
         ),
         ({"format": None}, "its card has format null; this fishd reads format 2"),
         ({"tick": None}, "its card: tick: is missing: a number in [1e-30, 1e+30] is needed"),
@@ -151,10 +153,10 @@ def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], mes
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "is no JSON: "),
-        ("NaN", "is no JSON: "),
-        ("[1]", "is no JSON object"),
-        ('"', "is no JSON: "),
+        ("", "is not JSON: "),
+        ("NaN", "is not JSON: "),
+        ("[1]", "is not a JSON object"),
+        ('"', "is not JSON: "),
         ("[" * 50_000, "is JSON that is nested too deeply"),
         ('{"provenance":' * 100 + "1" + "}" * 100, "is JSON that is nested too deeply"),
         (" " * 100_000, "has 100000 letters; 65536 are the most"),
@@ -296,8 +298,8 @@ def test_a_service_says_where_a_file_that_it_cannot_see_belongs(
     with pytest.raises(PolicyError) as caught:
         file.read(Path("/home/nobody-here/swim.onnx"))
     assert str(caught.value) == (
-        "/home/nobody-here/swim.onnx: no such file that this fishd could see: it is a service, put "
-        "the file into /var/lib/fishd/policies and give its name"
+        "/home/nobody-here/swim.onnx: no such file: this fishd is a service that sees no home "
+        "folders; put the file into /var/lib/fishd/policies and give its name"
     )
 
 

@@ -4,14 +4,14 @@ import os
 from pathlib import Path
 
 import pytest
-from harness import LIMITS
-from policy_files import card, linear, write
+from rigs.harness import LIMITS
+from rigs.policy_files import card, linear, write
 
 import fishd
 from fishd.controllers import registry
-from fishd.errors import ParameterError, PolicyError
-from fishd.policies import library
-from fishd.policies.network import to_onnx
+from fishd.controllers.policy import library
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import ParameterError, PolicyError
 
 
 @pytest.fixture(autouse=True)
@@ -89,7 +89,7 @@ def test_where_there_are_none_it_says_where_to_put_one(tmp_path: Path) -> None:
     with pytest.raises(PolicyError) as caught:
         library.find("swim")
     assert str(caught.value) == (
-        "no policy is named 'swim', there are none at all; put one into "
+        "no policy is named 'swim', and no other was found; put one into "
         f"{tmp_path}/state/fishd/policies, or give the path of a .onnx file"
     )
 

@@ -6,11 +6,11 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from policy_files import answer, card, linear, random_layers
+from rigs.policy_files import answer, card, linear, random_layers
 
-from fishd.errors import PolicyError
-from fishd.policies import file
-from fishd.policies.network import to_onnx
+from fishd.controllers.policy import file
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import PolicyError
 
 FEATURES = (("fy", 0.02), ("fy_rate", 0.3), ("instruction_angle", 0.42), ("fin_velocity", 0.002))
 
@@ -49,9 +49,9 @@ def test_an_old_onnxruntime_can_read_it_and_the_same_policy_is_the_same_bytes() 
 
 
 def test_layers_that_do_not_fit_one_another_or_the_card_are_refused() -> None:
-    with pytest.raises(PolicyError, match=r"layer 0: weights \(1, 2\) .* do not go with 1 inputs"):
+    with pytest.raises(PolicyError, match=r"layer 0: weights \(1, 2\) .* do not fit 1 inputs"):
         to_onnx(linear(1.0, 2.0), "tanh", card())
-    with pytest.raises(PolicyError, match=r"layer 1: weights \(1, 8\) .* do not go with 4 inputs"):
+    with pytest.raises(PolicyError, match=r"layer 1: weights \(1, 8\) .* do not fit 4 inputs"):
         to_onnx([*random_layers(1, 4), *random_layers(8, 1)], "tanh", card())
     with pytest.raises(PolicyError, match="at least one layer"):
         to_onnx([], "tanh", card())

@@ -11,14 +11,14 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from policy_files import card, random_layers, write
+from rigs.policy_files import card, random_layers, write
 
-from fishd.errors import PolicyError
-from fishd.policies import file, operators
-from fishd.policies.card import KEY, encode
-from fishd.policies.checksum import sealed
-from fishd.policies.network import to_onnx
-from fishd.policies.runtime import Network
+from fishd.controllers.policy import file, operators
+from fishd.controllers.policy.card import KEY, encode
+from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.runtime import Network
+from fishd.core.errors import PolicyError
 
 make = helper.make_node
 TRUE = numpy_helper.from_array(np.array(True), "true")
@@ -209,7 +209,7 @@ def test_a_network_that_takes_more_than_half_a_tick_is_refused_with_its_time(
     with pytest.raises(PolicyError) as caught:
         Network(file.read(path))
     expected = (
-        r": this machine takes [\d.e+]+ ms for one answer of it, more than half of its tick of "
+        r": this machine takes [\d.e+]+ ms to run it once, more than half of its tick of "
         r"2 ms; train a smaller network"
     )
     assert re.fullmatch(re.escape(str(path)) + expected, str(caught.value))

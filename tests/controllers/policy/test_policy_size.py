@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.errors import PolicyError
-from fishd.policies import bulk, library
-from fishd.policies.file import LARGEST, parse
+from fishd.controllers.policy import library, size_check
+from fishd.controllers.policy.file import LARGEST, parse
+from fishd.core.errors import PolicyError
 
 
 def field(number: int, content: bytes) -> bytes:
@@ -38,28 +38,28 @@ BOMBS = {
 
 @pytest.mark.parametrize("content", BOMBS.values(), ids=BOMBS)
 def test_millions_of_short_messages_are_refused_before_protobuf_sees_them(content: bytes) -> None:
-    with pytest.raises(PolicyError, match="256 kB of it are no raw weights"):
+    with pytest.raises(PolicyError, match="256 kB of it are not raw weights"):
         parse(content)
 
 
 def test_weights_do_not_count() -> None:
-    bulk.check(HEAD + field(7, field(5, field(9, bytes(10 * 2**20)))))
+    size_check.check(HEAD + field(7, field(5, field(9, bytes(10 * 2**20)))))
 
 
 def test_the_policy_that_comes_with_fishd_is_far_below_the_limit() -> None:
     content = library.find("default-fish").read_bytes()
-    bulk.check(content + field(14, bytes(200 * 2**10)))
+    size_check.check(content + field(14, bytes(200 * 2**10)))
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_counted_or_refused(content: bytes) -> None:
     try:
-        bulk.check(content)
-    except bulk.Broken:
+        size_check.check(content)
+    except size_check.Broken:
         return
 
 
 @pytest.mark.parametrize("content", [b"\x0a", b"\x0a\x05abc", b"\x0b", b"\xff" * 11, b"\x09abc"])
 def test_what_breaks_off_is_no_model(content: bytes) -> None:
-    with pytest.raises(PolicyError, match="this is no ONNX model"):
+    with pytest.raises(PolicyError, match="this is not an ONNX model"):
         parse(content)

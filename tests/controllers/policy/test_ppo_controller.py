@@ -1,7 +1,6 @@
 """The controller `ppo`: a policy in the loop, and which policies it refuses."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,18 +8,18 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from harness import LIMITS, Rig, observe
 from onnx import TensorProto, helper, numpy_helper
-from policy_files import FLIP, answer, card, linear, random_layers, write
-from processes import FISHCTL
+from rigs.harness import LIMITS, Rig, observe
+from rigs.policy_files import FLIP, answer, card, linear, random_layers, write
+from rigs.processes import FISHCTL, call
 
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
-from fishd.errors import ConfigError, ParameterError
-from fishd.policies.card import KEY, Card, encode
-from fishd.policies.checksum import sealed
-from fishd.policies.network import to_onnx
+from fishd.controllers.policy.card import KEY, Card, encode
+from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import ConfigError, ParameterError
 from fishd.simulation import simulate
 
 
@@ -79,14 +78,14 @@ def test_a_virtual_fish_can_be_simulated_with_a_policy(tmp_path: Path) -> None:
     assert report.frequency == pytest.approx(10.0)
 
 
-def test_a_rehearsal_changes_nothing(tmp_path: Path) -> None:
+def test_a_warm_up_changes_nothing(tmp_path: Path) -> None:
     layers = random_layers(1, 8, 1)
     path = write(tmp_path, to_onnx(layers, "tanh", card()))
-    rehearsed, plain = made(path), made(path)
-    rehearsed.rehearse()
+    warmed, plain = made(path), made(path)
+    warmed.warm_up()
     for angle in (0.1, -0.3, 0.42):
-        assert rehearsed.update(observe(angle)) == plain.update(observe(angle))
-        rehearsed.rehearse()
+        assert warmed.update(observe(angle)) == plain.update(observe(angle))
+        warmed.warm_up()
 
 
 def hand_made(nodes: list[Any], numbers: dict[str, float], about: Card) -> bytes:
@@ -223,13 +222,7 @@ def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path
     path = write(tmp_path, to_onnx(linear(0.5), "tanh", card()))
     home = tmp_path / "home"
     home.mkdir()
-    run = subprocess.run(
-        [FISHCTL, "simulate", "ppo", "--policy", str(path)],
-        env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": "", "XDG_STATE_HOME": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
+    environment = {**os.environ, "HOME": str(home), "XDG_CACHE_HOME": "", "XDG_STATE_HOME": ""}
+    run = call(FISHCTL, "simulate", "ppo", "--policy", str(path), env=environment)
     assert (run.returncode, run.stderr) == (0, "")
     assert list(home.iterdir()) == []

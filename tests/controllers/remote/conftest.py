@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import Rig
-from scripted_agent import ScriptedAgent
+from rigs.harness import Rig
+from rigs.scripted_agent import ScriptedAgent
 
 SLOW = ("tick=0.2",)
 """A tick with a deadline of 80 ms, so that a busy machine does not spoil a test."""

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 import zmq
-from harness import Rig
-from processes import running
+from rigs.harness import Rig
+from rigs.processes import running
 
 from fishd.client import Agent, Fish, FishError, NoDaemon
-from fishd.errors import ParameterError
-from fishd.signals import Tick
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Tick
 
 PATIENCE = 20.0
 
@@ -169,7 +169,7 @@ def test_when_another_controller_takes_over_it_says_so(tmp_path: Path) -> None:
         while not agent.poll(0.01):
             rig.run()
         rig.start("hold")
-        with pytest.raises(NoDaemon, match="another controller is in command, or none"):
+        with pytest.raises(NoDaemon, match="another controller is active, or none"):
             agent.observe()
 
 

@@ -6,13 +6,13 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from harness import LIMITS, Rig
-from scripted_agent import ScriptedAgent, connect, reason
+from rigs.harness import LIMITS, Rig
+from rigs.scripted_agent import ScriptedAgent, connect, reason
 
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.errors import ConfigError, ParameterError
-from fishd.remote.wire import Wire
+from fishd.controllers.remote.wire import Wire
+from fishd.core.errors import ConfigError, ParameterError
 
 
 def test_an_action_is_in_force_in_the_tick_whose_observation_it_answers(
@@ -63,7 +63,7 @@ def test_silence_is_neutral_and_after_some_ticks_a_fault(rig: Rig, agent: Script
         f"controller remote gave up: the agent at {agent.address} has not answered within 30 ms, "
         "5 ticks in a row (0 answers came too late)"
     )
-    assert rig.loop.controller_name == "hold"
+    assert rig.loop.active.name == "hold"
 
 
 def test_one_answer_in_time_forgives_the_silence_before(rig: Rig, agent: ScriptedAgent) -> None:
@@ -148,6 +148,7 @@ def test_a_pause_is_neutral_and_silent_and_ends_when_it_is_told(
     assert rig.mode == "running"
 
 
+@pytest.mark.realtime
 def test_a_pause_in_place_of_an_action_ends_the_wait(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=1)
     with agent.answering(lambda seen: agent.pause(1.0)):
@@ -198,6 +199,7 @@ def test_each_take_over_has_a_session_of_its_own_whose_end_is_told(
     assert ended == [first, second]
 
 
+@pytest.mark.realtime
 def test_an_agent_that_does_not_read_costs_no_time(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, deadline=1e-4, first_action=3600.0)
     begun = time.monotonic()
@@ -255,7 +257,7 @@ def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to(address: 
 def test_deadlines_change_in_command_but_not_the_agent(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
     rig.retune(misses=7)
-    assert rig.loop.controller.parameters.misses == 7
+    assert rig.loop.active.controller.parameters.misses == 7
     with pytest.raises(ParameterError, match=r"set-controller remote --agent tcp://"):
         rig.retune(agent="tcp://127.0.0.1:9873")
 

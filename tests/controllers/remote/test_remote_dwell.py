@@ -1,7 +1,7 @@
 """The shortest dwell that `remote` may be given: off by default, and who takes over."""
 
-from harness import Rig
-from scripted_agent import ScriptedAgent
+from rigs.harness import Rig
+from rigs.scripted_agent import ScriptedAgent
 
 
 def flip(agent: ScriptedAgent, seen: dict[str, float]) -> dict[str, object]:
@@ -15,7 +15,7 @@ def test_without_a_dwell_an_agent_may_reverse_in_every_tick(
     with agent.answering(lambda seen: flip(agent, seen)):
         angles = [tick.phi_c for tick in still.run(100)]
     assert angles == [0.42, -0.42] * 50
-    assert still.loop.controller_name == "remote"
+    assert still.loop.active.name == "remote"
 
 
 def test_with_a_dwell_its_reversals_wait(still: Rig, agent: ScriptedAgent) -> None:
@@ -44,8 +44,10 @@ def test_an_agent_that_insists_loses_command_to_swing_and_is_told(
     with agent.answering(lambda seen: flip(agent, seen)):
         ticks = still.run(60)
     assert ([tick.controller for tick in ticks].index("swing"), ticks[-1].mode) == (39, "running")
-    assert still.loop.fallback
-    assert still.loop.fallback.message.startswith("remote lost command: in 30 of the last 40 ticks")
+    assert still.loop.active.fallback
+    assert still.loop.active.fallback.message.startswith(
+        "remote gave up: in 30 of the last 40 ticks"
+    )
     agent.drain()
     assert agent.seen[-1]["kind"] == "ended"
 

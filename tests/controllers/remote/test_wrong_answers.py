@@ -5,8 +5,8 @@ import time
 from typing import Any
 
 import pytest
-from harness import Rig
-from scripted_agent import ScriptedAgent, connect, reason
+from rigs.harness import Rig
+from rigs.scripted_agent import ScriptedAgent, connect, reason
 
 
 def spoiled(**changes: Any) -> dict[str, Any]:
@@ -16,7 +16,7 @@ def spoiled(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("rubbish", "complaint"),
     [
-        (b"\xff\x00", "which is no action or pause"),
+        (b"\xff\x00", "which is neither an action nor a pause"),
         (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
         (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
         (spoiled(phi_c="0.1"), "Expected `float`, got `str` - at `$.phi_c`"),
@@ -69,6 +69,7 @@ def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
     assert len(reason(rig)) < 450
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("seq", [-3, 0, 2, 8, 10**18])
 def test_an_action_for_what_was_never_sent_is_a_fault(
     rig: Rig, agent: ScriptedAgent, seq: int

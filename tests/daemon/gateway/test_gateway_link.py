@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.gateway import link
+from fishd.daemon.gateway import link
 
 
 @given(topic=st.sampled_from([b"tick", b"event", b"status"]), payload=st.binary())

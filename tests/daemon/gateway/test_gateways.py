@@ -5,20 +5,19 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import zmq
-from processes import PATIENCE, Daemon, Subscriber, running
+from rigs.documents import ROOT
+from rigs.processes import PATIENCE, Daemon, Subscriber, call, running, wait_until
 
 from fishd.client import Fish
-from fishd.signals import Status
 
-ATTACKERS = str(Path(__file__).parents[2] / "tools" / "attackers.py")
+ATTACKERS = ROOT / "tools" / "reliability" / "attackers.py"
 
 
 @pytest.fixture
@@ -35,14 +34,9 @@ def gateways(daemon: Daemon) -> dict[str, int]:
     for child in children:
         with contextlib.suppress(FileNotFoundError):
             arguments = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
-            if b"fishd.gateway" in arguments:
-                found[arguments[arguments.index(b"fishd.gateway") + 1].decode()] = int(child)
+            if b"fishd.daemon.gateway" in arguments:
+                found[arguments[arguments.index(b"fishd.daemon.gateway") + 1].decode()] = int(child)
     return found
-
-
-def status(daemon: Daemon) -> Status:
-    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        return fish.status()
 
 
 def gone(pid: int) -> bool:
@@ -53,13 +47,7 @@ def gone(pid: int) -> bool:
         return True
 
 
-def wait_until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
+@pytest.mark.realtime
 def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry) as subscriber:
         subscriber.until(mode="running")
@@ -70,7 +58,7 @@ def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(daemon: 
         "the gateway of telemetry was started again: its process ended with status -9"
     )
     assert tick["missed"] == 0
-    assert status(daemon).counters["telemetry_restarts"] == 1
+    assert daemon.status().counters["telemetry_restarts"] == 1
 
 
 def test_while_the_gateway_of_telemetry_is_gone_requests_are_answered(daemon: Daemon) -> None:
@@ -83,16 +71,17 @@ def test_while_the_gateway_of_telemetry_is_gone_requests_are_answered(daemon: Da
 def test_a_client_of_a_gateway_that_died_is_answered_by_the_next_one(daemon: Daemon) -> None:
     os.kill(gateways(daemon)["control"], signal.SIGKILL)
     wait_until(lambda: "control" in gateways(daemon))
-    assert status(daemon).counters["control_restarts"] == 1
+    assert daemon.status().counters["control_restarts"] == 1
 
 
+@pytest.mark.realtime
 def test_gateways_that_hang_cost_messages_but_no_tick(tmp_path: Path) -> None:
     with running(tmp_path, "--set", "tick=0.005", "--set", "start.controller=swing") as daemon:
-        before = status(daemon)
+        before = daemon.status()
         hung = gateways(daemon)["telemetry"]
         os.kill(hung, signal.SIGSTOP)
-        wait_until(lambda: status(daemon).counters["telemetry_lost"] > 0)
-        after = status(daemon)
+        wait_until(lambda: daemon.status().counters["telemetry_lost"] > 0)
+        after = daemon.status()
         assert after.missed - before.missed <= 0.02 * (after.seq - before.seq)
         assert after.mode == "running"
         os.kill(gateways(daemon)["control"], signal.SIGSTOP)
@@ -121,11 +110,8 @@ def test_a_signal_for_the_whole_group_leaves_the_gateways_to_fishd(daemon: Daemo
 
 
 def attack(name: str, daemon: Daemon, seconds: float) -> None:
-    subprocess.run(
-        [sys.executable, ATTACKERS, name, daemon.telemetry, daemon.endpoint, str(seconds)],
-        check=True,
-        timeout=3 * PATIENCE,
-    )
+    attacker = (sys.executable, ATTACKERS, name, daemon.telemetry, daemon.endpoint, str(seconds))
+    call(*attacker, check=True, timeout=3 * PATIENCE)
 
 
 def memory(daemon: Daemon) -> float:
@@ -137,10 +123,11 @@ def memory(daemon: Daemon) -> float:
     return total / 1024
 
 
+@pytest.mark.realtime
 def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(daemon: Daemon) -> None:
-    before = status(daemon)
+    before = daemon.status()
     attack("subscriptions", daemon, 4.0)
-    after = status(daemon)
+    after = daemon.status()
     assert (after.mode, after.missed) == ("running", before.missed)
     assert memory(daemon) < 150.0
     with Subscriber(daemon.telemetry, b"tick") as subscriber:
@@ -156,47 +143,37 @@ def test_a_frame_that_announces_8_gb_ends_its_connection(daemon: Daemon) -> None
         with contextlib.suppress(ConnectionError):
             while connection.recv(4096):
                 pass
-    assert status(daemon).mode == "running"
+    assert daemon.status().mode == "running"
 
 
+@pytest.mark.realtime
 def test_a_thousand_idle_connections_end_nothing(tmp_path: Path) -> None:
     few_files = ("prlimit", "--nofile=1024")
     with running(tmp_path, "--set", "start.controller=swing", under=few_files) as daemon:
-        before = status(daemon)
+        before = daemon.status()
         attack("idle-telemetry", daemon, 3.0)
-        after = status(daemon)
+        after = daemon.status()
         assert (after.mode, after.missed) == ("running", before.missed)
         with Subscriber(daemon.telemetry, b"tick") as subscriber:
             assert subscriber.message()["mode"] == "running"
 
 
 def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: Daemon) -> None:
-    attacker = subprocess.Popen(
-        [sys.executable, ATTACKERS, "silent-dealers", daemon.telemetry, daemon.endpoint, "5"]
-    )
-    try:
-        time.sleep(2.0)
-        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-            state = fish.estop()
-        assert attacker.poll() is None
-    finally:
-        attacker.wait(PATIENCE)
+    attacker = threading.Thread(target=attack, args=("silent-dealers", daemon, 5.0))
+    attacker.start()
+    time.sleep(2.0)
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        state = fish.estop()
+    assert attacker.is_alive()
+    attacker.join()
     assert state.mode == "estop"
     assert memory(daemon) < 150.0
-
-
-def dealer(daemon: Daemon) -> "zmq.Socket[bytes]":
-    socket = zmq.Context.instance().socket(zmq.DEALER)
-    socket.set(zmq.LINGER, 0)
-    socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
-    socket.connect(daemon.endpoint)
-    return socket
 
 
 def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are_not(
     daemon: Daemon,
 ) -> None:
-    with dealer(daemon) as hasty, Fish(daemon.endpoint, timeout=PATIENCE) as calm:
+    with daemon.socket() as hasty, Fish(daemon.endpoint, timeout=PATIENCE) as calm:
         for number in range(1500):
             hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
         assert calm.status().mode == "running"
@@ -209,6 +186,7 @@ def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are
     assert "of your requests wait already; slow down" in refusals[0]["message"]
 
 
+@pytest.mark.realtime
 def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
     daemon: Daemon,
 ) -> None:
@@ -220,7 +198,7 @@ def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
 def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_one(
     daemon: Daemon,
 ) -> None:
-    with dealer(daemon) as client:
+    with daemon.socket() as client:
         client.send(b'{"v":1,"id":1,"op":"%s"}' % (b"x" * 16_000))
         error = json.loads(client.recv())["error"]
     assert error["code"] == "bad-request"
@@ -233,7 +211,7 @@ def test_replies_longer_than_the_link_has_room_for_arrive_whole_and_hold_up_no_e
 ) -> None:
     folder = tmp_path / "policies"
     folder.mkdir()
-    shipped = Path(__file__).parents[2] / "config" / "policies" / "default-fish.onnx"
+    shipped = ROOT / "config" / "policies" / "default-fish.onnx"
     for number in range(300):
         (folder / f"copy{number}.onnx").symlink_to(shipped)
     variables = ("env", f"FISHD_POLICIES={folder}")
@@ -245,19 +223,20 @@ def test_replies_longer_than_the_link_has_room_for_arrive_whole_and_hold_up_no_e
 
 
 def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path: Path) -> None:
-    with running(tmp_path) as daemon, dealer(daemon) as before:
+    with running(tmp_path) as daemon, daemon.socket() as before:
         for _ in range(4):
             before.send(b'{"v":1,"id":"before","op":"policies"}')
         killed = gateways(daemon)["control"]
         os.kill(killed, signal.SIGKILL)
         wait_until(lambda: gateways(daemon).get("control", killed) != killed)
-        with dealer(daemon) as after:
+        with daemon.socket() as after:
             for number in range(50):
                 after.send(b'{"v":1,"id":%d,"op":"status"}' % number)
                 assert json.loads(after.recv())["id"] == number
-        assert status(daemon).counters["control_restarts"] == 1
+        assert daemon.status().counters["control_restarts"] == 1
 
 
+@pytest.mark.realtime
 def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(
     daemon: Daemon,
 ) -> None:
@@ -265,7 +244,7 @@ def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(
     open_files = []
     for count in (1, 2):
         attack("idle-telemetry", daemon, 2.0)
-        wait_until(lambda count=count: status(daemon).counters["telemetry_restarts"] >= count)
+        wait_until(lambda count=count: daemon.status().counters["telemetry_restarts"] >= count)
         with Subscriber(daemon.telemetry, b"tick") as subscriber:
             assert subscriber.message()["missed"] == 0
         wait_until(lambda: len(list(Path(f"/proc/{pid}/fd").iterdir())) < 30)
@@ -284,6 +263,6 @@ def test_a_gateway_that_dies_again_and_again_is_reported_all_the_same(daemon: Da
             killed.add(pid)
         time.sleep(0.01)
     assert len(killed) >= 3
-    wait_until(lambda: status(daemon).counters["telemetry_restarts"] >= len(killed))
+    wait_until(lambda: daemon.status().counters["telemetry_restarts"] >= len(killed))
     _, _, errors = daemon.end()
     assert "the gateway of telemetry was started again: its process ended with status -9" in errors

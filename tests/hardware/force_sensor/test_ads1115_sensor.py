@@ -3,11 +3,11 @@
 import itertools
 
 import pytest
-from force_rig import ABSENT_BUS, STEP, TICK, ForceRig, Ticks, measurements
+from rigs.force_rig import ABSENT_BUS, STEP, TICK, ForceRig, Ticks, measurements
 
-from fishd.errors import SensorError
-from fishd.hardware.calibration import ForceCalibration
-from fishd.signals import Measurement
+from fishd.core.calibration import ForceCalibration
+from fishd.core.errors import SensorError
+from fishd.core.signals import Measurement
 
 CALIBRATION = ForceCalibration(xx=2.0, xy=0.1, x0=-0.3, yx=-0.2, yy=3.0, y0=0.4)
 

@@ -1,9 +1,9 @@
 """When the force sensor says that its forces are not to be believed."""
 
 import pytest
-from force_rig import ForceRig, Ticks, measurements
+from rigs.force_rig import ForceRig, Ticks, measurements
 
-from fishd.hardware.calibration import ForceCalibration
+from fishd.core.calibration import ForceCalibration
 
 
 def test_a_frozen_channel_is_suspected_after_its_time_and_only_then() -> None:

@@ -4,23 +4,24 @@ import threading
 import time
 
 import pytest
-from force_rig import TICK, ForceRig
+from rigs.force_rig import TICK, ForceRig
 
-from fishd.clock import SystemClock
-from fishd.errors import SensorError
-from fishd.hardware.ads1115 import CLOSE_LIMIT, Ads1115Sensor
-from fishd.hardware.calibration import ForceCalibration
-from fishd.hardware.settings import ForceSensorSettings
-from fishd.signals import Measurement
+from fishd.core.calibration import ForceCalibration
+from fishd.core.clock import SystemClock
+from fishd.core.errors import SensorError
+from fishd.core.signals import Measurement
+from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
+from fishd.hardware.force_sensor.sampled_sensor import CLOSE_LIMIT, SampledSensor
 
 
-def threaded() -> Ads1115Sensor:
-    return Ads1115Sensor(
-        ForceSensorSettings(), ForceCalibration(), SystemClock(), threaded=True, tick=TICK
+def threaded() -> SampledSensor:
+    clock = SystemClock()
+    return SampledSensor(
+        Ads1115(Ads1115Settings(), clock), ForceCalibration(), clock, threaded=True, tick=TICK
     )
 
 
-def wait_for_pair(sensor: Ads1115Sensor) -> Measurement:
+def wait_for_pair(sensor: SampledSensor) -> Measurement:
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
         try:
@@ -51,6 +52,7 @@ def test_a_thread_samples_in_real_time_until_closed() -> None:
         assert not sampler_threads()
 
 
+@pytest.mark.realtime
 def test_the_thread_stays_quiet_around_the_expected_read() -> None:
     with ForceRig(clock=SystemClock()) as rig:
         transfers: list[float] = []

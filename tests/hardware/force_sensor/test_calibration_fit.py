@@ -4,10 +4,17 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.calibrating import WORST_CONDITION, Load, PoorLoads, check, fit, missing_loads
+from fishd.hardware.force_sensor.calibration_fit import (
+    WORST_CONDITION,
+    Load,
+    PoorLoads,
+    check,
+    fit,
+    missing_loads,
+)
 
 PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
@@ -33,7 +40,6 @@ def sensor(gx: float, gy: float, cx: float = 0.0, cy: float = 0.0) -> "np.ndarra
     return np.array([[gx, cx * gx], [cy * gy, gy]])
 
 
-@settings(deadline=None)
 @given(gains, gains, crosstalk, crosstalk, zeros, zeros)
 def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
     gx: float, gy: float, cx: float, cy: float, x0: float, y0: float
@@ -48,7 +54,6 @@ def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
     assert calibration.loads == 5
 
 
-@settings(deadline=None)
 @given(crosstalk, crosstalk, st.integers(0, 2**32 - 1))
 def test_with_noise_it_is_recovered_within_what_the_noise_permits(
     cx: float, cy: float, seed: int
@@ -108,7 +113,6 @@ def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gai
     assert fit(measured(cross, sensor(1, 8))).calibration.condition == pytest.approx(8.0)
 
 
-@settings(deadline=None)
 @given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 def test_the_condition_number_depends_neither_on_units_nor_on_an_offset(
     unit: float, offset: float
@@ -131,7 +135,6 @@ def test_a_plan_without_one_of_its_loads_is_refused_by_the_name_of_that_load(
         fit(measured(plan, sensor(1, 1)))
 
 
-@settings(deadline=None)
 @given(st.floats(-3, 3), st.lists(st.floats(-1, 1), min_size=3, max_size=9))
 def test_loads_on_one_line_are_refused_whatever_its_direction(
     angle: float, sizes: list[float]

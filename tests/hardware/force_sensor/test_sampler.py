@@ -3,9 +3,9 @@
 from typing import Any
 
 import pytest
-from force_rig import STEP, ForceRig, take_pairs, volts
+from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 
-from fishd.emulation.i2c import Write
+from fishd.virtual.pi.i2c import Write
 
 CONFIG = 1
 
@@ -38,7 +38,7 @@ def test_the_channels_are_read_in_the_order_x_y_y_x() -> None:
 def test_the_order_cancels_the_lag_of_the_second_channel() -> None:
     with ForceRig(noise=0.0) as rig:
         rig.volts = {"A0-A1": lambda t: 0.5 * t, "A2-A3": lambda t: 0.5 * t}
-        differences = [pair.x - pair.y for pair in take_pairs(rig.sampler(), rig, 1.0)]
+        differences = [(pair.vx - pair.vy) / STEP for pair in take_pairs(rig.sampler(), rig, 1.0)]
     assert max(abs(difference) for difference in differences) >= 10
     assert abs(sum(differences[: len(differences) // 2 * 2])) <= 2
 
@@ -77,6 +77,7 @@ def test_every_data_rate_gives_right_values(data_rate: int) -> None:
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
 
 
+@pytest.mark.slow
 def test_no_value_is_ever_of_the_other_channel_though_one_transfer_in_a_hundred_fails() -> None:
     wrong = reads = 0
     with ForceRig(seed=7) as rig:

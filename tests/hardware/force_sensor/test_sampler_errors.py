@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from force_rig import ABSENT_BUS, STEP, ForceRig, take_pairs, volts
+from rigs.force_rig import ABSENT_BUS, STEP, ForceRig, take_pairs, volts
 
-from fishd.emulation.i2c import Message
-from fishd.emulation.linux_i2c import LinuxI2c
-from fishd.errors import StartupError
-from fishd.hardware.sampler import LONGEST_PAUSE
+from fishd.core.errors import MissingPackage
+from fishd.hardware.force_sensor.sampler import LONGEST_PAUSE
+from fishd.hardware.packages import driver_packages
+from fishd.virtual.pi.i2c import Message
+from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 
 @pytest.mark.parametrize("delay", [0.0, 2e-3, 6e-3, 8.6e-3])
@@ -225,8 +226,9 @@ def test_an_error_of_an_unknown_kind_is_passed_on_with_its_number() -> None:
 def test_without_the_driver_packages_the_message_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    single_shot = "fishd.hardware.force_sensor.ads1115_single_shot"
     monkeypatch.setitem(sys.modules, "adafruit_ads1x15", None)
-    monkeypatch.delitem(sys.modules, "fishd.hardware.single_shot", raising=False)
-    monkeypatch.delattr("fishd.hardware.single_shot", raising=False)
-    with pytest.raises(StartupError, match=r"install fishd\[pi\]"):
+    monkeypatch.delitem(sys.modules, single_shot, raising=False)
+    monkeypatch.delattr("fishd.hardware.force_sensor.ads1115_single_shot", raising=False)
+    with pytest.raises(MissingPackage, match=r"install fishd\[pi\]"), driver_packages("ads1115"):
         ForceRig().sampler()

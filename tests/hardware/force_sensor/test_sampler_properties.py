@@ -3,15 +3,15 @@
 import math
 
 import pytest
-from force_rig import STEP, ForceRig, Ticks
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs.force_rig import STEP, ForceRig, Ticks
 
-from fishd.hardware.calibration import ForceCalibration
-from fishd.hardware.sampler import Pair
+from fishd.core.calibration import ForceCalibration
+from fishd.core.signals import Measurement
+from fishd.hardware.driver import Pair
+from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
 from fishd.hardware.settings import ForceSensorSettings
-from fishd.hardware.window import Evaluation, VoltageWatch
-from fishd.signals import Measurement
 
 FAULTS = ("nack", "timeout", "clock-stretch", "bus-owned", "arbitration-lost", "unplugged")
 
@@ -25,11 +25,13 @@ windows = st.lists(st.tuples(codes, codes), min_size=1, max_size=30)
 
 def as_pairs(window: list[tuple[int, int]]) -> list[Pair]:
     return [
-        Pair(1.0 + 3e-3 * index, 1.002 + 3e-3 * index, x, y) for index, (x, y) in enumerate(window)
+        Pair(1.0 + 3e-3 * index, 1.002 + 3e-3 * index, x * STEP, y * STEP)
+        for index, (x, y) in enumerate(window)
     ]
 
 
-@settings(max_examples=60, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32),
     error_rate=st.sampled_from((0.0, 0.01, 0.1)),
@@ -56,7 +58,8 @@ def test_each_measurement_is_right_and_it_recovers(
             assert item.suspect == ""
 
 
-@settings(max_examples=60, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32), error_rate=st.sampled_from((0.0, 0.02, 0.2)))
 def test_times_of_measurements_never_go_back_nor_ahead(seed: int, error_rate: float) -> None:
     with ForceRig(seed=seed) as rig:
@@ -73,7 +76,7 @@ def test_times_of_measurements_never_go_back_nor_ahead(seed: int, error_rate: fl
 def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
     window: list[tuple[int, int]], calibration: ForceCalibration
 ) -> None:
-    evaluation = Evaluation(ForceSensorSettings(force_limit=1e4))
+    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=1e4), ("F_x", "F_y"))
     measured = evaluation.measure(as_pairs(window), calibration)
     forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
     assert measured.fx == pytest.approx(sum(fx for fx, _ in forces) / len(window), abs=1e-9)
@@ -86,7 +89,7 @@ def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
 def test_a_window_is_suspect_exactly_if_a_force_is_beyond_the_limit(
     window: list[tuple[int, int]], calibration: ForceCalibration, limit: float
 ) -> None:
-    evaluation = Evaluation(ForceSensorSettings(force_limit=limit))
+    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=limit), ("F_x", "F_y"))
     measured = evaluation.measure(as_pairs(window), calibration)
     forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
     assert bool(measured.suspect) == any(max(abs(fx), abs(fy)) > limit for fx, fy in forces)
@@ -96,7 +99,7 @@ def test_a_window_is_suspect_exactly_if_a_force_is_beyond_the_limit(
 def test_a_watch_finds_mean_and_deviation_of_all_pairs(
     parts: list[list[tuple[int, int]]],
 ) -> None:
-    watch = VoltageWatch(0.0, STEP, ForceCalibration())
+    watch = VoltageWatch(0.0, ForceCalibration())
     for part in parts:
         watch.add(as_pairs(part), "")
     sample = watch.close()

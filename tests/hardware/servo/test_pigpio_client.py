@@ -5,10 +5,11 @@ import struct
 import threading
 
 import pytest
+from rigs.processes import PATIENCE
 
-from fishd.errors import ServoError
-from fishd.hardware.pigpio_client import opened
-from fishd.hardware.settings import PigpioSettings
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.pigpio import PigpioSettings
+from fishd.hardware.servo.pigpio_client import opened
 
 
 class Server:
@@ -32,7 +33,7 @@ class Server:
 
     def close(self) -> None:
         self._done.set()
-        self._thread.join()
+        self._thread.join(PATIENCE)
         self._listener.close()
 
 

@@ -4,10 +4,10 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 import pytest
-from pigpio_bench import GPIO, PigpioBench, connect
+from rigs.pigpio_rig import GPIO, PigpioBench, connect, script_of
 
-from fishd.hardware.pigpio import PigpioServo
-from fishd.hardware.pigpio_client import TimedSocket
+from fishd.hardware.servo.calibrated_servo import CalibratedServo
+from fishd.hardware.servo.pigpio_client import TimedSocket
 
 SOON = 2.0
 """Neutral after 0.2 s and off 0.5 s later; longer where a test has lengthened the countdown [s]."""
@@ -39,7 +39,7 @@ def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     return kill_after
 
 
-def lose_connection(bench: PigpioBench, servo: PigpioServo) -> None:
+def lose_connection(bench: PigpioBench, servo: CalibratedServo) -> None:
     for connection in list(bench.daemon._connections.values()):
         connection.hang_up()
     with contextlib.suppress(OSError):
@@ -47,7 +47,7 @@ def lose_connection(bench: PigpioBench, servo: PigpioServo) -> None:
     bench.wait(0.6)
 
 
-def swim(bench: PigpioBench) -> PigpioServo:
+def swim(bench: PigpioBench) -> CalibratedServo:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(0.05)
@@ -90,13 +90,13 @@ def reconnect(bench: PigpioBench) -> None:
 
 def last_resort(bench: PigpioBench) -> None:
     swim(bench)
-    bench.servo().neutralise()
+    bench.last_resort()
 
 
 def last_resort_on_pulses_of_others(bench: PigpioBench) -> None:
     with bench.client() as other:
         other.set_servo_pulsewidth(GPIO, 1800)
-    bench.servo().neutralise()
+    bench.last_resort()
 
 
 DEEDS = (
@@ -182,7 +182,7 @@ def test_a_release_that_only_reaches_pigpiod_in_half_ends_the_pulses_at_once(
     servo = swim(bench)
     with bench.client() as client:
         # The first of its two commands, as after a cable that broke in between.
-        client.update_script(servo._script, [1, GPIO, 0])
+        client.update_script(script_of(servo), [1, GPIO, 0])
     bench.wait(0.05)
     assert bench.width == 0
 

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from fishd.clock import SystemClock, VirtualClock
-from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod.daemon import Pigpiod
-from fishd.errors import ServoError
-from fishd.hardware.pigpio_client import Client
-from fishd.hardware.pigpio_link import PigpioLink
-from fishd.hardware.settings import PigpioSettings
+from fishd.core.clock import SystemClock, VirtualClock
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.pigpio import PigpioSettings
+from fishd.hardware.servo.pigpio_client import Client
+from fishd.hardware.servo.pigpio_link import PigpioLink
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 
 
 @pytest.fixture

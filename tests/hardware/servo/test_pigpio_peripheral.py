@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pigpio
 import pytest
-from pigpio_bench import GPIO, PigpioBench, connect
+from rigs.pigpio_rig import GPIO, PigpioBench, connect
 
 HARDWARE_PWM = 86
 SET_MODE = 0
@@ -49,11 +49,11 @@ def test_the_last_resort_ends_them_at_neutral_and_says_so(
     if restarted:
         bench.faults.inject("pigpiod-restart")
     begun = bench.clock.now
-    assert bench.servo().neutralise() is True
+    assert bench.last_resort() is True
     bench.wait(1.0)
     assert bench.width == 0
     assert 1500 in [width for _, width in bench.changes_after(begun)]
-    assert bench.servo().neutralise() is False
+    assert bench.last_resort() is False
 
 
 @pytest.mark.parametrize("restarted", [False, True])
@@ -71,7 +71,7 @@ def test_a_fishd_that_starts_ends_them_at_neutral(bench: PigpioBench, restarted:
 def test_a_pin_that_is_the_peripherals_but_has_no_pulses_is_left_alone(bench: PigpioBench) -> None:
     with bench.client() as client:
         client.set_mode(GPIO, ALT5)  # as the overlay of the kernel's PWM leaves it
-    assert bench.servo().neutralise() is False
+    assert bench.last_resort() is False
     assert bench.daemon.history(GPIO) == []
     with bench.client() as client:
         assert client.get_mode(GPIO) == ALT5
@@ -81,6 +81,6 @@ def test_software_pwm_of_another_program_counts_as_pulses_too(bench: PigpioBench
     with bench.client() as client:
         client.set_PWM_dutycycle(GPIO, 128)
     bench.wait(0.1)
-    assert bench.servo().neutralise() is True
+    assert bench.last_resort() is True
     bench.wait(0.1)
     assert bench.width == 0

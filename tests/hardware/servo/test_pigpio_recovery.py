@@ -6,10 +6,10 @@ from collections.abc import Iterator
 import pigpio
 import pytest
 from msgspec.structs import replace
-from pigpio_bench import FRAME, GPIO, PigpioBench, connect
+from rigs.pigpio_rig import FRAME, GPIO, PigpioBench, connect
 
-from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration
+from fishd.core.calibration import ServoCalibration
+from fishd.core.errors import ServoError
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_pulses_that_went_on_in_a_frozen_pigpiod_stop_once_it_is_back(bench: Pig
     connect(servo)
     bench.wait(FRAME)
     assert bench.width == 0
-    assert servo.counters() == {"servo_reconnects": 1, "servo_late_answers": 3}
+    assert servo.driver.counters() == {"servo_reconnects": 1, "servo_late_answers": 3}
     bench.wait(1.0)
     assert bench.width == 0
 
@@ -78,7 +78,7 @@ def test_without_pigpiod_it_asks_at_most_twice_a_second_in_virtual_time(bench: P
     bench.wait(0.2)
     servo.write(0.5)
     assert bench.width == 1800
-    assert servo.counters() == {"servo_reconnects": 0, "servo_late_answers": 0}
+    assert servo.driver.counters() == {"servo_reconnects": 0, "servo_late_answers": 0}
 
 
 def test_killed_fishds_never_fill_pigpiod_with_scripts(bench: PigpioBench) -> None:
@@ -105,7 +105,7 @@ def test_the_last_resort_moves_a_swimming_servo_to_neutral_and_releases_it(
     bench.servo().write(0.5)
     bench.wait(0.1)
     begun = bench.clock.now
-    assert bench.servo(calibration=ServoCalibration(trim=10)).neutralise() is True
+    assert bench.last_resort(1510.0) is True
     assert bench.scripts() == 0
     bench.wait(2.0)
     assert [width for _, width in bench.changes_after(begun - 1e-9)] == [1510, 0]
@@ -113,12 +113,12 @@ def test_the_last_resort_moves_a_swimming_servo_to_neutral_and_releases_it(
 
 
 def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: PigpioBench) -> None:
-    assert bench.servo().neutralise() is False
+    assert bench.last_resort() is False
     killed = bench.servo()
     killed.write(0.5)
     bench.wait(2.0)  # the countdown has done its work
     before = bench.clock.now
-    assert bench.servo().neutralise() is False
+    assert bench.last_resort() is False
     assert bench.clock.now == before
     assert bench.changes_after(before) == []
     assert bench.scripts() == 0
@@ -129,7 +129,7 @@ def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: Pigpi
     bench.wait(0.1)
     bench.refuse(pigpio._PI_CMD_SERVO, 1500)
     with pytest.raises(ServoError, match="no permission"):
-        bench.servo().neutralise()
+        bench.last_resort()
     assert bench.width == 0
     assert bench.scripts() == 0
 
@@ -137,24 +137,22 @@ def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: Pigpi
 def test_the_last_resort_stops_the_pulses_though_its_connection_breaks(bench: PigpioBench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.1)
-    rescue = bench.servo()
     bench.hang_up_in_next_sleep()
     with pytest.raises(ServoError, match="pigpiod at"):
-        rescue.neutralise()
+        bench.last_resort()
     assert bench.width == 0
     assert bench.scripts() == 0
 
 
 def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: PigpioBench) -> None:
     bench.servo().write(0.5)
-    rescue = bench.servo()
 
     def interrupt(seconds: float) -> None:
         raise KeyboardInterrupt
 
     bench.clock.sleep = interrupt  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
-        rescue.neutralise()
+        bench.last_resort()
     del bench.clock.sleep
     assert bench.width == 0
 
@@ -162,7 +160,7 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Pi
 def test_the_last_resort_says_in_one_line_that_pigpiod_is_gone(bench: PigpioBench) -> None:
     bench.faults.inject("pigpiod-gone")
     with pytest.raises(ServoError, match=r"^pigpiod at 127\.0\.0\.1:\d+: Connection refused$"):
-        bench.servo().neutralise()
+        bench.last_resort()
 
 
 def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
@@ -170,7 +168,7 @@ def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
 ) -> None:
     servo = bench.servo()
     servo.write(0.5)
-    assert bench.servo().neutralise() is True
+    assert bench.last_resort() is True
     with pytest.raises(ServoError, match="reconnecting"):
         servo.write(0.5)
     assert bench.width == 0
@@ -179,7 +177,7 @@ def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
 def test_a_fishd_whose_script_was_taken_away_says_so(bench: PigpioBench) -> None:
     servo = bench.servo()
     servo.write(0.5)
-    bench.servo().neutralise()
+    bench.last_resort()
     with pytest.raises(
         ServoError, match=r"took fishd's script away, as 'fishctl release' does; re"
     ):

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 from msgspec.structs import replace
-from pigpio_bench import FRAME, GPIO, TICK, PigpioBench
+from rigs.pigpio_rig import FRAME, GPIO, TICK, PigpioBench
 
-from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration
+from fishd.core.calibration import ServoCalibration
+from fishd.core.errors import ServoError
 
 
 @pytest.fixture
@@ -120,12 +120,12 @@ def test_a_slow_loop_has_three_ticks_before_the_countdown_ends(bench: PigpioBenc
 
 def test_a_longer_countdown_forgives_longer_stalls(bench: PigpioBench) -> None:
     settings = bench.settings()
-    servo = bench.servo(replace(settings, pigpio=replace(settings.pigpio, countdown=1.0)))
+    servo = bench.servo(replace(settings, countdown=1.0))
     servo.write(0.5)
     bench.wait(0.95)
     assert bench.width == 1800
     bench.wait(0.1)
-    assert (bench.width, servo.countdown) == (1500, 1.0)
+    assert (bench.width, servo.driver.countdown) == (1500, 1.0)
 
 
 def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench) -> None:

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration, as_configured, calibrated
-from fishd.hardware.pulses import LONGEST, SHORTEST, pulse_width, reach
+from fishd.core.calibration import ServoCalibration
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.pulses import LONGEST, SHORTEST, pulse_width, reach
 from fishd.hardware.settings import ServoSettings
 
 servos = st.builds(
@@ -73,8 +73,8 @@ def test_every_angle_within_reach_is_a_pulse_and_none_beyond(servo: ServoSetting
 def test_a_calibration_takes_precedence_and_the_settings_own_one_changes_nothing(
     servo: ServoSettings, calibration: ServoCalibration, angle: float
 ) -> None:
-    assert calibrated(servo, as_configured(servo)) == servo
-    result = calibrated(servo, calibration)
+    assert servo.calibrated(servo.calibration) == servo
+    result = servo.calibrated(calibration)
     neutral = servo.centre + calibration.trim
     try:
         width = pulse_width(result, angle)

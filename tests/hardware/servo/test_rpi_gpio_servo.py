@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from fishd.clock import VirtualClock
-from fishd.emulation.lgpio import EmulatedLgpio
-from fishd.emulation.pins import Pins
-from fishd.errors import ServoError, StartupError
-from fishd.hardware.calibration import ServoCalibration
-from fishd.hardware.rpi_gpio import RpiGpioServo
-from fishd.hardware.settings import ServoSettings
+from fishd.core.calibration import ServoCalibration
+from fishd.core.clock import VirtualClock
+from fishd.core.errors import ServoError, StartupError
+from fishd.hardware.servo.calibrated_servo import CalibratedServo
+from fishd.hardware.servo.rpi_gpio import RpiGpio, RpiGpioSettings, pull_low
+from fishd.virtual.pi.lgpio import EmulatedLgpio
+from fishd.virtual.pi.pins import Pins
 
-SETTINGS = ServoSettings(driver="rpi-gpio", gpio=18)
+SETTINGS = RpiGpioSettings(gpio=18)
 
 
 @pytest.fixture
@@ -28,10 +28,16 @@ def pins() -> Iterator[Pins]:
 
 
 @pytest.fixture
-def servo(pins: Pins) -> Iterator[RpiGpioServo]:
-    servo = RpiGpioServo(SETTINGS, ServoCalibration(), VirtualClock())
+def servo(pins: Pins) -> Iterator[CalibratedServo]:
+    servo = opened(SETTINGS, ServoCalibration(), VirtualClock())
     yield servo
     servo.close()
+
+
+def opened(
+    settings: RpiGpioSettings, calibration: ServoCalibration, clock: VirtualClock
+) -> CalibratedServo:
+    return CalibratedServo(RpiGpio, settings, calibration, clock, threaded=False, tick=0.05)
 
 
 def width(pins: Pins, gpio: int = 18) -> float:
@@ -40,7 +46,7 @@ def width(pins: Pins, gpio: int = 18) -> float:
     return 0.0 if pwm is None else 1e4 * pwm[1] / pwm[0]
 
 
-def test_an_angle_becomes_a_pulse(pins: Pins, servo: RpiGpioServo) -> None:
+def test_an_angle_becomes_a_pulse(pins: Pins, servo: CalibratedServo) -> None:
     for angle, expected in ((0.5, 1800.0), (-0.5, 1200.0), (0.0, 1500.0)):
         servo.write(angle)
         assert width(pins) == pytest.approx(expected, abs=0.01)
@@ -49,8 +55,8 @@ def test_an_angle_becomes_a_pulse(pins: Pins, servo: RpiGpioServo) -> None:
 
 
 def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
-    fast = RpiGpioServo(
-        ServoSettings(driver="rpi-gpio", gpio=4, frequency=200.0),
+    fast = opened(
+        RpiGpioSettings(gpio=4, frequency=200.0),
         ServoCalibration(),
         VirtualClock(),
     )
@@ -60,14 +66,14 @@ def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
     fast.close()
 
 
-def test_opening_claims_the_pin_low_without_pulses(pins: Pins, servo: RpiGpioServo) -> None:
+def test_opening_claims_the_pin_low_without_pulses(pins: Pins, servo: CalibratedServo) -> None:
     assert pins.is_output(18)
     assert pins.writes(18) == [0]
     assert pins.pwm(18) is None
 
 
 def test_release_goes_on_without_pulses_and_write_begins_again(
-    pins: Pins, servo: RpiGpioServo
+    pins: Pins, servo: CalibratedServo
 ) -> None:
     servo.write(0.5)
     servo.release()
@@ -78,7 +84,7 @@ def test_release_goes_on_without_pulses_and_write_begins_again(
     assert width(pins) == pytest.approx(1800.0)
 
 
-def test_a_release_without_pulses_does_nothing(pins: Pins, servo: RpiGpioServo) -> None:
+def test_a_release_without_pulses_does_nothing(pins: Pins, servo: CalibratedServo) -> None:
     servo.release()
     assert pins.pwm(18) is None
 
@@ -87,7 +93,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
     from RPi import GPIO
 
     clock = VirtualClock()
-    servo = RpiGpioServo(SETTINGS, ServoCalibration(), clock)
+    servo = opened(SETTINGS, ServoCalibration(), clock)
     GPIO.setup(23, GPIO.OUT, initial=GPIO.HIGH)
     servo.write(0.5)
     before = clock.now
@@ -102,12 +108,12 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
 
 def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pins) -> None:
     pins.occupy(18)
-    servo = RpiGpioServo(SETTINGS, ServoCalibration(), VirtualClock())
+    servo = opened(SETTINGS, ServoCalibration(), VirtualClock())
     for _ in range(2):
         with pytest.raises(ServoError, match=r"^servo on GPIO 18: GPIO busy$"):
             servo.write(0.0)
     with pytest.raises(ServoError, match="GPIO busy"):
-        servo.neutralise()
+        pull_low(1500.0, gpio=18)
     servo.release()
     pins.occupy(18, False)
     servo.write(0.0)
@@ -115,7 +121,7 @@ def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pin
     servo.close()
 
 
-def test_a_cleanup_of_all_pins_by_others_is_survived(pins: Pins, servo: RpiGpioServo) -> None:
+def test_a_cleanup_of_all_pins_by_others_is_survived(pins: Pins, servo: CalibratedServo) -> None:
     from RPi import GPIO
 
     servo.write(0.5)
@@ -124,29 +130,31 @@ def test_a_cleanup_of_all_pins_by_others_is_survived(pins: Pins, servo: RpiGpioS
         servo.write(0.4)
     servo.write(0.4)
     assert width(pins) == pytest.approx(1740.0)
-    assert servo.counters() == {"servo_reconnects": 1}
+    assert servo.driver.counters() == {"servo_reconnects": 1}
 
 
-def test_the_last_resort_leaves_the_pin_low(pins: Pins, servo: RpiGpioServo) -> None:
-    assert servo.neutralise() is False
+def test_the_last_resort_leaves_the_pin_low(pins: Pins, servo: CalibratedServo) -> None:
+    assert pull_low(1500.0, gpio=18) is False
     assert pins.is_output(18)
     assert pins.level(18) == 0
 
 
-def test_another_calibration_holds_from_the_next_write_on(pins: Pins, servo: RpiGpioServo) -> None:
+def test_another_calibration_holds_from_the_next_write_on(
+    pins: Pins, servo: CalibratedServo
+) -> None:
     servo.write(0.2)
     servo.recalibrate(ServoCalibration(direction=-1, trim=20.0))
     servo.write(0.2)
     assert width(pins) == pytest.approx(1400.0)
     with pytest.raises(ServoError, match="needs a pulse of 2700 µs"):
-        RpiGpioServo(
-            ServoSettings(driver="rpi-gpio", gpio=4, centre=2400.0),
+        opened(
+            RpiGpioSettings(gpio=4, centre=2400.0),
             ServoCalibration(trim=300.0),
             VirtualClock(),
         )
 
 
-def test_an_angle_beyond_the_limits_changes_nothing(pins: Pins, servo: RpiGpioServo) -> None:
+def test_an_angle_beyond_the_limits_changes_nothing(pins: Pins, servo: CalibratedServo) -> None:
     servo.write(0.2)
     with pytest.raises(ServoError, match="soft limits"):
         servo.write(1.3)
@@ -154,11 +162,11 @@ def test_an_angle_beyond_the_limits_changes_nothing(pins: Pins, servo: RpiGpioSe
         servo.write(float("nan"))
     assert width(pins) == pytest.approx(1620.0)
     servo.write(0.1)
-    assert servo.counters() == {"servo_reconnects": 0}
+    assert servo.driver.counters() == {"servo_reconnects": 0}
 
 
-def test_it_says_that_its_pulses_jitter(servo: RpiGpioServo) -> None:
-    (line,) = servo.degraded
+def test_it_says_that_its_pulses_jitter(servo: CalibratedServo) -> None:
+    (line,) = servo.driver.degraded
     assert "jitter" in line
 
 
@@ -182,7 +190,7 @@ class TestALibraryThatCannotBeUsed:
 
     def start(self) -> str:
         with pytest.raises(StartupError) as caught:
-            RpiGpioServo(SETTINGS, ServoCalibration(), VirtualClock())
+            opened(SETTINGS, ServoCalibration(), VirtualClock())
         assert "\n" not in str(caught.value)
         return str(caught.value)
 

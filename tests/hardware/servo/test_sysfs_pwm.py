@@ -4,13 +4,13 @@ import os
 from pathlib import Path
 
 import pytest
-from sysfs_pwm_bench import PI5, Bench
+from rigs.sysfs_pwm_rig import PI5, Bench
 
-from fishd.clock import VirtualClock
-from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration
-from fishd.hardware.settings import ServoSettings, SysfsPwmSettings
-from fishd.hardware.sysfs_pwm import SysfsPwmServo
+from fishd.core.calibration import ServoCalibration
+from fishd.core.clock import VirtualClock
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.calibrated_servo import CalibratedServo
+from fishd.hardware.servo.sysfs_pwm import SysfsPwm, SysfsPwmSettings
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_opening_moves_nothing(bench: Bench) -> None:
 
 @pytest.mark.parametrize("frequency", [50.0, 100.0, 333.0])
 def test_pulses_come_at_the_configured_frequency(bench: Bench, frequency: float) -> None:
-    servo = bench.servo(ServoSettings(driver="sysfs-pwm", frequency=frequency))
+    servo = bench.servo(SysfsPwmSettings(frequency=frequency))
     assert bench.write(servo, 1.2) == pytest.approx(2220.0)
     assert bench.kernel.pulses(PI5, 2).at(bench.clock.now).frame == pytest.approx(1 / frequency)
     servo.close()
@@ -65,7 +65,7 @@ def test_close_switches_the_channel_off_and_gives_it_back(bench: Bench) -> None:
 
 
 def test_what_a_killed_fishd_left_behind_is_taken_over(bench: Bench) -> None:
-    killed = bench.servo(ServoSettings(driver="sysfs-pwm", frequency=100.0))
+    killed = bench.servo(SysfsPwmSettings(frequency=100.0))
     bench.write(killed, 0.4)
     servo = bench.servo()
     assert bench.width() == 1740.0  # opening changes nothing
@@ -99,9 +99,7 @@ def test_the_last_resort_moves_to_neutral_then_stops(bench: Bench) -> None:
     bench.write(bench.servo(), 0.5)  # of a fishd that was killed
     bench.go_into_a_pulse()
     begin = bench.clock.now
-    rescue = bench.servo(calibration=ServoCalibration(trim=30.0))
-    assert rescue.neutralise() is True
-    rescue.close()
+    assert bench.last_resort(1530.0) is True
     assert bench.widths() == [1800.0, 1530.0, 0.0]
     neutral, off = (time for time, _ in bench.kernel.pulses(PI5, 2).history[1:])
     assert neutral - begin <= 0.02
@@ -109,9 +107,7 @@ def test_the_last_resort_moves_to_neutral_then_stops(bench: Bench) -> None:
 
 
 def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: Bench) -> None:
-    rescue = bench.servo()
-    assert rescue.neutralise() is False
-    rescue.close()
+    assert bench.last_resort() is False
     assert bench.widths() == []
     assert bench.exported() == []
 
@@ -119,9 +115,7 @@ def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: Bench) -> No
 def test_a_living_fishd_notices_the_last_resort(bench: Bench) -> None:
     servo = bench.servo()
     bench.write(servo, 0.5)
-    rescue = bench.servo()
-    assert rescue.neutralise() is True
-    rescue.close()
+    assert bench.last_resort() is True
     assert bench.exported() == ["pwm2"]  # fishd still holds it
     with pytest.raises(ServoError, match="switched off from outside"):
         servo.write(0.5)
@@ -152,7 +146,7 @@ def test_another_calibration_holds_from_the_next_write_on(bench: Bench) -> None:
 
 
 def test_a_calibration_without_a_neutral_pulse_is_refused(bench: Bench) -> None:
-    high = ServoSettings(driver="sysfs-pwm", centre=2400.0)
+    high = SysfsPwmSettings(centre=2400.0)
     servo = bench.servo(high)
     with pytest.raises(ServoError, match="2700 µs"):
         servo.recalibrate(ServoCalibration(trim=300.0))
@@ -178,14 +172,20 @@ def tree(tmp_path: Path) -> Path:
     return root
 
 
+def on_true_files(settings: SysfsPwmSettings) -> CalibratedServo:
+    return CalibratedServo(
+        SysfsPwm, settings, ServoCalibration(), VirtualClock(), threaded=False, tick=0.05
+    )
+
+
 def number(path: Path) -> int:
     return int(path.read_text().split()[0])
 
 
 def test_on_true_files_a_channel_is_driven_released_and_unexported(tree: Path) -> None:
-    settings = ServoSettings(driver="sysfs-pwm", sysfs=SysfsPwmSettings(root=str(tree)))
+    settings = SysfsPwmSettings(root=str(tree))
     open_before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    servo = SysfsPwmServo(settings, ServoCalibration(), VirtualClock())
+    servo = on_true_files(settings)
     channel = tree / "pwmchip3" / "pwm2"
     assert (channel / "enable").read_text() == "0\n"
     servo.write(1.0)
@@ -205,8 +205,8 @@ def test_on_true_files_a_channel_is_driven_released_and_unexported(tree: Path) -
 
 
 def test_on_true_files_an_empty_one_is_an_error(tree: Path) -> None:
-    settings = ServoSettings(driver="sysfs-pwm", sysfs=SysfsPwmSettings(root=str(tree)))
+    settings = SysfsPwmSettings(root=str(tree))
     (tree / "pwmchip3" / "pwm2" / "enable").write_text("")
-    servo = SysfsPwmServo(settings, ServoCalibration(), VirtualClock())
+    servo = on_true_files(settings)
     with pytest.raises(ServoError, match="pwm2/enable does not contain a number"):
         servo.write(0.0)

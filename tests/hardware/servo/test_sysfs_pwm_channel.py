@@ -1,11 +1,11 @@
 """How the servo's channel of the kernel's PWM is found, waited for, lost and found again."""
 
 import pytest
-from sysfs_pwm_bench import FAN, PI4, PI5, Bench
-from sysfs_pwm_kernel import SysfsPwm
+from rigs.sysfs_pwm_kernel import SysfsPwm
+from rigs.sysfs_pwm_rig import FAN, PI4, PI5, Bench
 
-from fishd.errors import ServoError
-from fishd.hardware.settings import ServoSettings, SysfsPwmSettings
+from fishd.core.errors import ServoError
+from fishd.hardware.servo.sysfs_pwm import SysfsPwmSettings
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def test_the_chip_is_found_by_its_device_whatever_its_number(
     chips: dict[str, int], gpio: int, device: str, channel: int
 ) -> None:
     bench = Bench(chips)
-    servo = bench.servo(ServoSettings(driver="sysfs-pwm", gpio=gpio))
+    servo = bench.servo(SysfsPwmSettings(gpio=gpio))
     servo.write(0.0)
     bench.clock.sleep(0.02)
     assert bench.width(channel, device) == 1500.0
@@ -37,8 +37,7 @@ def test_the_chip_is_found_by_its_device_whatever_its_number(
 
 def test_chip_and_channel_can_be_named() -> None:
     bench = Bench({PI5: 4, "soc:pwm": 1})
-    named = SysfsPwmSettings(chip="soc:pwm", channel=0)
-    servo = bench.servo(ServoSettings(driver="sysfs-pwm", gpio=4, sysfs=named))
+    servo = bench.servo(SysfsPwmSettings(gpio=4, chip="soc:pwm", channel=0))
     servo.write(0.0)
     bench.clock.sleep(0.02)
     assert bench.width(0, "soc:pwm") == 1500.0
@@ -79,12 +78,12 @@ def test_an_unexported_channel_is_an_error_and_then_opened_again(bench: Bench) -
     bench.shell("pwmchip1/unexport", 2)
     with pytest.raises(ServoError, match=r"pwm2/enable is gone"):
         servo.write(0.2)
-    assert servo.counters() == {"servo_reconnects": 0}
+    assert servo.driver.counters() == {"servo_reconnects": 0}
     with pytest.raises(ServoError):
         servo.write(0.2)  # exported again, but udev has not seen it yet
     bench.clock.sleep(0.05)
     assert bench.write(servo, 0.2) == 1620.0
-    assert servo.counters() == {"servo_reconnects": 1}
+    assert servo.driver.counters() == {"servo_reconnects": 1}
     servo.close()
 
 
@@ -122,28 +121,28 @@ def test_a_servo_that_is_not_there_at_start_is_found_later(bench: Bench) -> None
 @pytest.mark.parametrize(
     ("chips", "settings", "message"),
     [
-        ({FAN: 4}, ServoSettings(), r"add dtoverlay=pwm-2chan to /boot/firmware/config.txt"),
-        ({}, ServoSettings(gpio=12), r"has none: add dtoverlay=pwm-2chan,pin=12,func=4,pin2=13"),
-        ({PI5: 4}, ServoSettings(gpio=17), r"^servo.gpio: GPIO 17 .*; 12, 13, 18, 19 have$"),
+        ({FAN: 4}, SysfsPwmSettings(), r"add dtoverlay=pwm-2chan to /boot/firmware/config.txt"),
+        ({}, SysfsPwmSettings(gpio=12), r"has none: add dtoverlay=pwm-2chan,pin=12,func=4,pin2=13"),
+        ({PI5: 4}, SysfsPwmSettings(gpio=17), r"^servo.gpio: GPIO 17 .*; 12, 13, 18, 19 have$"),
         (
             {FAN: 4},
-            ServoSettings(sysfs=SysfsPwmSettings(chip=FAN)),
-            r"^servo.sysfs.channel is missing: for chip 1f0009c000.pwm",
+            SysfsPwmSettings(chip=FAN),
+            r"^servo.channel is missing: for chip 1f0009c000.pwm",
         ),
         (
             {PI5: 4},
-            ServoSettings(sysfs=SysfsPwmSettings(channel=4)),
-            r"^servo.sysfs.channel: /sys/class/pwm/pwmchip0 has no channel 4$",
+            SysfsPwmSettings(channel=4),
+            r"^servo.channel: /sys/class/pwm/pwmchip0 has no channel 4$",
         ),
         (
             {PI5: 4},
-            ServoSettings(sysfs=SysfsPwmSettings(root="/sys/nowhere")),
+            SysfsPwmSettings(root="/sys/nowhere"),
             r"^no PWM chips can be found in /sys/nowhere: No such file",
         ),
     ],
 )
 def test_a_mistake_is_named_with_what_would_be_right(
-    chips: dict[str, int], settings: ServoSettings, message: str
+    chips: dict[str, int], settings: SysfsPwmSettings, message: str
 ) -> None:
     bench = Bench()
     bench.kernel = SysfsPwm(bench.clock, chips)
@@ -152,7 +151,7 @@ def test_a_mistake_is_named_with_what_would_be_right(
         servo.write(0.0)
     assert "\n" not in str(caught.value)
     with pytest.raises(ServoError):
-        servo.neutralise()
+        bench.last_resort(settings=settings)
 
 
 def test_a_channel_that_the_kernel_uses_itself_is_refused(bench: Bench) -> None:
@@ -176,10 +175,10 @@ def test_a_channel_that_others_have_inverted_gets_its_normal_polarity_back() -> 
 def test_the_last_resort_brings_an_inverted_servo_to_neutral_too() -> None:
     bench = Bench()
     leave_inverted(bench)
-    assert bench.servo().neutralise() is True
+    assert bench.last_resort() is True
     assert max(bench.widths()) == 18_200  # and never high for good
     assert bench.widths()[-2:] == [1500, 0]
-    assert bench.servo().neutralise() is False
+    assert bench.last_resort() is False
 
 
 def leave_inverted(bench: Bench) -> int:

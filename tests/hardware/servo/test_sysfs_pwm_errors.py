@@ -2,25 +2,22 @@
 
 import errno
 import os
+from typing import Any
 
 import pytest
-from sysfs_pwm_kernel import SysfsPwm
+from rigs.sysfs_pwm_kernel import SysfsPwm
+from rigs.sysfs_pwm_rig import PI5, Bench
 
-from fishd.clock import VirtualClock
-from fishd.errors import ServoError
-from fishd.hardware.calibration import ServoCalibration
-from fishd.hardware.settings import ServoSettings
-from fishd.hardware.sysfs_pwm import SysfsPwmServo
+from fishd.core.errors import ServoError
 
-PI5 = "1f00098000.pwm"
 NEUTRAL = 1_500_000
 
 
 class BrokenPwm(SysfsPwm):
     """A kernel that fails at some files: at every read, or when it is sent a certain number."""
 
-    def __init__(self, clock: VirtualClock) -> None:
-        super().__init__(clock, {PI5: 4})
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
         self.unwritable: set[tuple[str, int]] = set()
         self.unreadable: set[str] = set()
         self._names: dict[int, str] = {}
@@ -41,30 +38,25 @@ class BrokenPwm(SysfsPwm):
         return super().pwrite(fd, data, offset)
 
 
-class Bench:
+class BrokenBench(Bench):
     """Such a kernel, with the pulses of a fishd at 0.5 rad on it."""
 
     def __init__(self) -> None:
-        self.clock = VirtualClock()
-        self.kernel = BrokenPwm(self.clock)
+        super().__init__({PI5: 4}, kernel=BrokenPwm)
         self.fishd = self.servo()
         self.fishd.write(0.5)
         self.clock.sleep(0.1)
         assert self.width() == 1800.0
 
-    def servo(self) -> SysfsPwmServo:
-        settings = ServoSettings(driver="sysfs-pwm")
-        return SysfsPwmServo(settings, ServoCalibration(), self.clock, self.kernel)
-
-    def width(self) -> float:
+    def width(self, channel: int = 2, device: str = PI5) -> float:
         """The pulse in force two periods from now [µs]."""
         self.clock.sleep(0.04)
-        return self.kernel.pulses(PI5, 2).width(self.clock.now)
+        return super().width(channel, device)
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def bench() -> BrokenBench:
+    return BrokenBench()
 
 
 @pytest.mark.parametrize(
@@ -77,17 +69,15 @@ def bench() -> Bench:
     ],
 )
 def test_the_last_resort_stops_the_pulses_whatever_step_fails(
-    bench: Bench, unwritable: set[tuple[str, int]]
+    bench: BrokenBench, unwritable: set[tuple[str, int]]
 ) -> None:
-    rescue = bench.servo()
     bench.kernel.unwritable = unwritable
     with pytest.raises(ServoError, match="Input/output error"):
-        rescue.neutralise()
+        bench.last_resort()
     assert bench.width() == 0.0
 
 
-def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Bench) -> None:
-    rescue = bench.servo()
+def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: BrokenBench) -> None:
     sleep = bench.clock.sleep
 
     def interrupt(seconds: float) -> None:
@@ -96,13 +86,13 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Be
 
     bench.clock.sleep = interrupt  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
-        rescue.neutralise()
+        bench.last_resort()
     assert bench.width() == 0.0
 
 
 @pytest.mark.parametrize("unreadable", [{"duty_cycle"}, {"enable"}])
 def test_close_switches_off_a_channel_that_cannot_be_released(
-    bench: Bench, unreadable: set[str]
+    bench: BrokenBench, unreadable: set[str]
 ) -> None:
     bench.kernel.unreadable = unreadable
     with pytest.raises(ServoError, match="Input/output error"):
@@ -113,7 +103,7 @@ def test_close_switches_off_a_channel_that_cannot_be_released(
     assert channel.exported_at is None
 
 
-def test_close_switches_off_a_channel_that_takes_no_duty_cycle(bench: Bench) -> None:
+def test_close_switches_off_a_channel_that_takes_no_duty_cycle(bench: BrokenBench) -> None:
     bench.kernel.unwritable = {("duty_cycle", 0)}
     with pytest.raises(ServoError, match="Input/output error"):
         bench.fishd.close()

@@ -1,6 +1,6 @@
 """A controller that misbehaves as it is told: `deed` is done in `method`.
 
-tools/misbehaviour.py installs it as a package of its own and lets the true fishd meet it.
+`tools/reliability misbehaviour` installs it as a package and lets the true fishd meet it.
 """
 
 import asyncio
@@ -14,8 +14,8 @@ import numpy as np
 from msgspec import Struct
 
 from fishd.controllers.base import Controller, Limits
-from fishd.errors import ControllerFault, ParameterError
-from fishd.signals import Observation
+from fishd.core.errors import ControllerFault, ParameterError
+from fishd.core.signals import Observation
 
 
 class Mute(Exception):
@@ -155,9 +155,9 @@ class Zoo(Controller[ZooParameters]):
         _act("retune", parameters)
         super().retune(parameters)
 
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Misbehave before the tick."""
-        _act("rehearse", self.parameters)
+        _act("warm_up", self.parameters)
 
     def close(self) -> None:
         """Misbehave at the end."""

@@ -1,34 +1,28 @@
 """What the emulated ADS1115 measures, how fast, and what its registers do."""
 
 import statistics
+from collections.abc import Iterator
 
 import pytest
-from adafruit_ads1x15 import ADS1115, AnalogIn
-from adafruit_extended_bus import ExtendedI2C
-from ads1115_board import ABSENT_BUS, VOLTS, Board, X, Y, codes, config
+from adafruit_ads1x15 import AnalogIn
+from rigs.ads1115_board import VOLTS, Board, X, Y, codes, config
 
-from fishd.emulation.ads1115 import DATA_RATES, POWER_UP
-from fishd.emulation.i2c import Read, Write
+from fishd.virtual.pi.ads1115 import DATA_RATES, POWER_UP
+from fishd.virtual.pi.i2c import Read, Write
 
 PINS = [(0, 1), (0, 3), (1, 3), (2, 3), (0,), (1,), (2,), (3,)]
 """What AnalogIn is given, by mux bits."""
 
 
 @pytest.fixture
-def board() -> Board:
-    return Board()
+def board() -> Iterator[Board]:
+    with Board() as board:
+        yield board
 
 
-def test_the_driver_reads_every_input_through_the_busio_front_end(board: Board) -> None:
+def test_the_driver_reads_every_input(board: Board) -> None:
     ads = board.driver()
     assert [AnalogIn(ads, *pins).value for pins in PINS] == [codes(volts) for volts in VOLTS]
-
-
-def test_the_driver_reads_every_input_through_the_device_file(board: Board) -> None:
-    with board.device_file():
-        ads = ADS1115(ExtendedI2C(ABSENT_BUS, frequency=None), data_rate=860)
-        values = [AnalogIn(ads, *pins).value for pins in PINS]
-    assert values == [codes(volts) for volts in VOLTS]
 
 
 @pytest.mark.parametrize(
@@ -47,8 +41,9 @@ def test_a_code_is_a_share_of_the_range_and_clips_at_its_ends(
 
 def test_noise_is_as_large_as_asked_for_and_the_same_for_the_same_seed() -> None:
     def readings(seed: int) -> list[int]:
-        ads = Board(noise=5.0, seed=seed).driver()
-        return [ads.read(X) for _ in range(400)]
+        with Board(noise=5.0, seed=seed) as board:
+            ads = board.driver()
+            return [ads.read(X) for _ in range(400)]
 
     assert statistics.stdev(readings(1)) == pytest.approx(5.0, rel=0.15)
     assert statistics.mean(readings(1)) == pytest.approx(codes(VOLTS[X]), abs=1.0)
@@ -88,23 +83,15 @@ def test_registers_have_their_reset_values(board: Board) -> None:
     assert [board.register(pointer) for pointer in range(4)] == [0x0000, 0x8583, 0x8000, 0x7FFF]
 
 
-def test_the_pointer_stays_where_it_was_set(board: Board) -> None:
-    board.bus.transfer(0x48, [Write(b"\x03")])
-    assert board.bus.transfer(0x48, [Read(2)]) == [b"\x7f\xff"]
-    assert board.bus.transfer(0x48, [Read(1)]) == [b"\x7f"]
-    assert board.bus.transfer(0x48, [Read(3)]) == [b"\x7f\xff\xff"]
-
-
-def test_half_a_word_changes_no_register(board: Board) -> None:
-    board.bus.transfer(0x48, [Write(b"\x03\x12")])
+def test_registers_are_read_and_written_by_their_pointer(board: Board) -> None:
+    board.bus.transfer(0x48, [Write(b"\x02\x12\x34")])
+    assert [board.bus.transfer(0x48, [Read(n)]) for n in (1, 2, 3)] == [
+        [b"\x12"],
+        [b"\x12\x34"],
+        [b"\x12\x34\xff"],
+    ]
+    board.bus.transfer(0x48, [Write(b"\x03\x12")])  # half a word
     assert board.register(3) == 0x7FFF
-
-
-def test_a_general_call_resets_the_chip(board: Board) -> None:
-    board.configure(config(Y))
-    board.bus.transfer(0x00, [Write(b"\x06")])
-    board.wait()
-    assert [board.register(pointer) for pointer in range(2)] == [0x0000, 0x8583]
 
 
 def test_a_busy_chip_tells_so_and_ignores_a_start(board: Board) -> None:
@@ -124,18 +111,33 @@ def test_a_config_without_the_start_bit_starts_nothing(board: Board) -> None:
     assert board.measured == []
 
 
+@pytest.mark.parametrize(
+    ("word", "complaint"),
+    [
+        (config(X) & ~0x100, "continuous mode is not emulated: it converts nothing"),
+        (config(X, low_byte=0), "the comparator is not emulated: ALERT stays silent"),
+    ],
+)
+def test_what_is_not_emulated_is_told_once(
+    board: Board, caplog: pytest.LogCaptureFixture, word: int, complaint: str
+) -> None:
+    for _ in range(3):
+        board.configure(word)
+    assert caplog.messages == [f"emulated ADS1115: {complaint}"]
+
+
 @pytest.mark.parametrize(("speed", "fewest", "most"), [(400e3, 13, 16), (100e3, 8, 10)])
 def test_so_many_pairs_fit_into_a_window_of_50_ms(speed: float, fewest: int, most: int) -> None:
     for seed in range(10):
-        board = Board(speed, seed=seed)
-        ads = board.driver()
-        begun, pairs = board.clock.now, 0
-        while board.clock.now < begun + 0.5:
-            for mux in (X, Y):
-                ads._write_config(mux)
-                board.clock.sleep(POWER_UP + 1 / 860)
-                while not ads._conversion_complete():
-                    pass
-                assert ads.get_last_result() == codes(VOLTS[mux]) & 0xFFFF
-            pairs += 1
+        with Board(speed, seed=seed) as board:
+            ads = board.driver()
+            begun, pairs = board.clock.now, 0
+            while board.clock.now < begun + 0.5:
+                for mux in (X, Y):
+                    ads._write_config(mux)
+                    board.clock.sleep(POWER_UP + 1 / 860)
+                    while not ads._conversion_complete():
+                        pass
+                    assert ads.get_last_result() == codes(VOLTS[mux]) & 0xFFFF
+                pairs += 1
         assert fewest <= pairs / 10 <= most

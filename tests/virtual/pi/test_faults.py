@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 
-from fishd.clock import VirtualClock
-from fishd.emulation.faults import FAULTS, INSTANTANEOUS, TRANSFER_ERRORS, Faults
+from fishd.core.clock import VirtualClock
+from fishd.virtual.pi.faults import INSTANTANEOUS, TRANSFER_ERRORS, Faults
 
 
 @pytest.fixture
@@ -19,26 +19,20 @@ def faults(clock: VirtualClock) -> Faults:
     return Faults(clock)
 
 
-def test_nothing_is_wrong_at_first(faults: Faults) -> None:
-    assert not any(faults.active(name) for name in FAULTS)
+def test_a_fault_lasts_until_it_is_cleared_or_for_the_time_given(
+    faults: Faults, clock: VirtualClock
+) -> None:
     assert faults.listing() == {}
-    assert faults.transfer_error() is None
-
-
-def test_a_fault_lasts_until_it_is_cleared(faults: Faults, clock: VirtualClock) -> None:
     faults.inject("stuck-busy")
+    faults.inject("nack", 0.5)
+    clock.sleep(0.4)
+    assert faults.transfer_error() == "nack"
+    clock.sleep(0.2)
+    assert faults.transfer_error() is None
     clock.sleep(1e6)
     assert faults.active("stuck-busy")
     faults.clear("stuck-busy")
     assert not faults.active("stuck-busy")
-
-
-def test_a_timed_fault_ends_by_itself(faults: Faults, clock: VirtualClock) -> None:
-    faults.inject("nack", 0.5)
-    clock.sleep(0.4)
-    assert faults.active("nack")
-    clock.sleep(0.2)
-    assert not faults.active("nack")
 
 
 def test_the_listing_tells_how_long_each_has_left(faults: Faults, clock: VirtualClock) -> None:
@@ -100,10 +94,3 @@ def test_the_same_seed_gives_the_same_errors(clock: VirtualClock) -> None:
 
     assert draw(3) == draw(3)
     assert draw(3) != draw(4)
-
-
-def test_an_error_rate_that_is_no_share_is_refused(faults: Faults) -> None:
-    for share in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match=r"error rate .* is not valid"):
-            faults.error_rate = share
-    assert faults.error_rate == 0.0

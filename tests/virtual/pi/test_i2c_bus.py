@@ -3,12 +3,13 @@
 import threading
 
 import pytest
-from ads1115_board import Board
+from rigs.ads1115_board import Board
+from rigs.processes import PATIENCE
 
-from fishd.clock import VirtualClock
-from fishd.emulation.ads1115 import RESET_CONFIG, Ads1115Chip
-from fishd.emulation.faults import TRANSFER_ERRORS, Faults
-from fishd.emulation.i2c import I2cBus, Read, Write
+from fishd.core.clock import VirtualClock
+from fishd.virtual.pi.ads1115 import RESET_CONFIG, Ads1115Chip
+from fishd.virtual.pi.faults import TRANSFER_ERRORS, Faults
+from fishd.virtual.pi.i2c import I2cBus, Read, Write
 
 RESET_WORD = 0x8000 | RESET_CONFIG
 
@@ -38,18 +39,16 @@ def test_a_transfer_answers_each_of_its_reads(board: Board) -> None:
     assert replies == [RESET_WORD.to_bytes(2, "big"), b"\x7f\xff"]
 
 
-def test_nobody_acknowledges_an_address_without_a_chip(board: Board) -> None:
-    for message in (Write(b""), Write(b"\x01"), Read(1)):
-        with pytest.raises(OSError, match="Errno") as caught:
-            board.bus.transfer(0x49, [message])
-        assert caught.value.errno == 121
+@pytest.mark.parametrize("address", [0x00, 0x49])
+def test_nobody_acknowledges_an_address_without_a_chip(board: Board, address: int) -> None:
+    for message in (Write(b""), Write(b"\x06"), Read(1)):
+        with pytest.raises(OSError, match="Errno 121"):
+            board.bus.transfer(address, [message])
 
 
 def test_an_address_takes_one_chip_only(board: Board) -> None:
     with pytest.raises(ValueError, match="0x48 is taken"):
         board.bus.attach(0x48, board.chip)
-    with pytest.raises(ValueError, match="0x08 to 0x77 is needed"):
-        board.bus.attach(0x00, board.chip)
 
 
 def test_transfers_from_several_threads_queue() -> None:
@@ -72,7 +71,7 @@ def test_transfers_from_several_threads_queue() -> None:
     replies: list[bytes] = []
 
     def work() -> None:
-        together.wait()
+        together.wait(PATIENCE)
         for _ in range(5):
             replies.extend(bus.transfer(0x48, [Write(b"\x01"), Read(2)]))
 
@@ -80,7 +79,7 @@ def test_transfers_from_several_threads_queue() -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(PATIENCE)
     assert replies == [RESET_WORD.to_bytes(2, "big")] * 20
     assert clock.most == 1
 

@@ -8,15 +8,14 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from pigpiod_client import GPIO, PATIENCE, PigpiodBench, eventually, pigpiod_bench
+from rigs.pigpiod_client import GPIO, PATIENCE, PigpiodBench, eventually, pigpiod_bench
 
-from fishd.clock import SystemClock, VirtualClock
+from fishd.core.clock import SystemClock, VirtualClock
 
 PIGS = shutil.which("pigs")
-needs_pigs = pytest.mark.skipif(
+pytestmark = pytest.mark.skipif(
     PIGS is None, reason="`pigs` is not installed: it is in Debian's package pigpio-tools"
 )
-pytestmark = needs_pigs
 
 
 @pytest.fixture
@@ -128,7 +127,7 @@ def test_scripts_are_stored_run_watched_and_deleted(bench: PigpiodBench) -> None
         ("s 18 100", "-7", "pulsewidth not 0 or 500-2500"),
         ("gpw 18", "-93", "GPIO is not in use for servo pulses"),
         ("gdc 18", "-92", "GPIO is not in use for PWM"),
-        ("w 40 1", "-41", "no permission to update GPIO"),
+        ("w 30 1", "-41", "no permission to update GPIO"),
         ("procr 3", "-48", "unknown script id"),
         ("proc frob", "-55", "illegal script command"),
         ("i2co 1 0x48 0", "-88", "unknown command"),

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from fishd.emulation.pulses import PulseTrain
-from fishd.emulation.settings import VirtualPiSettings
-from fishd.emulation.tank import STEP, Tank
-from fishd.hardware.imperfections import SimulationSettings
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import TetheredFish
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.pulse_train import PulseTrain
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.pi.tank import STEP, Tank
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import TetheredFish
 
 TICK = 0.05
 X, Y = 0, 3

@@ -1,16 +1,16 @@
-import subprocess
 import sys
 from typing import get_type_hints
 
 import msgspec
 import pytest
+from rigs.processes import call
 
-from fishd.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import PlantParameters
 
 
 def test_reading_parameters_costs_no_numpy() -> None:
-    program = "import sys, fishd.plant.parameters; sys.exit('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+    program = "import sys, fishd.virtual.plant.parameters; sys.exit('numpy' in sys.modules)"
+    assert call(sys.executable, "-c", program).returncode == 0
 
 
 def test_every_parameter_has_bounds_a_unit_and_a_description() -> None:

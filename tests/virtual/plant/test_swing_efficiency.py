@@ -2,9 +2,9 @@ from collections.abc import Callable
 
 import pytest
 
-from fishd.plant.optimum import best_square_wave
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import TetheredFish
+from fishd.virtual.plant.optimum import best_square_wave
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import TetheredFish
 
 STEP = 0.004  # s
 

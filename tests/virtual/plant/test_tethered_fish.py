@@ -6,8 +6,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from fishd.plant.parameters import PlantParameters
-from fishd.plant.tethered import REST, PlantState, TetheredFish, Window
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import REST, PlantState, TetheredFish, Window
 
 FISHES = {
     "default": PlantParameters(),
@@ -119,6 +119,7 @@ def means(window: Window) -> list[float]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FISHES)
 def test_every_window_agrees_with_an_adaptive_solver(name: str) -> None:
     p = FISHES[name]
@@ -137,7 +138,6 @@ def test_every_window_agrees_with_an_adaptive_solver(name: str) -> None:
         assert np.abs(error).max() < 1e-7, (duration, command)
 
 
-@settings(deadline=None)
 @given(fishes, states, instructions, durations, st.floats(0.01, 0.99))
 def test_a_window_in_two_parts_leads_to_the_same_state_and_forces(
     p: PlantParameters, state: PlantState, command: float | None, duration: float, part: float
@@ -152,7 +152,6 @@ def test_a_window_in_two_parts_leads_to_the_same_state_and_forces(
     assert np.abs((together - means(window)) / force_scale)[:2].max() < 1e-8
 
 
-@settings(deadline=None)
 @given(fishes, states, angles, durations)
 def test_a_mirrored_fish_makes_the_same_thrust_and_the_opposite_lateral_force(
     p: PlantParameters, state: PlantState, command: float, duration: float
@@ -182,33 +181,32 @@ def test_without_pulses_the_wheel_keeps_its_angle_and_the_fin_settles_there() ->
     assert fish.state == pytest.approx((0.3, 0.3 * p.coupling, 0.0), abs=1e-12)
 
 
-def test_cable_slack_lets_the_wheel_turn_without_moving_the_fin() -> None:
-    fish = TetheredFish(PlantParameters(cable_slack=0.1))
-    fish.advance(0.099, 0.2, samples=1)
-    assert fish.state.phi > 0.09
-    assert fish.state.alpha == 0.0
-    fish.advance(0.3, 5.0, samples=1)
-    assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
+@pytest.mark.parametrize(
+    ("fault", "steps"),
+    [  # a command, and the wheel angle that the fin has followed then [rad]
+        ({"cable_slack": 0.1}, [(0.099, 0.0), (0.3, 0.2)]),
+        # back by less than twice the play, and by more
+        ({"backlash": 0.1}, [(0.3, 0.2), (0.11, 0.2), (0.0, 0.1)]),
+        ({"servo_dead_zone": 0.1}, [(0.09, 0.0), (0.4, 0.3), (0.25, 0.3)]),
+    ],
+    ids=str,
+)
+def test_slack_play_and_a_dead_zone_are_taken_off_what_the_fin_follows(
+    fault: dict[str, float], steps: list[tuple[float, float]]
+) -> None:
+    fish = TetheredFish(PlantParameters(**fault))
+    for command, followed in steps:
+        fish.advance(command, 5.0, samples=1)
+        assert fish.state.alpha == pytest.approx(0.46 * followed, rel=1e-6, abs=0.0)
 
 
-def test_backlash_is_taken_up_after_each_reversal() -> None:
-    fish = TetheredFish(PlantParameters(backlash=0.1))
-    fish.advance(0.3, 5.0, samples=1)
-    assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
-    fish.advance(0.11, 5.0, samples=1)  # back by less than twice the play
-    assert fish.state.alpha == pytest.approx(0.46 * 0.2, rel=1e-6)
-    fish.advance(0.0, 5.0, samples=1)
-    assert fish.state.alpha == pytest.approx(0.46 * 0.1, rel=1e-6)
-
-
-def test_a_lazy_servo_stops_at_the_edge_of_its_dead_zone_and_ignores_what_is_within() -> None:
-    fish = TetheredFish(PlantParameters(servo_dead_zone=0.1))
-    fish.advance(0.09, 1.0, samples=1)
-    assert fish.state.phi == 0.0
-    fish.advance(0.4, 5.0, samples=1)
-    assert fish.state.phi == pytest.approx(0.3)
-    fish.advance(0.25, 5.0, samples=1)
-    assert fish.state.phi == pytest.approx(0.3)
+def test_a_wheel_that_takes_up_slack_turns_and_one_in_its_dead_zone_does_not() -> None:
+    slack = TetheredFish(PlantParameters(cable_slack=0.1))
+    lazy = TetheredFish(PlantParameters(servo_dead_zone=0.1))
+    for fish in (slack, lazy):
+        fish.advance(0.099, 0.2, samples=1)
+    assert slack.state.phi > 0.09
+    assert lazy.state.phi == 0.0
 
 
 @pytest.mark.parametrize("delay", [0.03, 0.05, 0.08])
@@ -276,8 +274,12 @@ def turning_point(p: PlantParameters, start: PlantState, command: float, duratio
     return fish.state.alpha
 
 
+_STEPS = 100
+"""Of slow motion in a window; no fin turns twice in one."""
+
+
 @example(PlantParameters(omega0=60.0, xi=4.0), PlantState(0.0, 0.34375, 3.0), 0.0, 0.171875)
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(fishes, states, angles, durations)
 def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
     p: PlantParameters, state: PlantState, command: float, duration: float
@@ -285,15 +287,15 @@ def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
     fish, slow_motion = TetheredFish(p, state), TetheredFish(p, state)
     peak = fish.advance(command, duration, samples=1).fin_peak
     seen = [abs(state.alpha)]
-    for _ in range(500):
+    for _ in range(_STEPS):
         before = slow_motion.state
-        slow_motion.advance(command, duration / 500, samples=1)
+        slow_motion.advance(command, duration / _STEPS, samples=1)
         after = slow_motion.state
         seen.append(abs(after.alpha))
         if before.alpha_rate * after.alpha_rate < 0.0:  # it turned in between: find where
-            seen.append(abs(turning_point(p, before, command, duration / 500)))
+            seen.append(abs(turning_point(p, before, command, duration / _STEPS)))
     assert peak == pytest.approx(max(seen), rel=2e-5, abs=1e-7)
-    assert peak >= (1.0 - 1e-6) * max(seen)
+    assert peak >= (1.0 - 1e-6) * max(seen) - 1e-12  # far below, the equations are not resolved
 
 
 def test_the_thrust_of_a_periodic_motion_is_the_mean_square_fin_velocity() -> None:

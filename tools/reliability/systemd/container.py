@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from common.report import BrokenPromise
+
 PATIENCE = 30.0
 """How long anything may take [s]."""
 _ENVIRONMENT = ("env", "-i", "LANG=C.UTF-8", "PATH=/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin")
@@ -20,10 +22,6 @@ class Entry(NamedTuple):
     """[s], on the monotonic clock that the container shares with this machine."""
     unit: str
     message: str
-
-
-class Broken(Exception):
-    """Something did not happen that must; the message says what."""
 
 
 class Container:
@@ -61,12 +59,12 @@ class Container:
         self._console.close()
 
     def run(self, *command: str, check: bool = True) -> str:
-        """Run a command inside; its output. Raises `Broken` when it fails, unless told not to."""
+        """Run a command inside; its output. Raises `BrokenPromise` when it fails."""
         done = subprocess.run(
             self.command(*command), capture_output=True, text=True, check=False, timeout=300
         )
         if check and done.returncode:
-            raise Broken(f"{' '.join(command)}: {(done.stderr or done.stdout).strip()}")
+            raise BrokenPromise(f"{' '.join(command)}: {(done.stderr or done.stdout).strip()}")
         return done.stdout.strip()
 
     def command(self, *command: str) -> list[str]:
@@ -93,7 +91,7 @@ class Container:
 
     def _has_leader(self) -> bool:
         if self._nspawn.poll() is not None:
-            raise Broken(f"systemd-nspawn ended; see {self._console.name}")
+            raise BrokenPromise(f"systemd-nspawn ended; see {self._console.name}")
         children = Path(f"/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children").read_text()
         for child in children.split():
             # Children that only prepare the container end again.
@@ -109,10 +107,10 @@ class Container:
 
 
 def wait_for(condition: Callable[[], bool], otherwise: str, patience: float = PATIENCE) -> float:
-    """Wait until it holds and return the time [s]; raises `Broken` with `otherwise`."""
+    """Wait until it holds and return the time [s]; raises `BrokenPromise` with `otherwise`."""
     deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         if condition():
             return time.monotonic()
         time.sleep(0.02)
-    raise Broken(otherwise)
+    raise BrokenPromise(otherwise)

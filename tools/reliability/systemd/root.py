@@ -6,26 +6,26 @@ import subprocess
 import sys
 from pathlib import Path
 
-CHECKOUT = Path(__file__).resolve().parents[2]
+from common.report import progress
+
+CHECKOUT = Path(__file__).resolve().parents[3]
 _SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
 """Debian's release with the same Python as this one, so that wheels of compiled code fit."""
 _TOOLS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container", "git": "git"}
 _PACKAGES = "systemd,systemd-sysv,dbus,make,python3,python3-venv"
 
 
-class CannotTry(Exception):
-    """What this machine lacks, as one line."""
-
-
 def check_machine() -> None:
-    """Raises `CannotTry` when a root folder could not be made or booted here."""
+    """Raises SystemExit when a root folder could not be made or booted here."""
     if os.geteuid() != 0:
-        raise CannotTry("to boot a root folder needs root: sudo make trial-systemd")
+        raise SystemExit("to boot a root folder needs root: sudo make trial-systemd")
     for tool, package in _TOOLS.items():
         if shutil.which(tool) is None:
-            raise CannotTry(f"{tool} is missing: sudo apt install {package}")
+            raise SystemExit(f"{tool} is missing: sudo apt install {package}")
     if sys.version_info[:2] not in _SUITES:
-        raise CannotTry("run this with Python 3.11 or 3.13: a release of Debian must have the same")
+        raise SystemExit(
+            "run this with Python 3.11 or 3.13: a release of Debian must have the same"
+        )
 
 
 def build(work: Path, base: Path | None) -> Path:
@@ -58,7 +58,7 @@ def build(work: Path, base: Path | None) -> Path:
 
 def _debootstrap(folder: Path) -> None:
     suite = _SUITES[sys.version_info[:2]]
-    _say(f"making a Debian {suite}; takes a minute")
+    progress(f"making a Debian {suite}; takes a minute")
     subprocess.run(
         ["debootstrap", "--variant=minbase", f"--include={_PACKAGES}", suite, folder],
         stdout=subprocess.DEVNULL,
@@ -68,7 +68,7 @@ def _debootstrap(folder: Path) -> None:
 
 def _wheels(folder: Path) -> None:
     """Everything that installing fishd takes: there is no network inside."""
-    _say("collecting wheels")
+    progress("collecting wheels")
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     wanted = [f"{CHECKOUT}[{core_extras()}]", "hatchling"]
     subprocess.run([*pip, "wheel", "--wheel-dir", folder, *wanted], check=True)
@@ -81,7 +81,3 @@ def core_extras() -> str:
     script = 'source "$0/tools/install_pi.sh"; core_extras $(about_python "$1")'
     command = ["bash", "-c", script, str(CHECKOUT), sys.executable]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -1,6 +1,6 @@
 """What is tried on the booted system, and what must come of it.
 
-Each trial returns a row of the report; raises `Broken` where a promise of fishd is not kept.
+Each trial returns a row of the report; raises `BrokenPromise` where a promise of fishd is not kept.
 """
 
 import time
@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from container import Broken, Container, Entry, wait_for
+from common.report import BrokenPromise
+from reliability.systemd.container import Container, Entry, wait_for
 
 NEUTRAL = 1500.0
 """Pulse of a straight fin in the trial's configuration [us]."""
@@ -50,7 +51,7 @@ class Rig:
         time.sleep(1.5)
         faults = [e.message for e in self.container.journal(begun) if " fault: " in e.message]
         if faults or self.pulse() in (0.0, NEUTRAL):
-            raise Broken(f"the fish does not swim: {', '.join(faults) or 'no pulses'}")
+            raise BrokenPromise(f"the fish does not swim: {', '.join(faults) or 'no pulses'}")
 
     def pulse(self) -> float:
         """The pulse of now [us]; 0: none."""
@@ -83,7 +84,7 @@ class Rig:
         changes = [(t, p) for t, p in self.pulses() if t > since]
         last = next(i for i, (_, pulse) in enumerate(changes) if pulse == 0)
         if last == 0 or changes[last - 1][1] != NEUTRAL:
-            raise Broken("the pulses ended before the servo was neutral")
+            raise BrokenPromise("the pulses ended before the servo was neutral")
         return changes[last - 1][0] - since, changes[last][0] - since
 
 
@@ -96,7 +97,7 @@ def start(rig: Rig) -> Row:
     rig.swim()
     loop = rig.container.run("fishctl", "status")
     if "real-time scheduling" not in loop:
-        raise Broken("the daemon has no real-time scheduling")
+        raise BrokenPromise("the daemon has no real-time scheduling")
     return Row("`systemctl start`", None, None, ready, "ready with the first tick")
 
 
@@ -106,7 +107,7 @@ def stop(rig: Rig) -> Row:
     rig.systemctl("stop", _UNIT)
     ended = rig.when(begun, "Stopped fishd.service")
     if rig.container.show(_UNIT, "Result") != "success":
-        raise Broken("a clean stop counts as a failure")
+        raise BrokenPromise("a clean stop counts as a failure")
     return Row("`systemctl stop`", *rig.settled(begun), None, f"stopped after {ended:.2f} s")
 
 
@@ -125,7 +126,9 @@ def _survived(rig: Rig, what: str, begun: float, sign: str, name: str) -> Row:
     neutral, off = rig.settled(begun)
     again = rig.when(begun, "Started fishd.service")
     if neutral > NEUTRAL_LIMIT:
-        raise Broken(f"{what}: neutral after {neutral:.3f} s; {NEUTRAL_LIMIT} s are promised")
+        raise BrokenPromise(
+            f"{what}: neutral after {neutral:.3f} s; {NEUTRAL_LIMIT} s are promised"
+        )
     return Row(what, neutral, off, again, f"{name} after {noticed:.2f} s, released, restarted")
 
 
@@ -134,16 +137,16 @@ def killed_again_and_again(rig: Rig) -> Row:
     begun = time.monotonic()
     while (state := rig.container.show(_UNIT, "ActiveState")) != "failed":
         if time.monotonic() > begun + 120:
-            raise Broken("a daemon that always dies is restarted for ever")
+            raise BrokenPromise("a daemon that always dies is restarted for ever")
         if state == "active":
             rig.signal("SIGKILL")
         time.sleep(0.1)
     said = rig.when(begun, "fishd has failed", "fishd-failure.service")
     starts = [e for e in rig.container.journal(begun) if e.message.startswith("Started fishd.")]
     if said < starts[-1].time - begun:
-        raise Broken("the failure unit has acted before fishd was given up")
+        raise BrokenPromise("the failure unit has acted before fishd was given up")
     if rig.pulse() != 0:
-        raise Broken("pulses go on after the service was given up")
+        raise BrokenPromise("pulses go on after the service was given up")
     outcome = (
         f"given up after {len(starts)} restarts, {said:.0f} s; failure unit has run, pulses off"
     )
@@ -166,7 +169,7 @@ def wrong_config(rig: Rig) -> Row:
     finally:
         config.write_text(good)
     if (status, restarts) != ("78", "0"):
-        raise Broken(f"a wrong configuration: exit status {status}, {restarts} restarts")
+        raise BrokenPromise(f"a wrong configuration: exit status {status}, {restarts} restarts")
     rig.when(begun, "did you mean 'tick'?")
     return Row("wrong configuration", None, None, None, "exit 78, no restart; failure unit has run")
 

@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from fishd.emulation.link import RemotePi
+from fishd.virtual.pi.link import RemotePi
 
 PERIOD = 0.005  # [s]
 

@@ -1,38 +1,31 @@
 """What a check of `fishctl doctor` is given, and what it returns."""
 
 import os
-import pwd
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any
 
-from fishd import robots
-from fishd.cli.checks.daemon import Running, Unreachable, ask
+from fishd import wiring
+from fishd.cli.doctor.checks.daemon import Running, Unreachable, ask
 from fishd.config import Config
-from fishd.errors import StartupError
+from fishd.core.errors import StartupError
+from fishd.core.plugins import Plugins
 from fishd.hardware import ownership
+from fishd.hardware.checks import Machine, Result, skipped
+from fishd.hardware.registry import FORCE_SENSORS, SERVOS
 
 INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
 """Mends a missing driver."""
 
-Level = Literal["ok", "warning", "FAIL", "skipped"]
-
-
-class Result(NamedTuple):
-    """One line about one thing, and how to mend it where that is needed."""
-
-    level: Level
-    message: str
-    mend: str = ""
-
 
 @dataclass
-class Context:
-    """What the checks look at: the configuration, this machine and a daemon, if one runs."""
+class Context(Machine):
+    """What the checks look at: this machine, the configuration and a daemon, if one runs."""
 
     config: Config
     file: Path | None = None
@@ -40,6 +33,11 @@ class Context:
     endpoint: str | None = None
     root: Path = field(default_factory=lambda: Path("/"))
     """Where /sys, /proc, /dev and so on are looked for."""
+
+    @property
+    def robot(self) -> str:
+        """That of the configuration."""
+        return self.config.robot
 
     @cached_property
     def daemon(self) -> Running | Unreachable | None:
@@ -61,7 +59,7 @@ class Context:
     def owner(self) -> str:
         """Which fishd, at whatever endpoint, drives a part of this robot; empty where none does."""
         try:
-            return ownership.owner(robots.parts_of(self.config))
+            return ownership.owner(wiring.parts_of(self.config))
         except StartupError:  # where a virtual Pi would be is no good place; the check will say so
             return ""
 
@@ -97,60 +95,24 @@ class Context:
         file = f" --config {self.file}" if self.file else ""
         return f"sudo -u {shlex.quote(name)} fishctl doctor{file}"
 
-    def path(self, absolute: str) -> Path:
-        """A path of this machine, below `root`."""
-        return self.root / absolute.lstrip("/")
-
-    def text(self, absolute: str) -> str:
-        """A small file's text without the zero or newline at its end; empty if unreadable."""
-        try:
-            return self.path(absolute).read_text(encoding="utf-8", errors="replace").rstrip("\0\n ")
-        except OSError:
-            return ""
+    @contextmanager
+    def plugged_in(self) -> Iterator[None]:
+        """Where the robot is a virtual Pi: with its bus in this process. Raises `StartupError`."""
+        with ExitStack() as stack:
+            if self.robot == "virtual-pi":
+                wiring.plug_in_virtual_pi(self.config, stack)
+            yield
 
     @property
-    def model(self) -> str:
-        """What this machine calls itself, such as Raspberry Pi 5 Model B; empty if unknown."""
-        return self.text("/proc/device-tree/model")
-
-
-class Check(NamedTuple):
-    """A function of the context; it returns None where there is nothing to check."""
-
-    name: str
-    function: Callable[[Context], Result | None]
-    robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi")
-    """For which robots it is made."""
+    def drivers(self) -> tuple[tuple[str, Plugins[Any], Any], ...]:
+        """Section, kind and settings of the two drivers."""
+        config = self.config
+        return (
+            ("force_sensor", FORCE_SENSORS, config.force_sensor),
+            ("servo", SERVOS, config.servo),
+        )
 
 
 def sudo_unless(uid: int) -> str:
     """`sudo ` for a command that only this user, or root, may give; empty where that is us."""
     return "" if os.geteuid() in (0, uid) else "sudo "
-
-
-def name_of(uid: int) -> str:
-    """The name of a user, or its number where it has none."""
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return f"#{uid}"
-
-
-def ok(message: str) -> Result:
-    """Nothing to do."""
-    return Result("ok", message)
-
-
-def warning(message: str, mend: str) -> Result:
-    """It works, but could be better."""
-    return Result("warning", message, mend)
-
-
-def fail(message: str, mend: str) -> Result:
-    """It cannot work."""
-    return Result("FAIL", message, mend)
-
-
-def skipped(message: str) -> Result:
-    """It cannot be told, or was not tried."""
-    return Result("skipped", message)

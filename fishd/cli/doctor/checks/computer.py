@@ -1,4 +1,4 @@
-"""Checks of the computer: power, disk, and the folder of calibrations."""
+"""Checks of the computer: its model, system, power, disk, and the folder of calibrations."""
 
 import errno
 import os
@@ -6,53 +6,103 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from fishd.cli.checks.base import Check, Context, Result, fail, name_of, ok, skipped, warning
-from fishd.errors import ConfigError
-from fishd.hardware.calibration import ForceCalibration, ServoCalibration
+from fishd.cli.doctor.checks.base import Context
+from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.robots import state_folder
+from fishd.hardware.checks import Check, Result, fail, name_of, ok, skipped, warning
+from fishd.wiring import state_folder
 
 LITTLE_DISK, NO_DISK = 1e9, 50e6
 """Free space that is worth a warning, and that is too little [bytes]."""
 _THROTTLED = "/sys/devices/platform/soc/soc:firmware/get_throttled"
 _BEFORE = 16
 """A flag of what happened since start is so many bits above that of what happens now."""
+_OLDEST = "brcm,bcm2835"
+"""The one slow core of a Pi 1, Zero and Zero W, in the device tree."""
+_HEADER_OF_PI_5 = "1f000*"
+"""Devices of the RP1, the chip that a Pi 5 has its header on, where the kernel knows it."""
+_RASPBERRY_PI_OS = "use Raspberry Pi OS, or see 'Which system' in docs/installing.md"
+
+
+def model(context: Context) -> Result:
+    """Robot `pi` is for a Raspberry Pi that is fast enough."""
+    if "Raspberry Pi" not in context.model:
+        return warning(
+            f"this machine is no Raspberry Pi: {context.model or 'it does not say what it is'}",
+            "run fishd on the Pi, or set robot: simulated or virtual-pi",
+        )
+    if _OLDEST in context.text("/proc/device-tree/compatible").split("\0"):
+        return fail(
+            f"{context.model} has one core of ARMv6, too slow: its ticks would take 7 ms, one in a "
+            "hundred more than 10 ms, and a release of the servo 7 s",
+            "use a Pi Zero 2 W, 3, 4 or 5",
+        )
+    return ok(context.model)
+
+
+def system(context: Context) -> Result | None:
+    """Raspberry Pi OS and plain Debian look alike, but only one knows all of the Pi."""
+    if "Raspberry Pi" not in context.model:
+        return None
+    name = _name(context)
+    kernel = context.text("/proc/sys/kernel/osrelease") or "unknown"
+    if "Raspberry Pi 5" in context.model and not any(
+        context.path("/sys/bus/platform/devices").glob(_HEADER_OF_PI_5)
+    ):
+        return fail(
+            f"{name}: its kernel, {kernel}, does not know the header of a Pi 5, so there is "
+            "neither I2C nor a servo",
+            _RASPBERRY_PI_OS,
+        )
+    if not context.path("/proc/device-tree/__overrides__").is_dir():
+        servo = context.config.servo.driver
+        lacks = {"sysfs-pwm": ", the PWM of the header is off", "pigpio": ", there is no pigpiod"}
+        return warning(
+            f"{name} with its own kernel, {kernel}: dtparam= and dtoverlay= in config.txt do "
+            f"nothing{lacks.get(servo, '')}",
+            _RASPBERRY_PI_OS,
+        )
+    return ok(f"{name}, kernel {kernel}")
+
+
+def _name(context: Context) -> str:
+    """Such as Raspberry Pi OS (Debian GNU/Linux 12 (bookworm)); the two have one os-release."""
+    lines = dict(
+        line.split("=", 1) for line in context.text("/etc/os-release").splitlines() if "=" in line
+    )
+    debian = lines.get("PRETTY_NAME", "this system").strip('"')
+    return f"Raspberry Pi OS ({debian})" if context.path("/etc/rpi-issue").exists() else debian
 
 
 def power(context: Context) -> Result:
     """What the firmware says, or the kernel's own under-voltage alarm."""
-    text = context.text(_THROTTLED)
-    if text:
+    if text := context.text(_THROTTLED):
         return _firmware(int(text, 16))
     for monitor in sorted(context.path("/sys/class/hwmon").glob("hwmon*")):
-        name = context.text(f"/sys/class/hwmon/{monitor.name}/name")
-        if name == "rpi_volt":
-            if context.text(f"/sys/class/hwmon/{monitor.name}/in0_lcrit_alarm") == "1":
-                return _UNDER_VOLTAGE
-            return ok("no under-voltage")
+        if context.text(f"/sys/class/hwmon/{monitor.name}/name") == "rpi_volt":
+            alarm = context.text(f"/sys/class/hwmon/{monitor.name}/in0_lcrit_alarm") == "1"
+            return _firmware(1) if alarm else ok("no under-voltage")
     return skipped("this machine does not tell whether its power suffices")
 
 
 def _firmware(flags: int) -> Result:
     if flags & 1:
-        return _UNDER_VOLTAGE
-    now = [text for bit, text in _FLAGS.items() if flags >> bit & 1]
-    if now:
-        return warning(f"the Pi is {' and '.join(now)}", "cool it, and check its power supply")
-    before = [text for bit, text in _FLAGS.items() if flags >> bit + _BEFORE & 1]
-    if before:
-        return warning(
-            f"since it was started, the Pi has been {' and '.join(before)}",
-            "cool it, and check its power supply; give the servo a supply of its own",
+        return fail(
+            "under-voltage: the Pi gets less than 4.63 V",
+            f"use a stronger power supply and a shorter cable; {_APART}",
         )
+    if now := [text for bit, text in _FLAGS.items() if flags >> bit & 1]:
+        return warning(f"the Pi is {' and '.join(now)}", _COOL)
+    if before := [text for bit, text in _FLAGS.items() if flags >> bit + _BEFORE & 1]:
+        since = f"since it was started, the Pi has been {' and '.join(before)}"
+        return warning(since, f"{_COOL}; {_APART}")
     return ok("no under-voltage, not throttled")
 
 
 _FLAGS = {0: "under-voltage", 1: "slowed down", 2: "throttled", 3: "too hot"}
-_UNDER_VOLTAGE = fail(
-    "under-voltage: the Pi gets less than 4.63 V",
-    "use a stronger power supply and a shorter cable; give the servo a supply of its own",
-)
+_COOL = "cool it, and check its power supply"
+_APART = "give the servo a supply of its own"
 
 
 def state(context: Context) -> Result:
@@ -102,7 +152,7 @@ def disk(context: Context) -> Result:
 
 
 def calibrations(context: Context) -> Result:
-    """Both calibrations that are, or would be, in force."""
+    """Both calibrations that fishd uses, or would use."""
     folder = CalibrationFolder(state_folder(context.config))
     if context.running and (found := context.running.calibrations):
         file = found.force_file or found.servo_file
@@ -141,24 +191,18 @@ def _unreadable(context: Context, folder: Path, complaint: str) -> Result:
     if os.strerror(errno.EACCES) in complaint:
         return warning(complaint, f"run this as the user of fishd: {context.as_fishd}")
     if not _nearest(folder).is_dir():
-        return fail(complaint, "as for 'state folder'")
-    return fail(complaint, "mend that file, or remove it: the one before is then in force")
+        return fail(complaint, "mend the state folder first, see 'state folder'")
+    return fail(complaint, "mend that file, or remove it: the one before is used then")
 
 
 def _nearest(folder: Path) -> Path:
     """The folder, or the nearest above it that this user can see."""
-    return next(path for path in (folder, *folder.parents) if _is_seen(path))
-
-
-def _is_seen(path: Path) -> bool:
-    try:
-        path.stat()
-    except OSError:  # not there, below a file, or below a folder that may not be entered
-        return False
-    return True
+    return next(path for path in (folder, *folder.parents) if os.access(path, os.F_OK))
 
 
 CHECKS = (
+    Check("model", model, ("pi",)),
+    Check("system", system, ("pi",)),
     Check("power", power, ("pi",)),
     Check("state folder", state, ("pi", "virtual-pi")),
     Check("disk", disk),

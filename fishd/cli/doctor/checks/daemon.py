@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import msgspec
 
-from fishd.addresses import find_control, is_deserted, socket_path
 from fishd.client import Fish
-from fishd.errors import FishError, NoDaemon, Refused, Untrusted
-from fishd.protocol import Calibrations
-from fishd.signals import Status, Tick
+from fishd.core.addresses import find_control, socket_path
+from fishd.core.errors import FishError, NoDaemon, Refused, Untrusted
+from fishd.core.protocol import Calibrations
+from fishd.core.signals import Status, Tick
+from fishd.core.unix_sockets import is_deserted
 
 PATIENCE = 1.0
 """How long a daemon may take to answer [s]."""
@@ -60,18 +61,13 @@ def ask(endpoint: str | None) -> Running | Unreachable | None:
 
 def _is_nobody_at(endpoint: str) -> bool:
     """True where it is certain; raises PermissionError where this user cannot know."""
-    if endpoint.startswith("tcp://"):
+    path = socket_path(endpoint)
+    if path is None:
         return _is_refused(endpoint)
-    if is_deserted(endpoint):
+    if is_deserted(path):
         return True
-    if endpoint.startswith("ipc://"):
-        path = socket_path(endpoint)
-        try:
-            path.stat()
-        except (FileNotFoundError, NotADirectoryError):
-            return True
-        if not os.access(path, os.W_OK):
-            raise PermissionError
+    if not os.access(path, os.W_OK):
+        raise PermissionError
     return False
 
 

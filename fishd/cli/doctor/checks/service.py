@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-from fishd import addresses
-from fishd.cli.checks.base import Check, Context, Result, fail, ok, skipped, warning
-from fishd.cli.checks.daemon import Running, Unreachable
-from fishd.errors import StartupError
+from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor.checks.daemon import Running, Unreachable
+from fishd.core import addresses
+from fishd.core.errors import StartupError
+from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
 
 UNIT = "fishd.service"
 _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/lib/systemd/system")
@@ -72,7 +73,7 @@ def unit(context: Context) -> Result:
 def _address(context: Context, address: str, key: str) -> Result:
     found = context.daemon
     if isinstance(found, Unreachable):  # to bind could take its socket away
-        return skipped("not tried; see daemon")
+        return skipped("not tried: a fishd may use it; see 'daemon'")
     if found and address in (found.status.telemetry, found.endpoint):
         return ok(f"{address} is served by the running fishd")
     try:

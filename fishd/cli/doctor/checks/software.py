@@ -6,7 +6,9 @@ import stat
 import sys
 from importlib import metadata
 
-from fishd.cli.checks.base import Check, Context, Result, fail, ok, sudo_unless, warning
+from fishd.cli.doctor.checks.base import Context, sudo_unless
+from fishd.hardware import header
+from fishd.hardware.checks import Check, Result, fail, ok, warning
 from fishd.hardware.packages import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
@@ -40,28 +42,33 @@ def configuration(context: Context) -> Result:
 
 def packages(context: Context) -> Result:
     """Those that this configuration needs, as fishd's own metadata demands them."""
-    robot, servo = context.config.robot, context.config.servo
-    real = robot != "simulated"
-    wanted = []
-    for text in metadata.requires("fishd") or []:
+    robot, wanted, drivers = context.robot, [], ""
+    texts, packages = list(metadata.requires("fishd") or []), set[str]()
+    if robot != "simulated":
+        for _, plugins, settings in context.drivers:
+            packages |= {name.lower() for name in plugins.find(settings.driver).packages}
+            texts += plugins.requirements(settings.driver)
+            drivers += f" and {settings.driver}"
+    for text in texts:
         found = _REQUIREMENT.match(text)
         assert found
         name, extra = found["name"].lower(), found["extra"]
-        pigpio = servo.driver == "pigpio"
-        if extra is None or (extra == "pi" and real and (name != "pigpio" or pigpio)):
+        if extra is None or (extra == "pi" and name in packages):
             wanted.append((name, found["bounds"]))
     problems = [problem for name, bounds in wanted if (problem := _problem(name, bounds))]
     if problems:
-        extra = "fishd[pi]" if real else "fishd"
+        extra = "fishd" if robot == "simulated" else "fishd[pi]"
         return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
-    driver = f" and servo driver {servo.driver}" if real else ""
-    return ok(f"all {len(wanted)} that robot {robot}{driver} needs, under {sys.executable}")
+    return ok(f"all {len(wanted)} that robot {robot}{drivers} needs, under {sys.executable}")
 
 
 def gpio_package(context: Context) -> Result | None:
     """RPi.GPIO and rpi-lgpio overwrite each other."""
     panel = context.config.panel
-    pins = context.config.servo.driver == "rpi-gpio" or {panel.estop_gpio, panel.led_gpio} != {None}
+    pins = {panel.estop_gpio, panel.led_gpio} != {None} or any(
+        header.PACKAGE in plugins.find(settings.driver).packages
+        for _, plugins, settings in context.drivers
+    )
     installed = {
         name
         for d in metadata.distributions()

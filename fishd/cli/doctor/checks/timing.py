@@ -6,9 +6,11 @@ import resource
 import subprocess
 import sys
 
-from fishd.cli.checks.base import Check, Context, Result, ok, skipped, warning
+from fishd.cli.doctor.checks.base import Context
+from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
 _TRY = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
+_LIMITS = "/etc/security/limits.d/fishd.conf"
 ENOUGH_MEMORY = 512 * 2**20
 """Limit on locked memory that is no limit to fishd [bytes]."""
 _CAP_IPC_LOCK = 14
@@ -24,7 +26,7 @@ def realtime(context: Context) -> Result:
     if context.running:
         if context.running.status.realtime:
             return ok("the running fishd has real-time scheduling")
-        return warning("the running fishd has no real-time scheduling", _PRIVILEGE)
+        return warning("the running fishd has no real-time scheduling", _permit("rtprio 50"))
     tried = subprocess.run(
         [sys.executable, "-I", "-S", "-c", _TRY, str(priority)], capture_output=True, check=False
     )
@@ -32,7 +34,7 @@ def realtime(context: Context) -> Result:
         return ok(f"SCHED_FIFO {priority} is permitted")
     return warning(
         f"user {getpass.getuser()} may not use SCHED_FIFO {priority}: ticks come late under load",
-        _PRIVILEGE,
+        _permit("rtprio 50"),
     )
 
 
@@ -52,8 +54,7 @@ def memory(context: Context) -> Result:
     return warning(
         f"user {getpass.getuser()} may lock only {limit // 1024} kB of memory: a tick may wait for "
         "the disk",
-        "run fishd as its systemd service, or allow 'memlock unlimited' in "
-        "/etc/security/limits.d/fishd.conf",
+        _permit("memlock unlimited"),
     )
 
 
@@ -93,9 +94,9 @@ def _kernel_is_synchronised() -> bool:
     return 0 <= state < _TIME_ERROR and not status & _UNSYNCHRONISED
 
 
-_PRIVILEGE = (
-    "run fishd as its systemd service, or allow 'rtprio 50' in /etc/security/limits.d/fishd.conf"
-)
+def _permit(limit: str) -> str:
+    return f"run fishd as its systemd service, or allow '{limit}' in {_LIMITS}"
+
 
 CHECKS = (
     Check("real time", realtime),

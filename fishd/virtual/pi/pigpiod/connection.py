@@ -5,12 +5,15 @@ import math
 import socket
 import struct
 
-from fishd.emulation.pigpiod.commands import MICS, MILS, OPEN_IN_BAND, Commands
+from fishd.virtual.pi.pigpiod import errors
+from fishd.virtual.pi.pigpiod.commands import NAMES, Commands
+from fishd.virtual.pi.pigpiod.script import LONGEST_DELAY
 
 LARGEST_EXTENSION = 65_535
 """pigpiod hangs up on a client that announces more than this [byte]."""
+_MILS = NAMES.index("MILS")
 _HEADER = struct.Struct("<4I")
-_REPLY = struct.Struct("<3Ii")
+"""Of a command: number, p1, p2, length of the extension; of a reply, with the result at the end."""
 
 
 class Connection:
@@ -40,10 +43,15 @@ class Connection:
     def end_delay(self, time: float) -> bool:
         """Answer the delay that is over, and go on; False: the client is to be dropped."""
         self.due = math.inf
-        self.send(self._late_reply)
+        self._send(self._late_reply)
         return self._carry_out(time)
 
-    def send(self, data: bytes) -> None:
+    def hang_up(self) -> None:
+        """Let the client see the end; the server then finds the connection closed."""
+        with contextlib.suppress(OSError):
+            self.socket.shutdown(socket.SHUT_RDWR)
+
+    def _send(self, data: bytes) -> None:
         """Send, or hang up on a client that has not read what it was sent before."""
         try:
             if self.socket.send(data) == len(data):
@@ -51,16 +59,6 @@ class Connection:
         except OSError:
             pass
         self.hang_up()
-
-    def hang_up(self) -> None:
-        """Let the client see the end; the server then finds the connection closed."""
-        with contextlib.suppress(OSError):
-            self.socket.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        """Forget the client and its notification handles."""
-        self._commands.close_handles(self.send)
-        self.socket.close()
 
     def _carry_out(self, time: float) -> bool:
         while self.due == math.inf and len(self._input) >= _HEADER.size:
@@ -78,16 +76,12 @@ class Connection:
 
     def _answer(self, time: float, number: int, p1: int, p2: int, extension: bytes) -> None:
         following = b""
-        if number == OPEN_IN_BAND:
-            result = self._commands.open_handle(self.send)
-        elif number in (MICS, MILS):
-            result, delay = self._commands.delay(number, p1)
-            if delay:
-                self.due = time + delay
-                self._late_reply = _REPLY.pack(number, p1, p2, result)
-                return
-        else:
+        if number != _MILS:
             result, following = self._commands.execute(time, number, p1, p2, extension)
-        # Levels, ticks and revisions use all 32 bits.
-        signed = ((result + 2**31) & 0xFFFFFFFF) - 2**31
-        self.send(_REPLY.pack(number, p1, p2, signed) + following)
+        else:
+            result = 0 if p1 <= LONGEST_DELAY else errors.BAD_MILS_DELAY
+        reply = _HEADER.pack(number, p1, p2, result & 0xFFFFFFFF) + following
+        if number == _MILS and p1 and result == 0:
+            self.due, self._late_reply = time + p1 * 1e-3, reply
+        else:
+            self._send(reply)

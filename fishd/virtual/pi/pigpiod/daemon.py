@@ -6,15 +6,16 @@ frames catch up with the clock whenever a client or the tank wants to know somet
 
 import contextlib
 import math
+import os
 import select
 import socket
 import threading
 import time
 
-from fishd.clock import Clock
-from fishd.emulation.faults import Faults
-from fishd.emulation.pigpiod.commands import Commands
-from fishd.emulation.pigpiod.connection import Connection
+from fishd.core.clock import Clock
+from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.pigpiod.commands import Commands
+from fishd.virtual.pi.pigpiod.connection import Connection
 
 POLL = 5e-3
 """How often the server looks at the clock while something is due, and at faults that last [s]."""
@@ -23,19 +24,12 @@ POLL = 5e-3
 class Pigpiod:
     """One daemon; `start` before use, `close` after. Its methods may be called from any thread."""
 
-    def __init__(
-        self,
-        clock: Clock,
-        faults: Faults,
-        port: int = 0,
-        host: str = "127.0.0.1",
-        step: int = 5,
-    ) -> None:
-        """`port`: 0 takes a free one. `step`: what servo pulses are rounded down to [µs]."""
+    def __init__(self, clock: Clock, faults: Faults, port: int = 0) -> None:
+        """`port`: 0 takes a free one."""
         self._clock = clock
         self._faults = faults
-        self._address = (host, port)
-        self._commands = Commands(step)
+        self._address = ("127.0.0.1", port)
+        self._commands = Commands()
         self._lock = threading.Lock()
         self._connections: dict[int, Connection] = {}
         self._running = self._gone = self._frozen = False
@@ -54,8 +48,8 @@ class Pigpiod:
         self._listener = self._bound()
         self._address = self._listener.getsockname()[:2]
         self._epoll = select.epoll()
-        self._waker, self._woken = socket.socketpair()
-        self._epoll.register(self._woken, select.EPOLLIN)
+        self._waker = os.eventfd(0)
+        self._epoll.register(self._waker, select.EPOLLIN)
         self._listen()
         self._running = True
         self._thread = threading.Thread(target=self._serve, name="pigpiod", daemon=True)
@@ -67,12 +61,13 @@ class Pigpiod:
             if not self._running:
                 return
             self._running = False
-        self._waker.send(b"\0")
+        os.eventfd_write(self._waker, 1)
         self._thread.join()
         for connection in list(self._connections.values()):
             self._drop(connection)
-        for resource in (self._listener, self._epoll, self._waker, self._woken):
-            resource.close()
+        self._listener.close()
+        self._epoll.close()
+        os.close(self._waker)
 
     def width(self, gpio: int, time: float) -> float:
         """The pulse in force at a time up to now [s], in µs; 0 for no pulses."""
@@ -86,10 +81,11 @@ class Pigpiod:
             self._observe()
             return self._commands.pins.pins[gpio].train.history
 
-    def level(self, gpio: int) -> int:
-        """The level of a pin now."""
+    def stands_still(self) -> bool:
+        """Is it frozen? Then it answers nothing before the clock moves on."""
         with self._lock:
-            return self._commands.pins.level(self._observe(), gpio)
+            self._observe()
+            return self._frozen
 
     def _begin_fault(self) -> None:
         with self._lock:
@@ -151,10 +147,8 @@ class Pigpiod:
     def _time_out(self, now: float) -> float | None:
         if self._gone or self._frozen:
             return POLL
-        due = self._commands.next_time()
-        for connection in self._connections.values():
-            due = min(due, connection.due)
-        # Only looking tells how fast somebody else's clock goes.
+        due = min((each.due for each in self._connections.values()), default=math.inf)
+        # Polled, since a virtual clock may move at any speed.
         return None if due == math.inf else min(POLL, max(0.0, due - now))
 
     def _attend(self, descriptor: int, now: float) -> None:
@@ -162,8 +156,8 @@ class Pigpiod:
         if connection:
             if not connection.receive(now):
                 self._drop(connection)
-        elif descriptor == self._woken.fileno():
-            self._woken.recv(4096)
+        elif descriptor == self._waker:
+            os.eventfd_read(self._waker)
         elif descriptor == self._listener.fileno():
             # A client may have changed its mind, and a fault may have closed this in between.
             with contextlib.suppress(OSError):
@@ -174,7 +168,7 @@ class Pigpiod:
     def _drop(self, connection: Connection) -> None:
         del self._connections[connection.socket.fileno()]
         self._epoll.unregister(connection.socket)
-        connection.close()
+        connection.socket.close()
 
     def _die(self, now: float) -> None:
         for connection in list(self._connections.values()):
@@ -201,4 +195,4 @@ class Pigpiod:
 
     def _wake(self) -> None:
         if self._running:
-            self._waker.send(b"\0")
+            os.eventfd_write(self._waker, 1)

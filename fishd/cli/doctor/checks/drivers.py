@@ -1,0 +1,202 @@
+"""Checks of the robot's drivers: their own, those that are the same for all, and their pins.
+
+A running fishd is asked instead of its hardware.
+"""
+
+import os
+import re
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+from fishd.cli.doctor.checks.base import Context
+from fishd.config.drivers import claims_of
+from fishd.core.calibration import ForceCalibration
+from fishd.core.clock import SystemClock
+from fishd.core.errors import MissingPackage, SensorError, ServoError, StartupError
+from fishd.hardware.checks import START_VIRTUAL_PI, Check, Result, fail, ok, skipped, warning
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+from fishd.hardware.packages import driver_packages
+from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.servo import pulses
+from fishd.wiring import open_sensor
+
+TRIAL = 1.0
+"""How long the sensor is tried [s]."""
+_DEBUG = "/sys/kernel/debug"
+_LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
+
+
+def checks(context: Context) -> tuple[Check, ...]:
+    """All of them, for the drivers of the configuration."""
+    _, sensor, sensor_settings = context.drivers[0]
+    _, servo, servo_settings = context.drivers[1]
+    of_servo = servo.find(servo_settings.driver).checks(servo_settings)
+    return (
+        Check("drivers", drivers),
+        *sensor.find(sensor_settings.driver).checks(sensor_settings),
+        Check("force", force),
+        *(of_servo or (Check("servo", servo_opens),)),
+        Check("gpio pins", pins, ("pi",)),
+    )
+
+
+def drivers(context: Context) -> Result:
+    """Which ones, and whose."""
+    return ok(
+        ", ".join(
+            f"{section} {settings.driver} of {plugins.package(settings.driver)}"
+            for section, plugins, settings in context.drivers
+        )
+    )
+
+
+def servo_opens(context: Context) -> Result:
+    """That a driver without checks of its own can be opened; no pulses begin."""
+    if occupied := context.occupied("drives the servo; see daemon"):
+        return occupied
+    settings, tick = context.config.servo, context.config.tick
+    neutral = pulses.pulse_width(settings, 0.0)
+    with context.plugged_in(), driver_packages(settings.driver):
+        servo = SERVOS.find(settings.driver)(
+            settings, neutral, SystemClock(), tick=tick, threaded=True
+        )
+        try:
+            servo.close()
+        except ServoError as error:
+            return fail(str(error), "check its wires and its supply")
+    return ok(f"driver {settings.driver} opens")
+
+
+def force(context: Context) -> Result:
+    """What the running daemon measures; without one, the same driver for a second."""
+    if context.running:
+        return _force_of_daemon(context)
+    if occupied := context.occupied("owns the sensor"):
+        return occupied
+    config = context.config
+    try:
+        with context.plugged_in(), ExitStack() as stack:
+            sensor = open_sensor(config, ForceCalibration(), SystemClock(), threaded=True)
+            stack.callback(sensor.close)
+            trials = list(_windows(sensor, config.tick))
+    except MissingPackage:
+        raise
+    except StartupError as error:
+        return fail(str(error), START_VIRTUAL_PI)
+    except SensorError as error:
+        return fail(str(error), "mend what the lines above say first")
+    samples, suspicions = [n for n, _ in trials], {why for _, why in trials if why}
+    per_tick = sum(samples) / len(samples)
+    if not per_tick:
+        return fail("the sensor answers, but delivers nothing", "switch its power off and on")
+    if suspicions:
+        return fail(
+            f"not to be believed: {'; '.join(sorted(suspicions))}",
+            "check the wires of the sensor, its amplifier, and its range",
+        )
+    return _enough(per_tick, context, "not clipped, not frozen")
+
+
+def _force_of_daemon(context: Context) -> Result:
+    assert context.running
+    status, tick, _, _ = context.running
+    if tick is None:
+        return fail(f"fishd runs, but {status.telemetry} is silent", "fishctl status; a firewall?")
+    if status.reason and status.reason.code.startswith("sensor"):
+        return fail(
+            f"{status.reason.code}: {status.reason.message}",
+            "mend the cause, then fishctl clear-fault",
+        )
+    transport = FORCE_SENSORS.find(context.config.force_sensor.driver).transport
+    survived = ", ".join(
+        f"{n} {name}" for name, n in status.counters.items() if name.startswith(transport) and n
+    )
+    if tick.samples == 0:
+        return warning(
+            f"no new sample in the latest tick, the newest is {tick.age_ms:.0f} ms old",
+            "fishctl watch; check the wires if this goes on",
+        )
+    return _enough(
+        tick.samples,
+        context,
+        f"the newest {tick.age_ms:.0f} ms old, {survived or 'no errors'}",
+    )
+
+
+def _enough(per_tick: float, context: Context, details: str) -> Result:
+    """Compare with what a healthy bus gives at this data rate and tick."""
+    config = context.config
+    driver = FORCE_SENSORS.find(config.force_sensor.driver)
+    expected = driver.pair_rate(config.force_sensor) * config.tick
+    message = f"{per_tick:.1f} pairs of samples per tick, {details}"
+    if per_tick < expected:
+        return warning(
+            f"{message}: fewer than the {expected:.1f} that driver {config.force_sensor.driver} "
+            "gives where all is well",
+            "make its bus faster, and stop what else uses it or loads the processor",
+        )
+    return ok(message)
+
+
+def _windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
+    """Samples and suspicion of each window; the first, in which the sampler starts, is left out."""
+    latest: SensorError | None = None
+    began = time.monotonic()
+    first = True
+    while time.monotonic() - began < TRIAL:
+        time.sleep(tick)
+        try:
+            measurement = sensor.read(time.monotonic())
+        except SensorError as error:
+            latest = error
+            continue
+        if not first:
+            yield measurement.samples, measurement.suspect
+        first, latest = False, None
+    if latest or first:
+        raise latest or SensorError("the sensor says nothing")
+
+
+def pins(context: Context) -> Result | None:
+    """Who holds the pins that are configured, as far as the kernel knows."""
+    config = context.config
+    wanted = {config.panel.estop_gpio: "panel.estop_gpio", config.panel.led_gpio: "panel.led_gpio"}
+    wanted |= {
+        pin: f"{section}.{claim.key}"
+        for section, claims in claims_of(config.force_sensor, config.servo).items()
+        for claim in claims
+        for pin in claim.pins
+        if claim.key != "bus"  # whose pins the kernel drives
+    }
+    wanted.pop(None, None)
+    text = context.text(f"{_DEBUG}/gpio")
+    if not text:
+        return skipped(_why_unseen(context))
+    if occupied := context.occupied("uses its pins"):
+        return occupied
+    users = {int(found["pin"]): found["user"].strip() for found in _LINE.finditer(text)}
+    taken = [
+        f"GPIO{pin} ({key}) is used by {users[pin]}"
+        for pin, key in wanted.items()
+        if pin is not None and users.get(pin)
+    ]
+    if taken:
+        return warning(
+            "; ".join(taken), "stop that program, remove its dtoverlay, or choose another pin"
+        )
+    return ok(", ".join(f"GPIO{pin}" for pin in wanted) + " free")
+
+
+def _why_unseen(context: Context) -> str:
+    if os.geteuid() != 0:
+        return "only root can see who uses GPIO pins: sudo fishctl doctor"
+    try:
+        mounted = any(context.path(_DEBUG).iterdir())
+    except OSError as error:
+        return f"who uses GPIO pins cannot be seen: {_DEBUG}: {error.strerror}"
+    if mounted:
+        return f"this kernel does not say who uses GPIO pins: there is no {_DEBUG}/gpio"
+    return (
+        f"who uses GPIO pins cannot be seen, debugfs is not mounted: mount -t debugfs none {_DEBUG}"
+    )

@@ -1,0 +1,174 @@
+"""The screen of `fishctl watch`: a header, traces in braille, and the latest events."""
+
+import math
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from fishd.cli.output import spelled, time_of_day
+from fishd.core import text
+from fishd.core.signals import Event, Status, Tick
+
+SPAN = 5.0
+"""How far back the traces go [s]."""
+MODES = {"idle": "cyan", "running": "green", "fault": "red", "estop": "red"}
+LEVELS = {"warning": "yellow", "error": "red"}
+
+
+class Trace(NamedTuple):
+    """One quantity against time."""
+
+    name: str
+    style: str
+    least: float
+    """The scale reaches from minus this to plus this at least, so that noise looks small."""
+    value: Callable[[Tick], float]
+
+
+TRACES = (
+    Trace("fx mN", "cyan", 2.0, lambda tick: tick.fx * 1e3),
+    Trace("fy mN", "yellow", 2.0, lambda tick: tick.fy * 1e3),
+    Trace("phi_c rad", "green", 0.1, lambda tick: tick.phi_c),
+)
+LABEL = 14
+"""Columns left of the axis: a name and a number."""
+_DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
+"""Bits of the dots of a braille character, four rows of two."""
+
+
+class View:
+    """What is on the screen; adapts to the size of the screen each time it is drawn."""
+
+    def __init__(self, status: Status) -> None:
+        self.status = status
+        self._ticks: deque[Tick] = deque()
+        self._events: deque[Event] = deque(maxlen=3)
+        self._lost = 0
+
+    def add(self, tick: Tick) -> None:
+        """Take in a tick, and forget those of more than `SPAN` ago."""
+        ticks = self._ticks
+        if ticks:
+            # After a restart of the daemon, ticks are numbered from 1 again.
+            self._lost += max(0, tick.seq - ticks[-1].seq - 1)
+        ticks.append(tick)
+        while abs(tick.t - ticks[0].t) > SPAN:
+            ticks.popleft()
+
+    async def collect(self, events: AsyncIterator[Event]) -> None:
+        """Keep the latest of `events`, for ever."""
+        async for event in events:
+            self._events.append(event)
+
+    @property
+    def outdated(self) -> bool:
+        """True once the status is a second old, or no longer that of the latest tick."""
+        tick, status = self._ticks[-1], self.status
+        known = (status.mode, status.controller) == (tick.mode, tick.controller)
+        return not known or abs(tick.t - status.t) >= 1.0
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Header, as many traces as there is room for, and events below them on a tall screen."""
+        width, height = options.max_width, options.height or console.height
+        header = [self._title()]
+        reason, fallback = self.status.reason, self.status.fallback
+        if why := reason or fallback:
+            message = text.line(f"{'' if reason else 'took over: '}{why.code}: {why.message}")
+            header += Text(message, "red" if reason else "yellow").wrap(console, width)
+        yield from header
+        yield self._figures()
+        events = max(0, min(3, (height - 14) // 3))
+        room = height - len(header) - 2 - events - 1  # 2 rows of figures, 1 for the time axis
+        traces = TRACES[: max(0, room // 2)] if width >= 2 * LABEL else ()
+        for trace in traces:
+            yield self._plot(trace, width, room // len(traces))
+        if traces:
+            ago = f"-{SPAN:g} s"
+            yield Text(f"{'':{LABEL + 1}}{ago:<{width - LABEL - 4}}now", "dim")
+        for event in list(self._events)[-events:] if events else ():
+            yield _one_line(
+                (f"{time_of_day(event.t)} ", "dim"),
+                (text.line(f"{event.kind}: {event.message}"), LEVELS.get(event.level, "none")),
+            )
+
+    def _title(self) -> Text:
+        tick = self._ticks[-1]
+        return _one_line(
+            f"{text.quoted(self.status.name)} " if self.status.name else "",
+            (f" {text.quoted(tick.mode).upper()} ", f"bold reverse {MODES.get(tick.mode, 'none')}"),
+            (f" {text.quoted(tick.controller)} ", "bold"),
+            spelled(self.status.parameters),
+            "" if tick.servo_on else ("  no pulses", "dim"),
+            ("  servo not reached", "red") if self.status.servo_lost else "",
+        )
+
+    def _figures(self) -> Table:
+        tick = self._ticks[-1]
+        figures = {
+            "thrust": "– mN" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f} mN",
+            "tail beat": f"{tick.frequency:.2f} Hz",
+            "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
+            "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
+            "missed": f"{tick.missed}",
+            "lost": f"{self._lost}",
+        }
+        table = Table.grid(padding=(0, 3, 0, 0))
+        for _ in figures:
+            table.add_column(min_width=7, no_wrap=True)
+        table.add_row(*figures, style="dim")
+        table.add_row(*figures.values(), style="bold")
+        return table
+
+    def _plot(self, trace: Trace, width: int, rows: int) -> Text:
+        """A trace with its name and scale to the left; lost ticks leave a gap."""
+        values = [trace.value(tick) for tick in self._ticks]
+        low, high = _scale(values, trace.least)
+        now = self._ticks[-1].t
+        points = [(now - SPAN, math.nan)]
+        for before, tick, value in zip((None, *self._ticks), self._ticks, values, strict=False):
+            if before and tick.seq - before.seq != 1:
+                points.append((before.t, math.nan))
+            points.append((tick.t, (value - low) / (high - low)))
+        labels = [""] * rows
+        labels[round(high / (high - low) * (rows - 1))] = "0"
+        labels[-1] = f"{low:g}"
+        labels[0] = f"{trace.name:<9}{high:>{LABEL - 9}g}"
+        drawn = _curve(points, now - SPAN, now, rows, width - LABEL - 1)
+        lines = (f"{label:>{LABEL}}┤{line}" for label, line in zip(labels, drawn, strict=True))
+        return Text("\n".join(lines), trace.style, no_wrap=True)
+
+
+def _one_line(*parts: str | tuple[str, str]) -> Text:
+    """Text that is cut where the screen ends; each part with its style."""
+    return Text.assemble(*parts, no_wrap=True, overflow="ellipsis")
+
+
+def _scale(values: Sequence[float], least: float) -> tuple[float, float]:
+    """Round limits around `values`, zero and ±`least`, so that the scale seldom changes."""
+    low, high = min([-least, *values]), max([least, *values])
+    step = 10.0 ** math.floor(math.log10(high - low)) / 2.0
+    return step * math.floor(low / step), step * math.ceil(high / step)
+
+
+def _curve(
+    points: Sequence[tuple[float, float]], start: float, end: float, rows: int, columns: int
+) -> list[str]:
+    """Draw the line through `points`, as `rows` strings of `columns` braille characters.
+
+    points: x in rising order, and y from 0 at the bottom to 1 at the top; NaN leaves a gap
+    start, end: what x is at the left and at the right edge
+    """
+    x, y = np.array(points).T
+    across = np.linspace(start, end, 2 * columns)
+    level = (1.0 - np.interp(across, x, y)) * (4 * rows - 1)
+    before = np.concatenate((level[:1], level[:-1]))  # so that a jump is a stroke
+    upper, lower = np.rint(np.fmin(level, before)), np.rint(np.fmax(level, before))
+    down = np.arange(4 * rows)[:, None]
+    dots = ((upper <= down) & (down <= lower)).reshape(rows, 4, columns, 2)
+    codes = 0x2800 + np.einsum("rick,ik->rc", dots, _DOTS)
+    return ["".join(map(chr, line)) for line in codes]

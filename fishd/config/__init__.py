@@ -1,0 +1,27 @@
+"""The configuration: YAML in, one frozen `Config` out, or one line that says what is wrong."""
+
+from fishd.config.configuration import (
+    FILE_VARIABLE,
+    SERVICE_FILE,
+    Config,
+    Start,
+    adopt,
+    json_schema,
+    keys,
+    load,
+    service_file,
+    to_yaml,
+)
+
+__all__ = [
+    "FILE_VARIABLE",
+    "SERVICE_FILE",
+    "Config",
+    "Start",
+    "adopt",
+    "json_schema",
+    "keys",
+    "load",
+    "service_file",
+    "to_yaml",
+]

@@ -1,0 +1,267 @@
+"""The configuration file: YAML in, one frozen `Config` out, or one line that says what is wrong.
+
+Each section is a struct of the part that it configures; this module only puts them together.
+"""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from fishd.config import consistency as config_checks
+from fishd.config import drivers
+from fishd.config.overrides import apply_overrides
+from fishd.control.estimators.lateral_force import EstimatorSettings
+from fishd.controllers.base import Limits
+from fishd.controllers.chatter import ChatterSettings
+from fishd.core import strict_yaml
+from fishd.core.errors import ConfigError
+from fishd.core.schema import Problem, convert, leaves, note, unit, without_empty_sections
+from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
+from fishd.hardware.servo.pigpio import PigpioSettings
+from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.plant.parameters import PlantParameters
+
+SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
+"""What the service runs with, as installed by 'make install-pi'."""
+FILE_VARIABLE = "FISHD_CONFIG"
+
+
+Name = Annotated[
+    str, Meta(min_length=1, max_length=40, pattern=r"^(?! )[^\x00-\x1f\x7f-\x9f]+$(?<! )(?!\n)")
+]
+"""Printable, and without spaces around it."""
+
+
+class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the fish does once the daemon runs."""
+
+    controller: Annotated[
+        str | None, note("Controller to start with; null starts in mode idle.")
+    ] = None
+    parameters: Annotated[
+        dict[str, Any], note("Its parameters; those left out keep their defaults.")
+    ] = {}
+
+
+class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where telemetry is published."""
+
+    address: Annotated[
+        str,
+        note(
+            "ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH. Telemetry is not "
+            "secret: tcp://0.0.0.0:9872 lets the whole network watch."
+        ),
+    ] = "tcp://127.0.0.1:9872"
+
+
+class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where requests are taken."""
+
+    address: Annotated[
+        str | None,
+        note(
+            "ZeroMQ address of the ROUTER socket: ipc://PATH or tcp://127.0.0.1:PORT. null: a "
+            "socket named control in $RUNTIME_DIRECTORY, else in $XDG_RUNTIME_DIR/fishd, else in a "
+            "private folder under /tmp. From another machine, use an ssh tunnel."
+        ),
+    ] = None
+
+
+class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How hard fishd tries to be on time; without the privilege it warns once and goes on."""
+
+    priority: Annotated[
+        int, note("SCHED_FIFO priority; 0 keeps the normal scheduler.", ge=0, le=99)
+    ] = 50
+    warm_up: Annotated[
+        bool,
+        note(
+            "Run mock ticks just before each real one, so that it finds warm caches; has no effect "
+            "for ticks below 10 ms."
+        ),
+    ] = True
+    lock_memory: Annotated[bool, note("Keep fishd's memory from being paged out.")] = True
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Everything that can be configured; `Config()` is a simulated fish at rest."""
+
+    name: Annotated[
+        Name | None,
+        Meta(description="Name of the fish, in status and telemetry; null: this machine's name."),
+    ] = None
+    robot: Annotated[
+        Literal["simulated", "pi", "virtual-pi"],
+        note(
+            "What swims: a simulated fish, the robot on this Raspberry Pi, or a simulated fish "
+            "behind the robot's own drivers (fishctl virtual-pi)."
+        ),
+    ] = "simulated"
+    tick: Annotated[float, unit("s", "Period of the loop.", ge=0.002, le=0.2)] = 0.05
+    amplitude_limit: Annotated[
+        float, unit("rad", "Φ: no instruction angle goes beyond ±Φ.", gt=0, le=1.57)
+    ] = 0.42
+    slew_limit: Annotated[
+        Annotated[float, Meta(gt=0, le=10_000)] | None,
+        unit(
+            "rad/s",
+            "Fastest change of the instruction angle. null allows one full reversal, 2Φ, in each "
+            "tick and so leaves a square wave untouched.",
+        ),
+    ] = None
+    fade_time: Annotated[
+        float, unit("s", "Time to fade from Φ to neutral on stop, fault and exit.", gt=0, le=0.5)
+    ] = 0.4
+    start: Annotated[Start, note("What the fish does at once.")] = Start()
+    chatter: Annotated[ChatterSettings, note("A policy that would reverse too fast.")] = (
+        ChatterSettings()
+    )
+    lockstep: Annotated[
+        bool,
+        note(
+            "Virtual time, for a simulated fish: while remote is active, each tick waits for "
+            "its agent, and the next one follows at once."
+        ),
+    ] = False
+    estimator: Annotated[EstimatorSettings, note("Fin velocity from the lateral force.")] = (
+        EstimatorSettings()
+    )
+    plant: Annotated[PlantParameters, note("The simulated fish: physics.")] = PlantParameters()
+    simulation: Annotated[
+        SimulationSettings, note("The simulated fish: imperfections of the rig.")
+    ] = SimulationSettings()
+    force_sensor: Annotated[
+        ForceSensorSettings, note("The force sensor; not for a simulated fish.")
+    ] = Ads1115Settings(driver="ads1115")
+    servo: Annotated[ServoSettings, note("The tail servo; not for a simulated fish.")] = (
+        PigpioSettings(driver="pigpio")
+    )
+    panel: Annotated[
+        PanelSettings, note("E-stop button and status light, where there are any.")
+    ] = PanelSettings()
+    state_folder: Annotated[
+        str | None,
+        note(
+            "Folder for calibrations; null: $STATE_DIRECTORY, else $XDG_STATE_HOME/fishd, else "
+            "~/.local/state/fishd; in it, a folder for each robot."
+        ),
+    ] = None
+    virtual_pi: Annotated[VirtualPiSettings, note("The virtual Pi, with robot virtual-pi.")] = (
+        VirtualPiSettings()
+    )
+    telemetry: Annotated[TelemetrySettings, note("What is published, and where.")] = (
+        TelemetrySettings()
+    )
+    control: Annotated[ControlSettings, note("Where requests are taken.")] = ControlSettings()
+    realtime: Annotated[RealtimeSettings, note("Scheduling and memory.")] = RealtimeSettings()
+
+    @property
+    def limits(self) -> Limits:
+        """What controllers must respect."""
+        return Limits(
+            amplitude=self.amplitude_limit,
+            tick=self.tick,
+            virtual=self.lockstep,
+            chatter=self.chatter,
+        )
+
+
+def service_file() -> Path | None:
+    """The file that the fishd of this machine most likely runs with; None for the defaults.
+
+    $FISHD_CONFIG where it is set, empty for none; else that of the service where there is one.
+    """
+    given = os.environ.get(FILE_VARIABLE)
+    if given is not None:
+        return Path(given) if given else None
+    return SERVICE_FILE if os.path.lexists(SERVICE_FILE) else None
+
+
+def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Read a configuration file and apply `KEY=VALUE` overrides, such as `plant.xi=0.9`.
+
+    Without a path the defaults apply. Raises `ConfigError` with one line that names the file, the
+    line, the key and what is permitted.
+    """
+    data, sources = (
+        strict_yaml.read(path, "a configuration", "tick: 0.05") if path is not None else ({}, {})
+    )
+    sources |= apply_overrides(data, overrides)
+    try:
+        config_checks.check_removed(data)
+        config = _convert(without_empty_sections(data, Config))
+        _check(config)
+    except Problem as problem:
+        raise ConfigError(problem.located(sources)) from None
+    return config
+
+
+def _check(config: Config) -> None:
+    """Validate keys against each other; raises `Problem`."""
+    checks = config_checks
+    checks.check_start(config.start.controller, config.start.parameters, config.limits)
+    checks.check_addresses(config.telemetry.address, config.control.address)
+    sensor, servo = config.force_sensor, config.servo
+    drivers.check_drivers(config.robot, config.tick, sensor, servo)
+    checks.check_neutral(servo)
+    checks.check_pulses(servo, config.amplitude_limit)
+    checks.check_pins(drivers.claims_of(sensor, servo), config.panel)
+    checks.check_lockstep(config.robot, config.lockstep)
+    checks.check_virtual_pi(config.virtual_pi)
+
+
+def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
+    """The configuration that a running fishd reports (`Fish.config`), with overrides.
+
+    It is not validated across fields again: fishd has done so. Raises `ConfigError`.
+    """
+    sources = apply_overrides(data, overrides)
+    try:
+        return _convert(data)
+    except Problem as problem:
+        where = sources.get(problem.path, "the configuration of the fishd that runs")
+        raise ConfigError(problem.located({problem.path: where})) from None
+
+
+def _convert(data: Mapping[str, Any]) -> Config:
+    """Each section on its own; raises `Problem`."""
+    rest = {key: value for key, value in data.items() if key not in drivers.DRIVERS}
+    config = convert(rest, Config, elsewhere=drivers.keys)
+    return msgspec.structs.replace(config, **drivers.convert_sections(data))
+
+
+def keys() -> list[str]:
+    """Every key in dotted form, those of all drivers that load among them."""
+    return list(dict.fromkeys(leaves(Config) + drivers.keys()))
+
+
+def to_yaml(config: Config | dict[str, Any]) -> str:
+    """The whole configuration, defaults included, as YAML that `load` reads back."""
+    import yaml
+
+    return yaml.safe_dump(
+        msgspec.to_builtins(config), sort_keys=False, allow_unicode=True, default_flow_style=False
+    )
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of the configuration, with the keys of all drivers that load."""
+    choices = {section: drivers.settings_of_drivers(section) for section in drivers.DRIVERS}
+    types = [Config, *(struct for found in choices.values() for struct in found.values())]
+    (top, *_), parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
+    properties = parts["Config"]["properties"]
+    for section, found in choices.items():
+        refs = []
+        for name, struct in found.items():
+            parts[struct.__name__]["properties"]["driver"] = {"const": name}
+            refs.append({"$ref": f"#/$defs/{struct.__name__}"})
+        default = {key: value for key, value in properties[section].items() if key == "default"}
+        properties[section] = {"anyOf": refs, **default}
+    return {**top, "$defs": parts}

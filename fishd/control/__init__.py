@@ -1,0 +1,1 @@
+"""One tick: estimate, let the controller choose, guard, drive the servo, report."""

@@ -1,0 +1,97 @@
+"""The active controller. It may be anybody's code, so whatever it raises becomes an Exception."""
+
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd.control.reporting import Reporter
+from fishd.controllers.base import Controller, Limits
+from fishd.controllers.hold import Hold, HoldParameters
+from fishd.core import text
+from fishd.core.errors import ControllerFault
+from fishd.core.foreign_code import contained
+from fishd.core.signals import Observation, Reason
+
+Successor = tuple[str, Controller[Any]]
+
+
+class ActiveController:
+    """Calls the controller that chooses the angle, replaces it, and tells of either."""
+
+    def __init__(self, limits: Limits, reporter: Reporter) -> None:
+        self._limits = limits
+        self._reporter = reporter
+        self.name = "hold"
+        self.controller: Controller[Any] = Hold(HoldParameters(), limits)
+        self.parameters = _plain(self.controller)
+        """Its parameters, as JSON has them."""
+        self.fallback: Reason | None = None
+        """Why it took over from the controller that was set, if it did."""
+        self._fresh = False
+
+    def replace(self, name: str, controller: Controller[Any]) -> None:
+        """Make a ready-made controller the active one; raises what its parameters raise."""
+        former, self.parameters = self.controller, _plain(controller)
+        self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
+        try:
+            contained(former.close)
+        except Exception as error:
+            self._reporter.problem(f"the controller before {name} could not be closed", error)
+
+    def rest(self) -> None:
+        """Make `hold` the active one, at neutral."""
+        self.replace("hold", Hold(HoldParameters(), self._limits))
+
+    def succeed(self, error: ControllerFault, code: str, successor: Successor) -> None:
+        """The active controller gave up and named another one, which becomes active."""
+        before = self.name
+        self.replace(*successor)
+        self.fallback = Reason(code, text.line(f"{before} gave up: {text.said(error)}"))
+        self._reporter.fallback(before, self.name, self.parameters, self.fallback)
+
+    def update(self, observation: Observation) -> Any:
+        """What it commands, unchecked; raises what it raises."""
+        if self._fresh:
+            contained(self.controller.activate, observation)
+            self._fresh = False
+        return contained(self.controller.update, observation)
+
+    def retune(self, parameters: Struct) -> None:
+        """Give it new, already checked parameters; raises what it raises."""
+        contained(self.controller.retune, parameters)
+        self.parameters = _plain(self.controller)
+        self._reporter.controller("parameters", self.name, self.parameters)
+
+    def warm_up(self) -> None:
+        """Let it warm up for the next update, which is imminent; raises what it raises."""
+        contained(self.controller.warm_up)
+
+
+def told(error: ControllerFault) -> tuple[str, Successor | None]:
+    """Code and successor of a fault, whatever a subclass has made of them."""
+
+    def look() -> tuple[str, Successor | None]:
+        code, successor = error.code, error.successor
+        if type(code) is not str:
+            code = "controller-error"
+        if type(successor) is tuple and type(successor[0]) is str:
+            name, controller = successor
+            if isinstance(controller, Controller):
+                return code, (name, controller)
+        return code, None
+
+    try:
+        return contained(look)
+    except Exception:
+        return "controller-error", None
+
+
+def _plain(controller: Controller[Any]) -> dict[str, Any]:
+    """The parameters of a controller as JSON has them; raises what it raises, or an Exception."""
+
+    def plain() -> dict[str, Any]:
+        encoded = msgspec.json.encode(msgspec.structs.asdict(controller.parameters))
+        return msgspec.json.decode(encoded, type=dict[str, Any])
+
+    return contained(plain)

@@ -1,0 +1,1 @@
+"""What every part may import and that imports none of them: signals, errors, clocks, files."""

@@ -1,0 +1,280 @@
+"""The nouns that flow through fishd, from the force sensor to the wire.
+
+Everything is SI: newtons, radians, seconds. `Tick`, `Event` and `Status` are exactly what goes out
+over telemetry and the control channel, so their field names are the public protocol. The tables
+of docs/protocol.md are written from what is declared here (`make docs`).
+"""
+
+from typing import Annotated, Any, Literal, get_args
+
+from msgspec import UNSET, Struct, UnsetType
+
+from fishd.core.schema import Field, note, unit
+
+MODES = "`idle`, `running`, `fault` or `estop`."
+
+
+class Extremes(Struct, frozen=True, gc=False):
+    """Lowest and highest single samples of a window [N]."""
+
+    fx_min: float
+    fx_max: float
+    fy_min: float
+    fy_max: float
+
+
+class Measurement(Struct, frozen=True, gc=False):
+    """What the force sensor says about the window since the previous read."""
+
+    time: float
+    """Time of the newest sample in the window [s, monotonic]."""
+    fx: float
+    """Mean longitudinal force of the window, thrust positive [N]."""
+    fy: float
+    """Mean lateral force of the window [N]."""
+    samples: int
+    """How many pairs of samples the means are taken over."""
+    suspect: str = ""
+    """Why these forces are not to be believed, such as a clipped sample; empty where they are."""
+    extremes: Extremes | None = None
+    """What the means are taken over, as far as the sensor tells."""
+
+
+class Observation(Struct, frozen=True, gc=False):
+    """What a controller knows when it chooses the next instruction angle."""
+
+    time: float
+    """Time of this tick [s, monotonic]."""
+    dt: float
+    """Time since the previous tick: one period, more after missed slots [s]."""
+    fx: float
+    """Mean longitudinal force since the previous tick [N]."""
+    fy: float
+    """Mean lateral force since the previous tick [N]."""
+    fy_rate: float
+    """Rate of change of the lateral force [N/s]."""
+    fin_velocity: float
+    """Fin angular velocity up to an unknown positive scale; its sign is that of the true one."""
+    instruction_angle: float
+    """The instruction angle applied since the previous tick [rad]."""
+    previous_angle: float
+    """The instruction angle applied before that one, until the previous tick [rad]."""
+    thrust: float
+    """Mean longitudinal force over the latest whole tail beats [N]."""
+    frequency: float
+    """Tail-beat frequency, from the reversals of the instruction angle; 0 when not beating [Hz]."""
+
+
+class Truth(Struct, frozen=True, gc=False):
+    """The true state of a simulated fish; a real one has none."""
+
+    alpha: float
+    """Fin angle [rad]."""
+    alpha_rate: float
+    """Fin angular velocity [rad/s]."""
+    phi: float
+    """Servo wheel angle [rad]."""
+
+
+class Tick(Struct, frozen=True, gc=False):
+    """One tick as everyone outside sees it; published on topic `tick`.
+
+    `Reporter.tick` says where each field comes from.
+    """
+
+    t: Annotated[float, unit("s", "Time of the tick, unix.")]
+    seq: Annotated[int, note("Number of the tick, from 1; a gap means that messages were lost.")]
+    mode: Annotated[str, note(MODES)]
+    controller: Annotated[str, note("Name of the controller that chose the command.")]
+    fx: Annotated[float, unit("N", "Mean longitudinal force since the previous tick.")]
+    fy: Annotated[float, unit("N", "Mean lateral force since the previous tick.")]
+    fy_rate: Annotated[float, unit("N/s", "Rate of change of the lateral force.")]
+    fin_velocity: Annotated[
+        float, unit("1", "Fin angular velocity as estimated, up to an unknown positive scale.")
+    ]
+    phi_c: Annotated[
+        float, unit("rad", "Instruction angle that was sent to the servo in this tick.")
+    ]
+    servo_on: Annotated[bool, note("False once the servo is known to get no pulses.")]
+    thrust: Annotated[float, unit("N", "Mean `fx` over the latest whole tail beats.")]
+    frequency: Annotated[
+        float, unit("Hz", "Tail-beat frequency, from reversals of `phi_c`; 0.0 when not beating.")
+    ]
+    samples: Annotated[int, note("Pairs of force samples since the previous tick.")]
+    age_ms: Annotated[float, unit("ms", "Age of the newest force sample.")]
+    lateness_us: Annotated[float, unit("µs", "How late after its deadline the tick began.")]
+    busy_us: Annotated[float, unit("µs", "From the start of the tick until the servo was driven.")]
+    missed: Annotated[int, note("Slots skipped since start.")]
+    fx_min: Annotated[
+        float | UnsetType, unit("N", "Lowest of these samples of F_x; not of a simulated fish.")
+    ] = UNSET
+    fx_max: Annotated[float | UnsetType, unit("N", "The highest of F_x.")] = UNSET
+    fy_min: Annotated[float | UnsetType, unit("N", "The lowest of F_y.")] = UNSET
+    fy_max: Annotated[float | UnsetType, unit("N", "The highest of F_y.")] = UNSET
+    alpha: Annotated[
+        float | UnsetType, unit("rad", "True fin angle; of a simulated fish only, as the next two.")
+    ] = UNSET
+    alpha_rate: Annotated[float | UnsetType, unit("rad/s", "True fin angular velocity.")] = UNSET
+    phi: Annotated[float | UnsetType, unit("rad", "True servo wheel angle.")] = UNSET
+
+
+Level = Literal["info", "warning", "error"]
+EventKind = Literal[
+    "mode",
+    "controller",
+    "parameters",
+    "fallback",
+    "fault",
+    "overrun",
+    "servo",
+    "calibration",
+    "gateway",
+    "mark",
+]
+EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
+    ("mode", "info; error for estop", "another mode, but for `fault`", "`before`, `mode`"),
+    ("controller", "info", "a controller takes over", "`controller`, `parameters`"),
+    (
+        "parameters",
+        "info",
+        "parameters of the active controller changed",
+        "`controller`, `parameters`",
+    ),
+    (
+        "fallback",
+        "warning",
+        "the active controller gave up and another one took over, as `ppo` may",
+        "`controller`, `parameters` (of who takes over), `before`, `code`",
+    ),
+    ("fault", "error", "mode `fault` was entered", "`code`, `mode`"),
+    (
+        "overrun",
+        "warning",
+        "a tick took longer than a period, or slots were skipped",
+        "`seq`, `missed` (just before it)",
+    ),
+    (
+        "servo",
+        "error",
+        "in mode `fault` or `estop`: the servo cannot be released and may still have pulses",
+        "empty",
+    ),
+    ("servo", "info", "a servo that could not be reached can be reached again", "empty"),
+    ("calibration", "info", "another calibration was saved and is used now", "`file`"),
+    (
+        "calibration",
+        "info; warning where it was not renewed",
+        "a trial of a calibration ended, and the one before it is used again",
+        "empty",
+    ),
+    (
+        "gateway",
+        "warning",
+        "the process behind a socket was started again; messages were lost",
+        "`gateway`: `telemetry` or `control`",
+    ),
+    ("mark", "info", "a client asked for a mark", "empty"),
+)
+"""Kind, level, when, data: each kind of event."""
+
+
+class Event(Struct, frozen=True):
+    """Something that happened; published on topic `event` and logged."""
+
+    t: Annotated[float, unit("s", "When, unix.")]
+    level: Annotated[str, note(f"One of {', '.join(get_args(Level))}.")]
+    kind: Annotated[str, note(f"One of {', '.join(get_args(EventKind))}.")]
+    message: Annotated[str, note("One line for people.")]
+    data: Annotated[dict[str, Any], note("The same for programs.")] = {}
+
+
+class ControllerInfo(Struct, frozen=True):
+    """A controller as a person or an option parser wants to know it."""
+
+    name: str
+    summary: str
+    """One line that says what it does."""
+    parameters: tuple[Field, ...]
+
+
+class Reason(Struct, frozen=True):
+    """Why fishd is in mode fault or estop."""
+
+    code: Annotated[str, note("Short name, such as `sensor-stale`.")]
+    message: Annotated[str, note("One line that says what happened.")]
+    remedy: Annotated[str, note("What to do about it, before `fishctl clear-fault`.")] = ""
+
+
+class Percentiles(Struct, frozen=True):
+    """Distribution of a duration since start."""
+
+    p50: Annotated[float, unit("µs", "Median, at most 12 % too high.")]
+    p99: Annotated[float, unit("µs", "99th percentile, at most 12 % too high.")]
+    worst: Annotated[float, unit("µs", "The longest, exact.")]
+    worst_seq: Annotated[int, note("Number of the tick that took so long.")]
+
+
+class Timing(Struct, frozen=True):
+    """How well the loop keeps its time."""
+
+    lateness: Annotated[Percentiles, note("Start of a tick after its deadline.")]
+    busy: Annotated[Percentiles, note("A whole tick, publishing included.")]
+    phases: Annotated[
+        dict[str, Percentiles],
+        note("Each phase of a tick: `read`, `estimate`, `update`, `write`, `publish`."),
+    ]
+
+
+class Status(Struct, frozen=True):
+    """The daemon in one snapshot; published on topic `status`, and the answer to `status`.
+
+    `Operations.status` says where each field comes from.
+    """
+
+    t: Annotated[float, unit("s", "When the snapshot was taken, unix.")]
+    version: Annotated[str, note("Version of fishd.")]
+    pid: Annotated[int, note("Its process.")]
+    uptime: Annotated[float, unit("s", "Since start.")]
+    mode: Annotated[str, note(MODES)]
+    reason: Annotated[Reason | None, note("Why, in mode fault and estop.")]
+    controller: Annotated[str, note("The active controller; `hold` unless running.")]
+    parameters: Annotated[dict[str, Any], note("All its parameters.")]
+    servo_on: Annotated[bool, note("False once the servo is known to get no pulses.")]
+    thrust: Annotated[float, unit("N", "As in `tick`.")]
+    frequency: Annotated[float, unit("Hz", "As in `tick`.")]
+    tick: Annotated[float, unit("s", "Period of the loop.")]
+    amplitude_limit: Annotated[float, unit("rad", "The limit Φ of any angle.")]
+    lowest: Annotated[
+        float, unit("rad", "Lowest angle that Φ, soft limits and pulse widths permit.")
+    ]
+    highest: Annotated[float, unit("rad", "The highest that they permit.")]
+    seq: Annotated[int, note("Number of the latest tick.")]
+    missed: Annotated[int, note("Slots skipped since start.")]
+    overruns: Annotated[int, note("Ticks that took longer than a period, since start.")]
+    timing: Annotated[Timing, note("How well the loop keeps its time, since start.")]
+    robot: Annotated[str, note("What is driven: `simulated`, `pi` or `virtual-pi`.")]
+    degraded: Annotated[
+        tuple[str, ...], note("What keeps the robot from being as good as it could be.")
+    ]
+    counters: Annotated[dict[str, int], note("What was survived since start, by name.")]
+    realtime: Annotated[bool, note("True under real-time scheduling.")]
+    telemetry: Annotated[str, note("Address of the telemetry socket.")]
+    servo_lost: Annotated[
+        bool,
+        note("True while the servo cannot be reached; with `servo_on`, it may still have pulses."),
+    ] = False
+    calibrating: Annotated[bool, note("True while a client tries a calibration of the servo.")] = (
+        False
+    )
+    fallback: Annotated[
+        Reason | None,
+        note("Why the active controller took over from the one that was set, if it did."),
+    ] = None
+    sensor_lost: Annotated[
+        bool,
+        note("True while there is no force to believe; `thrust` is then that of the time before."),
+    ] = False
+    name: Annotated[
+        str, note("Name of the fish: `name` in the configuration, else the machine's.")
+    ] = ""
+    phi_c: Annotated[float, unit("rad", "As in `tick`.")] = 0.0

@@ -1,0 +1,1 @@
+"""The process `fishd`: the loop in real time, its sockets, its requests, and systemd."""

@@ -1,0 +1,100 @@
+"""What a check of `fishctl doctor` is given, and what it returns."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+START_VIRTUAL_PI = "fishctl virtual-pi run"
+"""Mends that no virtual Pi runs."""
+
+Level = Literal["ok", "warning", "FAIL", "skipped"]
+
+
+class Result(NamedTuple):
+    """One line about one thing, and how to mend it where that is needed."""
+
+    level: Level
+    message: str
+    mend: str = ""
+
+
+class Machine:
+    """The computer that the robot is wired to."""
+
+    root: Path = Path("/")
+    """Where /sys, /proc, /dev and so on are looked for."""
+
+    @property
+    def robot(self) -> str:
+        """`pi` or `virtual-pi`."""
+        raise NotImplementedError
+
+    @property
+    def model(self) -> str:
+        """What this machine calls itself, such as Raspberry Pi 5 Model B; empty if unknown."""
+        return self.text("/proc/device-tree/model")
+
+    def path(self, absolute: str) -> Path:
+        """A path of this machine, below `root`."""
+        return self.root / absolute.lstrip("/")
+
+    def text(self, absolute: str) -> str:
+        """A small file's text without the zero or newline at its end; empty if unreadable."""
+        try:
+            return self.path(absolute).read_text(encoding="utf-8", errors="replace").rstrip("\0\n ")
+        except OSError:
+            return ""
+
+    def occupied(self, by_fishd: str) -> Result | None:
+        """Why a check leaves the hardware alone; None where no fishd uses it.
+
+        by_fishd: what to say of a running fishd, such as `owns the bus`
+        """
+        raise NotImplementedError
+
+    def plugged_in(self) -> AbstractContextManager[Any]:
+        """Within, the I2C buses and pins are those of the robot, a virtual one's too.
+
+        Raises `StartupError` where no virtual Pi runs.
+        """
+        return nullcontext()
+
+
+class Check(NamedTuple):
+    """A function of the machine; it returns None where there is nothing to check."""
+
+    name: str
+    function: Callable[[Any], Result | None]
+    robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi")
+    """For which robots it is made."""
+
+
+def ok(message: str) -> Result:
+    """Nothing to do."""
+    return Result("ok", message)
+
+
+def warning(message: str, mend: str) -> Result:
+    """It works, but could be better."""
+    return Result("warning", message, mend)
+
+
+def fail(message: str, mend: str) -> Result:
+    """It cannot work."""
+    return Result("FAIL", message, mend)
+
+
+def skipped(message: str) -> Result:
+    """It cannot be told, or was not tried."""
+    return Result("skipped", message)
+
+
+def name_of(uid: int) -> str:
+    """The name of a user, or its number where it has none."""
+    import pwd
+
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"#{uid}"

@@ -1,0 +1,207 @@
+"""The dual force sensor on an ADS1115: two inputs of one chip, converted in turn.
+
+X Y Y X X Y …: so the lag of the second sample of each pair cancels out in their mean.
+"""
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from msgspec import Meta
+
+from fishd.core.clock import Clock
+from fishd.core.schema import Problem, note, unit
+from fishd.hardware import i2c
+from fishd.hardware.checks import Check
+from fishd.hardware.driver import Claim, ForceSensorDriver, Pair
+from fishd.hardware.settings import ForceSensorSettings
+
+if TYPE_CHECKING:
+    from fishd.hardware.force_sensor.ads1115_single_shot import SingleShot
+
+Channel = Literal["A0", "A1", "A2", "A3", "A0-A1", "A0-A3", "A1-A3", "A2-A3"]
+"""An input of the ADS1115: a pin against ground, or the difference of two."""
+I2cAddress = Annotated[int, Meta(ge=0x48, le=0x4B)]
+"""Of an ADS1115."""
+FULL_SCALES = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256)
+"""The ranges that the ADS1115 has, ± [V]."""
+STEPS = 32768
+"""Of the ADC, from zero to full scale."""
+SLOWEST = 1.25
+"""A conversion with its tolerance and its transfers, in units of 1 / data rate."""
+FEWEST_PAIRS = 8 / 0.05 / 860
+"""Pairs per conversion that a bus of 400 kbit/s leaves, at the least."""
+
+
+class Ads1115Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The ADS1115 that the dual force sensor is wired to."""
+
+    bus: Annotated[i2c.Bus, note("I2C bus: N of /dev/i2c-N.")] = 1
+    address: Annotated[I2cAddress, note("I2C address, set by the ADDR pin; 72 is 0x48.")] = 72
+    channel_x: Annotated[Channel, note("Input that carries F_x.")] = "A0-A1"
+    channel_y: Annotated[Channel, note("Input that carries F_y.")] = "A2-A3"
+    full_scale: Annotated[
+        float,
+        unit(
+            "V",
+            "Range of the inputs, ± this: 6.144, 4.096, 2.048, 1.024, 0.512 or 0.256.",
+            gt=0,
+            le=6.144,
+        ),
+    ] = 2.048
+    saturation_low: Annotated[
+        Annotated[float, Meta(ge=-6.144, le=6.144)] | None,
+        unit(
+            "V",
+            "At or below, an amplifier is at the end of its supply: as if the ADC had clipped. "
+            "Between the pins of the input, so 0.1 for A0 alone; null for none.",
+        ),
+    ] = -3.2
+    saturation_high: Annotated[
+        Annotated[float, Meta(ge=-6.144, le=6.144)] | None,
+        unit(
+            "V",
+            "The same at or above. An amplifier at 3.3 V ends below a full_scale of 4.096 or "
+            "6.144, where the ADC itself does not clip; null for none.",
+        ),
+    ] = 3.2
+    data_rate: Annotated[
+        Literal[8, 16, 32, 64, 128, 250, 475, 860], unit("1/s", "Conversions per second.")
+    ] = 860
+
+
+class Ads1115(ForceSensorDriver[Ads1115Settings]):
+    """An ADS1115 on the I2C bus."""
+
+    Settings = Ads1115Settings
+    packages = (
+        "adafruit-blinka",
+        "adafruit-circuitpython-ads1x15",
+        "adafruit-extended-bus",
+    )
+    on_virtual_pi = True
+    transport = "i2c"
+
+    def __init__(self, settings: Ads1115Settings, clock: Clock) -> None:
+        """Raises ImportError where the library is not installed; opens nothing yet."""
+        from fishd.hardware.force_sensor import ads1115_single_shot as library
+
+        super().__init__(settings, clock)
+        self._single_shot = library.SingleShot
+        # A conversion goes on when the transfer that asks for it fails. While it does, the chip
+        # ignores a start, and would answer with a sample of the other channel.
+        self.settling = library.TOO_SLOW / settings.data_rate + 1e-3
+        self.names = f"F_x (channel {settings.channel_x})", f"F_y (channel {settings.channel_y})"
+        self._duration = 1.0 / settings.data_rate
+        self._step = settings.full_scale / STEPS
+        low, high = settings.saturation_low, settings.saturation_high
+        self._lowest = -STEPS if low is None else max(-STEPS, math.floor(low / self._step))
+        self._highest = STEPS - 1 if high is None else min(STEPS - 1, math.ceil(high / self._step))
+        self._in_doubt = True
+        self._y_first = False
+        self._first: tuple[float, int] | None = None
+        self._bus: Any = None
+        self._chip: SingleShot
+        self._x: Any
+        self._y: Any
+
+    @property
+    def place(self) -> str:
+        """Address and bus."""
+        return f"the ADS1115 at {self.settings.address:#04x} on /dev/i2c-{self.settings.bus}"
+
+    def open(self) -> None:
+        """Open the bus and find the chip; raises OSError."""
+        settings = self.settings
+        bus = i2c.open_bus(settings.bus)
+        try:
+            self._chip = self._single_shot(bus, settings, self.clock)
+        except BaseException:
+            i2c.close_bus(bus)
+            raise
+        self._x = self._chip.input(settings.channel_x)
+        self._y = self._chip.input(settings.channel_y)
+        self._bus = bus
+
+    def sample(self) -> Pair | None:
+        """Convert once; with every second conversion a pair is complete. Raises OSError."""
+        first, self._first = self._first, None
+        if self._in_doubt:
+            first = None
+            self._chip.check_idle()
+        self._in_doubt = True  # until it has come to its end
+        started = self.clock.monotonic()
+        code = (self._y if self._y_first == (first is None) else self._x).value
+        self._in_doubt = False
+        if first is None:
+            self._first = started, code
+            return None
+        begun, other = first
+        x, y = (code, other) if self._y_first else (other, code)
+        self._y_first = not self._y_first
+        clipped = self._clipped(0, x) or self._clipped(1, y)
+        return Pair(begun, started + self._duration, x * self._step, y * self._step, clipped)
+
+    def close(self) -> None:
+        """Let go of the bus; never raises, may be called twice."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            del self._chip, self._x, self._y
+            i2c.close_bus(bus)
+
+    def explain(self, error: Exception) -> str:
+        """What to check."""
+        settings = self.settings
+        return i2c.explain(error, settings.bus, settings.address, "ADS1115", "force_sensor")
+
+    @classmethod
+    def pair_rate(cls, settings: Ads1115Settings) -> float:
+        """On a bus of 400 kbit/s."""
+        return FEWEST_PAIRS * settings.data_rate
+
+    @classmethod
+    def check(cls, settings: Ads1115Settings, tick: float) -> None:
+        """The ADC has the range, each force an input of its own, and each tick a pair."""
+        if settings.full_scale not in FULL_SCALES:
+            permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES)
+            raise Problem(
+                ("full_scale",),
+                f"{settings.full_scale:g} is not valid: one of {permitted} V is needed",
+            )
+        low, high = settings.saturation_low, settings.saturation_high
+        if low is not None and high is not None and low >= high:
+            raise Problem(
+                ("saturation_low",),
+                f"{low:g} is not valid: less than saturation_high, {high:g} V, is needed",
+            )
+        if settings.channel_x == settings.channel_y:
+            raise Problem(("channel_y",), f"'{settings.channel_y}' is what channel_x is wired to")
+        slowest = 2 * SLOWEST / settings.data_rate
+        if slowest > tick:
+            raise Problem(
+                ("data_rate",),
+                f"{settings.data_rate} is not valid: a pair of samples would take up to "
+                f"{slowest * 1e3:.1f} ms, longer than a tick of {tick * 1e3:g} ms",
+            )
+
+    @classmethod
+    def claims(cls, settings: Ads1115Settings) -> tuple[Claim, ...]:
+        """Two programs on one bus would take each other's samples, without an error."""
+        return (i2c.claim(settings.bus),)
+
+    @classmethod
+    def checks(cls, settings: Ads1115Settings) -> tuple[Check, ...]:
+        """Of bus, amplifier and chip."""
+        from fishd.hardware.force_sensor import ads1115_checks
+
+        return i2c.checks(settings.bus, "force_sensor") + ads1115_checks.checks(settings)
+
+    def _clipped(self, channel: int, code: int) -> str:
+        """The ADC's own end of the range, or that of the amplifier before it."""
+        if self._lowest < code < self._highest:
+            return ""
+        name = self.names[channel]
+        if code in (-STEPS, STEPS - 1):
+            return f"{name} is clipped at {math.copysign(self.settings.full_scale, code):+g} V"
+        key = "saturation_high" if code >= self._highest else "saturation_low"
+        volts = code * self._step
+        return f"{name} is at {volts:+.4g} V: the amplifier is at its end (force_sensor.{key})"

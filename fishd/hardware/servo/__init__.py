@@ -1,0 +1,1 @@
+"""The servo: drivers that send pulses, and what turns angles into pulses."""

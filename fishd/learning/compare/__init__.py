@@ -1,0 +1,1 @@
+"""Contestants against one another: scores, tables and figures."""

@@ -1,0 +1,1 @@
+"""The Gymnasium environments, on the simulated fish and on a running fishd."""

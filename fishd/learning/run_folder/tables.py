@@ -1,0 +1,160 @@
+"""The CSV files of a run, which go on after a resume, and the summary of several seeds."""
+
+import csv
+import io
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from stable_baselines3.common.logger import KVWriter
+
+from fishd.core import files
+from fishd.core.errors import ConfigError
+from fishd.core.files import FileProblem, write_atomically
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.run_folder.checkpoints import CheckpointError
+
+PROGRESS = {
+    "steps": "tank/steps",
+    "tank_time": "tank/time",
+    "reward": "rollout/reward",
+    "thrust": "rollout/thrust",
+    "efficiency": "rollout/efficiency",
+    "frequency": "rollout/frequency",
+    "fullness": "rollout/fullness",
+    "lost": "tank/lost",
+    "paused": "tank/paused",
+    "learning_rate": "train/learning_rate",
+    "loss": "train/loss",
+    "policy_loss": "train/policy_gradient_loss",
+    "value_loss": "train/value_loss",
+    "entropy_loss": "train/entropy_loss",
+    "kl": "train/approx_kl",
+    "clip_fraction": "train/clip_fraction",
+    "explained_variance": "train/explained_variance",
+    "deviation": "train/std",
+}
+"""Columns of progress.csv, and the keys that they have in TensorBoard."""
+EVALUATIONS = "evaluations.csv"
+SUMMARY = (
+    "steps",
+    "seeds",
+    "median",
+    "lowest",
+    "highest",
+    "best_median",
+    "best_lowest",
+    "best_highest",
+)
+"""Columns of seeds.csv: efficiencies of the current policies, and of each seed's best so far."""
+
+
+class Table:
+    """A CSV file with a header; every row is passed to the operating system at once."""
+
+    def __init__(self, path: Path, columns: Iterable[str]) -> None:
+        self._path = path
+        self._columns = tuple(columns)
+        if not path.exists():
+            write_atomically(path, _lines([self._columns]))
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """One row; numbers in full precision."""
+        values = [_plain(row.get(column)) for column in self._columns]
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            file.write(_lines([values]))
+
+    def keep_until(self, steps: int) -> None:
+        """Drop the rows of later steps, which a resumed run is going to do again.
+
+        Raises `CheckpointError` where the file is not such a table.
+        """
+        try:
+            head, *rows = _read(self._path)
+            at = head.index("steps")
+            complete = [row for row in rows if len(row) == len(head)]  # the last may be cut off
+            kept = [row for row in complete if int(row[at]) <= steps]
+        except (ValueError, FileProblem):
+            raise CheckpointError(
+                f"{self._path}: not a table of a training; move it away, and a new one is begun"
+            ) from None
+        write_atomically(self._path, _lines([head, *kept]))
+
+
+class ProgressWriter(KVWriter):
+    """Writes what stable-baselines3 logs in an update as a row of progress.csv."""
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+
+    def write(
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
+    ) -> None:
+        """One row."""
+        self._table.add({column: key_values.get(key) for column, key in PROGRESS.items()})
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def read_evaluations(folder: Path) -> list[Evaluation]:
+    """The evaluations of a run; empty where it has no table of them.
+
+    Raises `ConfigError` where it is another table.
+    """
+    path = folder / EVALUATIONS
+    try:
+        head, *rows = _read(path)
+        given = [{key: text for key, text in zip(head, row, strict=True) if text} for row in rows]
+        return msgspec.convert(given, list[Evaluation], strict=False)
+    except files.NoFile:
+        return []
+    except FileProblem as problem:
+        raise ConfigError(f"{path}: {problem}") from None
+    except ValueError:
+        raise ConfigError(f"{path}: not a table of evaluations") from None
+
+
+def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
+    """Efficiency of the best policy until each evaluation; one that stalls does not count."""
+    best = 0.0
+    return [best := one.efficiency if one.best else best for one in evaluations]
+
+
+def write_summary(path: Path, folders: Sequence[Path]) -> None:
+    """Write seeds.csv from the run folders of all seeds: a row for each evaluation."""
+    at: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    for folder in folders:
+        evaluations = read_evaluations(folder)
+        for one, best in zip(evaluations, best_so_far(evaluations), strict=True):
+            at[one.steps].append((one.efficiency, best))
+    lines: list[Sequence[Any]] = [SUMMARY]
+    for steps, pairs in sorted(at.items()):
+        columns = list(zip(*pairs, strict=True))
+        spread = [f(values) for values in columns for f in (statistics.median, min, max)]
+        lines.append([steps, len(pairs), *spread])
+    write_atomically(path, _lines(lines))
+
+
+def _read(path: Path) -> list[list[str]]:
+    """All rows, the header first; raises `FileProblem`."""
+    text = files.read_text(path, files.TABLE, "a table of a training")
+    try:
+        return list(csv.reader(io.StringIO(text)))
+    except csv.Error as error:
+        raise FileProblem(f"not a CSV file: {error}") from None
+
+
+def _lines(rows: Iterable[Sequence[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of numpy as those of Python, booleans as 0 and 1."""
+    value = value.item() if hasattr(value, "item") else value
+    return int(value) if isinstance(value, bool) else value

@@ -1,1 +1,0 @@
-"""An agent in another process, on another machine perhaps, that chooses the instruction angle."""

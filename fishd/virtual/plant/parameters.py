@@ -1,0 +1,85 @@
+"""The numbers that make one fish differ from another, shared by the configuration and the plant."""
+
+from typing import Annotated
+
+from msgspec import Struct
+
+from fishd.core.schema import unit
+
+
+class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Constants of the servo, the fin and the forces; the defaults are those of Fu et al."""
+
+    omega0: Annotated[
+        float,
+        unit(
+            "rad/s", "Undamped natural angular frequency of the fin in water, ω₀.", ge=0.1, le=1e3
+        ),
+    ] = 12.5
+    xi: Annotated[
+        float,
+        unit("1", "Damping ξ of the fin; its friction term is ξω₀α̇, not 2ξω₀α̇.", ge=0.0, le=20.0),
+    ] = 1.2
+    coupling: Annotated[
+        float, unit("1", "Fin angle at rest per angle of the servo wheel, λ.", gt=0.0, le=10.0)
+    ] = 0.46
+    servo_speed: Annotated[
+        float, unit("rad/s", "Highest angular speed of the servo wheel, Ω.", ge=0.01, le=1e4)
+    ] = 5.8
+    servo_lag: Annotated[
+        float,
+        unit(
+            "rad",
+            "Lag of the wheel behind its instruction that saturates the servo, Δ.",
+            ge=1e-4,
+            le=10.0,
+        ),
+    ] = 0.29
+    thrust_coefficient: Annotated[
+        float, unit("N s^2/rad^2", "Thrust coefficient K, in F_x = −K α α̈.", gt=0.0, le=10.0)
+    ] = 12.9e-3
+    lateral_drag: Annotated[
+        float,
+        unit("N s/rad", "Lateral drag coefficient K_d, in F_y = −K α̈ − K_d α̇.", ge=0.0, le=10.0),
+    ] = 39.9e-3
+    cable_slack: Annotated[
+        float,
+        unit(
+            "rad",
+            "Wheel angle either side of centre that only takes up slack in the cables.",
+            ge=0.0,
+            le=1.0,
+        ),
+    ] = 0.0
+    backlash: Annotated[
+        float,
+        unit(
+            "rad",
+            "Play of the tail against the wheel, either way: after a reversal the wheel turns by "
+            "twice as much before the tail follows.",
+            ge=0.0,
+            le=1.0,
+        ),
+    ] = 0.0
+    servo_delay: Annotated[
+        float, unit("s", "Time from an instruction until the servo acts on it.", ge=0.0, le=0.5)
+    ] = 0.0
+    servo_dead_zone: Annotated[
+        float,
+        unit(
+            "rad",
+            "The servo leaves a wheel alone that is this near to its instruction.",
+            ge=0.0,
+            le=1.0,
+        ),
+    ] = 0.0
+    servo_reaction: Annotated[
+        float,
+        unit(
+            "N s^2/rad",
+            "Reaction J to the wheel's acceleration that the force sensor feels: −J φ̈ is added "
+            "to F_y, smoothed over 10 ms.",
+            ge=-0.1,
+            le=0.1,
+        ),
+    ] = 0.0

@@ -1,0 +1,61 @@
+"""What holds for every test: which are fast, what may be reported, how many threads compute."""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import settings
+
+# One process per core computes; before numpy or torch is loaded, here and in what tests start.
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+for variable in ("COLUMNS", "LINES"):  # which workers have; a terminal says itself how large it is
+    os.environ.pop(variable, None)
+
+# How long an example takes says something of the machine only.
+settings.register_profile("fishd", deadline=None)
+settings.load_profile("fishd")
+
+SLOW = re.compile(
+    r"subprocess|multiprocessing|asyncio|time\.sleep|SystemClock|running\("
+    r"|operator_rig|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
+)
+"""A module of tests that mentions one of these starts processes, waits, or loads torch."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--fast", action="store_true", help="only tests on the virtual clock, without processes"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.option.fast:
+        config.option.markexpr = "not slow and not realtime"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With --fast, slow modules are not even imported; single slow tests are marked `slow`."""
+    if not config.option.fast or collection_path.suffix != ".py":
+        return None
+    whole = "end_to_end" in collection_path.parts
+    return whole or bool(SLOW.search(collection_path.read_text(encoding="utf-8"))) or None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_report_to_serializable() -> Iterator[Any]:
+    """Captured output may hold what no UTF-8 can carry from a worker to the one that reports."""
+    return _encodable((yield))
+
+
+def _encodable(found: Any) -> Any:
+    if isinstance(found, str):
+        return found.encode("utf-8", "backslashreplace").decode()
+    if isinstance(found, dict):
+        return {key: _encodable(value) for key, value in found.items()}
+    if isinstance(found, list | tuple):
+        return type(found)(_encodable(item) for item in found)
+    return found

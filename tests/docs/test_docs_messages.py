@@ -1,0 +1,204 @@
+"""What the documentation says that fishd prints: every reason, and every message word by word."""
+
+import ast
+import errno
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
+
+import pytest
+from rigs.documents import FENCE, ROOT, text_of
+
+from fishd.control.faults import FAULTS
+
+
+def sources() -> Iterator[str]:
+    for path in sorted((ROOT / "fishd").rglob("*.py")):
+        yield path.read_text(encoding="utf-8")
+
+
+def test_every_fault_that_fishd_latches_is_in_the_table_and_no_other() -> None:
+    code = re.compile(r"(?:\bfail\(|_fail\(|\.check\(|ControllerFault\()\s*\"([a-z-]+)\"")
+    assert {found for text in sources() for found in code.findall(text)} == FAULTS.keys()
+
+
+def test_troubleshooting_has_a_section_for_each_fault_and_no_other() -> None:
+    document = text_of(ROOT / "docs" / "troubleshooting.md")
+    section = document.split("## By reason")[1].split("\n## ")[0]
+    assert set(re.findall(r"^### (\S+)$", section, re.MULTILINE)) == FAULTS.keys()
+
+
+Template = tuple[str, ...]
+"""A message of the sources: its literal parts, with a gap for a value between each two."""
+ENOUGH = 7
+"""Letters that the literal parts of a template must have, to be a message."""
+
+
+def template_of(node: ast.expr) -> Template | None:
+    """What a string expression spells; None where it is no string that can be seen."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return tuple(re.split(r"\{\w+\}|%[sdg]", node.value))
+    if isinstance(node, ast.JoinedStr):
+        parts = [""]
+        for value in node.values:
+            if isinstance(value, ast.Constant):
+                parts[-1] += str(value.value)
+            else:
+                parts.append("")
+        return tuple(parts)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        left, right = template_of(node.left), template_of(node.right)
+        if left is None and right is None:
+            return None
+        left, right = left or ("", ""), right or ("", "")
+        return (*left[:-1], left[-1] + right[0], *right[1:])
+    return None
+
+
+@cache
+def templates() -> tuple[Template, ...]:
+    """Every message of the sources, docstrings left out; and what Linux says."""
+    found: set[Template] = {(os.strerror(number),) for number in errno.errorcode}
+    for source in sources():
+        tree = ast.parse(source)
+        about = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.expr) and id(node) not in about and (t := template_of(node)):
+                found.add(t)
+    return tuple(t for t in found if len(re.findall(r"[a-zA-Z]", "".join(t))) >= ENOUGH)
+
+
+def quoted_messages() -> list[str]:
+    """What troubleshooting.md says that fishd prints: tables of messages and lines, text blocks."""
+    document = text_of(ROOT / "docs" / "troubleshooting.md")
+    blocks = [block for kind, block in FENCE.findall(document) if kind == "text"]
+    table = re.compile(r"^\| (?:message|line) \|.*\n\|[-|]+\n((?:\|.*\n)+)", re.MULTILINE)
+    tables = table.findall(document)
+    rows = "".join(tables)
+    return "".join(blocks).splitlines() + re.findall(r"^\| `([^`]+)`", rows, re.MULTILINE)
+
+
+@cache
+def templates_by_ends() -> defaultdict[tuple[str, str], list[Template]]:
+    """By their first and last two letters, or none where a gap may be there."""
+    found = defaultdict(list)
+    for template in templates():
+        first, last = template[0][:2], template[-1][-2:]
+        found[first if len(first) == 2 else "", last if len(last) == 2 else ""].append(template)
+    return found
+
+
+UNITS = "µs|ms|s|N|V|rad|Hz|mN rms|mN"
+VALUE = re.compile(
+    rf"(?:…|[^ ]*[/…:@][^ ]*|'[^']*'|load \d|[+-]?\d[^ ]*(?: (?:{UNITS}))?|[\w.\[\]-]+)"
+)
+"""What stands in a gap: a number, a name, a path, a quoted text, or `…`."""
+JOINED = re.compile(r"(?:, | and | or | to )")
+
+
+@cache
+def is_value(text: str) -> bool:
+    """Is it one value, several in a list, or another message?"""
+    if not text or VALUE.fullmatch(text) or (text[0] == "(" and text[-1] == ")"):
+        return True
+    parts = JOINED.split(text)
+    if len(parts) > 1 and all(part and is_value(part) for part in parts):
+        return True
+    return is_message(text)
+
+
+@cache
+def is_message(text: str) -> bool:
+    """Is it just what some expression of the sources spells, with values in its gaps?"""
+    if len(re.findall(r"[a-zA-Z]", text)) < ENOUGH:
+        return False
+    candidates = templates_by_ends()[text[:2], ""] + templates_by_ends()["", text[-2:]]
+    candidates += templates_by_ends()[text[:2], text[-2:]] + templates_by_ends()["", ""]
+    if any(fits(template, text) for template in candidates if could_fit(template, text)):
+        return True
+    head, colon, tail = text.partition(": ")
+    if colon and is_value(head) and is_message(tail):
+        return True
+    path, _, tail = text.partition(" ")
+    if path.startswith("/") and is_message(tail):
+        return True
+    places = [found.start() for found in re.finditer("; ", text)]
+    return any(is_hint(text[place:]) and is_message(text[:place]) for place in places)
+
+
+def is_hint(text: str) -> bool:
+    """Is it what may follow a message, such as `; reconnecting`?"""
+    hints = (template for template in templates() if template[0].startswith("; "))
+    return any(fits(template, text) for template in hints)
+
+
+def could_fit(template: Template, text: str) -> bool:
+    """A quick look, for the many that do not: much of a message is not values."""
+    return (
+        (max(map(len, template)) > 12 or 4 * sum(map(len, template)) >= len(text))
+        and text.startswith(template[0])
+        and text.endswith(template[-1])
+        and all(part in text for part in template)
+    )
+
+
+def fits(template: Template, text: str) -> bool:
+    """Is a text this template, with a value or nothing in each gap?"""
+    first, *rest = template
+    if not text.startswith(first):
+        return False
+    left = text[len(first) :]
+    if not rest:
+        return not left
+    if not all(part in left for part in rest):
+        return False
+    return any(
+        left.startswith(rest[0], gap) and is_value(left[:gap]) and fits(tuple(rest), left[gap:])
+        for gap in range(len(left) + 1)
+    )
+
+
+@pytest.mark.parametrize("line", quoted_messages())
+def test_every_message_that_is_quoted_is_one_that_fishd_prints(line: str) -> None:
+    assert is_message(line)
+
+
+NEGATIONS = (
+    ("cannot", "can"), ("has not", "has"), ("does not", "does"), ("is not", "is"), ("no ", "a "),
+    (" is ", " is not "), (" are ", " are not "), (" must ", " must not "), ("more ", "less "),
+    ("at most", "at least"), (" may not ", " may "), (" beyond ", " within "),
+)  # fmt: skip
+
+
+IN_GAPS = (
+    "another fishd (pid 812)",
+    "not connected: Connection",
+    "cannot start",
+    "load 2",
+    "servo driver",
+)
+"""Words that stand in gaps, so that other words could."""
+
+
+def falsified(line: str) -> Iterator[str]:
+    """A line with a word dropped that is no value, or made to say the contrary."""
+    gaps = {
+        place
+        for phrase in IN_GAPS
+        for found in re.finditer(re.escape(phrase), line)
+        for place in range(found.start(), found.end())
+    }
+    for word in re.finditer(r"(?<!\S)[a-zA-Z]{2,}(?!\S) ", line):
+        if word.start() not in gaps:
+            yield line[: word.start()] + line[word.end() :]
+    for said, contrary in NEGATIONS:
+        place = line.find(said)
+        if place >= 0 and place not in gaps:
+            yield line.replace(said, contrary, 1)
+
+
+@pytest.mark.parametrize("line", quoted_messages())
+def test_a_dropped_word_or_a_negation_is_noticed(line: str) -> None:
+    assert [wrong for wrong in falsified(line) if is_message(wrong)] == []

@@ -1,0 +1,60 @@
+"""What the shell offers for a half-typed command line of fishctl."""
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from rigs.processes import FISHCTL, Daemon, call
+
+
+def offered(*words: str) -> list[str]:
+    """What bash would be told for these words, of which the last is not complete."""
+    shell = {"_FISHCTL_COMPLETE": "bash_complete", "COMP_CWORD": str(len(words))}
+    shell["COMP_WORDS"] = "\n".join(("fishctl", *words))
+    done = call(FISHCTL, env=os.environ | shell, check=True)
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+def test_set_parameter_offers_the_parameters_of_the_running_controller(daemon: Daemon) -> None:
+    daemon.fishctl("set-controller", "swing")
+    to = ("--endpoint", daemon.endpoint)
+    assert offered(*to, "set-parameter", "") == [
+        "plain,C", "plain,amplitude", "plain,longest_half_period"
+    ]  # fmt: skip
+    assert offered("set-parameter", *to, "C", "0.3", "am") == ["plain,amplitude"]
+    assert offered(*to, "set-parameter", "C", "") == []
+
+
+def test_set_parameter_offers_nothing_without_a_daemon(tmp_path: Path) -> None:
+    assert offered("--endpoint", f"ipc://{tmp_path}/nobody", "set-parameter", "") == []
+
+
+def test_set_offers_keys_of_the_configuration() -> None:
+    keys = offered("simulate", "swing", "--set", "plant.")
+    assert "plain,plant.omega0=" in keys
+    assert all(key.startswith("plain,plant.") for key in keys)
+    assert "plain,plant=" not in offered("config", "show", "--set", "pl")
+
+
+def test_evaluate_offers_controllers_and_policies() -> None:
+    assert offered("learn", "evaluate", "sw") == ["file,sw", "plain,swing"]
+    assert "plain,default-fish" in offered("learn", "evaluate", "swing", "def")
+    assert "plain,remote" not in offered("learn", "evaluate", "")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+def test_bash_itself_completes_named_policies_and_files() -> None:
+    folder = Path(sys.executable).parent
+    script = """
+        eval "$(fishctl completion bash)"
+        compopt() { :; }
+        COMP_WORDS=(fishctl set-controller ppo --policy def); COMP_CWORD=4
+        _fishctl_completion fishctl
+        echo "${COMPREPLY[@]}"
+    """
+    path = {"PATH": f"{folder}:{os.environ['PATH']}"}
+    done = call("bash", "--norc", "-c", script, env=os.environ | path, check=True)
+    assert done.stdout.split() == ["default-fish"]

@@ -1,0 +1,273 @@
+"""The link to a running fishd: the numbers of a simulated link, and why control was lost."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rigs.processes import Daemon, Subscriber, running
+
+from fishd.client import Agent, Fish, FishError, NoDaemon
+from fishd.config import load
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.fishd_link import FishdLink
+from fishd.learning.env.link import Link, LinkLost
+from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.settings import EnvironmentSettings
+
+FISH = ["simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.seed=7"]
+HALF = np.full(1, 0.5, np.float32)
+
+
+def options(*settings: str) -> list[str]:
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    """A fishd in real time, in which an agent on a busy machine may lose ticks but no training."""
+    with running(tmp_path, *options("tick=0.1")) as found:
+        yield found
+
+
+@pytest.fixture
+def fish(daemon: Daemon) -> Iterator[Fish]:
+    with Fish(daemon.endpoint) as fish:
+        yield fish
+
+
+@pytest.fixture
+def link(daemon: Daemon) -> Iterator[FishdLink]:
+    """Swims already."""
+    link = FishdLink(daemon.endpoint)
+    link.reset()
+    link.step(0.3)
+    yield link
+    link.close()
+
+
+def env_on(daemon: Daemon) -> SwimEnv:
+    settings = EnvironmentSettings(longest_start=0)
+    return SwimEnv(FishdLink(daemon.endpoint), load(None, ["tick=0.1"]), settings)
+
+
+@pytest.fixture
+def env(daemon: Daemon) -> Iterator[SwimEnv]:
+    """Swims already."""
+    made = env_on(daemon)
+    made.reset()
+    made.step(HALF)
+    yield made
+    made.close()
+
+
+def swims(env: SwimEnv) -> bool:
+    """Is what a step observes a consequence of its action?"""
+    return any(env.step(HALF)[4]["lost"] == 0 for _ in range(20))
+
+
+def swim_for_ever(link: Link) -> None:
+    while True:
+        link.step(0.3)
+
+
+@contextmanager
+def losing(message: str) -> Iterator[None]:
+    with pytest.raises(LinkLost, match=message):
+        yield
+
+
+def history(link: Link, steps: int, pause_every: int) -> list[tuple[bytes, float, int]]:
+    """What an agent sees that acts at random, always in the same way."""
+    env = SwimEnv(link, load(None, FISH), EnvironmentSettings(episode=100))
+    draw = np.random.default_rng(4)
+    seen = [(env.reset(seed=3)[0].tobytes(), 0.0, 0)]
+    for step in range(1, steps + 1):
+        observed, reward, _, truncated, info = env.step(draw.uniform(-1, 1, 1).astype(np.float32))
+        seen.append((observed.tobytes(), float(reward), info["lost"]))
+        if truncated:
+            seen.append((env.reset()[0].tobytes(), 0.0, 0))
+        if pause_every and step % pause_every == 0:
+            env.pause(60.0)
+            seen.append((env.resume().tobytes(), 0.0, 0))
+    env.close()
+    return seen
+
+
+@pytest.mark.parametrize("pause_every", [0, 64], ids=["without pauses", "with pauses"])
+def test_a_fishd_in_lockstep_gives_the_numbers_of_a_fish_in_process(
+    tmp_path: Path, pause_every: int
+) -> None:
+    agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
+    settings = ("lockstep=true", "start.controller=remote", agent, *FISH)
+    with running(tmp_path, *options(*settings)) as daemon:  # its first tick waits for the agent
+        there = history(FishdLink(daemon.endpoint), 300, pause_every)
+    assert there == history(SimulatedLink(load(None, FISH)), 300, pause_every)
+
+
+def test_it_swims_a_fishd_in_real_time_and_leaves_it_at_rest(daemon: Daemon, fish: Fish) -> None:
+    link = FishdLink(daemon.endpoint)
+    with Subscriber(daemon.telemetry, b"tick") as telemetry:
+        assert (link.tick, link.amplitude) == (0.1, 0.42)
+        before = link.reset()
+        told: dict[float, float] = {}
+        for n in range(20):
+            angle = 0.02 * (n + 1)
+            found, lost = link.step(angle)
+            if not lost:
+                told[before.fx] = angle
+                assert found.time == pytest.approx(before.time + 0.1)
+                assert found.instruction_angle == pytest.approx(angle)
+            before = found
+        assert len(told) > 10
+        applied: dict[float, float] = {}
+        while before.fx not in applied:
+            tick = telemetry.message()
+            applied[tick["fx"]] = tick["phi_c"]
+    # What the agent was told did happen in the tick that it had observed, says telemetry.
+    assert told == {fx: applied[fx] for fx in told}
+    link.close()
+    assert fish.status().mode == "idle"
+
+
+def test_a_late_action_is_reported_as_lost(link: FishdLink) -> None:
+    for _ in range(3):
+        while link.step(0.3).lost:
+            pass
+        time.sleep(0.15)  # beyond the deadline, and the next tick
+        assert link.step(0.3).lost >= 1
+
+
+def test_a_pause_is_at_neutral_and_what_follows_is_fresh(link: FishdLink, fish: Fish) -> None:
+    before = link.step(0.3).observation
+    link.pause(30.0)
+    seq = fish.status().seq
+    while fish.status().seq < seq + 12:  # more ticks than it may miss
+        time.sleep(0.02)
+    after = link.resume()
+    assert after.time >= before.time + 1.0
+    assert after.instruction_angle == 0.0
+    assert fish.status().mode == "running"
+    assert link.step(0.3).observation.time > after.time
+
+
+def test_a_reset_in_control_swims_on_without_a_lost_tick(env: SwimEnv, fish: Fish) -> None:
+    lost = 0
+    for _ in range(10):
+        before = env.latest
+        env.reset()
+        assert env.latest.time - before.time < 0.15
+        lost += env.step(HALF)[4]["lost"]
+    assert lost < 5
+    assert fish.status().mode == "running"
+
+
+def test_a_stop_ends_it_and_a_reset_reacquires_control(env: SwimEnv, fish: Fish) -> None:
+    fish.stop()
+    stopped = fish.status().seq
+    with losing("fishd was told to stop"):
+        env.step(HALF)
+    env.reset()
+    assert fish.status().mode == "running"
+    assert fish.status().seq > stopped
+    assert swims(env)
+
+
+def test_another_controller_ends_it_and_a_reset_does_not_take_the_fish_from_it(
+    env: SwimEnv, fish: Fish
+) -> None:
+    fish.set_controller("swing")
+    with losing("another controller has taken command: swing"):
+        env.step(HALF)
+    for _ in range(2):
+        with losing("another controller has taken command: swing; 'fishctl stop' frees the fish"):
+            env.reset()
+    assert fish.status().controller == "swing"
+    fish.stop()
+    env.reset()
+    assert swims(env)
+
+
+def test_another_active_agent_is_named(env: SwimEnv, fish: Fish, tmp_path: Path) -> None:
+    with Agent(f"ipc://{tmp_path}/other") as other:
+        fish.set_controller("remote", agent=other.address)
+        with losing(f"another agent has taken command: {other.address}"):
+            env.reset()
+
+
+@pytest.mark.realtime
+def test_a_fault_ends_it_with_the_reason_of_fishd_until_it_is_cleared(
+    env: SwimEnv, fish: Fish
+) -> None:
+    while fish.status().mode != "fault":
+        time.sleep(0.02)  # nobody answers
+    with losing(r"fishd is in mode fault: .* has not answered within"):
+        env.step(HALF)
+    with losing("fishd is in mode fault"):
+        env.pause(1.0)
+    with losing("has not answered within"):
+        env.reset()
+    fish.clear_fault()
+    env.reset()
+    assert swims(env)
+
+
+def test_an_emergency_stop_ends_it_with_its_message(env: SwimEnv, fish: Fish) -> None:
+    fish.estop("water on the floor")
+    with losing("fishd is in mode estop: water on the floor"):
+        env.step(HALF)
+    with losing("water on the floor"):
+        env.reset()
+    fish.clear_fault()
+    env.reset()
+    assert swims(env)
+
+
+def test_a_reset_in_a_pause_ends_it(env: SwimEnv) -> None:
+    env.pause(60.0)
+    env.reset()
+    assert swims(env)
+
+
+def test_a_fishd_that_is_gone_or_was_restarted_ends_it(tmp_path: Path) -> None:
+    with running(tmp_path, *options("tick=0.1")) as first:
+        env = env_on(first)
+        env.reset()
+        first.process.kill()
+        first.process.wait()
+        with losing("no fishd at ipc://"):
+            swim_for_ever(env.link)
+    with running(tmp_path, *options("tick=0.1")) as second:
+        env.reset()
+        assert swims(env)
+        second.process.kill()
+        second.process.wait()
+    with running(tmp_path, *options("tick=0.1")) as third:
+        pids = f"it is process {third.process.pid} now, and was {second.process.pid}"
+        with losing(f"^fishd was restarted: {pids}$"):
+            swim_for_ever(env.link)
+        env.reset()
+        assert swims(env)
+        env.close()
+        with Fish(third.endpoint) as fish:
+            assert fish.status().mode == "idle"
+
+
+def test_a_closed_link_says_so(link: FishdLink) -> None:
+    link.close()
+    link.close()
+    for use in (link.reset, link.resume, lambda: link.step(0.1), lambda: link.pause(1.0)):
+        with losing("this link to fishd is closed"):
+            use()
+
+
+def test_an_address_that_no_agent_can_have_is_refused(daemon: Daemon) -> None:
+    with pytest.raises(FishError, match="99999 is no port"):
+        FishdLink(daemon.endpoint, address="tcp://127.0.0.1:99999")
+
+
+def test_without_a_fishd_it_says_so(tmp_path: Path) -> None:
+    with pytest.raises(NoDaemon, match="nobody listens there"):
+        FishdLink(f"ipc://{tmp_path}/nobody")

@@ -1,0 +1,37 @@
+"""Runs the real `fishctl doctor`, and reads what it found."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+from rigs.processes import FISHCTL, PATIENCE, fishctl
+
+Findings = dict[str, tuple[str, str]]
+
+
+def doctor(
+    folder: Path, *settings: str, under: tuple[str, ...] = (), **env: str
+) -> tuple[int, Findings]:
+    """Exit status, and level and message of each check; a FAIL or warning says how to mend it."""
+    verb = ("doctor", "--json", "--set", f"control.address=ipc://{folder}/control", *settings)
+    if under or env:
+        ended = subprocess.run(
+            [*under, FISHCTL, *verb],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
+            env=os.environ | env,
+        )
+    else:
+        ended = fishctl(*verb)
+    assert ended.stderr == ""
+    findings = json.loads(ended.stdout)
+    assert all(bool(f["mend"]) == (f["level"] in ("warning", "FAIL")) for f in findings)
+    assert not any("broke off" in finding["message"] for finding in findings)
+    return ended.returncode, {f["check"]: (f["level"], f["message"]) for f in findings}
+
+
+def free_telemetry() -> list[str]:
+    return ["--set", "telemetry.address=tcp://127.0.0.1:0"]

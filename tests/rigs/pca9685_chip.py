@@ -1,0 +1,126 @@
+"""A PCA9685 at the level of its registers, for an `I2cBus`; after its data sheet, NXP, Rev. 4."""
+
+import errno
+from collections.abc import Callable
+
+from fishd.core.clock import Clock
+from fishd.virtual.pi.i2c import kernel_error
+from fishd.virtual.pi.pulse_train import PulseTrain
+
+MODE1, MODE2, LED0, ALL_LED, PRE_SCALE = 0x00, 0x01, 0x06, 0xFA, 0xFE
+RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10
+FULL = 0x10
+OSCILLATOR = 25e6
+START_UP = 500e-6
+
+
+class Pca9685Chip:
+    """Sixteen channels, of which one is looked at."""
+
+    def __init__(self, clock: Clock, channel: int = 0, oscillator: float = OSCILLATOR) -> None:
+        self.clock = clock
+        self.channel = channel
+        self.oscillator = oscillator
+        self.plugged_in = True
+        self.refused: set[tuple[int, int]] = set()
+        """Registers and values whose write is not acknowledged."""
+        self.on_write: Callable[[], None] = lambda: None
+        self.pulses = PulseTrain()
+        self.writes: list[bytes] = []
+        self.reset()
+
+    def reset(self) -> None:
+        """As after power-on, and after the general call 06."""
+        self.registers = bytearray(256)
+        self.registers[MODE1], self.registers[MODE2] = SLEEP | 0x01, 0x04
+        self.registers[PRE_SCALE] = 0x1E
+        for channel in range(16):
+            self.registers[LED0 + 4 * channel + 3] = FULL
+        self._pointer = 0
+        self._runs_from = 0.0
+        self._update()
+
+    def power_cycle(self) -> None:
+        """A brown-out: no pulse is ended in good order."""
+        self.pulses.cut(self.clock.monotonic())
+        self.reset()
+
+    def width(self, time: float) -> float:
+        """The pulse that is sent at a time [µs]; 0 for none."""
+        return self.pulses.width(time)
+
+    def general_call(self, data: bytes) -> None:
+        if data == b"\x06":
+            self.reset()
+
+    def write(self, data: bytes) -> None:
+        self._need_power()
+        if not data:
+            return
+        self.on_write()
+        self.writes.append(data)
+        self._pointer = data[0]
+        for value in data[1:]:
+            if (self._pointer, value) in self.refused:
+                raise kernel_error(errno.EREMOTEIO)
+            self._store(self._pointer, value)
+            self._advance()
+        self._update()  # with the stop condition, as OCH is 0
+
+    def read(self, length: int) -> bytes:
+        self._need_power()
+        found = bytearray()
+        for _ in range(length):
+            found.append(self.registers[self._pointer])
+            self._advance()
+        return bytes(found)
+
+    def _need_power(self) -> None:
+        if not self.plugged_in:
+            raise kernel_error(errno.EREMOTEIO)
+
+    def _advance(self) -> None:
+        if self.registers[MODE1] & AUTO_INCREMENT:
+            self._pointer = 0 if self._pointer == 0x45 else (self._pointer + 1) & 0xFF
+
+    def _store(self, register: int, value: int) -> None:
+        mode = self.registers[MODE1]
+        if register == PRE_SCALE:
+            if mode & SLEEP:  # else the write is blocked
+                self.registers[PRE_SCALE] = max(3, value)
+        elif register == MODE1:
+            self._set_mode(mode, value)
+        elif register >= ALL_LED:
+            for channel in range(16):
+                self.registers[LED0 + 4 * channel + register - ALL_LED] = value
+        else:
+            self.registers[register] = value
+
+    def _set_mode(self, mode: int, value: int) -> None:
+        restart = mode & RESTART
+        if not mode & SLEEP and value & SLEEP:
+            restart = RESTART if any(map(self._on, range(16))) else 0
+        if mode & SLEEP and not value & SLEEP:
+            self._runs_from = self.clock.monotonic() + START_UP
+        ready = not mode & SLEEP and self.clock.monotonic() >= self._runs_from
+        if value & RESTART and ready:
+            restart = 0
+        self.registers[MODE1] = value & ~RESTART | restart
+
+    def _counts(self, channel: int) -> tuple[int, int]:
+        first = LED0 + 4 * channel
+        on, off = (self.registers[i] | self.registers[i + 1] << 8 for i in (first, first + 2))
+        return on, off
+
+    def _on(self, channel: int) -> bool:
+        on, off = self._counts(channel)
+        return not off & FULL << 8 and on & 0xFFF != off & 0xFFF
+
+    def _update(self) -> None:
+        """Tell the outside what the channel sends from now on."""
+        now = max(self.clock.monotonic(), self._runs_from)
+        on, off = self._counts(self.channel)
+        asleep = self.registers[MODE1] & (SLEEP | RESTART)
+        counts = 0 if asleep or not self._on(self.channel) else (off - on) % 4096
+        step = (self.registers[PRE_SCALE] + 1) / self.oscillator
+        self.pulses.set(now, counts * step * 1e6, 4096 * step)

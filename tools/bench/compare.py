@@ -1,0 +1,162 @@
+"""Two checkouts of fishd in turns, for `tick --against`: is this one worse than that one?
+
+It knows of either only what users know: the programs fishd and fishctl, READY=1, and the fields
+`lateness_us` and `busy_us` of a tick. So the checkouts may differ in all else.
+"""
+
+import json
+import resource
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from msgspec import Struct
+
+from common.daemon import PATIENCE, Fishd
+from common.machine import machine_in_short, priorities, scheduling
+from common.report import Report, progress, quantile, table
+
+SETTLE = 2.0
+"""How long a fishd ticks before it is measured [s]."""
+VIRTUAL_SECONDS = 300.0
+RESAMPLES = 10_000
+Quantity = tuple[str, str, Callable[["Turn"], float]]
+
+
+class Turn(Struct, frozen=True):
+    """What one checkout did in one turn."""
+
+    start_up: float
+    """From starting the process to its READY=1 [ms]."""
+    start_up_cpu: float
+    """Processor time until then, of all its processes [ms]."""
+    lateness: list[float]
+    """Of each tick [µs]."""
+    busy: list[float]
+    """Of each tick, until its record was sealed [µs]."""
+    cpu: float
+    """Of all its processes, per tick [µs]."""
+    memory: float
+    """Of fishd's own process, at rest [MB]."""
+    total_memory: float
+    """With its gateways, shared pages counted once [MB]."""
+    virtual: float
+    """Per tick of `fishctl simulate` [µs]."""
+    virtual_cpu: float
+    """Processor time of all of `fishctl simulate` [ms]."""
+
+
+# More is worse for each.
+QUANTITIES: list[Quantity] = [
+    ("lateness p50", "µs", lambda turn: quantile(turn.lateness, 0.5)),
+    ("lateness p99", "µs", lambda turn: quantile(turn.lateness, 0.99)),
+    ("busy time per tick, p50", "µs", lambda turn: quantile(turn.busy, 0.5)),
+    ("busy time per tick, p99", "µs", lambda turn: quantile(turn.busy, 0.99)),
+    ("CPU per tick, all processes", "µs", lambda turn: turn.cpu),
+    ("RSS at rest", "MB", lambda turn: turn.memory),
+    ("PSS at rest, with gateways", "MB", lambda turn: turn.total_memory),
+    ("start-up until READY=1", "ms", lambda turn: turn.start_up),
+    ("start-up, processor time", "ms", lambda turn: turn.start_up_cpu),
+    ("virtual time, per tick", "µs", lambda turn: turn.virtual),
+    (f"{VIRTUAL_SECONDS:g} s of virtual time, processor time", "ms", lambda turn: turn.virtual_cpu),
+]
+
+
+def compare(checkout: Path, seconds: float, rounds: int) -> Report:
+    """Let both take turns, each first in every other round.
+
+    checkout: the other one, with its virtual environment in .venv, or that environment itself
+    seconds: how long a fishd ticks in a turn [s]
+    """
+    other = next((b for b in (checkout / ".venv/bin", checkout / "bin") if b.is_dir()), None)
+    if other is None:
+        raise SystemExit(f"{checkout}: no virtual environment here: no .venv/bin and no bin")
+    sides = [other.absolute(), Path(sys.executable).parent]
+    for side in sides:
+        take_turn(side, 1.0)  # whatever is compiled or read from disk only once
+    turns: list[tuple[Turn, Turn]] = []
+    for number in range(rounds):
+        order = sides if number % 2 else sides[::-1]
+        found = {side: take_turn(side, seconds) for side in order}
+        turns.append((found[sides[0]], found[sides[1]]))
+        progress(f"round {number + 1} of {rounds}", *_row(QUANTITIES[1], turns)[:4])
+    head = "quantity | before | after | after / before | 95 % interval | worse"
+    text = (
+        f"Before: {sides[0].parent}. After: {sides[1].parent}. Medians of {rounds} rounds in "
+        f"turns; {seconds:g} s of 50 ms ticks each, {scheduling(priorities()[-1])} scheduling; "
+        f"interval of the median ratio by bootstrap over rounds. {machine_in_short()}\n\n"
+        f"{table(head, [_row(quantity, turns) for quantity in QUANTITIES])}"
+    )
+    return Report({"bench tick against": text}, turns)
+
+
+def take_turn(bin_folder: Path, seconds: float) -> Turn:
+    """Start a fishd, let it tick at rest, end it; then swim in virtual time."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+        ready.bind("")  # the kernel gives it an abstract name, which ends with it
+        ready.settimeout(PATIENCE)
+        name = ready.getsockname().decode().replace("\0", "@")
+        command = (str(bin_folder / "fishd"), "--no-print-status")
+        priority = f"realtime.priority={priorities()[-1]}"
+        begun = time.monotonic()
+        with Fishd(priority, command=command, environment={"NOTIFY_SOCKET": name}) as fishd:
+            while b"READY=1" not in ready.recv(4096):
+                pass
+            start_up, start_up_cpu = time.monotonic() - begun, fishd.cpu_seconds()
+            time.sleep(SETTLE)
+            fishd.waiting_messages()
+            cpu = fishd.cpu_seconds()
+            time.sleep(seconds)
+            cpu = fishd.cpu_seconds() - cpu
+            ticks = [json.loads(message) for message in fishd.waiting_messages()]
+            memory, total = fishd.memory(), fishd.total_memory()
+    virtual, virtual_cpu = virtual_time(bin_folder)
+    return Turn(
+        start_up=start_up * 1e3,
+        start_up_cpu=start_up_cpu * 1e3,
+        lateness=[tick["lateness_us"] for tick in ticks],
+        busy=[tick["busy_us"] for tick in ticks],
+        cpu=cpu / len(ticks) * 1e6,
+        memory=memory,
+        total_memory=total,
+        virtual=virtual,
+        virtual_cpu=virtual_cpu * 1e3,
+    )
+
+
+def virtual_time(bin_folder: Path) -> tuple[float, float]:
+    """What one tick takes in virtual time [µs], and the processor time of the whole run [s]."""
+    command = [str(bin_folder / "fishctl"), "simulate", "swing", "--json"]
+    command += ["--seconds", str(VIRTUAL_SECONDS)]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    report = subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return 0.05e6 / float(json.loads(report)["real_time_factor"]), cpu
+
+
+def interval(ratios: Sequence[float]) -> tuple[float, float]:
+    """Where the median of such ratios lies, with 95 % confidence."""
+    draw = np.random.default_rng(0)
+    medians = np.median(draw.choice(ratios, (RESAMPLES, len(ratios))), axis=1)
+    low, high = np.percentile(medians, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def _row(quantity: Quantity, turns: list[tuple[Turn, Turn]]) -> list[str]:
+    name, unit, figure = quantity
+    before, after = ([figure(turn) for turn in side] for side in zip(*turns, strict=True))
+    ratios = [new / old for old, new in zip(before, after, strict=True)]
+    low, high = interval(ratios)
+    return [
+        name,
+        *(f"{statistics.median(side):.4g} {unit}" for side in (before, after)),
+        f"{statistics.median(ratios):.3f}",
+        f"{low:.3f} – {high:.3f}",
+        "**yes**" if low > 1.0 else "no" if high < 1.0 else "not shown",
+    ]

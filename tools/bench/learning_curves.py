@@ -1,0 +1,65 @@
+"""Draws the learning curves of `tools/bench learning`."""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+
+from fishd.learning.compare import figures
+
+_CURVES = (
+    ("#0072b2", "-", 2.6),
+    ("#d55e00", (0, (3, 1.5)), 1.4),
+    ("#009e73", "-", 1.2),
+    ("#cc79a7", (0, (1, 1)), 1.6),
+    ("#000000", (0, (6, 1.5, 1, 1.5)), 1.1),
+    ("#e69f00", "-", 0.9),
+)
+"""Colour (Okabe and Ito's, which the colour-blind can tell apart), line style, width [points].
+Later ones are thinner or have gaps, so that an earlier one with the same course is still seen."""
+_FIRST, _TICKS = 200, (200, 500, 1000, 2000, 5000, 10_000, 20_000)
+"""Control steps."""
+_LOWEST = 60
+"""Efficiency at which the axis begins [%]."""
+
+
+def learning_curves(
+    path: Path, curves: Mapping[str, Sequence[tuple[Sequence[int], Sequence[float]]]], goal: float
+) -> None:
+    """Efficiency against steps: median and range of the seeds of each training.
+
+    curves: for each training its seeds, each as steps and efficiencies
+    goal: drawn as a line
+    Raises `FishdError` where matplotlib is missing or the file cannot be made.
+    """
+    plt = figures.pyplot()
+    steps_shown = max(seeds[0][0][-1] for seeds in curves.values())
+    with plt.rc_context(figures.STYLE):
+        figure, axis = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+        for (color, style, width), (label, seeds) in zip(cycle(_CURVES), curves.items()):
+            steps = np.array(seeds[0][0])
+            efficiency = 100.0 * np.array([efficiencies for _, efficiencies in seeds])
+            low, high = efficiency.min(0), efficiency.max(0)
+            axis.fill_between(steps, low, high, color=color, alpha=0.1, linewidth=0)
+            for edge in (low, high):
+                axis.plot(steps, edge, color=color, linestyle=style, linewidth=0.5, alpha=0.6)
+            middle = np.median(efficiency, 0)
+            axis.plot(steps, middle, color=color, linestyle=style, linewidth=width, label=label)
+        axis.axhline(
+            100.0 * goal,
+            color="0.45",
+            linewidth=0.7,
+            linestyle=figures.DASHED,
+            label=f"{100.0 * goal:.0f} %",
+        )
+        axis.set_xscale("log")
+        axis.set_xlim(_FIRST, steps_shown)
+        ticks = [tick for tick in _TICKS if _FIRST <= tick <= steps_shown]
+        axis.set_xticks(ticks, [f"{tick:,}".replace(",", " ") for tick in ticks])
+        axis.minorticks_off()
+        axis.set_ylim(_LOWEST, 101)
+        axis.set_xlabel("control steps")
+        axis.set_ylabel(f"efficiency (% of the best square wave, from {_LOWEST} % up)")
+        figure.legend(loc="outside lower center", ncols=3, fontsize=7)
+        figures.save(plt, figure, path)

@@ -1,0 +1,125 @@
+"""What all measurements share: the command line, tables in Markdown, and their place in docs/."""
+
+import argparse
+import ast
+import importlib
+import statistics
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+Options = dict[str, dict[str, Any]]
+"""What a command line can ask for: arguments of `ArgumentParser.add_argument`, by name."""
+
+
+class Report(NamedTuple):
+    """What a measurement has found; each has a function `measure` that returns one."""
+
+    sections: dict[str, str]
+    """Markdown, by the name of the markers in its document that it belongs between."""
+    figures: Any
+    """The same for programs: whatever msgspec can write as JSON."""
+    broken: bool = False
+    """A promise of fishd was not kept; the exit status is 1 then."""
+
+
+class BrokenPromise(BaseException):
+    """A promise of fishd was not kept; nothing in fishd may catch it."""
+
+
+def run(package: str, names: Sequence[str]) -> int:
+    """Do what the command line asks for; the exit status.
+
+    package: the folder below tools/; each of `names` is a module in it with `DOCUMENT`, the file in
+    docs/ that has its markers, `OPTIONS` and `measure(options) -> Report`
+    """
+    parser = argparse.ArgumentParser(prog=f"tools/{package}")
+    commands = parser.add_subparsers(dest="name", metavar="NAME", required=True)
+    for name in names:
+        text = _docstring(f"{package}.{name}")
+        command = commands.add_parser(
+            name,
+            help=text.partition("\n")[0],
+            description=text,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if name in sys.argv[1:2]:  # the others may need extras that are not installed
+            module = importlib.import_module(f"{package}.{name}")
+            for option, settings in module.OPTIONS.items():
+                command.add_argument(option, **settings)
+            command.add_argument("--json", action="store_true", help="print all figures as JSON")
+            command.add_argument(
+                "--write", action="store_true", help=f"put the result into docs/{module.DOCUMENT}"
+            )
+    options = parser.parse_args()
+    try:
+        report: Report = module.measure(options)
+    except BrokenPromise as broken:
+        print(f"{package} {options.name}: BROKEN: {broken}", file=sys.stderr)
+        return 1
+    text = "\n\n".join(report.sections.values())
+    print(msgspec.json.encode(report.figures).decode() if options.json else text)
+    if options.write:
+        for marker, section in report.sections.items():
+            put(DOCS / module.DOCUMENT, marker, section)
+    return int(report.broken)
+
+
+def _docstring(module: str) -> str:
+    spec = find_spec(module)
+    assert spec
+    assert spec.origin
+    source = Path(spec.origin).read_text(encoding="utf-8")
+    return ast.get_docstring(ast.parse(source)) or ""
+
+
+def progress(*words: str) -> None:
+    """Say on standard error how far a long measurement is."""
+    print(" | ".join(words), file=sys.stderr, flush=True)
+
+
+def table(head: str, rows: Iterable[Iterable[str]]) -> str:
+    """A table in Markdown; the cells of its head are separated by " | "."""
+    rule = " | ".join("---" for _ in head.split(" | "))
+    return "\n".join(f"| {line} |" for line in (head, rule, *map(" | ".join, rows)))
+
+
+def put(document: Path, name: str, text: str) -> None:
+    """Replace what is between the two markers of `name` in a document.
+
+    Raises SystemExit where the markers are missing.
+    """
+    before, _, after = _parted(document, name)
+    document.write_text(f"{before}\n\n{text}\n\n{after}", encoding="utf-8")
+
+
+def between(document: Path, name: str) -> str:
+    """What is between the two markers; raises as `put` does."""
+    return _parted(document, name)[1].strip("\n")
+
+
+def _parted(document: Path, name: str) -> tuple[str, str, str]:
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, found, rest = document.read_text(encoding="utf-8").partition(begin)
+    text, ended, after = rest.partition(end)
+    if not (found and ended):
+        raise SystemExit(f"{document}: the markers {begin} and {end} are needed")
+    return before + begin, text, end + after
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """The value that `share` of all values do not exceed."""
+    return sorted(values)[min(len(values) - 1, int(share * len(values)))]
+
+
+def spread(values: Sequence[float], factor: float = 100.0, digits: int = 1) -> str:
+    """Median, and range in brackets; in per cent unless there is another factor."""
+    middle, low, high = (
+        f"{factor * function(values):.{digits}f}" for function in (statistics.median, min, max)
+    )
+    return f"{middle} [{low} – {high}]"

@@ -1,0 +1,133 @@
+"""The tables of docs/protocol.md, and that of faults in docs/concepts.md, from the code.
+
+`tools/protocol_reference.py --write` puts them into the documents; `--check` exits with 1 where one
+is out of date there.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+
+import msgspec
+from msgspec import NODEFAULT, Struct, inspect
+
+from common.report import DOCS, between, put, table
+from fishd.control.faults import FAULTS
+from fishd.core import protocol, signals
+from fishd.core.schema import fields_of
+
+TYPES = {
+    inspect.FloatType: "float",
+    inspect.IntType: "integer",
+    inspect.StrType: "string",
+    inspect.BoolType: "boolean",
+    inspect.NoneType: "null",
+    inspect.DictType: "object",
+    inspect.StructType: "object",
+    inspect.RawType: "any",
+    inspect.AnyType: "any",
+}
+STRUCTS: dict[str, type[Struct]] = {
+    "tick": signals.Tick,
+    "event": signals.Event,
+    "status": signals.Status,
+    "reason": signals.Reason,
+    "timing": signals.Timing,
+    "distribution": signals.Percentiles,
+    "request": protocol.Request,
+    "reply": protocol.Reply,
+    "state": protocol.State,
+    "calibrations": protocol.Calibrations,
+}
+"""By the name of their markers."""
+
+
+def references() -> Iterator[tuple[str, str, str]]:
+    """Document, name of the markers, and the table between them."""
+    for name, struct in STRUCTS.items():
+        yield "protocol.md", name, _fields(struct)
+    kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]
+    yield "protocol.md", "kinds", table("kind | level | when | `data`", kinds)
+    operations = [
+        [f"`{name}`", _arguments(operation.arguments), operation.does, operation.result]
+        for name, operation in protocol.OPERATIONS.items()
+    ]
+    head = "op | arguments | what it does | result"
+    yield "protocol.md", "operations", table(head, operations)
+    faults = [
+        [f"[`{code}`](troubleshooting.md#{code})", _times(row.in_a_row) + row.text, row.remedy]
+        for code, row in FAULTS.items()
+    ]
+    yield "concepts.md", "faults", table("code | what triggers it | what to do", faults)
+
+
+def _fields(struct: type[Struct]) -> str:
+    types = {field.encode_name: field.type for field in _info(struct)}
+    fields = fields_of(struct)
+    units = any(field.unit for field in fields)
+    rows = [
+        [
+            f"`{field.name}`",
+            _type(types[field.name]),
+            *([field.unit.replace("1", "–")] if units else []),
+            field.description[:1].lower() + field.description[1:].rstrip("."),
+        ]
+        for field in fields
+    ]
+    return table("field | type | unit | meaning" if units else "field | type | meaning", rows)
+
+
+def _arguments(struct: type[Struct]) -> str:
+    limits = {field.name: field.interval for field in fields_of(struct)}
+    return "; ".join(_argument(field, limits[field.name]) for field in _info(struct)) or "none"
+
+
+def _argument(field: inspect.Field, limits: str) -> str:
+    text = f"`{field.name}`: {_type(field.type)}{f' {limits}' if limits else ''}"
+    if field.required:
+        return text
+    default = msgspec.json.encode(field.default).decode() if field.default is not NODEFAULT else ""
+    return f"{text}, optional" + (f" (`{default}`)" if default else "")
+
+
+def _info(struct: type[Struct]) -> tuple[inspect.Field, ...]:
+    info = inspect.type_info(struct)
+    assert isinstance(info, inspect.StructType)
+    return info.fields
+
+
+def _type(kind: inspect.Type) -> str:
+    if isinstance(kind, inspect.Metadata):
+        return _type(kind.type)
+    if isinstance(kind, inspect.UnionType):
+        return " or ".join(_type(part) for part in kind.types)
+    if isinstance(kind, inspect.VarTupleType):
+        return f"list of {_type(kind.item_type)}s"
+    return TYPES[type(kind)]
+
+
+def _times(in_a_row: int) -> str:
+    return f"{in_a_row} times in a row: " if in_a_row > 1 else ""
+
+
+def main() -> int:
+    """Print, write or check; the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--write", action="store_true", help="put them into docs/")
+    parser.add_argument("--check", action="store_true", help="exit with 1 when one is out of date")
+    options = parser.parse_args()
+    stale = 0
+    for document, name, text in references():
+        if options.write:
+            put(DOCS / document, name, text)
+        elif not options.check:
+            print(f"{document}, {name}:\n\n{text}\n")
+        elif between(DOCS / document, name) != text:
+            command = "python tools/protocol_reference.py --write"
+            print(f"docs/{document}: {name} is out of date: run {command}", file=sys.stderr)
+            stale = 1
+    return stale
+
+
+if __name__ == "__main__":
+    sys.exit(main())
