@@ -23,4 +23,4 @@ def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_pat
         pi.control("clear")
         release = fishctl("release", *pi.settings)
         assert "pulses were on: neutral, then off" in release.stdout, release.stderr
-        assert pi.pulse() == 0.0
+        pi.wait_until_released()

@@ -40,8 +40,8 @@ def test_a_sensor_that_is_pulled_out_is_a_fault_that_a_clear_ends(
         assert reason
         assert reason.code == "sensor-stale"
         assert "check" in reason.message
-        pi.control("clear", "unplugged")
         ticks.until(samples=0)
+        pi.control("clear", "unplugged")
         while ticks.message()["samples"] < 2:
             pass
         daemon.fishctl("clear-fault")

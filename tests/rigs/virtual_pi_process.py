@@ -53,7 +53,7 @@ class Pi(Process):
         return found
 
     def wait_until_released(self) -> None:
-        """Until there are no pulses: the last one ends a moment after fishd says so."""
+        """Until there are no pulses: a frame that has begun is sent to its end."""
         wait_until(lambda: not self.pulse())
 
 
