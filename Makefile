@@ -2,10 +2,12 @@
 PYTHON ?= python3
 # What `make test` and `make lint` install; without `learn`, its tests are skipped.
 EXTRAS ?= dev,learn,cluster
-# How many tests run at a time: some only wait.
-JOBS ?= $(shell expr $$(nproc) + 1)
+# How many tests run at a time: many only wait.
+JOBS ?= $(shell expr $$(nproc) + 3)
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Each of the hundreds of processes that tests start would compile fishd again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help run test test-fast lint docs bench clean
 
@@ -33,7 +35,6 @@ lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 docs: $(VENV)/installed-dev  ## Write the generated parts of docs/ again
 	$(BIN)/python tools/config_reference.py --write
 	$(BIN)/python tools/protocol_reference.py --write
-	$(BIN)/python tools/bench swing --write
 
 bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine
 	$(BIN)/python tools/bench tick

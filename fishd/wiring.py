@@ -292,7 +292,7 @@ def build_loop(
     publisher: Publisher,
     notify: Callable[[float], None] = lambda now: None,
 ) -> ControlLoop:
-    """A loop in which `config.start.controller` is in command, if there is one.
+    """A loop in which `config.start.controller` is active, if there is one.
 
     notify: called at the end of every tick with the time of its start [s, monotonic]
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.

@@ -47,7 +47,7 @@ class Chirp(Controller[ChirpParameters]):
             )
 
     def activate(self, observation: Observation) -> None:
-        """Start on the side on which the angle in force is."""
+        """Start on the side of the present angle."""
         self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
 
     def update(self, observation: Observation) -> float:

@@ -49,7 +49,7 @@ class Agent:
         self.timeout = timeout
         self.latest: Observed | None = None
         """What `act` answers."""
-        self.in_command = False
+        self.active = False
         """False before the first observation, and once fishd has said that it was the last."""
         self.lost = 0
         """Ticks without an action in time, between the latest two observations that were taken."""
@@ -97,9 +97,9 @@ class Agent:
             before, self.lost, found = self.latest, 0, False
             while self._socket.poll(0):
                 found = self._take() or found
-            if found and self.in_command:
+            if found and self.active:
                 return self.latest
-            if before and not self.in_command:
+            if before and not self.active:
                 return None
         return None
 
@@ -151,7 +151,7 @@ class Agent:
             return False
         if isinstance(message, Ended):
             if self.latest and message.session == self.latest.session:
-                self.in_command = False
+                self.active = False
             self._past.append(message.session)
             return False
         if self.latest and message.session != self.latest.session:
@@ -160,7 +160,7 @@ class Agent:
         elif self.latest and message.seq == self.latest.seq:
             return True  # once more, after a pause
         self.lost += message.lost
-        self._peer, self.latest, self.in_command = peer, message, True
+        self._peer, self.latest, self.active = peer, message, True
         return True
 
     def _nothing(self) -> NoDaemon:
@@ -169,7 +169,7 @@ class Agent:
             why += f" within {self.timeout:g} s"
         if self._strange:
             return NoDaemon(f"{why}, but what is none: {self._strange}")
-        if self.latest and not self.in_command:
+        if self.latest and not self.active:
             return NoDaemon(f"{why}: another controller is active, or none")
         return NoDaemon(
             f"{why}: is a fishd running, and was it asked to "

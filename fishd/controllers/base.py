@@ -62,7 +62,7 @@ class Controller(ABC, Generic[P]):
     def activate(self, observation: Observation) -> None:
         """Take over: called in the tick of the switch, just before the first `update`.
 
-        `observation.instruction_angle` is the angle in force; start from it where that makes sense.
+        `observation.instruction_angle` is the present angle; start from it where that makes sense.
         """
 
     def retune(self, parameters: P) -> None:
@@ -89,6 +89,6 @@ class Controller(ABC, Generic[P]):
 
 
 def amplitude_of(parameters: Any, limits: Limits) -> float:
-    """The amplitude in force: the parameter where it is given, else all that the robot grants."""
+    """The present amplitude: the parameter where it is given, else all that the robot grants."""
     amplitude: float | None = getattr(parameters, "amplitude", None)
     return limits.amplitude if amplitude is None else amplitude

@@ -48,7 +48,7 @@ class DwellLimit:
         self._count = 0
 
     def activate(self, angle: float) -> None:
-        """Begin at the angle in force [rad], as if the tail had reversed just now."""
+        """Begin at the present angle [rad], as if the tail had reversed just now."""
         self._angle = angle
         self._side = math.copysign(1.0, angle) if angle else 0.0
 

@@ -50,7 +50,7 @@ class Swing(Controller[SwingParameters]):
         self._elapsed = 0.0
 
     def activate(self, observation: Observation) -> None:
-        """Push on towards the side on which the angle in force is; from rest, towards plus."""
+        """Push on towards the side of the present angle; from rest, towards plus."""
         self._direction = 1.0 if observation.instruction_angle >= 0 else -1.0
 
     def update(self, observation: Observation) -> float:

@@ -1,6 +1,6 @@
 """`square`, `sine` and `triangle`: periodic commands of a given frequency and amplitude.
 
-All keep their phase when the frequency changes. Sine and triangle start from the angle in force.
+All keep their phase when the frequency changes. Sine and triangle start from the present angle.
 """
 
 import math
@@ -48,7 +48,7 @@ class Waveform(Controller[WaveformParameters]):
 
     @property
     def amplitude(self) -> float:
-        """The amplitude in force [rad]."""
+        """The present amplitude [rad]."""
         return amplitude_of(self.parameters, self.limits)
 
     @abstractmethod
@@ -60,7 +60,7 @@ class Square(Waveform):
     """A square wave between plus and minus the amplitude: the best waveform there is."""
 
     def activate(self, observation: Observation) -> None:
-        """Start on the side on which the angle in force is."""
+        """Start on the side of the present angle."""
         self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
 
     def shape(self, phase: float) -> float:
@@ -70,7 +70,7 @@ class Square(Waveform):
 
 
 class Smooth(Waveform):
-    """A waveform without jumps: on a switch or a new amplitude it goes on from the angle in force.
+    """A waveform without jumps: on a switch or a new amplitude it goes on from the present angle.
 
     An angle that the new waveform never reaches is left at the waveform's own top speed.
     """
@@ -83,7 +83,7 @@ class Smooth(Waveform):
         self._excess = 0.0
 
     def activate(self, observation: Observation) -> None:
-        """Choose phase and excess such that the first angle is the one in force."""
+        """Choose phase and excess such that the first angle is the present one."""
         angle = observation.instruction_angle
         self._phase = self.phase_of(max(-1.0, min(1.0, angle / self.amplitude)))
         self._excess = angle - self.amplitude * self.shape(self._phase)

@@ -94,7 +94,7 @@ class Plugins(Generic[T]):
         if not value:
             hint = nearest(name, self.names())
             raise self._unknown(f"no {self.kind} is named '{text.quoted(name)}'; {hint}")
-        where = f"{self.kind} '{name}' ({value})"
+        where = f"{self.kind} '{name}' ({value} in {self.package(name)})"
         try:
             found = contained(pkgutil.resolve_name, value.partition(" [")[0])
         except Exception as error:

@@ -1,6 +1,6 @@
 """The dated files that calibrations are kept in.
 
-None is ever overwritten; the newest one of a kind is in force.
+None is ever overwritten; the newest one of a kind is used.
 """
 
 import datetime
@@ -36,7 +36,7 @@ class CalibrationFolder:
         self.folder = folder
 
     def newest(self, kind: type[C]) -> tuple[C, Path] | None:
-        """The calibration in force and its file; None where none was ever saved.
+        """The newest calibration and its file; None where none was ever saved.
 
         Raises `ConfigError` where the folder cannot be read, or the newest file cannot, is not
         whole or makes no sense: an older one, or a default, would be wrong silently.

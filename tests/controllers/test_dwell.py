@@ -127,7 +127,7 @@ def test_who_insists_for_two_seconds_loses_command(tick: float, alternating: boo
     assert (name, successor.parameters.amplitude) == ("swing", 0.3)
 
 
-def test_who_is_held_back_now_and_then_stays_in_command() -> None:
+def test_who_is_held_back_now_and_then_stays_active() -> None:
     # A half beat of six ticks that is begun again one tick after each reversal.
     beat = [0.42, -0.42, 0.42, 0.42, 0.42, 0.42, -0.42, 0.42, -0.42, -0.42, -0.42, -0.42]
     assert reversals(limited(beat * 100)) == list(range(6, 1200, 6))

@@ -57,10 +57,19 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
     ("name", "message"),
     [
         ("keys", r"^no gadget is named 'keys'; did you mean 'key'\?$"),
-        ("text", rf"^gadget 'text' \(string:digits\) is no subclass of {__name__}.Gadget$"),
-        ("shapeless", r"^gadget 'shapeless' \(.*:Shapeless\) has no Settings, a msgspec.Struct$"),
-        ("unfinished", r"^gadget 'unfinished' \(.*:Unfinished\) does not define turn$"),
-        ("lost", r"^gadget 'lost' \(nowhere:Lost\) does not load: ModuleNotFoundError: No mod"),
+        (
+            "text",
+            rf"^gadget 'text' \(string:digits in fishd\) is no subclass of {__name__}.Gadget$",
+        ),
+        (
+            "shapeless",
+            r"^gadget 'shapeless' \(.*:Shapeless in fishd\) has no Settings, a msgspec.Struct$",
+        ),
+        ("unfinished", r"^gadget 'unfinished' \(.*:Unfinished in fishd\) does not define turn$"),
+        (
+            "lost",
+            r"^gadget 'lost' \(nowhere:Lost in fishd\) does not load: ModuleNotFoundError: No mod",
+        ),
     ],
 )
 def test_what_cannot_be_had_is_refused_with_the_reason(

@@ -1,4 +1,4 @@
-"""Policies in a running fishd: put in command by name and by path, refused, listed, never late."""
+"""Policies in a running fishd: set by name and by path, refused, listed, never late."""
 
 import json
 import pickle

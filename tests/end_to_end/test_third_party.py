@@ -95,11 +95,14 @@ def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> No
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("shapeless", "(manners:Shapeless) has no Parameters, a msgspec.Struct"),
-        ("quitter", "(quitter:Quitter) does not load: SystemExit: 3"),
-        ("untyped", "(untyped:Untyped) has Parameters that cannot be read: NameError"),
-        ("absent", "(nowhere:Absent) does not load: ModuleNotFoundError"),
-        ("function", "(time:sleep) is no subclass of fishd.controllers.base.Controller"),
+        ("shapeless", "(manners:Shapeless in slow 1.0) has no Parameters, a msgspec.Struct"),
+        ("quitter", "(quitter:Quitter in slow 1.0) does not load: SystemExit: 3"),
+        ("untyped", "(untyped:Untyped in slow 1.0) has Parameters that cannot be read: NameError"),
+        ("absent", "(nowhere:Absent in slow 1.0) does not load: ModuleNotFoundError"),
+        (
+            "function",
+            "(time:sleep in slow 1.0) is no subclass of fishd.controllers.base.Controller",
+        ),
         ("explosive", "controller 'explosive' cannot start: RuntimeError: no such model"),
     ],
 )
@@ -128,8 +131,8 @@ def test_one_that_was_installed_since_and_cannot_be_imported_needs_a_restart(
     with Fish(daemon.endpoint) as fish, pytest.raises(Refused) as refusal:
         fish.set_controller("hidden")
     assert str(refusal.value) == (
-        "controller 'hidden' (hidden:Hidden) does not load: ModuleNotFoundError: No module named "
-        "'hidden'; it was installed after fishd had started: restart fishd"
+        "controller 'hidden' (hidden:Hidden in hidden 1.0) does not load: ModuleNotFoundError: "
+        "No module named 'hidden'; it was installed after fishd had started: restart fishd"
     )
 
 

@@ -1,4 +1,4 @@
-"""The dated files that calibrations are kept in: never overwritten, the newest in force."""
+"""The dated files that calibrations are kept in: never overwritten, the newest is used."""
 
 import contextlib
 import datetime

@@ -229,7 +229,7 @@ def forces(daemon: Daemon, seconds: float = 0.3) -> tuple[float, float]:
 
 
 def calibrations(daemon: Daemon) -> Calibrations:
-    """What is in force."""
+    """What fishd uses now."""
     with Fish(daemon.endpoint) as fish:
         return fish.calibrations()
 

@@ -64,7 +64,7 @@ class PigpioBench:
 
     @property
     def width(self) -> float:
-        """The pulse in force one frame from now [µs]."""
+        """The pulse one frame from now [µs]."""
         return self.daemon.width(GPIO, self.clock.now + FRAME)
 
     def wait(self, seconds: float) -> None:

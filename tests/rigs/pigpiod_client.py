@@ -33,12 +33,12 @@ class PigpiodBench:
 
     @property
     def width(self) -> float:
-        """The pulse in force now [µs]."""
+        """The pulse now [µs]."""
         return self.daemon.width(GPIO, self.clock.monotonic())
 
     @property
     def settled_width(self) -> float:
-        """The pulse in force when the next frame has begun [µs]."""
+        """The pulse when the next frame has begun [µs]."""
         self.sleep(0.02)
         return self.width
 

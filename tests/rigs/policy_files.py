@@ -27,7 +27,7 @@ PROVENANCE = Provenance(
 
 
 def card(*features: tuple[FeatureName, float], tick: float = 0.05, amplitude: float = 0.42) -> Card:
-    """By default it sees the angle in force, over Φ."""
+    """By default it sees the present angle, over Φ."""
     return Card(
         observation=tuple(Feature(*f) for f in features or (("instruction_angle", 0.42),)),
         tick=tick,

@@ -83,7 +83,7 @@ class ScriptedAgent:
 
 
 def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]:
-    """Put `remote` in command, and tick until its first observation has come; that."""
+    """Make `remote` active, and tick until its first observation has come; that."""
     before = {message["session"] for message in agent.seen}
     rig.start("remote", agent=agent.address, **parameters)
     for _ in range(100):

@@ -90,7 +90,7 @@ class FishdLink:
         another reset begins anew.
         """
         self._check_open()
-        if self._paused and self._agent.in_command:
+        if self._paused and self._agent.active:
             return self.resume()
         if self._begun and self._is_fresh():
             return self._asked()
@@ -103,8 +103,8 @@ class FishdLink:
                 self._fish.set_controller(
                     "remote", agent=self._agent.address, deadline=self._deadline
                 )
-                self._agent.in_command = False
-            elif self._agent.latest and (self._agent.poll(SILENCE) or self._agent.in_command):
+                self._agent.active = False
+            elif self._agent.latest and (self._agent.poll(SILENCE) or self._agent.active):
                 self._begun, self._known, self._taken = True, status, time.monotonic()
                 return self._agent.latest  # for which fishd still waits, in lockstep
         except (NoDaemon, Refused) as error:
@@ -153,7 +153,7 @@ class FishdLink:
     def _asked(self) -> Observed:
         """The observation to be answered, while this agent controls the fish."""
         self._check_open()
-        if self._agent.latest is None or not self._agent.in_command:
+        if self._agent.latest is None or not self._agent.active:
             raise self._lost()
         return self._agent.latest
 
@@ -161,7 +161,7 @@ class FishdLink:
         """Does fishd still wait for the answer to the latest observation, as far as is known?"""
         if self._agent.poll():
             self._taken = time.monotonic()
-        return self._agent.in_command and time.monotonic() - self._taken < SILENCE
+        return self._agent.active and time.monotonic() - self._taken < SILENCE
 
     def _next(self, *, begun: bool = True) -> Observed:
         """The next observation, of the same session if one had begun."""
@@ -177,7 +177,7 @@ class FishdLink:
                 )
             if found:
                 return found
-            if begun and not self._agent.in_command:
+            if begun and not self._agent.active:
                 break
             self._check()
         raise self._lost()
@@ -187,7 +187,7 @@ class FishdLink:
         try:
             status = self._fish.status()
         except NoDaemon as error:
-            self._agent.in_command = False
+            self._agent.active = False
             raise LinkLost(str(error)) from None
         if not self._is_ours(status):
             raise self._lost(status)
@@ -195,7 +195,7 @@ class FishdLink:
     def _is_ours(self, status: Status) -> bool:
         """Is this the agent that fishd asks, or waits for?"""
         return _waits_for_an_agent(status) and (
-            (self._agent.in_command and not self._is_another(status))
+            (self._agent.active and not self._is_another(status))
             or status.parameters["agent"] == self._agent.address
         )
 
@@ -206,7 +206,7 @@ class FishdLink:
 
     def _lost(self, status: Status | None = None) -> LinkLost:
         """Why control was lost, in fishd's own words where it says so."""
-        self._agent.in_command = False
+        self._agent.active = False
         try:
             status = status or self._fish.status()
         except NoDaemon as error:

@@ -36,7 +36,7 @@ _IDLE_BIT, _SINGLE_SHOT, _COMPARATOR_OFF = 0x8000, 0x0100, 0x0003
 
 
 class _Conversion(NamedTuple):
-    """A conversion under way, with the config that was in force when it began."""
+    """A conversion under way, with the config that held when it began."""
 
     start: float
     end: float

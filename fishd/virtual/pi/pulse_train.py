@@ -1,4 +1,4 @@
-"""A pin that sends pulses: which width is in force when, frame by frame; for the pigpiod."""
+"""A pin that sends pulses: which width it has when, frame by frame; for the pigpiod."""
 
 import math
 from collections import deque
@@ -52,14 +52,14 @@ class PulseTrain:
         self._append(Pulses(_frame_end(time, now.frame), 0.0, now.frame))
 
     def at(self, time: float) -> Pulses:
-        """The entry in force at a time [s]; before the first one there are no pulses."""
+        """The entry that holds at a time [s]; before the first one there are no pulses."""
         for entry in reversed(self._log):
             if entry.time <= time:
                 return entry
         return Pulses(-math.inf, 0.0, SERVO_FRAME)
 
     def width(self, time: float) -> float:
-        """The width in force at a time [µs]; 0 is no pulses."""
+        """The width at a time [µs]; 0 is no pulses."""
         return self.at(time).width
 
     def level(self, time: float) -> int:

@@ -37,7 +37,7 @@ class Tank:
         """The fish is at rest at `start` [s].
 
         tick: period that the noise of `imperfections` refers to [s]
-        pulse: the servo pulse in force at a time [s], past or present [µs]; 0 for none
+        pulse: the servo pulse at a time [s], past or present [µs]; 0 for none
         """
         self._settings = settings
         self._pulse = pulse

@@ -29,7 +29,7 @@ NOISY = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
 
 
 def flipping(tmp_path: Path, *overrides: str) -> Rig:
-    """A loop in which a policy is in command that wants to reverse in every tick."""
+    """A loop in which a policy is active that wants to reverse in every tick."""
     rig = Rig(*overrides)
     rig.start("ppo", policy=str(write(tmp_path)))
     return rig
@@ -92,7 +92,7 @@ def test_patience_and_dwell_are_those_of_the_configuration(tmp_path: Path) -> No
     assert [tick.controller for tick in ticks].index("swing") == 19
 
 
-def test_who_is_put_in_command_again_starts_anew(tmp_path: Path) -> None:
+def test_a_policy_that_is_set_again_starts_anew(tmp_path: Path) -> None:
     rig = flipping(tmp_path)
     rig.run_for(5.0)
     assert rig.loop.active.name == "swing"

@@ -30,7 +30,7 @@ def agent(tmp_path: Path) -> Iterator[Agent]:
 
 @contextmanager
 def swimming(rig: Rig, agent: Agent, ticks: int) -> Iterator[list[Tick]]:
-    """`remote` is in command for some ticks, in another thread; the list is filled at the end."""
+    """`remote` is active for some ticks, in another thread; the list is filled at the end."""
     rig.start("remote", agent=agent.address)
     swum: list[Tick] = []
 
@@ -55,7 +55,7 @@ def test_it_takes_observations_and_answers_each(agent: Agent) -> None:
             if seen.seq == 20:
                 break
         assert agent.poll(PATIENCE) is None  # as soon as fishd says that this was all
-        assert not agent.in_command
+        assert not agent.active
     assert [tick.phi_c for tick in ticks] == pytest.approx([0.01 * n for n in range(1, 21)])
 
 

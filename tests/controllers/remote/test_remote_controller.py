@@ -254,7 +254,9 @@ def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to(address: 
         load(None, ["start.controller=remote", f"start.parameters.agent='{address}'"])
 
 
-def test_deadlines_change_in_command_but_not_the_agent(rig: Rig, agent: ScriptedAgent) -> None:
+def test_deadlines_change_while_it_swims_but_the_agent_stays(
+    rig: Rig, agent: ScriptedAgent
+) -> None:
     connect(rig, agent)
     rig.retune(misses=7)
     assert rig.loop.active.controller.parameters.misses == 7

@@ -50,7 +50,7 @@ class Bench:
 
     @property
     def width(self) -> float:
-        """The pulse in force one frame from now [µs]."""
+        """The pulse one frame from now [µs]."""
         return self.daemon.width(GPIO, self.clock.monotonic() + 0.02)
 
     def write(self, angle: float) -> str | None:

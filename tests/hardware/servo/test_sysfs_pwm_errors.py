@@ -49,7 +49,7 @@ class BrokenBench(Bench):
         assert self.width() == 1800.0
 
     def width(self, channel: int = 2, device: str = PI5) -> float:
-        """The pulse in force two periods from now [µs]."""
+        """The pulse two periods from now [µs]."""
         self.clock.sleep(0.04)
         return super().width(channel, device)
 

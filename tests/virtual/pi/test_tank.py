@@ -73,7 +73,7 @@ def test_a_conversion_is_the_mean_force_while_it_lasts() -> None:
 def test_pulses_that_change_during_a_conversion_count_from_their_frame_on() -> None:
     rig = Rig()
     rig.pin.set(0.0, width(LEFT))
-    rig.pin.set(0.1034, width(RIGHT))  # in force from 0.12
+    rig.pin.set(0.1034, width(RIGHT))  # from 0.12 on
     fish = fish_at((LEFT, 0.1))
     before, after = fish.advance(LEFT, 0.02, 1), fish.advance(RIGHT, 0.03, 1)
     impulse = 0.02 * before.lateral_force + 0.03 * after.lateral_force

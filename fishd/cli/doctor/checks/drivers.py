@@ -83,7 +83,8 @@ def force(context: Context) -> Result:
     except MissingPackage:
         raise
     except StartupError as error:
-        return fail(str(error), START_VIRTUAL_PI)
+        virtual = config.robot == "virtual-pi"
+        return fail(str(error), START_VIRTUAL_PI if virtual else "mend what this line says")
     except SensorError as error:
         return fail(str(error), "mend what the lines above say first")
     samples, suspicions = [n for n, _ in trials], {why for _, why in trials if why}

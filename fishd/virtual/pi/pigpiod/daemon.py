@@ -70,7 +70,7 @@ class Pigpiod:
         os.close(self._waker)
 
     def width(self, gpio: int, time: float) -> float:
-        """The pulse in force at a time up to now [s], in µs; 0 for no pulses."""
+        """The pulse at a time up to now [s], in µs; 0 for no pulses."""
         with self._lock:
             self._observe()
             return self._commands.pins.pins[gpio].train.width(time)
