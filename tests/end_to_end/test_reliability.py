@@ -20,19 +20,22 @@ def measured(*arguments: str) -> Any:
     return msgspec.json.decode(done.stdout)
 
 
-def death(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = measured("deaths", "--only", name)[name]
-    return found
+SIGNALS = {"SIGTERM": 0, "SIGKILL": -9, "SIGSTOP": None, "SIGCONT": None}
+PHASES = ("statistics", "between ticks")
+
+
+@pytest.fixture(scope="module")
+def deaths() -> Any:
+    """Six fishds that die side by side."""
+    return measured("deaths", "--only", *SIGNALS, *PHASES)
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize(
-    ("name", "status"), [("SIGTERM", 0), ("SIGKILL", -9), ("SIGSTOP", None), ("SIGCONT", None)]
-)
+@pytest.mark.parametrize(("name", "status"), SIGNALS.items())
 def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then(
-    name: str, status: int | None
+    deaths: Any, name: str, status: int | None
 ) -> None:
-    found = death(name)
+    found = deaths[name]
     assert found["status"] == status
     limit = 0.3 if status != 0 else 0.6  # a countdown in pigpiod; a fade of 0.4 s
     assert found["neutral"] <= limit
@@ -41,13 +44,13 @@ def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then(
         assert found["reason"] == "overrun"
 
 
-@pytest.mark.parametrize("phase", ["statistics", "between ticks"])
+@pytest.mark.realtime
+@pytest.mark.parametrize("phase", PHASES)
 def test_an_exception_outside_the_phases_ends_fishd_and_the_servo_comes_to_rest_first(
-    phase: str,
+    deaths: Any, phase: str
 ) -> None:
-    found = death(phase)
-    assert found["status"] == 1
-    assert found["neutral"] < found["off"]
+    assert deaths[phase]["status"] == 1
+    assert deaths[phase]["neutral"] < deaths[phase]["off"]
 
 
 def test_a_fishd_that_is_killed_at_any_moment_leaves_no_pulses() -> None:

@@ -163,7 +163,6 @@ def waiting_daemon(folder: Path, address: str) -> Iterator[Daemon]:
         yield daemon
 
 
-@pytest.mark.realtime
 def test_in_lockstep_fishd_waits_for_its_agent_and_answers_meanwhile(
     tmp_path: Path, address: str
 ) -> None:
@@ -183,18 +182,17 @@ def test_in_lockstep_fishd_waits_for_its_agent_and_answers_meanwhile(
             assert fish.status().missed == 0
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("request_", ["stop", "estop", "set-controller swing"])
 def test_in_lockstep_a_request_ends_the_wait(tmp_path: Path, address: str, request_: str) -> None:
     with waiting_daemon(tmp_path, address) as daemon:
+        begun = time.monotonic()
         assert daemon.fishctl(*request_.split()).returncode == 0
         with Subscriber(daemon.telemetry, b"tick") as ticks:
             first = ticks.message()
             assert first["controller"] == ("swing" if "swing" in request_ else "hold")
-            begun = time.monotonic()
-            while ticks.message()["seq"] < first["seq"] + 20:
+            while ticks.message()["seq"] < 20:
                 pass
-            assert time.monotonic() - begun > 0.5  # at the pace of real time
+        assert time.monotonic() - begun > 0.8  # at the pace of real time, from tick 1
 
 
 def test_in_lockstep_a_signal_ends_the_wait(tmp_path: Path, address: str) -> None:

@@ -10,7 +10,10 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
+from threading import Barrier
 
 from msgspec import Struct
 
@@ -118,8 +121,8 @@ def await_pulses(pi: VirtualPi, fishd: Fishd) -> None:
         time.sleep(0.01)
 
 
-def die(name: str) -> Outcome:
-    """Do one of DEATHS or PHASES to a swimming fishd, and watch its servo."""
+def die(name: str, together: Barrier) -> Outcome:
+    """Do one of DEATHS or PHASES to a fishd, once all of `together` swim, and watch its servo."""
     command: Sequence[str] = FISHD
     deed = DEATHS[name][1] if name in DEATHS else signalled(signal.SIGUSR1)
     if name in PHASES:
@@ -136,6 +139,7 @@ def die(name: str) -> Outcome:
         Fishd(*on_it, *settings, command=command) as fishd,
     ):
         await_pulses(pi, fishd)
+        together.wait(PATIENCE)
         begun = time.monotonic()
         deed(pi, fishd)
         time.sleep(WATCHED + (2.0 if name == "frozen-code" else 0.0))
@@ -177,16 +181,24 @@ def row(name: str, outcome: Outcome) -> list[str]:
 
 
 OPTIONS: Options = {
-    "--only": {"choices": [*DEATHS, *PHASES], "help": "this death"},
+    "--only": {
+        "choices": [*DEATHS, *PHASES],
+        "nargs": "+",
+        "default": [],
+        "help": "these deaths, side by side",
+    },
 }
 
 
 def measure(options: Namespace) -> Report:
-    """Every death; half a minute."""
+    """Every death, one after the other; half a minute."""
     outcomes = {}
-    for name in [options.only] if options.only else [*DEATHS, *PHASES]:
-        outcomes[name] = die(name)
-        progress(*row(name, outcomes[name]))
+    for names in [options.only] if options.only else [[name] for name in (*DEATHS, *PHASES)]:
+        with ThreadPool(len(names)) as pool:
+            found = pool.map(partial(die, together=Barrier(len(names))), names)
+        outcomes |= dict(zip(names, found, strict=True))
+        for name in names:
+            progress(*row(name, outcomes[name]))
     head = "what happens | neutral after [ms] | no pulses after [ms] | fishd"
     rows = [row(*item) for item in outcomes.items()]
     return Report({"reliability deaths": table(head, rows)}, outcomes)
