@@ -221,7 +221,7 @@ def assemble(
     def degraded() -> tuple[str, ...]:
         lines = servo.driver.degraded
         if sensor.calibration.untouched:
-            lines += ("the force is not calibrated: fishctl calibrate force",)
+            lines += ("the force is not calibrated, volts are shown: fishctl calibrate force",)
         cut = _cut_by_calibration(config, servo)
         return (*lines, cut) if cut else lines
 

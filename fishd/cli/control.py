@@ -182,7 +182,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
-        ("thrust", f"{_thrust(status)} mN at {status.frequency:.2f} Hz"),
+        ("thrust", f"{_thrust(status)} m{status.force_unit} at {status.frequency:.2f} Hz"),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
         *([("survived", spelled(survived))] if survived else []),

@@ -24,6 +24,7 @@ class Trace(NamedTuple):
     """One quantity against time."""
 
     name: str
+    """With its unit."""
     style: str
     least: float
     """The scale reaches from minus this to plus this at least, so that noise looks small."""
@@ -31,8 +32,8 @@ class Trace(NamedTuple):
 
 
 TRACES = (
-    Trace("fx mN", "cyan", 2.0, lambda tick: tick.fx * 1e3),
-    Trace("fy mN", "yellow", 2.0, lambda tick: tick.fy * 1e3),
+    Trace("fx m{force_unit}", "cyan", 2.0, lambda tick: tick.fx * 1e3),
+    Trace("fy m{force_unit}", "yellow", 2.0, lambda tick: tick.fy * 1e3),
     Trace("phi_c rad", "green", 0.1, lambda tick: tick.phi_c),
 )
 LABEL = 14
@@ -109,8 +110,9 @@ class View:
 
     def _figures(self) -> Table:
         tick = self._ticks[-1]
+        thrust = "–" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f}"
         figures = {
-            "thrust": "– mN" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f} mN",
+            "thrust": f"{thrust} m{self.status.force_unit}",
             "tail beat": f"{tick.frequency:.2f} Hz",
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
             "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
@@ -137,7 +139,8 @@ class View:
         labels = [""] * rows
         labels[round(high / (high - low) * (rows - 1))] = "0"
         labels[-1] = f"{low:g}"
-        labels[0] = f"{trace.name:<9}{high:>{LABEL - 9}g}"
+        name = trace.name.format(force_unit=self.status.force_unit)
+        labels[0] = f"{name:<9}{high:>{LABEL - 9}g}"
         drawn = _curve(points, now - SPAN, now, rows, width - LABEL - 1)
         lines = (f"{label:>{LABEL}}┤{line}" for label, line in zip(labels, drawn, strict=True))
         return Text("\n".join(lines), trace.style, no_wrap=True)

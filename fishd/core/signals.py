@@ -278,3 +278,7 @@ class Status(Struct, frozen=True):
         str, note("Name of the fish: `name` in the configuration, else the machine's.")
     ] = ""
     phi_c: Annotated[float, unit("rad", "As in `tick`.")] = 0.0
+    force_unit: Annotated[
+        str,
+        note("`N`; `V` where the sensor is not calibrated: then forces and thrust are voltages."),
+    ] = "N"

@@ -126,6 +126,7 @@ class Operations:
             calibrating=self._calibrations.calibrating,
             name=self._name,
             phi_c=loop.applied,
+            force_unit=loop.robot.force_unit,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:

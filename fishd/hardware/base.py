@@ -81,6 +81,11 @@ class Robot:
     countdown: float = math.inf
     """How long the servo goes on without a write before it ends its pulses by itself [s]."""
 
+    @property
+    def force_unit(self) -> str:
+        """`N`; `V` where the sensor was never calibrated, so that volts count as newtons."""
+        return "V" if self.calibrated and self.calibrated.sensor.calibration.untouched else "N"
+
 
 @dataclass(frozen=True)
 class CalibratedParts:

@@ -68,11 +68,17 @@ def test_a_force_that_is_not_to_be_believed_is_lost_too() -> None:
     assert not rig.loop.supervisor.sensor_lost
 
 
-def line(**lost: bool) -> str:
+def line(**given: object) -> str:
     none = Percentiles(0.0, 0.0, 0.0, 0)
     fields = dict.fromkeys(Status.__struct_fields__, 0)
-    what = {"mode": "fault", "reason": None, "controller": "hold", "thrust": 0.0217}
-    return status_line(Status(**fields | what | {"timing": Timing(none, none, {})} | lost))
+    what = {
+        "mode": "fault",
+        "reason": None,
+        "controller": "hold",
+        "thrust": 0.0217,
+        "force_unit": "N",
+    }
+    return status_line(Status(**fields | what | {"timing": Timing(none, none, {})} | given))
 
 
 def test_the_status_line_shows_no_thrust_without_a_force_and_says_that_the_servo_is_lost() -> None:
@@ -80,3 +86,7 @@ def test_the_status_line_shows_no_thrust_without_a_force_and_says_that_the_servo
     assert "servo" not in line()
     assert "thrust      – mN" in line(sensor_lost=True)
     assert line(servo_lost=True).endswith("servo not reached")
+
+
+def test_the_status_line_shows_volts_where_the_sensor_is_not_calibrated() -> None:
+    assert "thrust  21.70 mV" in line(force_unit="V")

@@ -71,15 +71,17 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
 
 
 def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> None:
-    not_calibrated = "the force is not calibrated: fishctl calibrate force"
+    not_calibrated = "the force is not calibrated, volts are shown: fishctl calibrate force"
     asked = subject(rig)
     perform(rig, asked, ("tare", BRIEFLY))
     assert not_calibrated in rig.robot.degraded()
+    assert rig.robot.force_unit == "V"
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
         assert not_calibrated in again.robot.degraded()
     fitted = ForceCalibration(x0=-0.2, loads=5)
     perform(rig, asked, ("calibrate-force", CalibrateForce(fitted)))
     assert not_calibrated not in rig.robot.degraded()
+    assert rig.robot.force_unit == "N"
 
 
 def test_two_tares_at_the_same_time_are_one(rig: LockstepRig) -> None:
