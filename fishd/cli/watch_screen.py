@@ -112,7 +112,7 @@ class View:
         tick = self._ticks[-1]
         thrust = "–" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f}"
         figures = {
-            "thrust": f"{thrust} m{self.status.force_unit}",
+            "thrust": f"{thrust} m{text.quoted(self.status.force_unit)}",
             "tail beat": f"{tick.frequency:.2f} Hz",
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
             "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
@@ -139,7 +139,7 @@ class View:
         labels = [""] * rows
         labels[round(high / (high - low) * (rows - 1))] = "0"
         labels[-1] = f"{low:g}"
-        name = trace.name.format(force_unit=self.status.force_unit)
+        name = trace.name.format(force_unit=text.quoted(self.status.force_unit))
         labels[0] = f"{name:<9}{high:>{LABEL - 9}g}"
         drawn = _curve(points, now - SPAN, now, rows, width - LABEL - 1)
         lines = (f"{label:>{LABEL}}┤{line}" for label, line in zip(labels, drawn, strict=True))

@@ -25,7 +25,7 @@ def status_line(status: Status) -> str:
     thrust = "     –" if status.sensor_lost else f"{status.thrust * 1e3:6.2f}"
     servo = "  servo not reached" if status.servo_lost else ""
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust} m{status.force_unit}  "
+        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust} m{text.quoted(status.force_unit)}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
     )
