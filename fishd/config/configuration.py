@@ -195,7 +195,6 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = 
     )
     sources |= apply_overrides(data, overrides)
     try:
-        config_checks.check_removed(data)
         config = _convert(without_empty_sections(data, Config))
         _check(config)
     except Problem as problem:

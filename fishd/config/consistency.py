@@ -18,23 +18,6 @@ from fishd.hardware.servo import pulses
 from fishd.hardware.settings import PanelSettings, ServoSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 
-REMOVED = {
-    ("servo", "pigpio"): "its keys stand beside servo.driver now, such as servo.port",
-    ("servo", "sysfs"): "its keys stand beside servo.driver now, such as servo.chip",
-    ("realtime", "rehearse"): "this key has another name; write realtime.warm_up",
-}
-"""Keys that older versions had, and what to write instead."""
-
-
-def check_removed(data: Mapping[str, Any]) -> None:
-    """Refuse keys of older versions; data: the file, with overrides."""
-    for path, instead in REMOVED.items():
-        section: Any = data
-        for key in path[:-1]:
-            section = section.get(key) if isinstance(section, Mapping) else None
-        if isinstance(section, Mapping) and path[-1] in section:
-            raise Problem(path, instead)
-
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
     """The controller to start with is installed and accepts its parameters."""

@@ -21,7 +21,7 @@ class ServoOutput:
         self._written = now()
 
     def why_at_rest(self) -> str:
-        """One line where the servo was left alone for so long that it came to rest; else empty.
+        """One line if no write came for so long that the servo went to rest; else empty.
 
         It is at neutral, or has no pulses any more: it must not begin again by itself.
         """

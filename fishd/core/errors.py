@@ -52,7 +52,7 @@ class UnknownDriver(FishdError, LookupError):
 
 
 class PolicyError(FishdError, ValueError):
-    """A policy file is no such file, or does not fit this robot."""
+    """A file holds no policy, or one that does not fit this robot."""
 
 
 class ControllerFault(FishdError, RuntimeError):

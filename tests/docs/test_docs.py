@@ -14,7 +14,6 @@ from fishd.cli.doctor.checks import checks
 from fishd.cli.doctor.checks.base import Context
 from fishd.cli.main import fishctl
 from fishd.config import Config, keys, load
-from fishd.config.consistency import REMOVED
 from fishd.core.errors import UnknownController
 from fishd.core.schema import fields_of
 from fishd.daemon.main import fishd
@@ -143,7 +142,7 @@ def test_every_configuration_key_that_is_named_exists(document: Path) -> None:
     if document.name == "configuration.md":
         wrong -= {"plant.omega"}  # an example of a mistake
     if document.name == "troubleshooting.md":
-        wrong -= {"servo.gpoi", *map(".".join, REMOVED)}
+        wrong -= {"servo.gpoi"}
     assert not wrong
 
 

@@ -47,9 +47,9 @@ VIRTUAL_PI_TICKS = 20_000
 
 
 def check(loop: ControlLoop) -> None:
-    """The angle in force is within limits."""
+    """The present angle is within limits."""
     if not abs(loop.applied) <= 0.42 + 1e-9:
-        raise BrokenPromise(f"tick {loop.seq}: the angle in force is {loop.applied} rad")
+        raise BrokenPromise(f"tick {loop.seq}: the present angle is {loop.applied} rad")
 
 
 def soak_simulated(ticks: int, seed: int) -> str:
