@@ -23,9 +23,10 @@ def status_line(status: Status) -> str:
         what = f"{status.mode} {status.reason.code}"
     what = text.quoted(what)
     thrust = "     –" if status.sensor_lost else f"{status.thrust * 1e3:6.2f}"
+    thrust += f" m{text.quoted(status.force_unit)}"
     servo = "  servo not reached" if status.servo_lost else ""
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust} m{text.quoted(status.force_unit)}  "
+        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
     )
