@@ -8,6 +8,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # Each of the hundreds of processes that tests start would compile fishd again.
 unexport PYTHONDONTWRITEBYTECODE
+# Who judges real time goes ahead of other programs, where that is permitted.
+AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -20)
 
 .PHONY: help run test test-fast lint docs bench clean
 
@@ -20,7 +22,7 @@ run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
 # First what shares the cores, then, alone, what judges real time: also after failures.
 test: $(VENV)/installed-dev  ## Run the whole test suite
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not realtime"; shared=$$?; \
-	$(BIN)/python -m pytest -m realtime $$(grep -rl --include='test_*.py' 'mark\.realtime' tests); \
+	$(AHEAD) $(BIN)/python -m pytest -m realtime $$(grep -rl --include='test_*.py' 'mark\.realtime' tests); \
 	alone=$$?; exit $$((shared || alone))
 
 test-fast: $(VENV)/installed-dev  ## Run what is on the virtual clock: no processes, no torch

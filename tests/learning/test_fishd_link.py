@@ -204,7 +204,8 @@ def test_a_fault_ends_it_with_the_reason_of_fishd_until_it_is_cleared(
     while fish.status().mode != "fault":
         time.sleep(0.02)  # nobody answers
     with losing(r"fishd is in mode fault: .* has not answered within"):
-        env.step(HALF)
+        for _ in range(5):  # observations that had been sent before
+            env.step(HALF)
     with losing("fishd is in mode fault"):
         env.pause(1.0)
     with losing("has not answered within"):
