@@ -83,12 +83,10 @@ class Supervisor:
 
     def check(self, code: str, problem: str | None) -> None:
         """Count a check, failed or passed (None or empty); `in_a_row` failures latch the fault."""
-        if not problem:
-            self._failures[code] = 0
-            return
-        self._failures[code] += 1
-        if self._failures[code] >= FAULTS[code].in_a_row:
-            self.fail(code, f"{problem}, {self._failures[code]} times in a row")
+        enough = FAULTS[code].in_a_row
+        self._failures[code] = count = self._failures[code] + 1 if problem else 0
+        if count >= enough:
+            self.fail(code, f"{problem}, {count} times in a row" if enough > 1 else str(problem))
 
     @property
     def sensor_lost(self) -> bool:

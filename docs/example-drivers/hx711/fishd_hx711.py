@@ -34,8 +34,8 @@ LONGEST_HIGH = 50e-6
 """PD_SCK may be high for so long; from 60 µs on it is a power-down [s]."""
 POWER_DOWN = 100e-6
 STEPS = 1 << 23
-SILENCE = 0.5
-"""No conversion lasts so long [s]."""
+SILENCE = 2.5
+"""So many times the time of a conversion, and none is done: fishd is told before its next ticks."""
 LOOK = 1e-3
 """Between two looks at DOUT [s]."""
 
@@ -85,7 +85,7 @@ class Hx711(ForceSensorDriver[Hx711Settings]):
         now = self.clock.monotonic()
         waiting = [data for data in self._data if self._gpio.input(data)]
         if waiting:
-            if now - self._latest > SILENCE:
+            if now - max(self._latest, self._valid_from) > SILENCE / self.settings.rate:
                 raise TimeoutError(
                     f"no data from the HX711 on GPIO {waiting[0]}: check its power and wires"
                 )

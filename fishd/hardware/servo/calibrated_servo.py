@@ -1,4 +1,4 @@
-"""The servo as the loop drives it, by angles: the one place where they become a driver's pulses."""
+"""The servo as the loop drives it: angles in, a driver's pulses out, by the newest calibration."""
 
 from collections.abc import Callable
 from typing import Any
