@@ -1,7 +1,7 @@
 """Whatever instant a process dies at, the pulses that it asked pigpiod for end by themselves."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 from rigs.pigpio_rig import GPIO, PigpioBench, connect, script_of
@@ -40,8 +40,7 @@ def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
 
 
 def lose_connection(bench: PigpioBench, servo: CalibratedServo) -> None:
-    for connection in list(bench.daemon._connections.values()):
-        connection.hang_up()
+    bench.hang_up()
     with contextlib.suppress(OSError):
         servo.write(0.5)
     bench.wait(0.6)
@@ -146,33 +145,22 @@ def test_a_kill_between_any_two_commands_leaves_no_pulses(
     pytest.fail("it never came to its end")
 
 
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
-
-
-def test_bytes_of_a_killed_process_that_pigpiod_reads_late_do_not_stay_in_force(
-    bench: PigpioBench,
-) -> None:
+def swim_until_the_countdown_has_ended(bench: PigpioBench) -> None:
     swim(bench)
-    successor = bench.servo()
-    connect(successor)  # which has put everything in order
-    with bench.client() as dead:
-        dead.set_servo_pulsewidth(GPIO, 1800)
     bench.wait(SOON)
     assert bench.width == 0
 
 
-def test_bytes_of_a_lost_connection_do_not_stay_in_force_after_a_release(
-    bench: PigpioBench,
+@pytest.mark.parametrize(
+    "past", [start_after_a_kill, reconnect, swim_until_the_countdown_has_ended]
+)
+def test_bytes_of_a_dead_process_or_connection_that_pigpiod_reads_late_do_not_stay_in_force(
+    bench: PigpioBench, past: Callable[[PigpioBench], None]
 ) -> None:
-    servo = swim(bench)
-    lose_connection(bench, servo)
-    connect(servo)
-    with bench.client() as lost:
-        lost.set_servo_pulsewidth(GPIO, 1800)
-    bench.wait(SOON)
+    past(bench)
+    with bench.client() as late:
+        late.set_servo_pulsewidth(GPIO, 1800)
+    bench.wait(0.1 if past is swim_until_the_countdown_has_ended else SOON)
     assert bench.width == 0
 
 
@@ -184,27 +172,4 @@ def test_a_release_that_only_reaches_pigpiod_in_half_ends_the_pulses_at_once(
         # The first of its two commands, as after a cable that broke in between.
         client.update_script(script_of(servo), [1, GPIO, 0])
     bench.wait(0.05)
-    assert bench.width == 0
-
-
-def test_a_servo_that_is_written_to_right_after_a_release_is_under_guard_at_once(
-    bench: PigpioBench,
-) -> None:
-    servo = swim(bench)
-    servo.release()
-    bench.wait(0.05)
-    servo.write(0.5)
-    bench.wait(0.25)
-    assert bench.width == 1500
-
-
-def test_a_pulse_that_arrives_after_its_countdown_has_ended_is_ended_at_once(
-    bench: PigpioBench,
-) -> None:
-    swim(bench).write(-0.5)
-    bench.wait(2.0)
-    assert bench.width == 0
-    with bench.client() as late:
-        late.set_servo_pulsewidth(GPIO, 1750)
-    bench.wait(0.1)
     assert bench.width == 0

@@ -2,26 +2,15 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 from rigs.pigpio_rig import FRAME, GPIO, TICK, PigpioBench
 
-from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
-from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
-from fishd.virtual.pi.faults import Faults
-from fishd.virtual.pi.pigpiod.daemon import Pigpiod
-
-
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
 
 
 def late_tick(bench: PigpioBench, servo: CalibratedServo, angle: float) -> None:
@@ -138,15 +127,11 @@ def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(
 
 @pytest.mark.realtime
 def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() -> None:
-    clock = SystemClock()
-    faults = Faults(clock)
-    daemon = Pigpiod(clock, faults)
-    daemon.start()
-    settings = PigpioSettings(gpio=GPIO, port=daemon.port, timeout=0.03)
-    servo = CalibratedServo(Pigpio, settings, ServoCalibration(), clock, threaded=True, tick=TICK)
-    try:
+    with contextlib.ExitStack() as stack:
+        bench = PigpioBench(stack, SystemClock())
+        servo = bench.servo(replace(bench.settings(), timeout=0.03))
         servo.write(0.5)
-        faults.inject("pigpiod-frozen")
+        bench.faults.inject("pigpiod-frozen")
         durations = []
         for _ in range(3):
             begun = time.monotonic()
@@ -154,10 +139,6 @@ def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() 
                 servo.write(0.5)
             durations.append(time.monotonic() - begun)
         assert max(durations) < 0.06  # twice the limit, for a machine that is busy
-    finally:
-        with contextlib.suppress(ServoError):
-            servo.close()
-        daemon.close()
 
 
 def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: PigpioBench) -> None:

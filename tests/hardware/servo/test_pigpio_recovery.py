@@ -1,8 +1,5 @@
 """What the pigpio servo does about a past: killed predecessors, a lost pigpiod, a last resort."""
 
-import contextlib
-from collections.abc import Iterator
-
 import pigpio
 import pytest
 from msgspec.structs import replace
@@ -11,11 +8,7 @@ from rigs.pigpio_rig import FRAME, GPIO, PigpioBench, connect
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ServoError
 
-
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
+ALT5 = 2
 
 
 def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(
@@ -169,16 +162,78 @@ def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
     servo = bench.servo()
     servo.write(0.5)
     assert bench.last_resort() is True
-    with pytest.raises(ServoError, match="reconnecting"):
+    with pytest.raises(
+        ServoError, match=r"took fishd's script away, as 'fishctl release' does; reconnecting"
+    ):
         servo.write(0.5)
     assert bench.width == 0
 
 
-def test_a_fishd_whose_script_was_taken_away_says_so(bench: PigpioBench) -> None:
-    servo = bench.servo()
-    servo.write(0.5)
-    bench.last_resort()
-    with pytest.raises(
-        ServoError, match=r"took fishd's script away, as 'fishctl release' does; re"
-    ):
-        servo.write(0.5)
+def leave_pulses_of_the_peripheral(bench: PigpioBench, width: float = 1740.0) -> None:
+    """As a fishd of old with hardware PWM, or another program, when it was killed."""
+    with bench.client() as client:
+        client.hardware_PWM(GPIO, 50, round(width * 50))
+    bench.wait(0.1)
+    assert bench.width == pytest.approx(width, abs=0.1)
+
+
+def test_pulses_of_the_peripheral_go_on_when_pigpiod_is_started_again_which_knows_nothing_of_them(
+    bench: PigpioBench,
+) -> None:
+    leave_pulses_of_the_peripheral(bench)
+    bench.faults.inject("pigpiod-restart")
+    bench.wait(1.0)
+    assert bench.width == pytest.approx(1740, abs=0.1)
+    with bench.client() as client, pytest.raises(pigpio.error, match="not in use for PWM"):
+        client.get_PWM_dutycycle(GPIO)
+    with bench.client() as client:
+        client.hardware_PWM(GPIO, 0, 0)  # of no use, as on a Pi
+    bench.wait(0.1)
+    assert bench.width == pytest.approx(1740, abs=0.1)
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_the_last_resort_ends_pulses_of_the_peripheral_at_neutral_and_says_so(
+    bench: PigpioBench, restarted: bool
+) -> None:
+    leave_pulses_of_the_peripheral(bench)
+    if restarted:
+        bench.faults.inject("pigpiod-restart")
+    begun = bench.clock.now
+    assert bench.last_resort() is True
+    bench.wait(1.0)
+    assert bench.width == 0
+    assert 1500 in [width for _, width in bench.changes_after(begun)]
+    assert bench.last_resort() is False
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_fishd_that_starts_ends_pulses_of_the_peripheral_at_neutral(
+    bench: PigpioBench, restarted: bool
+) -> None:
+    leave_pulses_of_the_peripheral(bench)
+    if restarted:
+        bench.faults.inject("pigpiod-restart")
+    connect(bench.servo())
+    bench.wait(0.05)
+    assert bench.width == 1500
+    bench.wait(1.0)
+    assert bench.width == 0
+
+
+def test_a_pin_that_is_the_peripherals_but_has_no_pulses_is_left_alone(bench: PigpioBench) -> None:
+    with bench.client() as client:
+        client.set_mode(GPIO, ALT5)  # as the overlay of the kernel's PWM leaves it
+    assert bench.last_resort() is False
+    assert bench.daemon.history(GPIO) == []
+    with bench.client() as client:
+        assert client.get_mode(GPIO) == ALT5
+
+
+def test_software_pwm_of_another_program_counts_as_pulses_too(bench: PigpioBench) -> None:
+    with bench.client() as client:
+        client.set_PWM_dutycycle(GPIO, 128)
+    bench.wait(0.1)
+    assert bench.last_resort() is True
+    bench.wait(0.1)
+    assert bench.width == 0

@@ -55,11 +55,7 @@ def test_an_angle_becomes_a_pulse(pins: Pins, servo: CalibratedServo) -> None:
 
 
 def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
-    fast = opened(
-        RpiGpioSettings(gpio=4, frequency=200.0),
-        ServoCalibration(),
-        VirtualClock(),
-    )
+    fast = opened(RpiGpioSettings(gpio=4, frequency=200.0), ServoCalibration(), VirtualClock())
     fast.write(0.5)
     assert width(pins, 4) == pytest.approx(1800.0)
     assert pins.pwm(4) == (200.0, pytest.approx(36.0))
@@ -137,32 +133,6 @@ def test_the_last_resort_leaves_the_pin_low(pins: Pins, servo: CalibratedServo) 
     assert pull_low(1500.0, gpio=18) is False
     assert pins.is_output(18)
     assert pins.level(18) == 0
-
-
-def test_another_calibration_holds_from_the_next_write_on(
-    pins: Pins, servo: CalibratedServo
-) -> None:
-    servo.write(0.2)
-    servo.recalibrate(ServoCalibration(direction=-1, trim=20.0))
-    servo.write(0.2)
-    assert width(pins) == pytest.approx(1400.0)
-    with pytest.raises(ServoError, match="needs a pulse of 2700 µs"):
-        opened(
-            RpiGpioSettings(gpio=4, centre=2400.0),
-            ServoCalibration(trim=300.0),
-            VirtualClock(),
-        )
-
-
-def test_an_angle_beyond_the_limits_changes_nothing(pins: Pins, servo: CalibratedServo) -> None:
-    servo.write(0.2)
-    with pytest.raises(ServoError, match="soft limits"):
-        servo.write(1.3)
-    with pytest.raises(ServoError, match="soft limits"):
-        servo.write(float("nan"))
-    assert width(pins) == pytest.approx(1620.0)
-    servo.write(0.1)
-    assert servo.driver.counters() == {"servo_reconnects": 0}
 
 
 def test_it_says_that_its_pulses_jitter(servo: CalibratedServo) -> None:

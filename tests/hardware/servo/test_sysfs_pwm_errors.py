@@ -90,21 +90,22 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Br
     assert bench.width() == 0.0
 
 
-@pytest.mark.parametrize("unreadable", [{"duty_cycle"}, {"enable"}])
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"unreadable": {"duty_cycle"}},
+        {"unreadable": {"enable"}},
+        {"unwritable": {("duty_cycle", 0)}},
+    ],
+    ids=str,
+)
 def test_close_switches_off_a_channel_that_cannot_be_released(
-    bench: BrokenBench, unreadable: set[str]
+    bench: BrokenBench, broken: dict[str, Any]
 ) -> None:
-    bench.kernel.unreadable = unreadable
+    vars(bench.kernel).update(broken)
     with pytest.raises(ServoError, match="Input/output error"):
         bench.fishd.close()
     channel = bench.kernel._chips[PI5][2]
     assert channel.state.enable == 0
     assert bench.width() == 0.0
     assert channel.exported_at is None
-
-
-def test_close_switches_off_a_channel_that_takes_no_duty_cycle(bench: BrokenBench) -> None:
-    bench.kernel.unwritable = {("duty_cycle", 0)}
-    with pytest.raises(ServoError, match="Input/output error"):
-        bench.fishd.close()
-    assert bench.kernel._chips[PI5][2].state.enable == 0
