@@ -26,12 +26,11 @@ def starts(rig: ForceRig) -> list[tuple[float, int]]:
     return found
 
 
-def test_the_channels_are_read_in_the_order_x_y_y_x() -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        found = starts(rig)
-        for _ in range(8):
-            sampler.step()
+def test_the_channels_are_read_in_the_order_x_y_y_x(rig: ForceRig) -> None:
+    sampler = rig.sampler()
+    found = starts(rig)
+    for _ in range(8):
+        sampler.step()
     assert [mux for _, mux in found] == [0, 3, 3, 0, 0, 3, 3, 0]
 
 
@@ -43,20 +42,19 @@ def test_the_order_cancels_the_lag_of_the_second_channel() -> None:
     assert abs(sum(differences[: len(differences) // 2 * 2])) <= 2
 
 
-def test_the_sampler_sleeps_through_a_conversion_and_asks_once() -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        sampler.step()
-        polls = 0
-        transfer = rig.device.transfer
+def test_the_sampler_sleeps_through_a_conversion_and_asks_once(rig: ForceRig) -> None:
+    sampler = rig.sampler()
+    sampler.step()
+    polls = 0
+    transfer = rig.device.transfer
 
-        def counted(address: int, messages: Any) -> list[bytes]:
-            nonlocal polls
-            polls += 1
-            return transfer(address, messages)
+    def counted(address: int, messages: Any) -> list[bytes]:
+        nonlocal polls
+        polls += 1
+        return transfer(address, messages)
 
-        rig.device.transfer = counted
-        sampler.step()
+    rig.device.transfer = counted
+    sampler.step()
     assert polls == 4  # start, config, pointer, conversion
 
 
@@ -70,9 +68,8 @@ def test_chips_at_either_end_of_the_tolerance_are_read_without_an_error(seed: in
 
 
 @pytest.mark.parametrize("data_rate", [8, 16, 32, 64, 128, 250, 475, 860])
-def test_every_data_rate_gives_right_values(data_rate: int) -> None:
-    with ForceRig() as rig:
-        pairs = take_pairs(rig.sampler(data_rate=data_rate), rig, 2.0)
+def test_every_data_rate_gives_right_values(rig: ForceRig, data_rate: int) -> None:
+    pairs = take_pairs(rig.sampler(data_rate=data_rate), rig, 2.0)
     assert len(pairs) >= 0.75 * data_rate * 2.0 / 2 * 0.7
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
 
@@ -121,23 +118,21 @@ def test_no_pair_is_made_of_samples_from_before_and_after_an_error() -> None:
         assert volts(sampler.pairs[0]) == pytest.approx((0.75, -0.25), abs=STEP)
 
 
-def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for() -> None:
-    with ForceRig() as rig:
-        rig.volts["A3"] = 1.9
-        rig.chip.write(bytes((1, 0b1111_0101, 0b0000_0011)))  # A3, 8 samples per second
-        sampler = rig.sampler()
-        pairs = take_pairs(sampler, rig, 1.0)
+def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for(rig: ForceRig) -> None:
+    rig.volts["A3"] = 1.9
+    rig.chip.write(bytes((1, 0b1111_0101, 0b0000_0011)))  # A3, 8 samples per second
+    sampler = rig.sampler()
+    pairs = take_pairs(sampler, rig, 1.0)
     assert sampler.errors > 0
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
     assert len(pairs) > 100
 
 
-def test_a_conversion_that_ends_when_a_stuck_chip_recovers_is_not_believed() -> None:
+def test_a_conversion_that_ends_when_a_stuck_chip_recovers_is_not_believed(rig: ForceRig) -> None:
     """The start was ignored while it was stuck, so the code is an old one, of the other channel."""
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        for _ in range(200):
-            rig.faults.inject("stuck-busy", 0.0047)
-            pairs = take_pairs(sampler, rig, 0.02)
-            assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
+    sampler = rig.sampler()
+    for _ in range(200):
+        rig.faults.inject("stuck-busy", 0.0047)
+        pairs = take_pairs(sampler, rig, 0.02)
+        assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
     assert sampler.errors >= 200

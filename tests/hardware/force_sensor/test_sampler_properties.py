@@ -34,12 +34,12 @@ def as_pairs(window: list[tuple[int, int]]) -> list[Pair]:
 @settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32),
-    error_rate=st.sampled_from((0.0, 0.01, 0.1)),
+    error_rate=st.sampled_from((0.0, 0.02, 0.2)),
     faults=st.lists(
         st.tuples(st.sampled_from(FAULTS), st.floats(1e-4, 0.3), st.floats(0.0, 0.3)), max_size=5
     ),
 )
-def test_each_measurement_is_right_and_it_recovers(
+def test_each_measurement_is_right_none_is_of_the_future_and_it_recovers(
     seed: int, error_rate: float, faults: list[tuple[str, float, float]]
 ) -> None:
     with ForceRig(seed=seed) as rig:
@@ -52,24 +52,13 @@ def test_each_measurement_is_right_and_it_recovers(
         rig.faults.clear()
         found += ticks.run(0.7)
     assert isinstance(found[-1], Measurement)
-    for item in found:
+    newest = -math.inf
+    for index, item in enumerate(found, 1):
         if isinstance(item, Measurement):
+            assert newest <= item.time <= index * ticks.tick
+            newest = item.time
             assert (item.fx, item.fy) == pytest.approx((0.5, -0.25), abs=6 * STEP)
             assert item.suspect == ""
-
-
-@pytest.mark.slow
-@settings(max_examples=60)
-@given(seed=st.integers(0, 2**32), error_rate=st.sampled_from((0.0, 0.02, 0.2)))
-def test_times_of_measurements_never_go_back_nor_ahead(seed: int, error_rate: float) -> None:
-    with ForceRig(seed=seed) as rig:
-        ticks = Ticks(rig.sensor())
-        rig.faults.error_rate = error_rate
-        newest = -math.inf
-        for item in ticks.run(1.0):
-            if isinstance(item, Measurement):
-                assert newest <= item.time <= rig.clock.now
-                newest = item.time
 
 
 @given(windows, calibrations)
@@ -96,9 +85,7 @@ def test_a_window_is_suspect_exactly_if_a_force_is_beyond_the_limit(
 
 
 @given(st.lists(windows, max_size=5))
-def test_a_watch_finds_mean_and_deviation_of_all_pairs(
-    parts: list[list[tuple[int, int]]],
-) -> None:
+def test_a_watch_finds_mean_and_deviation_of_all_pairs(parts: list[list[tuple[int, int]]]) -> None:
     watch = VoltageWatch(0.0, ForceCalibration())
     for part in parts:
         watch.add(as_pairs(part), "")
@@ -113,10 +100,11 @@ def test_a_watch_finds_mean_and_deviation_of_all_pairs(
 
 
 @pytest.mark.parametrize("tick", [0.005, 0.01, 0.02, 0.05, 0.1, 0.2])
-def test_a_loop_of_any_tick_gets_most_of_the_samples_there_could_be(tick: float) -> None:
-    with ForceRig() as rig:
-        ticks = Ticks(rig.sensor(tick=tick), tick)
-        ticks.run(0.05)
-        found = ticks.run(2.0)
-        assert all(isinstance(item, Measurement) for item in found)
-        assert sum(item.samples for item in found if isinstance(item, Measurement)) >= 320
+def test_a_loop_of_any_tick_gets_most_of_the_samples_there_could_be(
+    rig: ForceRig, tick: float
+) -> None:
+    ticks = Ticks(rig.sensor(tick=tick), tick)
+    ticks.run(0.05)
+    found = ticks.run(2.0)
+    assert all(isinstance(item, Measurement) for item in found)
+    assert sum(item.samples for item in found if isinstance(item, Measurement)) >= 320
