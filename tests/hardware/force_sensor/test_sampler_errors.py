@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.force_rig import ABSENT_BUS, STEP, ForceRig, take_pairs, volts
+from rigs.ads1115_board import ABSENT_BUS
+from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 
 from fishd.core.errors import MissingPackage
 from fishd.hardware.force_sensor.sampler import LONGEST_PAUSE

@@ -124,20 +124,3 @@ def test_what_is_not_emulated_is_told_once(
     for _ in range(3):
         board.configure(word)
     assert caplog.messages == [f"emulated ADS1115: {complaint}"]
-
-
-@pytest.mark.parametrize(("speed", "fewest", "most"), [(400e3, 13, 16), (100e3, 8, 10)])
-def test_so_many_pairs_fit_into_a_window_of_50_ms(speed: float, fewest: int, most: int) -> None:
-    for seed in range(10):
-        with Board(speed, seed=seed) as board:
-            ads = board.driver()
-            begun, pairs = board.clock.now, 0
-            while board.clock.now < begun + 0.5:
-                for mux in (X, Y):
-                    ads._write_config(mux)
-                    board.clock.sleep(POWER_UP + 1 / 860)
-                    while not ads._conversion_complete():
-                        pass
-                    assert ads.get_last_result() == codes(VOLTS[mux]) & 0xFFFF
-                pairs += 1
-        assert fewest <= pairs / 10 <= most

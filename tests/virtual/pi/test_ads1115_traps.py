@@ -3,37 +3,13 @@
 from collections.abc import Iterator
 
 import pytest
-from rigs.ads1115_board import VOLTS, Board, Enough, X, Y, codes, config
+from rigs.ads1115_board import VOLTS, Board, X, Y, codes, config
 
 
 @pytest.fixture
 def board() -> Iterator[Board]:
     with Board() as board:
         yield board
-
-
-def test_an_absent_chip_is_a_value_error_at_the_start(board: Board) -> None:
-    with pytest.raises(ValueError, match="No I2C device at address: 0x49"):
-        board.driver(address=0x49)
-    board.faults.inject("unplugged")
-    with pytest.raises(ValueError, match="No I2C device at address: 0x48"):
-        board.driver()
-
-
-def test_a_single_shot_read_spins_without_a_pause_until_the_chip_is_ready(board: Board) -> None:
-    ads = board.driver(data_rate=8)
-    board.transfers = 0
-    ads.read(X)
-    assert board.transfers > 500, "polls in one conversion of 125 ms"
-
-
-def test_a_chip_that_is_stuck_busy_would_hold_the_driver_for_ever(board: Board) -> None:
-    ads = board.driver()
-    board.faults.inject("stuck-busy")
-    board.allowed = board.transfers + 10_000
-    with pytest.raises(Enough):
-        ads.read(X)
-    assert board.clock.now > 1.0
 
 
 def test_a_chip_that_was_stuck_busy_goes_on_once_it_is_not(board: Board) -> None:
@@ -78,14 +54,6 @@ def test_an_error_of_the_start_itself_may_leave_the_chip_converting(board: Board
     assert 0 < swapped < 20
 
 
-def test_a_brown_out_heals_with_the_next_single_shot_read(board: Board) -> None:
-    ads = board.driver(gain=16)
-    board.volts[X] = 0.2
-    board.faults.inject("brown-out")
-    assert board.register(1) == 0x8583, "gain and rate are lost"
-    assert ads.read(X) == codes(0.2, 0.256)
-
-
 def test_a_brown_out_amid_a_conversion_reads_as_zero_and_shows_in_the_config(board: Board) -> None:
     ads = board.driver()
     ads._write_config(X)
@@ -114,9 +82,3 @@ def test_a_frozen_code_is_that_of_its_own_channel(board: Board) -> None:
     assert [ads.read(X), ads.read(Y)] == before
     board.faults.clear()
     assert [ads.read(X), ads.read(Y)] == [codes(-1.0), codes(1.0)]
-
-
-def test_a_clipped_input_reads_full_scale(board: Board) -> None:
-    ads = board.driver()
-    board.faults.inject("clipped")
-    assert [ads.read(X), ads.read(Y)] == [32767, 32767]

@@ -27,13 +27,6 @@ def test_the_true_client_finds_a_pi_4(bench: PigpiodBench) -> None:
     assert bench.pi.read_bank_1() >> 4 & 1 == 1
 
 
-def test_servo_pulses_begin_change_and_end(bench: PigpiodBench) -> None:
-    for width in (1500, 1600, 0):
-        bench.pi.set_servo_pulsewidth(GPIO, width)
-        assert bench.settled_width == width
-    assert [width for _, width in bench.daemon.history(GPIO)] == [1500, 1600, 0]
-
-
 def test_pulses_are_rounded_down_to_five_microseconds(bench: PigpiodBench) -> None:
     bench.pi.set_servo_pulsewidth(GPIO, 1504)
     assert bench.settled_width == 1500
@@ -149,13 +142,6 @@ def test_another_use_of_the_pin_ends_its_pulses(
     getattr(bench.pi, command[0])(GPIO, command[1])
     assert bench.settled_width == 0
     assert bench.result("get_servo_pulsewidth", GPIO) == pigpio.PI_NOT_SERVO_GPIO
-
-
-def test_pulses_go_on_when_the_client_is_gone(bench: PigpiodBench) -> None:
-    bench.pi.set_servo_pulsewidth(GPIO, 1500)
-    dispose(bench.pi)
-    bench.sleep(3600)
-    assert bench.width == 1500
 
 
 def test_there_is_room_for_32_scripts_until_one_is_deleted(bench: PigpiodBench) -> None:

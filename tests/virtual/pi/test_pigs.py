@@ -27,11 +27,7 @@ def bench() -> Iterator[PigpiodBench]:
 def pigs(bench: PigpiodBench, *arguments: str) -> subprocess.CompletedProcess[str]:
     assert PIGS is not None
     return subprocess.run(
-        [PIGS, *arguments],
-        env=environment(bench),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
+        [PIGS, *arguments], env=environment(bench), capture_output=True, text=True, timeout=PATIENCE
     )
 
 
@@ -89,22 +85,6 @@ def test_a_delay_is_one_of_the_daemons_clock() -> None:
             assert waiting.wait(PATIENCE) == 0
         first, second = bench.daemon.history(GPIO)
         assert second[0] - first[0] >= 60.0
-
-
-def test_values_are_read_back(bench: PigpiodBench) -> None:
-    told(bench, "s", "18", "1504", "m", "4", "w", "w", "4", "1")
-    assert told(bench, "gpw", "18", "mg", "4", "r", "4", "pigpv").split() == [
-        "1504",
-        "1",
-        "1",
-        "79",
-    ]
-
-
-def test_hardware_pwm_is_set(bench: PigpiodBench) -> None:
-    told(bench, "hp", "18", "333", str(333 * 1500))
-    assert told(bench, "gdc", "18") == str(333 * 1500)
-    assert eventually(lambda: bench.width == pytest.approx(1500, abs=0.01))
 
 
 def test_scripts_are_stored_run_watched_and_deleted(bench: PigpiodBench) -> None:

@@ -1,5 +1,3 @@
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -296,19 +294,6 @@ def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
             seen.append(abs(turning_point(p, before, command, duration / _STEPS)))
     assert peak == pytest.approx(max(seen), rel=2e-5, abs=1e-7)
     assert peak >= (1.0 - 1e-6) * max(seen) - 1e-12  # far below, the equations are not resolved
-
-
-def test_the_thrust_of_a_periodic_motion_is_the_mean_square_fin_velocity() -> None:
-    p = PlantParameters()
-    fish = TetheredFish(p)
-    times = np.linspace(0.0, 0.5, 401)
-    for _ in range(20):
-        rates, thrust = [], 0.0
-        for start, end in pairwise(times):
-            rates.append(fish.state.alpha_rate)
-            command = 0.42 * np.sin(2.0 * np.pi * (start + end) / (2.0 * 0.5))
-            thrust += fish.advance(command, 0.5 / 400, samples=1).thrust / 400
-    assert thrust == pytest.approx(p.thrust_coefficient * np.mean(np.square(rates)), rel=1e-4)
 
 
 @pytest.mark.parametrize(("duration", "samples"), [(0.0, 10), (-0.1, 10), (0.05, 0)])
