@@ -3,22 +3,13 @@
 import random
 
 import onnx
-import pytest
 from onnx import helper
-from rigs.policy_files import FLIP, card, random_layers
+from rigs.policy_files import FLIP, card, random_layers, refusal
 
 from fishd.controllers.policy import checksum, file, library
 from fishd.controllers.policy.network import to_onnx
-from fishd.core.errors import PolicyError
 
 DEFAULT = library.find("default-fish").read_bytes()
-
-
-def refusal(content: bytes) -> str:
-    with pytest.raises(PolicyError) as caught:
-        file.parse(content)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def test_every_flipped_bit_of_a_small_policy_is_refused() -> None:

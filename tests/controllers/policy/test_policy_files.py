@@ -3,7 +3,6 @@
 import io
 import os
 import pickle
-import threading
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from rigs.policy_files import FLIP, card, random_layers, write
+from rigs.policy_files import FLIP, card, random_layers, refusal, write
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.card import KEY, encode
@@ -37,13 +36,6 @@ def with_card(**values: Any) -> bytes:
     data = msgspec.json.decode(encode(card())) | values
     text = msgspec.json.encode({key: value for key, value in data.items() if value is not None})
     return changed(lambda model: helper.set_model_props(model, {KEY: text.decode()}))
-
-
-def refusal(content: bytes) -> str:
-    with pytest.raises(PolicyError) as caught:
-        file.parse(content)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 class Trap:
@@ -301,22 +293,6 @@ def test_a_service_says_where_a_file_that_it_cannot_see_belongs(
         "/home/nobody-here/swim.onnx: no such file: this fishd is a service that sees no home "
         "folders; put the file into /var/lib/fishd/policies and give its name"
     )
-
-
-def test_a_pipe_does_not_hold_the_reader(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.onnx")
-    problems = []
-
-    def read() -> None:
-        try:
-            file.read(tmp_path / "pipe.onnx")
-        except PolicyError as error:
-            problems.append(str(error))
-
-    reader = threading.Thread(target=read, daemon=True)
-    reader.start()
-    reader.join(20.0)
-    assert problems == [f"{tmp_path / 'pipe.onnx'}: is a named pipe; a regular file is needed"]
 
 
 def test_a_file_that_is_far_too_large_is_refused_before_it_is_read(tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 import zmq
 from rigs.harness import Rig
-from rigs.processes import running
 
-from fishd.client import Agent, Fish, FishError, NoDaemon
+from fishd.client import Agent, FishError, NoDaemon
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 
@@ -225,15 +224,6 @@ def test_the_address_of_an_agent_that_was_killed_is_free(tmp_path: Path) -> None
     assert (tmp_path / "agent").is_socket()  # left behind
     Agent(address).close()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_control_socket_of_a_fishd_is_not_taken_from_it(tmp_path: Path) -> None:
-    with running(tmp_path) as daemon, Fish(daemon.endpoint) as fish:
-        with pytest.raises(FishError, match=rf"\(pid {daemon.process.pid}\) already serves"):
-            Agent(daemon.endpoint)
-        assert fish.status().pid == daemon.process.pid
-        with Fish(daemon.endpoint) as another:
-            assert another.status().mode == "idle"
 
 
 def test_a_socket_that_anyone_listens_at_is_not_taken(tmp_path: Path) -> None:

@@ -50,12 +50,3 @@ def test_an_agent_that_insists_loses_command_to_swing_and_is_told(
     )
     agent.drain()
     assert agent.seen[-1]["kind"] == "ended"
-
-
-def test_it_is_a_fault_where_that_is_configured(agent: ScriptedAgent) -> None:
-    rig = Rig("lockstep=true", "chatter.fallback=fault")
-    rig.start("remote", agent=agent.address, dwell=0.2)
-    with agent.answering(lambda seen: flip(agent, seen)):
-        rig.run(45)
-    assert (rig.mode, rig.reason) == ("fault", "chatter")
-    rig.loop.close()
