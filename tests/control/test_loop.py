@@ -101,14 +101,6 @@ def test_after_an_emergency_stop_the_way_back_is_clear_and_gentle() -> None:
     assert rig.mode == "running"
 
 
-def test_a_stop_does_not_clear_a_fault() -> None:
-    rig = Rig()
-    rig.start(Scripted(lambda _: math.nan))
-    rig.run()
-    rig.loop.stop()
-    assert rig.mode == "fault"
-
-
 def test_a_tick_that_takes_longer_than_a_period_is_blamed_on_its_slowest_phase() -> None:
     rig = Rig()
 

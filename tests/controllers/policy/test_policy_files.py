@@ -82,11 +82,6 @@ def test_what_is_no_onnx_is_refused(content: bytes) -> None:
     )
 
 
-@pytest.mark.parametrize("kept", [0.2, 0.5, 0.9, 0.99])
-def test_a_file_that_was_cut_off_is_refused(kept: float) -> None:
-    assert refusal(FLIP[: int(kept * len(FLIP))])
-
-
 def test_a_file_without_a_card_is_refused() -> None:
     def strip(model: Any) -> None:
         del model.metadata_props[:]
