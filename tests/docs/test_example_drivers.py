@@ -1,13 +1,11 @@
 """The packages in docs/example-drivers, installed and used as their reader would."""
 
-import contextlib
 import json
 import os
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,16 +18,8 @@ from rigs.example_drivers import (
     install,
 )
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
-from rigs.pca9685_chip import (
-    AUTO_INCREMENT,
-    LED0,
-    MODE1,
-    PRE_SCALE,
-    RESTART,
-    SLEEP,
-    Pca9685Chip,
-)
-from rigs.processes import FISHCTL, Daemon, running
+from rigs.pca9685_chip import AUTO_INCREMENT, LED0, MODE1, PRE_SCALE, RESTART, SLEEP, Pca9685Chip
+from rigs.processes import FISHCTL
 
 from fishd import wiring
 from fishd.config import load
@@ -72,17 +62,13 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
+def options(*settings: str) -> list[str]:
+    return [word for each in settings for word in ("--set", each)]
+
+
 def doctor(site: Path, folder: Path, *settings: str) -> dict[str, dict[str, str]]:
-    options = [word for each in settings for word in ("--set", each)]
-    done = fishctl(
-        site,
-        "--endpoint",
-        f"ipc://{folder}/nobody",
-        "doctor",
-        "--json",
-        *options,
-        *("--set", f"state_folder={folder}", "--set", f"telemetry.address=ipc://{folder}/t"),
-    )
+    mine = options(*settings, f"state_folder={folder}", f"telemetry.address=ipc://{folder}/t")
+    done = fishctl(site, "--endpoint", f"ipc://{folder}/nobody", "doctor", "--json", *mine)
     return {found["check"]: found for found in json.loads(done.stdout)}
 
 
@@ -215,30 +201,36 @@ def test_hx711_a_wrong_setting_is_refused_by_key(setting: str, complaint: str) -
     assert "\n" not in str(refusal.value)
 
 
+HX711 = [
+    "force_sensor.driver=hx711",
+    *("force_sensor.clock=25", "force_sensor.data_x=26", "force_sensor.data_y=27"),
+    "servo.host=127.0.0.2",
+]
+PCA9685 = ["servo.driver=pca9685", "servo.bus=177", "force_sensor.bus=178"]
+
+
 @pytest.mark.usefixtures("_installed")
-def test_hx711_a_second_fishd_is_refused(tmp_path: Path) -> None:
-    pins = ["force_sensor.clock=25", "force_sensor.data_x=26", "force_sensor.data_y=27"]
-    port = "servo.host=127.0.0.2"
-    settings = ["robot=pi", "force_sensor.driver=hx711", *pins, port, f"state_folder={tmp_path}"]
-    config = load(None, settings)
+@pytest.mark.parametrize(
+    ("settings", "part", "complaint"),
+    [
+        (HX711, 0, r"drives the HX711's PD_SCK on GPIO 25; .*sensor\.clock"),
+        (PCA9685, 1, r"drives /dev/i2c-177; stop it.* another servo\.bus"),
+    ],
+    ids=["hx711", "pca9685"],
+)
+def test_a_second_fishd_on_the_same_chip_is_refused(
+    tmp_path: Path, settings: list[str], part: int, complaint: str
+) -> None:
+    config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])
     with (
-        ownership.owned(wiring.parts_of(config)[:1]),
+        ownership.owned(wiring.parts_of(config)[part : part + 1]),
         ExitStack() as stack,
-        pytest.raises(StartupError, match=r"drives the HX711's PD_SCK on GPIO 25; .*sensor\.clock"),
+        pytest.raises(StartupError, match=complaint),
     ):
         wiring.open_robot(config, VirtualClock(), stack)
-    for lock in ownership.FOLDER.glob("fishd-gpio2[567].lock"):
-        lock.unlink()
-
-
-def test_hx711_doctor_names_it_and_makes_its_checks(site: Path, tmp_path: Path) -> None:
-    found = doctor(site, tmp_path, "robot=pi", "force_sensor.driver=hx711", "servo.port=1")
-    assert found["drivers"]["message"] == (
-        "force_sensor hx711 of fishd-hx711 0.1.0, servo pigpio of fishd"
-    )
-    assert found["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
-    assert found["force"]["level"] == "FAIL"  # there are no pins on this machine
-    assert "adc" not in found
+    for name in ("gpio2[567]", "i2c-17[78]*"):
+        for lock in ownership.FOLDER.glob(f"fishd-{name}.lock"):
+            lock.unlink()
 
 
 class ServoBoard:
@@ -405,50 +397,20 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
     assert sum(tick.fx for tick in ticks) / len(ticks) == pytest.approx(THRUST, rel=0.05)
 
 
-@contextlib.contextmanager
-def fishd_on_a_board(site: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A fishd whose board is not there, and the settings of another one."""
-    monkeypatch.setenv("PYTHONPATH", str(site))
-    bus = 150 + os.getpid() % 50
-    settings = ["robot=pi", "servo.driver=pca9685", f"servo.bus={bus}"]
-    options = [word for each in settings for word in ("--set", each)]
-    one, other = folder / "one", folder / "other"
-    one.mkdir()
-    other.mkdir()
-    mine = [*options, "--set", f"force_sensor.bus={bus}"]
-    with running(one, *mine, "--set", f"state_folder={one}") as daemon:
-        yield SimpleNamespace(
-            daemon=daemon,
-            bus=bus,
-            settings=[*options, "--set", f"force_sensor.bus={bus + 50}"],
-            folder=other,
-        )
-    for lock in ownership.FOLDER.glob(f"fishd-i2c-{bus}*.lock"):
-        lock.unlink()
-
-
-def test_pca9685_fishd_says_what_is_wrong_and_a_second_one_is_refused(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_doctor_names_both_and_makes_their_checks_and_release_works(
+    site: Path, tmp_path: Path
 ) -> None:
-    with fishd_on_a_board(site, tmp_path, monkeypatch) as first:
-        status, _, err = Daemon(first.folder, *first.settings).finish()
-        assert status == 1
-        pid = first.daemon.process.pid
-        assert f"another fishd (pid {pid}) drives /dev/i2c-{first.bus}; stop it" in err
-        assert "another servo.bus" in err
-        assert f"/dev/i2c-{first.bus} does not exist" in first.daemon.fishctl("status").stdout
-    with contextlib.suppress(OSError):
-        (ownership.FOLDER / f"fishd-i2c-{first.bus + 50}.lock").unlink()
-
-
-def test_pca9685_doctor_and_release_work_for_it(site: Path, tmp_path: Path) -> None:
-    settings = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
-    found = doctor(site, tmp_path, *settings)
-    assert found["drivers"]["message"].endswith("servo pca9685 of fishd-pca9685 0.1.0")
+    servo = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
+    found = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
+    assert found["drivers"]["message"] == (
+        "force_sensor hx711 of fishd-hx711 0.1.0, servo pca9685 of fishd-pca9685 0.1.0"
+    )
+    assert found["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
+    assert found["force"]["level"] == "FAIL"  # there are no pins on this machine
+    assert "adc" not in found
     assert found["pca9685"]["level"] == "FAIL"
     assert f"/dev/i2c-{BUS} does not exist" in found["pca9685"]["message"]
-    options = [word for each in settings for word in ("--set", each)]
-    done = fishctl(site, "release", *options, "--set", f"state_folder={tmp_path}")
+    done = fishctl(site, "release", *options(*servo, f"state_folder={tmp_path}"))
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith(f"fishctl: /dev/i2c-{BUS} does not exist")
     assert done.stderr.count("\n") == 1

@@ -7,6 +7,7 @@ from rigs.force_rig import STEP, TICK, ForceRig, Ticks, measurements
 
 from fishd.core.calibration import ForceCalibration
 from fishd.core.errors import SensorError
+from fishd.core.signals import Measurement
 
 CALIBRATION = ForceCalibration(xx=2.0, xy=0.1, x0=-0.3, yx=-0.2, yy=3.0, y0=0.4)
 
@@ -73,6 +74,37 @@ def test_a_read_leaves_the_clock_at_the_tick(rig: ForceRig) -> None:
     for index in range(1, 100):
         sensor.read(index * TICK)
         assert rig.clock.now == pytest.approx(index * TICK, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "nack",
+        "timeout",
+        "clock-stretch",
+        "bus-owned",
+        "arbitration-lost",
+        "unplugged",
+        "stuck-busy",
+    ],
+)
+def test_while_the_chip_cannot_be_read_reads_raise_and_half_a_second_later_it_is_well(
+    rig: ForceRig, fault: str
+) -> None:
+    sensor = rig.sensor()
+    ticks = Ticks(sensor)
+    measurements(ticks.run(1.0))
+    rig.faults.inject(fault, 2.0)
+    during = ticks.run(2.0)
+    assert all(isinstance(item, str) for item in during[1:])
+    after = ticks.run(0.6)
+    assert isinstance(after[-1], Measurement)
+    for measured in measurements(ticks.run(1.0)):
+        assert measured.samples >= 12
+        assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+    counters = sensor.counters()
+    assert counters["i2c_errors"] >= 5
+    assert counters["i2c_reconnects"] == 1
 
 
 def test_a_brown_out_costs_a_sample_and_nothing_else(rig: ForceRig) -> None:
