@@ -256,9 +256,3 @@ def test_without_pins_no_library_is_needed(monkeypatch: pytest.MonkeyPatch) -> N
     panel = RpiGpioPanel(PanelSettings(), VirtualClock())
     assert panel.update("running", 0.0) is False
     panel.close()
-
-
-def test_a_missing_library_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "RPi", None)
-    with pytest.raises(StartupError, match=r"fishd\[rpi-lgpio\] .* or fishd\[rpi-gpio\]"):
-        RpiGpioPanel(PanelSettings(led_gpio=LIGHT), VirtualClock())

@@ -22,7 +22,7 @@ FRAME = 0.02
 TICK = 0.05
 
 
-class PigpioBench:
+class Bench:
     """In virtual time, or in real time if that is what its clock shows."""
 
     def __init__(

@@ -4,10 +4,10 @@ import contextlib
 from collections.abc import Iterator
 
 import pytest
-from rigs.pigpio_rig import PigpioBench
+from rigs.pigpio_rig import Bench
 
 
 @pytest.fixture
-def bench() -> Iterator[PigpioBench]:
+def bench() -> Iterator[Bench]:
     with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
+        yield Bench(stack)

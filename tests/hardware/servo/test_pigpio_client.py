@@ -6,7 +6,7 @@ import struct
 import threading
 
 import pytest
-from rigs.pigpio_rig import PigpioBench
+from rigs.pigpio_rig import Bench
 from rigs.processes import PATIENCE
 
 from fishd.core.clock import SystemClock, VirtualClock
@@ -74,7 +74,7 @@ def test_a_host_that_is_none_is_one_line_too(host: str) -> None:
         pass
 
 
-def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: PigpioBench) -> None:
+def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: Bench) -> None:
     attempts: list[Client] = []
 
     def prepare(client: Client) -> None:
@@ -89,7 +89,7 @@ def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: PigpioBench)
             attempts[0].get_pigpio_version()
 
 
-def test_an_unforeseen_error_is_the_reason_why_there_is_no_connection(bench: PigpioBench) -> None:
+def test_an_unforeseen_error_is_the_reason_why_there_is_no_connection(bench: Bench) -> None:
     def prepare(client: Client) -> None:
         raise IndexError("out of range")
 

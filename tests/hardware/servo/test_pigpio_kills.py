@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable
 
 import pytest
-from rigs.pigpio_rig import GPIO, PigpioBench, connect, script_of
+from rigs.pigpio_rig import GPIO, Bench, connect, script_of
 
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio_client import TimedSocket
@@ -39,14 +39,14 @@ def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     return kill_after
 
 
-def lose_connection(bench: PigpioBench, servo: CalibratedServo) -> None:
+def lose_connection(bench: Bench, servo: CalibratedServo) -> None:
     bench.hang_up()
     with contextlib.suppress(OSError):
         servo.write(0.5)
     bench.wait(0.6)
 
 
-def swim(bench: PigpioBench) -> CalibratedServo:
+def swim(bench: Bench) -> CalibratedServo:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(0.05)
@@ -54,31 +54,31 @@ def swim(bench: PigpioBench) -> CalibratedServo:
     return servo
 
 
-def write(bench: PigpioBench) -> None:
+def write(bench: Bench) -> None:
     swim(bench).write(-0.5)
 
 
-def first_write(bench: PigpioBench) -> None:
+def first_write(bench: Bench) -> None:
     servo = swim(bench)
     servo.release()
     bench.wait(0.05)
     servo.write(0.5)
 
 
-def release(bench: PigpioBench) -> None:
+def release(bench: Bench) -> None:
     swim(bench).release()
 
 
-def close(bench: PigpioBench) -> None:
+def close(bench: Bench) -> None:
     swim(bench).close()
 
 
-def start_after_a_kill(bench: PigpioBench) -> None:
+def start_after_a_kill(bench: Bench) -> None:
     swim(bench)
     connect(bench.servo())
 
 
-def reconnect(bench: PigpioBench) -> None:
+def reconnect(bench: Bench) -> None:
     servo = swim(bench)
     with bench.client() as other:  # so that the pulses are still on, and no countdown ends them
         for script in range(2):
@@ -87,12 +87,12 @@ def reconnect(bench: PigpioBench) -> None:
     connect(servo)
 
 
-def last_resort(bench: PigpioBench) -> None:
+def last_resort(bench: Bench) -> None:
     swim(bench)
     bench.last_resort()
 
 
-def last_resort_on_pulses_of_others(bench: PigpioBench) -> None:
+def last_resort_on_pulses_of_others(bench: Bench) -> None:
     with bench.client() as other:
         other.set_servo_pulsewidth(GPIO, 1800)
     bench.last_resort()
@@ -111,10 +111,7 @@ DEEDS = (
 
 
 def die_at(
-    n: int,
-    bench: PigpioBench,
-    deed: Callable[[PigpioBench], None],
-    kill_after: Callable[[int | None], None],
+    n: int, bench: Bench, deed: Callable[[Bench], None], kill_after: Callable[[int | None], None]
 ) -> bool:
     """True when it died; False when it had done everything before."""
     kill_after(n)
@@ -129,11 +126,11 @@ def die_at(
 
 @pytest.mark.parametrize("deed", DEEDS)
 def test_a_kill_between_any_two_commands_leaves_no_pulses(
-    deed: Callable[[PigpioBench], None], mortal: Callable[[int | None], None]
+    deed: Callable[[Bench], None], mortal: Callable[[int | None], None]
 ) -> None:
     for n in range(100):
         with contextlib.ExitStack() as stack:
-            bench = PigpioBench(stack)
+            bench = Bench(stack)
             died = die_at(n, bench, deed, mortal)
             bench.wait(SOON)
             # Pulses of others that nobody has touched yet are theirs.
@@ -145,7 +142,7 @@ def test_a_kill_between_any_two_commands_leaves_no_pulses(
     pytest.fail("it never came to its end")
 
 
-def swim_until_the_countdown_has_ended(bench: PigpioBench) -> None:
+def swim_until_the_countdown_has_ended(bench: Bench) -> None:
     swim(bench)
     bench.wait(SOON)
     assert bench.width == 0
@@ -155,7 +152,7 @@ def swim_until_the_countdown_has_ended(bench: PigpioBench) -> None:
     "past", [start_after_a_kill, reconnect, swim_until_the_countdown_has_ended]
 )
 def test_bytes_of_a_dead_process_or_connection_that_pigpiod_reads_late_do_not_stay_in_force(
-    bench: PigpioBench, past: Callable[[PigpioBench], None]
+    bench: Bench, past: Callable[[Bench], None]
 ) -> None:
     past(bench)
     with bench.client() as late:
@@ -165,7 +162,7 @@ def test_bytes_of_a_dead_process_or_connection_that_pigpiod_reads_late_do_not_st
 
 
 def test_a_release_that_only_reaches_pigpiod_in_half_ends_the_pulses_at_once(
-    bench: PigpioBench, mortal: Callable[[int | None], None]
+    bench: Bench, mortal: Callable[[int | None], None]
 ) -> None:
     servo = swim(bench)
     with bench.client() as client:

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from rigs.pigpio_rig import FRAME, GPIO, TICK, PigpioBench
+from rigs.pigpio_rig import FRAME, GPIO, TICK, Bench
 
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 
 
-def late_tick(bench: PigpioBench, servo: CalibratedServo, angle: float) -> None:
+def late_tick(bench: Bench, servo: CalibratedServo, angle: float) -> None:
     """A tick whose answer does not come in time, but before the next tick."""
     bench.faults.inject("pigpiod-frozen")
     try:
@@ -23,14 +23,14 @@ def late_tick(bench: PigpioBench, servo: CalibratedServo, angle: float) -> None:
     bench.wait(TICK)
 
 
-def thaw(bench: PigpioBench) -> None:
+def thaw(bench: Bench) -> None:
     """Pigpiod goes on, and has carried out all that it was sent when this returns."""
     bench.faults.clear()
     with bench.client() as client:
         client.get_pigpio_version()
 
 
-def test_a_late_answer_now_and_then_does_not_end_the_link(bench: PigpioBench) -> None:
+def test_a_late_answer_now_and_then_does_not_end_the_link(bench: Bench) -> None:
     servo = bench.servo()
     for _ in range(4):
         servo.write(0.5)
@@ -43,7 +43,7 @@ def test_a_late_answer_now_and_then_does_not_end_the_link(bench: PigpioBench) ->
     assert {width for _, width in bench.daemon.history(GPIO)} == {1800}
 
 
-def stall(bench: PigpioBench) -> None:
+def stall(bench: Bench) -> None:
     """The machine is so busy that the next command takes 0.3 s of real time."""
     commands = bench.daemon._commands
     execute = commands.execute
@@ -56,7 +56,7 @@ def stall(bench: PigpioBench) -> None:
     commands.execute = stalling  # type: ignore[method-assign]
 
 
-def test_in_virtual_time_no_answer_is_late_because_the_machine_is_busy(bench: PigpioBench) -> None:
+def test_in_virtual_time_no_answer_is_late_because_the_machine_is_busy(bench: Bench) -> None:
     servo = bench.servo()
     stall(bench)
     servo.write(0.5)  # which connects
@@ -66,7 +66,7 @@ def test_in_virtual_time_no_answer_is_late_because_the_machine_is_busy(bench: Pi
     assert servo.driver.counters() == {"servo_reconnects": 0, "servo_late_answers": 0}
 
 
-def test_the_third_late_answer_in_a_row_ends_it(bench: PigpioBench) -> None:
+def test_the_third_late_answer_in_a_row_ends_it(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     late_tick(bench, servo, 0.5)
@@ -76,7 +76,7 @@ def test_the_third_late_answer_in_a_row_ends_it(bench: PigpioBench) -> None:
 
 
 def test_where_the_next_tick_would_come_after_the_countdown_the_first_one_ends_it(
-    bench: PigpioBench,
+    bench: Bench,
 ) -> None:
     servo = bench.servo(tick=0.2)  # and so a countdown of 0.6 s
     servo.write(0.5)
@@ -85,7 +85,7 @@ def test_where_the_next_tick_would_come_after_the_countdown_the_first_one_ends_i
         late_tick(bench, servo, 0.5)
 
 
-def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: PigpioBench) -> None:
+def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(TICK)
@@ -97,7 +97,7 @@ def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: PigpioBen
         servo.write(0.5)
 
 
-def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: PigpioBench) -> None:
+def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")
@@ -109,9 +109,7 @@ def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: Pigpi
     assert bench.width == 0
 
 
-def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(
-    bench: PigpioBench,
-) -> None:
+def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")
@@ -128,7 +126,7 @@ def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(
 @pytest.mark.realtime
 def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() -> None:
     with contextlib.ExitStack() as stack:
-        bench = PigpioBench(stack, SystemClock())
+        bench = Bench(stack, SystemClock())
         servo = bench.servo(replace(bench.settings(), timeout=0.03))
         servo.write(0.5)
         bench.faults.inject("pigpiod-frozen")
@@ -141,7 +139,7 @@ def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() 
         assert max(durations) < 0.06  # twice the limit, for a machine that is busy
 
 
-def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: PigpioBench) -> None:
+def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: Bench) -> None:
     settings = bench.settings()
     servo = bench.servo(replace(settings, countdown=1.0))
     servo.write(0.5)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from msgspec.structs import replace
-from rigs.pigpio_rig import PigpioBench
+from rigs.pigpio_rig import Bench
 from rigs.processes import PATIENCE
 
 from fishd.core.clock import SystemClock
@@ -20,7 +20,7 @@ BOUND = 0.05
 """No write may take longer, on a machine that is busy with other things [s]; the limit is 8 ms."""
 
 
-class Bench(PigpioBench):
+class Swimming(Bench):
     """A pigpiod in real time, with a servo that swims."""
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
@@ -44,9 +44,9 @@ class Bench(PigpioBench):
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
+def bench() -> Iterator[Swimming]:
     with contextlib.ExitStack() as stack:
-        yield Bench(stack)
+        yield Swimming(stack)
 
 
 def eventually(condition: Callable[[], bool], seconds: float = 10.0) -> None:
@@ -56,12 +56,12 @@ def eventually(condition: Callable[[], bool], seconds: float = 10.0) -> None:
         time.sleep(0.01)
 
 
-def test_a_healthy_pigpiod_takes_the_first_write(bench: Bench) -> None:
+def test_a_healthy_pigpiod_takes_the_first_write(bench: Swimming) -> None:
     bench.write_until_it_works(0.5)
     assert bench.width == 1800
 
 
-def test_one_thread_and_one_connection_are_all_it_needs(bench: Bench) -> None:
+def test_one_thread_and_one_connection_are_all_it_needs(bench: Swimming) -> None:
     kinds = [type(thread).__name__ for thread in threading.enumerate()]
     assert "_callback_thread" not in kinds
     names = [thread.name for thread in threading.enumerate()]
@@ -71,7 +71,7 @@ def test_one_thread_and_one_connection_are_all_it_needs(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("fault", "forgiven"), [("pigpiod-gone", 0), ("pigpiod-frozen", 2)])
-def test_no_write_is_held_up(bench: Bench, fault: str, forgiven: int) -> None:
+def test_no_write_is_held_up(bench: Swimming, fault: str, forgiven: int) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     errors, durations = [], []
@@ -90,7 +90,7 @@ def test_no_write_is_held_up(bench: Bench, fault: str, forgiven: int) -> None:
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_no_release_is_held_up_either(bench: Bench, fault: str) -> None:
+def test_no_release_is_held_up_either(bench: Swimming, fault: str) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     for _ in range(3):
@@ -101,7 +101,7 @@ def test_no_release_is_held_up_either(bench: Bench, fault: str) -> None:
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_no_thread_spins_meanwhile(bench: Bench, fault: str) -> None:
+def test_no_thread_spins_meanwhile(bench: Swimming, fault: str) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     bench.write(0.5)
@@ -111,7 +111,7 @@ def test_no_thread_spins_meanwhile(bench: Bench, fault: str) -> None:
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen", "pigpiod-restart"])
-def test_pulses_come_back_only_with_a_write(bench: Bench, fault: str) -> None:
+def test_pulses_come_back_only_with_a_write(bench: Swimming, fault: str) -> None:
     bench.write_until_it_works(0.5)
     before = bench.swimmer.driver.counters()["servo_reconnects"]
     bench.faults.inject(fault)
@@ -125,7 +125,7 @@ def test_pulses_come_back_only_with_a_write(bench: Bench, fault: str) -> None:
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-frozen", "pigpiod-restart"])
-def test_the_countdown_is_there_again_after_a_reconnection(bench: Bench, fault: str) -> None:
+def test_the_countdown_is_there_again_after_a_reconnection(bench: Swimming, fault: str) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     eventually(lambda: bench.write(0.5) is not None)
@@ -136,7 +136,7 @@ def test_the_countdown_is_there_again_after_a_reconnection(bench: Bench, fault: 
     assert bench.scripts() == 1
 
 
-def test_without_a_pigpiod_it_starts_all_the_same_and_connects_later(bench: Bench) -> None:
+def test_without_a_pigpiod_it_starts_all_the_same_and_connects_later(bench: Swimming) -> None:
     bench.swimmer.close()
     bench.faults.inject("pigpiod-gone")
     begun = time.monotonic()
@@ -151,7 +151,7 @@ def test_without_a_pigpiod_it_starts_all_the_same_and_connects_later(bench: Benc
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_closing_takes_a_bounded_time(bench: Bench, fault: str) -> None:
+def test_closing_takes_a_bounded_time(bench: Swimming, fault: str) -> None:
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     eventually(lambda: bench.write(0.5) is not None)
@@ -163,7 +163,9 @@ def test_closing_takes_a_bounded_time(bench: Bench, fault: str) -> None:
     assert "pigpio-link" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_an_emergency_release_from_another_thread_does_not_disturb_the_writes(bench: Bench) -> None:
+def test_an_emergency_release_from_another_thread_does_not_disturb_the_writes(
+    bench: Swimming,
+) -> None:
     bench.write_until_it_works(0.5)
     stop = threading.Event()
     failures = []

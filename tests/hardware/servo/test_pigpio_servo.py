@@ -2,13 +2,13 @@
 
 import pytest
 from msgspec.structs import replace
-from rigs.pigpio_rig import FRAME, GPIO, TICK, PigpioBench
+from rigs.pigpio_rig import FRAME, GPIO, TICK, Bench
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ServoError
 
 
-def test_a_write_makes_the_pulse_of_the_angle(bench: PigpioBench) -> None:
+def test_a_write_makes_the_pulse_of_the_angle(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     assert bench.width == 1800
@@ -17,12 +17,12 @@ def test_a_write_makes_the_pulse_of_the_angle(bench: PigpioBench) -> None:
     assert bench.width == 1200
 
 
-def test_a_pulse_is_rounded_to_the_microsecond_not_cut_off(bench: PigpioBench) -> None:
+def test_a_pulse_is_rounded_to_the_microsecond_not_cut_off(bench: Bench) -> None:
     bench.servo().write(0.4999)  # 1799.94 µs
     assert bench.width == 1800
 
 
-def test_nothing_moves_before_the_first_write(bench: PigpioBench) -> None:
+def test_nothing_moves_before_the_first_write(bench: Bench) -> None:
     servo = bench.servo()
     servo.release()
     bench.wait(1.0)
@@ -30,7 +30,7 @@ def test_nothing_moves_before_the_first_write(bench: PigpioBench) -> None:
 
 
 def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_half_a_second_later(
-    bench: PigpioBench,
+    bench: Bench,
 ) -> None:
     servo = bench.servo(calibration=ServoCalibration(trim=25))
     for _ in range(10):
@@ -44,7 +44,7 @@ def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_half_a_second_late
     assert 0.49 <= off - neutral <= 0.54
 
 
-def test_the_countdown_knows_the_newest_neutral(bench: PigpioBench) -> None:
+def test_the_countdown_knows_the_newest_neutral(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     servo.recalibrate(ServoCalibration(trim=-40.4))
@@ -53,7 +53,7 @@ def test_the_countdown_knows_the_newest_neutral(bench: PigpioBench) -> None:
     assert bench.width == 1460
 
 
-def test_regular_writes_keep_the_countdown_from_ending(bench: PigpioBench) -> None:
+def test_regular_writes_keep_the_countdown_from_ending(bench: Bench) -> None:
     servo = bench.servo()
     for _ in range(100):
         servo.write(0.3)
@@ -63,7 +63,7 @@ def test_regular_writes_keep_the_countdown_from_ending(bench: PigpioBench) -> No
 
 @pytest.mark.parametrize(("tick", "countdown", "seconds"), [(0.2, 0.2, 0.6), (TICK, 1.0, 1.0)])
 def test_a_slow_loop_has_three_ticks_and_a_longer_countdown_forgives_longer_stalls(
-    bench: PigpioBench, tick: float, countdown: float, seconds: float
+    bench: Bench, tick: float, countdown: float, seconds: float
 ) -> None:
     servo = bench.servo(replace(bench.settings(), countdown=countdown), tick=tick)
     servo.write(0.5)
@@ -73,7 +73,7 @@ def test_a_slow_loop_has_three_ticks_and_a_longer_countdown_forgives_longer_stal
     assert (bench.width, servo.driver.countdown) == (1500, seconds)
 
 
-def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench) -> None:
+def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(0.4)
@@ -86,7 +86,7 @@ def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench)
 
 @pytest.mark.parametrize("while_it_is", [TICK, 0.4], ids=["swimming", "held at neutral"])
 def test_a_release_stops_the_pulses_and_disarms_the_countdown(
-    bench: PigpioBench, while_it_is: float
+    bench: Bench, while_it_is: float
 ) -> None:
     servo = bench.servo()
     servo.write(0.5)
@@ -101,7 +101,7 @@ def test_a_release_stops_the_pulses_and_disarms_the_countdown(
 
 @pytest.mark.parametrize("pause", [0.05, 1.0])
 def test_writing_after_a_release_brings_pulses_back_with_their_countdown(
-    bench: PigpioBench, pause: float
+    bench: Bench, pause: float
 ) -> None:
     servo = bench.servo()
     servo.write(0.5)
@@ -113,7 +113,7 @@ def test_writing_after_a_release_brings_pulses_back_with_their_countdown(
     assert bench.width == 1500
 
 
-def test_close_releases_and_leaves_no_script(bench: PigpioBench) -> None:
+def test_close_releases_and_leaves_no_script(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     servo.close()
@@ -124,7 +124,7 @@ def test_close_releases_and_leaves_no_script(bench: PigpioBench) -> None:
         servo.write(0.0)
 
 
-def test_close_says_when_pulses_may_still_be_on(bench: PigpioBench) -> None:
+def test_close_says_when_pulses_may_still_be_on(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")

@@ -6,21 +6,21 @@ from collections.abc import Iterator
 
 import pigpio
 import pytest
-from rigs.pigpiod_client import GPIO, PigpiodBench, dispose, eventually, pigpiod_bench
+from rigs.pigpiod_client import GPIO, Bench, dispose, eventually, pigpiod_bench
 
 from fishd.core.clock import SystemClock
 from fishd.hardware.servo.pigpio_pulses import COUNTDOWN
 
 
 @pytest.fixture
-def bench() -> Iterator[PigpiodBench]:
+def bench() -> Iterator[Bench]:
     with pigpiod_bench() as bench:
         bench.pi.set_servo_pulsewidth(GPIO, 1600)
         bench.sleep(0.05)
         yield bench
 
 
-def answers(bench: PigpiodBench) -> bool:
+def answers(bench: Bench) -> bool:
     """Whether a daemon listens."""
     try:
         socket.create_connection(("127.0.0.1", bench.daemon.port), 1.0).close()
@@ -29,7 +29,7 @@ def answers(bench: PigpiodBench) -> bool:
     return True
 
 
-def test_it_comes_back_on_the_same_port_without_scripts_and_pulses(bench: PigpiodBench) -> None:
+def test_it_comes_back_on_the_same_port_without_scripts_and_pulses(bench: Bench) -> None:
     port = bench.daemon.port
     bench.stored(COUNTDOWN)
     bench.faults.inject("pigpiod-gone", 2.0)
@@ -45,7 +45,7 @@ def test_it_comes_back_on_the_same_port_without_scripts_and_pulses(bench: Pigpio
     assert bench.result("get_servo_pulsewidth", GPIO) == pigpio.PI_NOT_SERVO_GPIO
 
 
-def test_frozen_its_pulses_go_on_and_its_scripts_stand_still(bench: PigpiodBench) -> None:
+def test_frozen_its_pulses_go_on_and_its_scripts_stand_still(bench: Bench) -> None:
     number = bench.stored(COUNTDOWN)
     bench.pi.run_script(number, [20, GPIO, 1500])
     bench.sleep(0.1)

@@ -171,14 +171,6 @@ def test_a_fish_at_rest_stays_at_rest_and_feels_nothing() -> None:
     assert window.fin_peak == 0.0
 
 
-def test_without_pulses_the_wheel_keeps_its_angle_and_the_fin_settles_there() -> None:
-    p = PlantParameters()
-    fish = TetheredFish(p, PlantState(phi=0.3))
-    for _ in range(100):
-        fish.advance(None, 0.05, samples=1)
-    assert fish.state == pytest.approx((0.3, 0.3 * p.coupling, 0.0), abs=1e-12)
-
-
 @pytest.mark.parametrize(
     ("fault", "steps"),
     [  # a command, and the wheel angle that the fin has followed then [rad]
@@ -196,15 +188,6 @@ def test_slack_play_and_a_dead_zone_are_taken_off_what_the_fin_follows(
     for command, followed in steps:
         fish.advance(command, 5.0, samples=1)
         assert fish.state.alpha == pytest.approx(0.46 * followed, rel=1e-6, abs=0.0)
-
-
-def test_a_wheel_that_takes_up_slack_turns_and_one_in_its_dead_zone_does_not() -> None:
-    slack = TetheredFish(PlantParameters(cable_slack=0.1))
-    lazy = TetheredFish(PlantParameters(servo_dead_zone=0.1))
-    for fish in (slack, lazy):
-        fish.advance(0.099, 0.2, samples=1)
-    assert slack.state.phi > 0.09
-    assert lazy.state.phi == 0.0
 
 
 @pytest.mark.parametrize("delay", [0.03, 0.05, 0.08])
