@@ -43,7 +43,7 @@ def test_a_fade_reaches_neutral_and_stays_there(
 
 
 @given(amplitudes, ticks)
-def test_the_default_slew_limit_leaves_a_full_square_wave_untouched(
+def test_the_default_slew_limit_leaves_a_square_wave_as_it_is(
     amplitude: float, tick: float
 ) -> None:
     guard = Guard(amplitude, tick, None, fade_time=0.4)
@@ -105,9 +105,7 @@ CHOICES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slew_limit", [None, 3.0])
-def test_ten_thousand_switches_stay_within_amplitude_and_slew_limit(
-    slew_limit: float | None,
-) -> None:
+def test_ten_thousand_switches_stay_within_amplitude_and_slew(slew_limit: float | None) -> None:
     rig = Rig(f"slew_limit={'null' if slew_limit is None else slew_limit}")
     generator = random.Random(7)
     step = 0.84 if slew_limit is None else slew_limit * 0.05

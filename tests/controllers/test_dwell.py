@@ -84,9 +84,7 @@ def test_without_a_dwell_every_command_passes() -> None:
     st.sampled_from([0.005, 0.02, 0.05, 0.2]),
     st.sampled_from([0.01, 0.1, 0.2, 0.5]),
 )
-def test_whatever_is_wanted_no_reversal_comes_too_soon(
-    wanted: list[float], tick: float, dwell: float
-) -> None:
+def test_no_reversal_comes_too_soon(wanted: list[float], tick: float, dwell: float) -> None:
     limits = replace(LIMITS, chatter=PATIENT)
     angles = limited(wanted, dwell, tick, limits)
     for before, now in pairwise(reversals(angles)):

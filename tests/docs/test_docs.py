@@ -104,9 +104,7 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
 
 @each_document
 @pytest.mark.parametrize("program", [fishctl, fishd], ids=["fishctl", "fishd"])
-def test_every_verb_and_option_of_a_command_line_exists(
-    document: Path, program: click.Command
-) -> None:
+def test_each_verb_and_option_of_a_command_exists(document: Path, program: click.Command) -> None:
     lines = command_lines(document, program.name or "")
     problems = [found for words in lines if (found := complaint(program, words))]
     assert not problems

@@ -25,11 +25,7 @@ class Laptop:
 
     def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [FISHCTL, *arguments],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            check=False,
+            [FISHCTL, *arguments], env=self.environment, capture_output=True, text=True, check=False
         )
 
 
@@ -93,9 +89,7 @@ def test_it_can_be_named_in_the_configuration(laptop: Laptop, tmp_path: Path) ->
     ],
     ids=["out of its bounds", "at odds with another", "beyond the robot"],
 )
-def test_a_bad_parameter_is_refused_in_one_line(
-    laptop: Laptop, option: str, complaint: str
-) -> None:
+def test_a_bad_parameter_is_one_line(laptop: Laptop, option: str, complaint: str) -> None:
     done = laptop.fishctl("simulate", "chirp", option)
     assert done.returncode == 1
     assert done.stderr.startswith(f"fishctl: {complaint}")

@@ -141,9 +141,7 @@ def test_hx711_a_pulse_that_lasts_too_long_costs_a_start_and_no_wrong_sample(
     assert all((p.vx, p.vy) == pytest.approx((1e-3, -2e-3), abs=1e-8) for p in pairs)
 
 
-def test_hx711_a_wire_that_is_off_is_named_and_comes_back(
-    load_cells: Callable[..., LoadCells],
-) -> None:
+def test_hx711_a_wire_that_is_off_is_named_till_back(load_cells: Callable[..., LoadCells]) -> None:
     with load_cells() as rig:
         rig.run(0.5)
         rig.gpio.unplugged.add(13)
@@ -279,7 +277,7 @@ def board(_installed: None) -> Iterator[ServoBoard]:
 
 
 @pytest.mark.parametrize("frequency", [50.0, 100.0, 333.0])
-def test_pca9685_an_angle_becomes_a_pulse_within_half_a_count(
+def test_pca9685_an_angle_is_a_pulse_within_half_a_count(
     board: ServoBoard, frequency: float
 ) -> None:
     servo = board.servo(frequency=frequency)
@@ -367,9 +365,7 @@ def test_pca9685_the_last_resort_goes_to_neutral_and_ends_the_pulses(board: Serv
     assert 0.28 < off - neutral < 0.33
 
 
-def test_pca9685_the_last_resort_ends_the_pulses_though_neutral_is_refused(
-    board: ServoBoard,
-) -> None:
+def test_pca9685_the_last_resort_ends_pulses_though_neutral_is_refused(board: ServoBoard) -> None:
     board.servo().write(0.5)
     board.chip.refused = {(LED0 + 4 * 3, 0)}
     with pytest.raises(ServoError, match="nothing answers"):
@@ -397,9 +393,7 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
     assert sum(tick.fx for tick in ticks) / len(ticks) == pytest.approx(THRUST, rel=0.05)
 
 
-def test_doctor_names_both_and_makes_their_checks_and_release_works(
-    site: Path, tmp_path: Path
-) -> None:
+def test_doctor_names_both_with_their_checks_and_release_works(site: Path, tmp_path: Path) -> None:
     servo = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
     found = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
     assert found["drivers"]["message"] == (

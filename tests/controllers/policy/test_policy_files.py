@@ -61,9 +61,7 @@ def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) 
     assert (tmp_path / "trace").exists()  # so it was a trap
 
 
-def test_an_archive_of_torch_or_stable_baselines_is_refused_and_never_unpickled(
-    tmp_path: Path,
-) -> None:
+def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_path: Path) -> None:
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as made:
         made.writestr("policy/data.pkl", pickle.dumps(Trap(tmp_path / "trace")))
@@ -219,7 +217,7 @@ def test_a_card_with_more_features_than_the_network_has_inputs_is_refused() -> N
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("layer", [0, 1, 2])
-def test_weights_that_are_not_finite_are_refused_even_where_tanh_hides_them(
+def test_weights_that_are_not_finite_are_refused_though_tanh_hides_them(
     bad: float, layer: int
 ) -> None:
     content = to_onnx(random_layers(1, 8, 8, 1), "tanh", card())
@@ -278,9 +276,7 @@ def test_a_path_that_leads_to_no_file_is_named(tmp_path: Path, name: str, messag
     assert str(caught.value) == f"{tmp_path / name}: {message}"
 
 
-def test_a_service_says_where_a_file_that_it_cannot_see_belongs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_service_says_where_a_file_it_cannot_see_belongs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/fishd")
     with pytest.raises(PolicyError) as caught:
         file.read(Path("/home/nobody-here/swim.onnx"))

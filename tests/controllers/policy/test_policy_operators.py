@@ -170,9 +170,7 @@ def test_a_size_that_the_file_only_claims_does_not_count() -> None:
     assert "its network computes 1e+10 values" in refusal(sealed(model))
 
 
-def test_a_network_that_takes_more_than_half_a_tick_is_refused_with_its_time(
-    tmp_path: Path,
-) -> None:
+def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path: Path) -> None:
     """80 products with the same weights: some 8 ms on a fast machine, for a tick of 2 ms."""
     names = ["wide", *(f"v{number}" for number in range(79)), "narrow"]
     chain = [make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)]

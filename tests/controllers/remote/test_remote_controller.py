@@ -15,7 +15,7 @@ from fishd.controllers.remote.wire import Wire
 from fishd.core.errors import ConfigError, ParameterError
 
 
-def test_an_action_is_in_force_in_the_tick_whose_observation_it_answers(
+def test_an_action_is_in_force_in_the_tick_that_it_answers(
     still: Rig, agent: ScriptedAgent
 ) -> None:
     angles = {n: 0.4 * math.sin(n) for n in range(1, 51)}
@@ -124,9 +124,7 @@ def test_ticks_without_an_observation_are_lost_too(rig: Rig, agent: ScriptedAgen
     assert agent.seen[0]["lost"] == rig.index - 1 >= 7
 
 
-def test_a_pause_is_neutral_and_silent_and_ends_when_it_is_told(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2)
     with agent.answering(lambda seen: agent.action(0.2)):
         while rig.run()[-1].phi_c == 0.0:
@@ -187,9 +185,7 @@ def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) 
     assert [seen["seq"] for seen in agent.seen] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
 
 
-def test_each_take_over_has_a_session_of_its_own_whose_end_is_told(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_each_take_over_is_a_session_whose_end_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     first = connect(rig, agent)["session"]
     second = connect(rig, agent)["session"]
     rig.start("hold")
@@ -254,9 +250,7 @@ def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to(address: 
         load(None, ["start.controller=remote", f"start.parameters.agent='{address}'"])
 
 
-def test_deadlines_change_while_it_swims_but_the_agent_stays(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_deadlines_change_while_it_swims_the_agent_stays(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
     rig.retune(misses=7)
     assert rig.loop.active.controller.parameters.misses == 7

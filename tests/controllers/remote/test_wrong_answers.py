@@ -71,7 +71,7 @@ def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("seq", [-3, 0, 2, 8, 10**18])
-def test_an_action_for_what_was_never_sent_is_a_fault(
+def test_an_action_for_what_was_not_sent_is_a_fault(
     rig: Rig, agent: ScriptedAgent, seq: int
 ) -> None:
     assert connect(rig, agent)["seq"] == 1
@@ -82,9 +82,7 @@ def test_an_action_for_what_was_never_sent_is_a_fault(
     assert f"an action for observation {seq}, which was never sent; the latest is 1" in reason(rig)
 
 
-def test_answers_that_name_another_session_are_told_from_late_ones(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
     with agent.answering(lambda seen: agent.action(0.1)):
         while rig.run()[-1].phi_c == 0.0:
@@ -98,9 +96,7 @@ def test_answers_that_name_another_session_are_told_from_late_ones(
     assert int(said[2]) >= 4
 
 
-def test_before_the_first_action_the_wrong_answers_are_counted_too(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, first_action=2.0)
     with agent.answering(lambda seen: agent.action(0.3, session="0123")):
         rig.run(10)
@@ -125,9 +121,7 @@ def flip(agent: ScriptedAgent, seen: dict[str, float]) -> dict[str, object]:
     return agent.action(0.42 if seen["instruction_angle"] <= 0.0 else -0.42)
 
 
-def test_without_a_dwell_an_agent_may_reverse_in_every_tick(
-    still: Rig, agent: ScriptedAgent
-) -> None:
+def test_without_a_dwell_an_agent_may_reverse_every_tick(still: Rig, agent: ScriptedAgent) -> None:
     still.start("remote", agent=agent.address)
     with agent.answering(lambda seen: flip(agent, seen)):
         angles = [tick.phi_c for tick in still.run(100)]
@@ -154,7 +148,7 @@ def test_a_dwell_can_be_changed_in_flight(still: Rig, agent: ScriptedAgent) -> N
     assert angles == [0.42, 0.42, -0.42, -0.42] * 2
 
 
-def test_an_agent_that_insists_loses_command_to_swing_and_is_told(
+def test_an_agent_that_insists_is_told_and_swing_takes_over(
     still: Rig, agent: ScriptedAgent
 ) -> None:
     still.start("remote", agent=agent.address, dwell=0.2)

@@ -144,9 +144,7 @@ def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: Fo
 
 
 @pytest.mark.parametrize("data_rate", [8, 16, 32])
-def test_no_measurement_is_newer_than_its_tick_though_a_conversion_outlasts_it(
-    data_rate: int,
-) -> None:
+def test_no_measurement_is_newer_than_its_tick_if_a_conversion_outlasts_it(data_rate: int) -> None:
     with ForceRig(noise=0.0) as rig:
         rig.volts["A0-A1"] = lambda t: 0.1 * t
         found = Ticks(rig.sensor(data_rate=data_rate)).run(5.0)

@@ -98,9 +98,7 @@ def test_the_limit_is_of_forces_and_not_of_voltages(rig: ForceRig) -> None:
     assert ticks.next().suspect.startswith("F_x is +50.")
 
 
-def test_a_suspicion_is_of_the_window_it_came_with_and_not_of_reads_without_a_sample(
-    rig: ForceRig,
-) -> None:
+def test_a_suspicion_is_of_its_own_window_and_not_of_reads_without_a_sample(rig: ForceRig) -> None:
     rig.volts["A0-A1"] = lambda t: 3.0 if t < 0.1 else 0.5  # in the first conversion only
     found = Ticks(rig.sensor(data_rate=8)).run(1.5)
     read = [item for item in found if not isinstance(item, str)]

@@ -233,9 +233,7 @@ def test_a_watch_finds_mean_and_deviation_of_all_pairs(parts: list[list[tuple[in
 
 
 @pytest.mark.parametrize("tick", [0.005, 0.01, 0.02, 0.05, 0.1, 0.2])
-def test_a_loop_of_any_tick_gets_most_of_the_samples_there_could_be(
-    rig: ForceRig, tick: float
-) -> None:
+def test_a_loop_of_any_tick_gets_most_of_the_possible_samples(rig: ForceRig, tick: float) -> None:
     ticks = Ticks(rig.sensor(tick=tick), tick)
     ticks.run(0.05)
     found = ticks.run(2.0)

@@ -75,9 +75,7 @@ def _without_blocking_error(call: Any) -> Any:
     return as_raw_file
 
 
-def test_while_a_chip_is_away_the_pauses_between_attempts_grow_to_half_a_second(
-    rig: ForceRig,
-) -> None:
+def test_while_a_chip_is_away_pauses_between_attempts_grow_to_half_a_second(rig: ForceRig) -> None:
     sampler = rig.sampler()
     take_pairs(sampler, rig, 0.1)
     rig.faults.inject("unplugged")
@@ -169,7 +167,7 @@ def test_sampling_leaves_no_garbage(rig: ForceRig) -> None:
         gc.enable()
 
 
-def test_a_bus_that_cannot_even_be_closed_is_opened_again(
+def test_a_bus_that_cannot_be_closed_is_reopened(
     rig: ForceRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from Adafruit_PureIO import smbus
@@ -198,9 +196,7 @@ def test_a_bus_that_cannot_even_be_closed_is_opened_again(
     sampler.close()
 
 
-def test_a_hanging_bus_keeps_the_sampler_for_20_ms_and_not_for_the_kernels_whole_second(
-    rig: ForceRig,
-) -> None:
+def test_a_hanging_bus_keeps_the_sampler_for_20_ms_not_the_kernels_second(rig: ForceRig) -> None:
     sampler = rig.sampler()
     take_pairs(sampler, rig, 0.1)
     rig.faults.inject("timeout")

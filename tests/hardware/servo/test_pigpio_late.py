@@ -75,9 +75,7 @@ def test_the_third_late_answer_in_a_row_ends_it(bench: Bench) -> None:
         late_tick(bench, servo, 0.5)
 
 
-def test_where_the_next_tick_would_come_after_the_countdown_the_first_one_ends_it(
-    bench: Bench,
-) -> None:
+def test_where_the_next_tick_would_come_after_the_countdown_the_first_ends_it(bench: Bench) -> None:
     servo = bench.servo(tick=0.2)  # and so a countdown of 0.6 s
     servo.write(0.5)
     bench.wait(0.45)

@@ -163,9 +163,7 @@ def test_closing_takes_a_bounded_time(bench: Swimming, fault: str) -> None:
     assert "pigpio-link" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_an_emergency_release_from_another_thread_does_not_disturb_the_writes(
-    bench: Swimming,
-) -> None:
+def test_an_emergency_release_of_another_thread_does_not_disturb_writes(bench: Swimming) -> None:
     bench.write_until_it_works(0.5)
     stop = threading.Event()
     failures = []

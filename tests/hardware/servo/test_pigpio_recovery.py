@@ -22,9 +22,7 @@ def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(ben
     assert all(width in (1500, 0) for _, width in bench.changes_after(started))
 
 
-def test_the_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(
-    bench: Bench,
-) -> None:
+def test_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(bench: Bench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.05)
     with pytest.raises(ServoError, match="soft limits"):
@@ -171,9 +169,7 @@ def leave_pulses_of_the_peripheral(bench: Bench, width: float = 1740.0) -> None:
     assert bench.width == pytest.approx(width, abs=0.1)
 
 
-def test_pulses_of_the_peripheral_go_on_when_pigpiod_is_started_again_which_knows_nothing_of_them(
-    bench: Bench,
-) -> None:
+def test_pulses_of_the_peripheral_go_on_when_pigpiod_is_started_again(bench: Bench) -> None:
     leave_pulses_of_the_peripheral(bench)
     bench.faults.inject("pigpiod-restart")
     bench.wait(1.0)
@@ -187,9 +183,7 @@ def test_pulses_of_the_peripheral_go_on_when_pigpiod_is_started_again_which_know
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_the_last_resort_ends_pulses_of_the_peripheral_at_neutral_and_says_so(
-    bench: Bench, restarted: bool
-) -> None:
+def test_the_last_resort_ends_them_at_neutral_and_says_so(bench: Bench, restarted: bool) -> None:
     leave_pulses_of_the_peripheral(bench)
     if restarted:
         bench.faults.inject("pigpiod-restart")
@@ -202,9 +196,7 @@ def test_the_last_resort_ends_pulses_of_the_peripheral_at_neutral_and_says_so(
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_a_fishd_that_starts_ends_pulses_of_the_peripheral_at_neutral(
-    bench: Bench, restarted: bool
-) -> None:
+def test_a_fishd_that_starts_ends_them_at_neutral(bench: Bench, restarted: bool) -> None:
     leave_pulses_of_the_peripheral(bench)
     if restarted:
         bench.faults.inject("pigpiod-restart")

@@ -29,9 +29,7 @@ def test_nothing_moves_before_the_first_write(bench: Bench) -> None:
     assert bench.width == 0
 
 
-def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_half_a_second_later(
-    bench: Bench,
-) -> None:
+def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_after_0_5_more(bench: Bench) -> None:
     servo = bench.servo(calibration=ServoCalibration(trim=25))
     for _ in range(10):
         servo.write(0.5)
@@ -85,9 +83,7 @@ def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: Bench) -> No
 
 
 @pytest.mark.parametrize("while_it_is", [TICK, 0.4], ids=["swimming", "held at neutral"])
-def test_a_release_stops_the_pulses_and_disarms_the_countdown(
-    bench: Bench, while_it_is: float
-) -> None:
+def test_a_release_stops_pulses_and_disarms_the_countdown(bench: Bench, while_it_is: float) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(while_it_is)
@@ -100,7 +96,7 @@ def test_a_release_stops_the_pulses_and_disarms_the_countdown(
 
 
 @pytest.mark.parametrize("pause", [0.05, 1.0])
-def test_writing_after_a_release_brings_pulses_back_with_their_countdown(
+def test_a_write_after_a_release_brings_pulses_and_countdown_back(
     bench: Bench, pause: float
 ) -> None:
     servo = bench.servo()

@@ -51,9 +51,7 @@ def test_another_calibration_holds_from_the_next_write_on() -> None:
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf, 1.3, -1.3])
-def test_an_angle_that_is_not_finite_or_out_of_limits_never_reaches_the_driver(
-    angle: float,
-) -> None:
+def test_an_angle_that_is_not_finite_or_within_limits_never_reaches_a_driver(angle: float) -> None:
     made = servo()
     with pytest.raises(ServoError, match="soft limits"):
         made.write(angle)

@@ -68,9 +68,7 @@ def test_opening_claims_the_pin_low_without_pulses(pins: Pins, servo: Calibrated
     assert pins.pwm(18) is None
 
 
-def test_release_goes_on_without_pulses_and_write_begins_again(
-    pins: Pins, servo: CalibratedServo
-) -> None:
+def test_a_release_ends_pulses_and_a_write_begins_again(pins: Pins, servo: CalibratedServo) -> None:
     servo.write(0.5)
     servo.release()
     servo.release()
@@ -140,9 +138,7 @@ def test_it_says_that_its_pulses_jitter(servo: CalibratedServo) -> None:
     assert "jitter" in line
 
 
-def test_a_warning_of_the_library_becomes_a_line_of_the_log(
-    pins: Pins, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_librarys_warnings_are_logged(pins: Pins, caplog: pytest.LogCaptureFixture) -> None:
     from fishd.hardware import header
 
     caplog.set_level("INFO")

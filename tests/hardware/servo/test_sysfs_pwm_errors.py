@@ -68,7 +68,7 @@ def bench() -> BrokenBench:
         {("enable", 0)},
     ],
 )
-def test_the_last_resort_stops_the_pulses_whatever_step_fails(
+def test_the_last_resort_ends_pulses_whatever_fails(
     bench: BrokenBench, unwritable: set[tuple[str, int]]
 ) -> None:
     bench.kernel.unwritable = unwritable
@@ -99,7 +99,7 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Br
     ],
     ids=str,
 )
-def test_close_switches_off_a_channel_that_cannot_be_released(
+def test_close_ends_a_channel_that_cannot_be_released(
     bench: BrokenBench, broken: dict[str, Any]
 ) -> None:
     vars(bench.kernel).update(broken)

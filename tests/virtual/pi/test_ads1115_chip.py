@@ -52,9 +52,7 @@ def test_noise_is_as_large_as_asked_for_and_the_same_for_the_same_seed() -> None
 
 
 @pytest.mark.parametrize(("bits", "rate"), list(enumerate(DATA_RATES)))
-def test_a_conversion_lasts_one_period_of_a_data_rate_that_is_off_by_up_to_a_tenth(
-    bits: int, rate: int
-) -> None:
+def test_a_conversion_lasts_a_period_of_a_rate_that_is_off_by_a_tenth(bits: int, rate: int) -> None:
     lengths = []
     for seed in range(20):
         board = Board(seed=seed)

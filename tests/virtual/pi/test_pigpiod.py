@@ -120,7 +120,7 @@ def test_servo_0_lets_the_pulse_under_way_end_by_itself(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("off", [("hardware_PWM", GPIO, 0, 0), ("set_servo_pulsewidth", GPIO, 0)])
-def test_hardware_pwm_sends_duty_times_period_until_it_ends(
+def test_hardware_pwm_sends_duty_times_period_till_its_end(
     bench: Bench, off: tuple[str, int]
 ) -> None:
     for width in (1500, 1600):
@@ -177,9 +177,7 @@ def test_commands_may_arrive_in_any_pieces(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("garbage", [b"\xff" * 16, b"GET / HTTP/1.1\r\n\r\n"])
-def test_garbage_costs_its_sender_the_connection_and_nobody_else(
-    bench: Bench, garbage: bytes
-) -> None:
+def test_garbage_costs_its_sender_the_link_and_nobody_else(bench: Bench, garbage: bytes) -> None:
     with socket.create_connection(("127.0.0.1", bench.daemon.port)) as link:
         link.sendall(garbage)
         assert link.recv(64) == b""
