@@ -1,25 +1,23 @@
 """The packages in docs/example-drivers, installed and used as their reader would."""
 
 import json
-import os
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.example_drivers import (
+from rigs.example_packages import (
     BUS,
     MILLIVOLTS_PER_NEWTON,
     LoadCellRig,
     ServoBoardRig,
+    fishctl,
     forget_drivers,
     install,
 )
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.pca9685_chip import AUTO_INCREMENT, LED0, MODE1, PRE_SCALE, RESTART, SLEEP, Pca9685Chip
-from rigs.processes import FISHCTL
 
 from fishd import wiring
 from fishd.config import load
@@ -44,7 +42,7 @@ THRUST = 0.026
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    install(folder)
+    install(folder, "example-drivers")
     return folder
 
 
@@ -54,12 +52,6 @@ def _installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget_drivers()
     yield
     forget_drivers()
-
-
-def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(site), "XDG_RUNTIME_DIR": str(site)}
-    command = [FISHCTL, *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def options(*settings: str) -> list[str]:

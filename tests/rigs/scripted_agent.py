@@ -94,6 +94,13 @@ def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]
     raise AssertionError("no observation has come")
 
 
+def swim(rig: Rig, agent: ScriptedAgent, angle: float = 0.2) -> None:
+    """Tick until an action is in force."""
+    with agent.answering(lambda seen: agent.action(angle)):
+        while rig.run()[-1].phi_c == 0.0:
+            pass
+
+
 def reason(rig: Rig) -> str:
     """Of the fault, in words."""
     assert rig.loop.supervisor.reason

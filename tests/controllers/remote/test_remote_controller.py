@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from rigs.harness import LIMITS, Rig
-from rigs.scripted_agent import ScriptedAgent, connect, reason
+from rigs.scripted_agent import ScriptedAgent, connect, reason, swim
 
 from fishd.config import load
 from fishd.controllers import registry
@@ -52,9 +52,7 @@ def test_virtual_time_waits_for_a_slow_agent(still: Rig, agent: ScriptedAgent) -
 
 def test_silence_is_neutral_and_after_some_ticks_a_fault(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, deadline=0.03)
-    with agent.answering(lambda seen: agent.action(0.2)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     ticks = rig.run(4)
     assert [(tick.phi_c, tick.mode) for tick in ticks] == [(0.0, "running")] * 4
     assert rig.run()[-1].mode == "fault"
@@ -126,9 +124,7 @@ def test_ticks_without_an_observation_are_lost_too(rig: Rig, agent: ScriptedAgen
 
 def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2)
-    with agent.answering(lambda seen: agent.action(0.2)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     agent.drain()
     agent.send(agent.pause(100.0))
     time.sleep(0.02)
@@ -158,9 +154,7 @@ def test_a_pause_in_place_of_an_action_ends_the_wait(rig: Rig, agent: ScriptedAg
 
 def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2, deadline=0.001)
-    with agent.answering(lambda seen: agent.action(0.2)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     agent.drain()
     agent.send(agent.pause(1.0))
     time.sleep(0.02)

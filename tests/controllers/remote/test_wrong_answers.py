@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from rigs.harness import Rig
-from rigs.scripted_agent import ScriptedAgent, connect, reason
+from rigs.scripted_agent import ScriptedAgent, connect, reason, swim
 
 
 def spoiled(**changes: Any) -> dict[str, Any]:
@@ -84,9 +84,7 @@ def test_an_action_for_what_was_not_sent_is_a_fault(
 
 def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
-    with agent.answering(lambda seen: agent.action(0.1)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     with agent.answering(lambda seen: agent.action(0.3, session="0123")):
         assert {tick.phi_c for tick in rig.run(5)} == {0.0}
     assert rig.reason == "remote-silent"

@@ -129,12 +129,6 @@ def test_one_failed_transfer_fails_no_read() -> None:
     assert sensor.counters()["i2c_errors"] > 100
 
 
-def test_before_the_first_pair_a_read_says_so(rig: ForceRig) -> None:
-    sensor = rig.sensor()
-    with pytest.raises(SensorError, match="0x48 on /dev/i2c-1 has not delivered yet"):
-        sensor.read(0.0)
-
-
 def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: ForceRig) -> None:
     ticks = Ticks(rig.sensor(data_rate=16))
     found = measurements(ticks.run(3.0)[4:])
@@ -191,10 +185,6 @@ def test_a_watch_remembers_that_samples_were_suspect(rig: ForceRig) -> None:
     rig.faults.inject("clipped", 0.1)
     ticks.run(1.0)
     assert "is clipped at +2.048 V" in watch.close().suspect
-
-
-def test_a_watch_without_a_sample_has_no_pairs(rig: ForceRig) -> None:
-    assert rig.sensor().watch().close().pairs == 0
 
 
 def test_a_closed_sensor_can_be_closed_again_and_not_be_read(rig: ForceRig) -> None:

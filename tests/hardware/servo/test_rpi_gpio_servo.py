@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,15 +30,14 @@ def pins() -> Iterator[Pins]:
 
 @pytest.fixture
 def servo(pins: Pins) -> Iterator[CalibratedServo]:
-    servo = opened(SETTINGS, ServoCalibration(), VirtualClock())
+    servo = opened()
     yield servo
     servo.close()
 
 
-def opened(
-    settings: RpiGpioSettings, calibration: ServoCalibration, clock: VirtualClock
-) -> CalibratedServo:
-    return CalibratedServo(RpiGpio, settings, calibration, clock, threaded=False, tick=0.05)
+def opened(settings: RpiGpioSettings = SETTINGS, clock: Any = None) -> CalibratedServo:
+    time = clock or VirtualClock()
+    return CalibratedServo(RpiGpio, settings, ServoCalibration(), time, threaded=False, tick=0.05)
 
 
 def width(pins: Pins, gpio: int = 18) -> float:
@@ -55,7 +55,7 @@ def test_an_angle_becomes_a_pulse(pins: Pins, servo: CalibratedServo) -> None:
 
 
 def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
-    fast = opened(RpiGpioSettings(gpio=4, frequency=200.0), ServoCalibration(), VirtualClock())
+    fast = opened(RpiGpioSettings(gpio=4, frequency=200.0))
     fast.write(0.5)
     assert width(pins, 4) == pytest.approx(1800.0)
     assert pins.pwm(4) == (200.0, pytest.approx(36.0))
@@ -87,7 +87,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
     from RPi import GPIO
 
     clock = VirtualClock()
-    servo = opened(SETTINGS, ServoCalibration(), clock)
+    servo = opened(clock=clock)
     GPIO.setup(23, GPIO.OUT, initial=GPIO.HIGH)
     servo.write(0.5)
     before = clock.now
@@ -102,7 +102,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
 
 def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pins) -> None:
     pins.occupy(18)
-    servo = opened(SETTINGS, ServoCalibration(), VirtualClock())
+    servo = opened()
     for _ in range(2):
         with pytest.raises(ServoError, match=r"^servo on GPIO 18: GPIO busy$"):
             servo.write(0.0)
@@ -156,7 +156,7 @@ class TestALibraryThatCannotBeUsed:
 
     def start(self) -> str:
         with pytest.raises(StartupError) as caught:
-            opened(SETTINGS, ServoCalibration(), VirtualClock())
+            opened()
         assert "\n" not in str(caught.value)
         return str(caught.value)
 

@@ -7,30 +7,25 @@ from scipy.integrate import solve_ivp
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import REST, PlantState, TetheredFish, Window
 
+Fish = PlantParameters
 FISHES = {
-    "default": PlantParameters(),
-    "slack cables": PlantParameters(cable_slack=0.08),
-    "fast servo": PlantParameters(servo_speed=200.0, servo_lag=0.05),
-    "very fast servo, slack cables": PlantParameters(
-        servo_speed=1000.0, servo_lag=0.02, cable_slack=0.05
-    ),
-    "slow servo": PlantParameters(servo_speed=1.0, servo_lag=0.002),
-    "slow servo, very slack cables": PlantParameters(
-        servo_speed=2.0, servo_lag=0.02, cable_slack=0.3
-    ),
-    "backlash": PlantParameters(backlash=0.1),
-    "backlash and slack cables": PlantParameters(backlash=0.2, cable_slack=0.15),
-    "very fast servo, backlash": PlantParameters(servo_speed=1000.0, servo_lag=0.02, backlash=0.3),
-    "lazy servo": PlantParameters(servo_dead_zone=0.1),
-    "servo that pushes back": PlantParameters(servo_reaction=0.004, cable_slack=0.05),
-    "fast servo that pushes back": PlantParameters(
-        servo_speed=200.0, servo_lag=0.05, servo_reaction=-0.002
-    ),
-    "no damping": PlantParameters(xi=0.0),
-    "little damping": PlantParameters(xi=0.02),
-    "heavy damping": PlantParameters(xi=15.0),
-    "stiff fin": PlantParameters(omega0=60.0, xi=4.0),
-    "slow fin": PlantParameters(omega0=3.0, servo_speed=30.0, servo_lag=0.3),
+    "default": Fish(),
+    "slack cables": Fish(cable_slack=0.08),
+    "fast servo": Fish(servo_speed=200.0, servo_lag=0.05),
+    "very fast servo, slack cables": Fish(servo_speed=1000.0, servo_lag=0.02, cable_slack=0.05),
+    "slow servo": Fish(servo_speed=1.0, servo_lag=0.002),
+    "slow servo, very slack cables": Fish(servo_speed=2.0, servo_lag=0.02, cable_slack=0.3),
+    "backlash": Fish(backlash=0.1),
+    "backlash and slack cables": Fish(backlash=0.2, cable_slack=0.15),
+    "very fast servo, backlash": Fish(servo_speed=1000.0, servo_lag=0.02, backlash=0.3),
+    "lazy servo": Fish(servo_dead_zone=0.1),
+    "servo that pushes back": Fish(servo_reaction=0.004, cable_slack=0.05),
+    "fast servo that pushes back": Fish(servo_speed=200.0, servo_lag=0.05, servo_reaction=-0.002),
+    "no damping": Fish(xi=0.0),
+    "little damping": Fish(xi=0.02),
+    "heavy damping": Fish(xi=15.0),
+    "stiff fin": Fish(omega0=60.0, xi=4.0),
+    "slow fin": Fish(omega0=3.0, servo_speed=30.0, servo_lag=0.3),
 }
 
 REACTION_TIME = 0.01
