@@ -105,14 +105,6 @@ def test_a_force_that_is_lost_or_not_to_be_believed_ends_in_neutral_and_recovers
     assert_recovers_by_clear_fault_only(rig)
 
 
-def test_a_reset_of_the_chip_is_survived(rig: LockstepRig) -> None:
-    for _ in range(20):
-        rig.pi.faults.inject("brown-out")
-        rig.run_for(0.2)
-        assert rig.recorder.ticks[-1].samples >= 8
-    assert rig.mode == "running"
-
-
 def test_the_extremes_of_a_window_enclose_its_mean(rig: LockstepRig) -> None:
     for tick in rig.run_for(2.0):
         assert tick.fx_min < tick.fx < tick.fx_max

@@ -7,12 +7,10 @@ import time
 
 import pytest
 from fishd_zoo import RAISED
-from rigs.processes import wait_until
+from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.errors import Escaped
 from fishd.core.foreign_code import Attempt, contained
-
-PATIENCE = 10.0
 
 
 @pytest.mark.usefixtures("sigint_ignored")

@@ -50,12 +50,6 @@ def panel(pins: Pins, make: Make) -> RpiGpioPanel:
     return make(OPENS)
 
 
-def test_a_press_acts_in_the_next_tick(pins: Pins, panel: RpiGpioPanel) -> None:
-    assert panel.update("running", 0.0) is False
-    pins.set_level(BUTTON, OPEN)
-    assert panel.update("running", 0.05) is True
-
-
 def test_a_press_is_reported_at_once_by_a_library_thread(pins: Pins, panel: RpiGpioPanel) -> None:
     threads = []
     panel.on_press = lambda: threads.append(threading.current_thread())

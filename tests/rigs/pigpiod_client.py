@@ -9,10 +9,9 @@ import pigpio
 from fishd.core.clock import Clock, VirtualClock
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
+from rigs.processes import PATIENCE
 
 GPIO = 18
-PATIENCE = 20.0
-"""How long to wait for what another thread has to do, on a busy machine [s]."""
 
 
 class Bench:

@@ -10,8 +10,8 @@ import msgspec
 import zmq
 
 from rigs.harness import Rig
+from rigs.processes import PATIENCE
 
-PATIENCE = 20.0
 Answer = dict[str, Any] | bytes | None
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from adafruit_ads1x15 import ADS1115, AnalogIn
 from adafruit_extended_bus import ExtendedI2C
+from rigs.processes import PATIENCE
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import StartupError
@@ -30,7 +31,6 @@ from fishd.virtual.plant.parameters import PlantParameters
 
 ADDRESS = 0x48
 CONFIG = [Write(b"\x01"), Read(2)]
-PATIENCE = 20.0
 
 
 def virtual_pi() -> VirtualPi:
