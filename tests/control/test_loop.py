@@ -154,9 +154,7 @@ def test_one_or_two_failed_reads_are_bridged_with_the_last_measurement() -> None
         ({"write_error": TypeError("my bug")}, "servo-link"),
     ],
 )
-def test_broken_hardware_is_a_fault_with_its_reason_and_one_event(
-    breakage: dict[str, Any], reason: str
-) -> None:
+def test_broken_hardware_is_a_fault_and_one_event(breakage: dict[str, Any], reason: str) -> None:
     rig, robot = fragile_rig()
     rig.start("swing")
     rig.run(20)

@@ -328,9 +328,7 @@ def test_pca9685_a_bus_that_fails_is_an_error_in_words_and_opened_again(board: S
 
 
 @pytest.mark.parametrize("by", ["a reset", "fishctl release"])
-def test_pca9685_pulses_that_were_ended_from_outside_do_not_begin_by_themselves(
-    board: ServoBoard, by: str
-) -> None:
+def test_pca9685_pulses_ended_from_outside_do_not_begin_again(board: ServoBoard, by: str) -> None:
     servo = board.servo()
     servo.write(0.3)
     board.clock.sleep(0.1)

@@ -88,7 +88,7 @@ def test_a_read_leaves_the_clock_at_the_tick(rig: ForceRig) -> None:
         "stuck-busy",
     ],
 )
-def test_while_the_chip_cannot_be_read_reads_raise_and_half_a_second_later_it_is_well(
+def test_while_the_chip_is_away_reads_raise_and_soon_after_it_is_well(
     rig: ForceRig, fault: str
 ) -> None:
     sensor = rig.sensor()

@@ -216,9 +216,7 @@ def test_an_error_of_an_unknown_kind_is_passed_on_with_its_number() -> None:
     assert sampler.trouble == "a transfer on /dev/i2c-1 failed: Protocol error (error 71)"
 
 
-def test_without_the_driver_packages_the_message_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     single_shot = "fishd.hardware.force_sensor.ads1115_single_shot"
     monkeypatch.setitem(sys.modules, "adafruit_ads1x15", None)
     monkeypatch.delitem(sys.modules, single_shot, raising=False)

@@ -54,9 +54,7 @@ HEADER = struct.pack("<IIII", 45, 0, 0, 44)
         (b"", True, "it closed the connection"),
     ],
 )
-def test_an_answer_that_breaks_off_is_an_error_not_a_loop_without_end(
-    answer: bytes, dies: bool, message: str
-) -> None:
+def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, message: str) -> None:
     server = Server(answer, dies=dies)
     try:
         with pytest.raises(ServoError, match=message), opened(server.settings, 0.2) as client:

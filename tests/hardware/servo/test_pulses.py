@@ -99,7 +99,7 @@ def test_an_angle_is_a_permitted_pulse_or_refused(servo: ServoSettings, angle: f
 
 
 @given(servos, st.floats(0, 1), st.floats(0, 1))
-def test_a_larger_angle_turns_further_in_the_stated_direction(
+def test_a_larger_angle_turns_further_that_way(
     servo: ServoSettings, one: float, other: float
 ) -> None:
     lowest, highest = reach(servo)

@@ -29,7 +29,7 @@ def test_the_driver_reads_every_input(board: Board) -> None:
     ("gain", "full_scale"),
     [(2 / 3, 6.144), (1, 4.096), (2, 2.048), (4, 1.024), (8, 0.512), (16, 0.256)],
 )
-def test_a_code_is_a_share_of_the_range_and_clips_at_its_ends(
+def test_a_code_is_a_share_of_its_range_or_end(
     board: Board, gain: float, full_scale: float
 ) -> None:
     board.volts[:3] = [0.2, 1.001 * full_scale, -1.001 * full_scale]

@@ -51,7 +51,7 @@ def test_clearing_all_ends_random_errors_too(faults: Faults) -> None:
 
 
 @pytest.mark.parametrize("call", [Faults.inject, Faults.clear])
-def test_an_unknown_name_is_answered_with_the_nearest_one(
+def test_an_unknown_name_gets_the_nearest(
     faults: Faults, call: Callable[[Faults, str], None]
 ) -> None:
     with pytest.raises(ValueError, match="no fault is called 'brownout'; did you mean 'brown-out'"):

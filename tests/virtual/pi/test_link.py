@@ -186,9 +186,7 @@ def test_a_virtual_pi_that_goes_away_is_no_device_until_it_is_back(path: Path) -
             assert second.bus.timeout == 0.03
 
 
-def test_a_second_virtual_pi_is_refused_and_the_first_one_unharmed(
-    pi: VirtualPi, path: Path, tmp_path: Path
-) -> None:
+def test_a_second_virtual_pi_harms_no_first_one(pi: VirtualPi, path: Path, tmp_path: Path) -> None:
     link = tmp_path / "link"
     link.symlink_to(path)
     with RemotePi(path) as remote:

@@ -113,9 +113,7 @@ def test_scripts_are_stored_run_watched_and_deleted(bench: Bench) -> None:
         ("i2co 1 0x48 0", "-88", "unknown command"),
     ],
 )
-def test_errors_are_told_and_make_its_exit_status(
-    bench: Bench, command: str, number: str, message: str
-) -> None:
+def test_errors_are_its_exit_status(bench: Bench, command: str, number: str, message: str) -> None:
     done = pigs(bench, *command.split(" ", 1 if command.startswith("proc ") else -1))
     assert done.returncode != 0
     assert done.stdout.strip() == number

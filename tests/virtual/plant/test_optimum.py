@@ -47,7 +47,7 @@ def test_square_waves_make_the_reference_thrust_at_every_frequency(reference: Re
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wave", [sine, triangle])
-def test_smooth_waves_make_the_reference_thrust_at_every_frequency(
+def test_smooth_waves_make_the_reference_thrust(
     reference: Reference, wave: Callable[[float], float]
 ) -> None:
     rows = [r for r in reference("thrust_vs_frequency") if r["waveform"] == wave.__name__]
