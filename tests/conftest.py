@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,14 @@ SLOW = re.compile(
     r"|operator_rig|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
 )
 """A module of tests that mentions one of these starts processes, waits, or loads torch."""
+
+
+@pytest.fixture
+def sigint_ignored() -> Iterator[None]:
+    """As in the daemon, where a KeyboardInterrupt can only be raised by somebody's code."""
+    before = signal.signal(signal.SIGINT, lambda number, frame: None)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

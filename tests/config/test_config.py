@@ -166,7 +166,7 @@ telemetry: {address: localhost}
         ("a: !!int '" + "1:" * 20000 + "1'", "fish.yaml:1: a: a number of 40001 letters"),
     ],
 )
-def test_a_bad_file_gets_one_line_that_names_place_and_remedy(
+def test_a_bad_file_gets_a_line_with_place_and_remedy(
     text: str, message: str, tmp_path: Path
 ) -> None:
     assert message in complaint(text, tmp_path)
@@ -257,7 +257,7 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["virtual_pi.channel_y=A0-A1"], "virtual_pi.channel_y", "channel_x"),
     ],
 )
-def test_hardware_that_does_not_go_together_is_refused_by_key(
+def test_hardware_that_is_at_odds_is_refused_by_key(
     overrides: list[str], key: str, words: str
 ) -> None:
     with pytest.raises(ConfigError) as refusal:

@@ -1,11 +1,13 @@
 """The guard: nothing that is not finite, within ±Φ and slow enough reaches the servo."""
 
 import math
+import random
 
 import pytest
 from fishd_zoo import BAD, GOOD
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.harness import Rig
 
 from fishd.control.guard import Guard
 
@@ -41,7 +43,7 @@ def test_a_fade_reaches_neutral_and_stays_there(
 
 
 @given(amplitudes, ticks)
-def test_the_default_slew_limit_leaves_a_full_square_wave_untouched(
+def test_the_default_slew_limit_leaves_a_square_wave_as_it_is(
     amplitude: float, tick: float
 ) -> None:
     guard = Guard(amplitude, tick, None, fade_time=0.4)
@@ -89,3 +91,46 @@ def test_any_finite_real_number_is_an_angle(name: str) -> None:
 def test_what_is_no_finite_real_number_is_refused_with_its_type(name: str) -> None:
     with pytest.raises(ValueError, match=r"the command is (of type \w+, not one real|nan|inf)"):
         Guard(0.42, 0.05, None, 0.4).apply(BAD[name], 0.0)
+
+
+SWITCHES = 10_000
+CHOICES = {
+    "hold": {"angle": (-0.42, 0.42)},
+    "square": {"frequency": (0.2, 5.0), "amplitude": (0.02, 0.42)},
+    "sine": {"frequency": (0.2, 5.0), "amplitude": (0.02, 0.42)},
+    "triangle": {"frequency": (0.2, 5.0), "amplitude": (0.02, 0.42)},
+    "swing": {"C": (0.0, 1.0), "amplitude": (0.02, 0.42)},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slew_limit", [None, 3.0])
+def test_ten_thousand_switches_stay_within_amplitude_and_slew(slew_limit: float | None) -> None:
+    rig = Rig(f"slew_limit={'null' if slew_limit is None else slew_limit}")
+    generator = random.Random(7)
+    step = 0.84 if slew_limit is None else slew_limit * 0.05
+    angle = 0.0
+    for _ in range(SWITCHES):
+        name = generator.choice(list(CHOICES))
+        if generator.random() < 0.1:
+            rig.loop.stop()
+        else:
+            rig.start(name, **{k: generator.uniform(*v) for k, v in CHOICES[name].items()})
+        for tick in rig.run(generator.choice((1, 1, 2, 3, 7))):
+            assert abs(tick.phi_c) <= 0.42
+            assert abs(tick.phi_c - angle) <= step * (1 + 1e-8)
+            angle = tick.phi_c
+        rig.recorder.ticks.clear()
+        rig.recorder.events.clear()
+    assert rig.mode in ("idle", "running")
+
+
+def test_sine_and_triangle_begin_from_the_angle_in_force_after_any_switch() -> None:
+    rig = Rig()
+    generator = random.Random(11)
+    for _ in range(500):
+        first = generator.choice(list(CHOICES))
+        rig.start(first, **{k: generator.uniform(*v) for k, v in CHOICES[first].items()})
+        before = rig.run(generator.randint(1, 9))[-1].phi_c
+        rig.start(generator.choice(("sine", "triangle")), frequency=generator.uniform(0.2, 3.0))
+        assert rig.run(1)[0].phi_c == pytest.approx(before, abs=1e-12)

@@ -1,24 +1,118 @@
-"""What the loop says of a servo that cannot be reached, and of a force that is not there."""
+"""A fishd that stood still, a servo that cannot be reached, and a force that is not there."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rigs.harness import fragile_rig
-from rigs.lockstep_rig import LockstepRig, lockstep_rig
+from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
+from rigs.lockstep_rig import NEUTRAL, LockstepRig, lockstep_rig
 
 from fishd.core.console import status_line
 from fishd.core.errors import SensorError, ServoError
-from fishd.core.signals import Percentiles, Status, Timing
+from fishd.core.signals import Observation, Percentiles, Status, Timing
+from fishd.hardware.base import Robot
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[LockstepRig]:
     with lockstep_rig(tmp_path) as rig:
-        rig.start("square")
+        rig.start("hold", angle=0.3)
         rig.run_for(1.0)
-        assert (rig.loop.servo.on, rig.loop.servo.lost) == (True, False)
+        assert rig.pulse > NEUTRAL + 100
         yield rig
+
+
+def stand_still(rig: LockstepRig, seconds: float) -> None:
+    """As a process that was stopped, or a machine that was suspended."""
+    rig.index += round(seconds / rig.config.tick)
+
+
+@pytest.mark.parametrize("seconds", [0.25, 0.5, 2.0])
+def test_after_a_hang_longer_than_the_countdown_the_servo_is_released_until_a_clear(
+    rig: LockstepRig, seconds: float
+) -> None:
+    since = rig.now
+    stand_still(rig, seconds)
+    rig.run_for(1.0)
+    assert (rig.mode, rig.reason) == ("fault", "overrun")
+    assert rig.loop.supervisor.reason
+    assert rig.loop.supervisor.reason.message.startswith(
+        f"fishd stood still for {1e3 * seconds + 50:.0f} ms, and the servo has gone to neu"
+    )
+    assert rig.recorder.kinds().count("fault") == 1
+    widths = [width for _, width in rig.pulses_since(since)]
+    assert widths == [pytest.approx(NEUTRAL, abs=5), 0.0]  # and nothing after it
+    assert not rig.loop.servo.on
+    rig.loop.clear_fault()
+    rig.run_for(0.2)
+    assert rig.mode == "idle"
+    assert rig.pulse == pytest.approx(NEUTRAL, abs=5)
+
+
+def test_a_hang_at_rest_is_no_reason_to_begin_pulses_again_either(rig: LockstepRig) -> None:
+    rig.loop.stop()
+    rig.run_for(1.0)
+    stand_still(rig, 1.0)
+    since = rig.now
+    rig.run_for(1.0)
+    assert (rig.mode, rig.reason) == ("fault", "overrun")
+    assert [width for _, width in rig.pulses_since(since) if width] == []
+
+
+def test_a_hang_while_fading_in_fault_ends_in_a_release(rig: LockstepRig) -> None:
+    rig.start(Scripted(lambda _: float("nan")))
+    rig.run_for(0.1)
+    since = rig.now
+    stand_still(rig, 0.5)
+    rig.run_for(0.5)
+    assert rig.reason == "controller-error"
+    assert [width for _, width in rig.pulses_since(since)][-2:] == [
+        pytest.approx(NEUTRAL, abs=5),
+        0.0,
+    ]
+    assert not rig.loop.servo.on
+
+
+def test_a_shorter_hang_is_survived(rig: LockstepRig) -> None:
+    since = rig.now
+    stand_still(rig, 0.1)
+    rig.run_for(1.0)
+    assert rig.mode == "running"
+    assert rig.pulses_since(since) == []
+
+
+def rig_with_countdown(seconds: float) -> tuple[Rig, Wrapped]:
+    made: list[Wrapped] = []
+
+    def wrap(robot: Robot) -> Robot:
+        made.append(Wrapped(robot))
+        return dataclasses.replace(made[0].robot(), countdown=seconds)
+
+    return Rig(wrap=wrap), made[0]
+
+
+def test_a_hang_within_a_tick_is_noticed_before_its_angle_is_sent() -> None:
+    rig, robot = rig_with_countdown(0.2)
+    naps = iter([0.0, 0.0, 0.3])
+
+    def doze(_: Observation) -> float:
+        rig.clock.now += next(naps, 0.0)
+        return 0.4
+
+    rig.start(Scripted(doze))
+    rig.run(2)
+    robot.log.clear()
+    tick = rig.run(1)[-1]
+    assert (tick.mode, tick.phi_c, tick.servo_on) == ("fault", 0.0, False)
+    assert robot.log == [None]
+
+
+def test_a_servo_that_waits_for_ever_goes_on_after_a_hang() -> None:
+    rig = Rig()
+    rig.start("square")
+    rig.run(10)
+    assert rig.run(1, missed=40)[-1].mode == "running"
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])

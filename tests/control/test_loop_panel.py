@@ -3,10 +3,9 @@
 import dataclasses
 from collections.abc import Callable
 
-from rigs.harness import Rig, fragile_rig
+from rigs.harness import Rig
 
 from fishd.core.clock import Slot
-from fishd.core.errors import ServoError
 from fishd.hardware.base import Robot
 
 
@@ -87,22 +86,6 @@ def test_the_panel_shows_the_mode_of_every_tick() -> None:
     rig.start("square")
     rig.run(2)
     assert button.shown == ["idle", "idle", "running", "running"]
-
-
-def test_a_servo_that_was_lost_is_released_when_it_is_back_and_driven_only_after_a_clear() -> None:
-    rig, robot = fragile_rig()
-    rig.start("square")
-    rig.run(2)
-    robot.write_error = robot.release_error = ServoError("pigpiod is gone")
-    rig.run(2)
-    assert rig.reason == "servo-link"
-    robot.log.clear()
-    robot.write_error = robot.release_error = None
-    rig.run(20)
-    assert set(robot.log) == {None}
-    rig.loop.clear_fault()
-    rig.run(1)
-    assert robot.log[-1] == 0.0
 
 
 def test_every_tick_feeds_the_watchdog_whatever_the_mode_is() -> None:

@@ -1,8 +1,5 @@
 """Whatever a controller raises, in whichever method, the loop goes on ticking and says why."""
 
-import signal
-from collections.abc import Iterator
-from types import FrameType
 from typing import Any
 
 import msgspec
@@ -12,17 +9,7 @@ from rigs.harness import LIMITS, Rig
 
 from fishd.core import text
 
-
-@pytest.fixture(autouse=True)
-def _as_in_the_daemon() -> Iterator[None]:
-    """There a SIGINT raises nothing, so that a KeyboardInterrupt can only be the controller's."""
-
-    def ignore(number: int, frame: FrameType | None) -> None:
-        pass
-
-    before = signal.signal(signal.SIGINT, ignore)
-    yield
-    signal.signal(signal.SIGINT, before)
+pytestmark = pytest.mark.usefixtures("sigint_ignored")
 
 
 def started(method: str, deed: str) -> Rig:

@@ -9,9 +9,7 @@ from fishd.control.statistics import PHASES, Histogram, Statistics
 
 
 @given(st.lists(st.floats(1e-7, 100.0), min_size=1, max_size=300), st.floats(0.01, 1.0))
-def test_a_quantile_is_at_most_an_eighth_above_the_true_one(
-    durations: list[float], share: float
-) -> None:
+def test_a_quantile_is_at_most_an_eighth_too_large(durations: list[float], share: float) -> None:
     histogram = Histogram()
     for seq, duration in enumerate(durations):
         histogram.add(duration, seq)

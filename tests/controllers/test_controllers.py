@@ -72,7 +72,7 @@ def test_after_a_start_beyond_their_amplitude_they_return_into_it_without_a_jump
 @given(
     st.sampled_from(["square", "sine", "triangle"]), frequencies, frequencies, st.integers(1, 99)
 )
-def test_a_change_of_frequency_keeps_the_phase(
+def test_a_new_frequency_keeps_the_phase(
     name: str, before: float, after: float, ticks: int
 ) -> None:
     changed, steady = made(name, frequency=before), made(name, frequency=before)
@@ -84,9 +84,7 @@ def test_a_change_of_frequency_keeps_the_phase(
 
 
 @given(smooth, st.floats(0.05, 0.42), st.floats(0.05, 0.42), st.integers(1, 99))
-def test_a_change_of_amplitude_makes_no_jump(
-    name: str, before: float, after: float, ticks: int
-) -> None:
+def test_a_new_amplitude_makes_no_jump(name: str, before: float, after: float, ticks: int) -> None:
     controller = made(name, frequency=1.0, amplitude=before)
     last = commands(controller, ticks)[-1]
     controller.retune(type(controller.parameters)(frequency=1.0, amplitude=after))
@@ -136,9 +134,7 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
         ),
     ],
 )
-def test_a_wrong_parameter_is_named_with_what_is_right(
-    values: dict[str, object], message: str
-) -> None:
+def test_a_wrong_parameter_is_told_what_is_right(values: dict[str, object], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         made("swing", **values)
 

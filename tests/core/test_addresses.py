@@ -6,14 +6,7 @@ from pathlib import Path
 import pytest
 
 from fishd.config import load
-from fishd.core.addresses import (
-    is_local,
-    listen,
-    parse,
-    served,
-    why_not_connected,
-    why_not_served,
-)
+from fishd.core.addresses import is_local, listen, parse, served, why_not_connected, why_not_served
 from fishd.core.errors import ConfigError, StartupError
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 import pytest
+from rigs.processes import PATIENCE
 
 from fishd.cli.calibrate import load_files
 from fishd.config import load
@@ -17,7 +18,6 @@ from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError, FishdError, PolicyError
 from fishd.hardware.calibration_files import CalibrationFolder
 
-PATIENCE = 20.0
 FORCE = "force-2026-01-01T000000.000000Z.yaml"
 SERVO = "servo-2026-01-01T000000.000000Z.yaml"
 

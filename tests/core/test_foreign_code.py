@@ -4,32 +4,16 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from types import FrameType
 
 import pytest
 from fishd_zoo import RAISED
-from rigs.processes import wait_until
+from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.errors import Escaped
 from fishd.core.foreign_code import Attempt, contained
 
-PATIENCE = 10.0
 
-
-@pytest.fixture
-def _as_in_the_daemon() -> Iterator[None]:
-    """There a SIGINT raises nothing."""
-
-    def ignore(number: int, frame: FrameType | None) -> None:
-        pass
-
-    before = signal.signal(signal.SIGINT, ignore)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("_as_in_the_daemon")
+@pytest.mark.usefixtures("sigint_ignored")
 @pytest.mark.parametrize("deed", RAISED)
 def test_whatever_is_raised_is_an_exception_outside(deed: str) -> None:
     def misbehave() -> None:

@@ -22,9 +22,7 @@ with locked(Path(sys.argv[1])):
 """
 
 
-def test_a_lock_names_the_process_that_holds_it_and_ends_when_that_is_killed(
-    tmp_path: Path,
-) -> None:
+def test_a_lock_names_the_process_that_holds_it_and_ends_when_it_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "control"
     command = [sys.executable, "-c", HOLDER, str(path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
@@ -104,9 +102,7 @@ def test_a_link_to_a_file_that_is_not_there_makes_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user")
-def test_a_lock_of_another_user_counts_only_where_all_share_them_or_the_folder_is_his(
-    tmp_path: Path,
-) -> None:
+def test_a_lock_of_another_user_counts_where_all_share_or_the_folder_is_his(tmp_path: Path) -> None:
     path = tmp_path / "control"
     lock_path(path).write_text("")
     os.chown(lock_path(path), 60101, 60101)

@@ -72,14 +72,12 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         ),
     ],
 )
-def test_what_cannot_be_had_is_refused_with_the_reason(
-    gadgets: Plugins[Gadget], name: str, message: str
-) -> None:
+def test_what_cannot_be_had_is_explained(gadgets: Plugins[Gadget], name: str, message: str) -> None:
     with pytest.raises(FishdError, match=message):
         gadgets.find(name)
 
 
-def test_a_package_that_is_installed_later_is_found(
+def test_a_package_installed_later_is_found(
     gadgets: Plugins[Gadget], install: Callable[[str, str], None]
 ) -> None:
     assert gadgets.names() == ["key", "lost", "shapeless", "text", "unfinished"]

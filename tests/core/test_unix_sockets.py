@@ -114,9 +114,7 @@ def test_fishctl_says_in_one_line_that_it_was_not_asked() -> None:
 
 
 @as_root
-def test_a_planted_folder_does_not_hide_the_service(
-    shared: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_planted_folder_hides_no_service(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, session = shared / "run", shared / "session"
     (run / "fishd").mkdir(parents=True)
     run.chmod(0o755)
@@ -125,10 +123,7 @@ def test_a_planted_folder_does_not_hide_the_service(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
     with user(OTHER):
         session.mkdir()
-    with (
-        Listener(run / "fishd" / "control", USER),
-        Listener(session / "fishd" / "control", OTHER),
-    ):
+    with Listener(run / "fishd" / "control", USER), Listener(session / "fishd" / "control", OTHER):
         assert addresses.find_control() == f"ipc://{run}/fishd/control"
         with Fish(timeout=0.2) as fish, pytest.raises(NoDaemon, match="no answer within"):
             fish.status()  # so it was asked
@@ -160,9 +155,7 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
         assert stranger(shared / "nowhere" / "control") == ""
 
 
-def test_the_fishd_of_the_same_user_is_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fishd_of_the_same_user_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "fishd").mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with running(tmp_path / "fishd"), Fish() as fish:

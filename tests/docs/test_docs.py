@@ -1,4 +1,4 @@
-"""The documentation against the program: links, verbs, options, keys, faults."""
+"""The documentation against the program: links, verbs, options, keys, faults, policies."""
 
 import re
 from collections.abc import Iterator
@@ -14,6 +14,8 @@ from fishd.cli.doctor.checks import checks
 from fishd.cli.doctor.checks.base import Context
 from fishd.cli.main import fishctl
 from fishd.config import Config, keys, load
+from fishd.controllers.policy import checksum, file, library, operators
+from fishd.controllers.policy.card import FORMAT, KEY, Card, Provenance
 from fishd.core.errors import UnknownController
 from fishd.core.schema import fields_of
 from fishd.daemon.main import fishd
@@ -101,9 +103,7 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
 
 @each_document
 @pytest.mark.parametrize("program", [fishctl, fishd], ids=["fishctl", "fishd"])
-def test_every_verb_and_option_of_a_command_line_exists(
-    document: Path, program: click.Command
-) -> None:
+def test_each_verb_and_option_of_a_command_exists(document: Path, program: click.Command) -> None:
     lines = command_lines(document, program.name or "")
     problems = [found for words in lines if (found := complaint(program, words))]
     assert not problems
@@ -178,3 +178,38 @@ def test_the_table_of_checks_has_each_check_of_doctor_in_its_order() -> None:
         assert [name for name in table if name in names] == names
         every |= set(names)
     assert {name for name in table if " " not in name} <= every
+
+
+DOCUMENT = ROOT / "docs" / "policies.md"
+
+
+def test_each_key_of_the_card_is_described() -> None:
+    table = first_cells(DOCUMENT, "What is in a policy file")
+    assert table == [field.name for field in fields_of(Card)]
+    text = text_of(DOCUMENT)
+    assert f"| `format` | | {FORMAT} |" in text
+    assert all(f"`{field.name}`" in text for field in fields_of(Provenance))
+
+
+def test_names_of_files_ends_and_folders_are_right() -> None:
+    text = text_of(DOCUMENT)
+    for word in (
+        KEY,
+        checksum.KEY,
+        file.INPUT,
+        file.OUTPUT,
+        library.SUFFIX,
+        f"${library.FOLDERS_VARIABLE}",
+    ):
+        assert f"`{word}`" in text or f"`{word} " in text or f"metadata `{word}`" in text
+    assert f"more than {file.LARGEST // 2**20} MB" in text
+    assert "/etc/fishd/policies" in text
+
+
+def test_each_permitted_operator_is_listed() -> None:
+    text = text_of(DOCUMENT)
+    for what, names in operators.PERMITTED.items():
+        assert f"| {what} | {', '.join(f'`{name}`' for name in sorted(names))} |" in text
+    assert f"versions {operators.OPSETS[0]} to {operators.OPSETS[-1]}:" in text
+    assert f"more than {operators.LARGEST_NODES} operators, 10⁸ multiplications" in text
+    assert operators.LARGEST_WORK == 10**8

@@ -1,35 +1,23 @@
 """The packages in docs/example-drivers, installed and used as their reader would."""
 
-import contextlib
 import json
-import os
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rigs.example_drivers import (
+from rigs.example_packages import (
     BUS,
     MILLIVOLTS_PER_NEWTON,
     LoadCellRig,
     ServoBoardRig,
+    fishctl,
     forget_drivers,
     install,
 )
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
-from rigs.pca9685_chip import (
-    AUTO_INCREMENT,
-    LED0,
-    MODE1,
-    PRE_SCALE,
-    RESTART,
-    SLEEP,
-    Pca9685Chip,
-)
-from rigs.processes import FISHCTL, Daemon, running
+from rigs.pca9685_chip import AUTO_INCREMENT, LED0, MODE1, PRE_SCALE, RESTART, SLEEP, Pca9685Chip
 
 from fishd import wiring
 from fishd.config import load
@@ -54,7 +42,7 @@ THRUST = 0.026
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    install(folder)
+    install(folder, "example-drivers")
     return folder
 
 
@@ -66,23 +54,13 @@ def _installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget_drivers()
 
 
-def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(site), "XDG_RUNTIME_DIR": str(site)}
-    command = [FISHCTL, *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+def options(*settings: str) -> list[str]:
+    return [word for each in settings for word in ("--set", each)]
 
 
 def doctor(site: Path, folder: Path, *settings: str) -> dict[str, dict[str, str]]:
-    options = [word for each in settings for word in ("--set", each)]
-    done = fishctl(
-        site,
-        "--endpoint",
-        f"ipc://{folder}/nobody",
-        "doctor",
-        "--json",
-        *options,
-        *("--set", f"state_folder={folder}", "--set", f"telemetry.address=ipc://{folder}/t"),
-    )
+    mine = options(*settings, f"state_folder={folder}", f"telemetry.address=ipc://{folder}/t")
+    done = fishctl(site, "--endpoint", f"ipc://{folder}/nobody", "doctor", "--json", *mine)
     return {found["check"]: found for found in json.loads(done.stdout)}
 
 
@@ -155,9 +133,7 @@ def test_hx711_a_pulse_that_lasts_too_long_costs_a_start_and_no_wrong_sample(
     assert all((p.vx, p.vy) == pytest.approx((1e-3, -2e-3), abs=1e-8) for p in pairs)
 
 
-def test_hx711_a_wire_that_is_off_is_named_and_comes_back(
-    load_cells: Callable[..., LoadCells],
-) -> None:
+def test_hx711_a_wire_that_is_off_is_named_till_back(load_cells: Callable[..., LoadCells]) -> None:
     with load_cells() as rig:
         rig.run(0.5)
         rig.gpio.unplugged.add(13)
@@ -215,30 +191,36 @@ def test_hx711_a_wrong_setting_is_refused_by_key(setting: str, complaint: str) -
     assert "\n" not in str(refusal.value)
 
 
+HX711 = [
+    "force_sensor.driver=hx711",
+    *("force_sensor.clock=25", "force_sensor.data_x=26", "force_sensor.data_y=27"),
+    "servo.host=127.0.0.2",
+]
+PCA9685 = ["servo.driver=pca9685", "servo.bus=177", "force_sensor.bus=178"]
+
+
 @pytest.mark.usefixtures("_installed")
-def test_hx711_a_second_fishd_is_refused(tmp_path: Path) -> None:
-    pins = ["force_sensor.clock=25", "force_sensor.data_x=26", "force_sensor.data_y=27"]
-    port = "servo.host=127.0.0.2"
-    settings = ["robot=pi", "force_sensor.driver=hx711", *pins, port, f"state_folder={tmp_path}"]
-    config = load(None, settings)
+@pytest.mark.parametrize(
+    ("settings", "part", "complaint"),
+    [
+        (HX711, 0, r"drives the HX711's PD_SCK on GPIO 25; .*sensor\.clock"),
+        (PCA9685, 1, r"drives /dev/i2c-177; stop it.* another servo\.bus"),
+    ],
+    ids=["hx711", "pca9685"],
+)
+def test_a_second_fishd_on_the_same_chip_is_refused(
+    tmp_path: Path, settings: list[str], part: int, complaint: str
+) -> None:
+    config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])
     with (
-        ownership.owned(wiring.parts_of(config)[:1]),
+        ownership.owned(wiring.parts_of(config)[part : part + 1]),
         ExitStack() as stack,
-        pytest.raises(StartupError, match=r"drives the HX711's PD_SCK on GPIO 25; .*sensor\.clock"),
+        pytest.raises(StartupError, match=complaint),
     ):
         wiring.open_robot(config, VirtualClock(), stack)
-    for lock in ownership.FOLDER.glob("fishd-gpio2[567].lock"):
-        lock.unlink()
-
-
-def test_hx711_doctor_names_it_and_makes_its_checks(site: Path, tmp_path: Path) -> None:
-    found = doctor(site, tmp_path, "robot=pi", "force_sensor.driver=hx711", "servo.port=1")
-    assert found["drivers"]["message"] == (
-        "force_sensor hx711 of fishd-hx711 0.1.0, servo pigpio of fishd"
-    )
-    assert found["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
-    assert found["force"]["level"] == "FAIL"  # there are no pins on this machine
-    assert "adc" not in found
+    for name in ("gpio2[567]", "i2c-17[78]*"):
+        for lock in ownership.FOLDER.glob(f"fishd-{name}.lock"):
+            lock.unlink()
 
 
 class ServoBoard:
@@ -287,7 +269,7 @@ def board(_installed: None) -> Iterator[ServoBoard]:
 
 
 @pytest.mark.parametrize("frequency", [50.0, 100.0, 333.0])
-def test_pca9685_an_angle_becomes_a_pulse_within_half_a_count(
+def test_pca9685_an_angle_is_a_pulse_within_half_a_count(
     board: ServoBoard, frequency: float
 ) -> None:
     servo = board.servo(frequency=frequency)
@@ -346,9 +328,7 @@ def test_pca9685_a_bus_that_fails_is_an_error_in_words_and_opened_again(board: S
 
 
 @pytest.mark.parametrize("by", ["a reset", "fishctl release"])
-def test_pca9685_pulses_that_were_ended_from_outside_do_not_begin_by_themselves(
-    board: ServoBoard, by: str
-) -> None:
+def test_pca9685_pulses_ended_from_outside_do_not_begin_again(board: ServoBoard, by: str) -> None:
     servo = board.servo()
     servo.write(0.3)
     board.clock.sleep(0.1)
@@ -375,9 +355,7 @@ def test_pca9685_the_last_resort_goes_to_neutral_and_ends_the_pulses(board: Serv
     assert 0.28 < off - neutral < 0.33
 
 
-def test_pca9685_the_last_resort_ends_the_pulses_though_neutral_is_refused(
-    board: ServoBoard,
-) -> None:
+def test_pca9685_the_last_resort_ends_pulses_though_neutral_is_refused(board: ServoBoard) -> None:
     board.servo().write(0.5)
     board.chip.refused = {(LED0 + 4 * 3, 0)}
     with pytest.raises(ServoError, match="nothing answers"):
@@ -405,50 +383,18 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
     assert sum(tick.fx for tick in ticks) / len(ticks) == pytest.approx(THRUST, rel=0.05)
 
 
-@contextlib.contextmanager
-def fishd_on_a_board(site: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A fishd whose board is not there, and the settings of another one."""
-    monkeypatch.setenv("PYTHONPATH", str(site))
-    bus = 150 + os.getpid() % 50
-    settings = ["robot=pi", "servo.driver=pca9685", f"servo.bus={bus}"]
-    options = [word for each in settings for word in ("--set", each)]
-    one, other = folder / "one", folder / "other"
-    one.mkdir()
-    other.mkdir()
-    mine = [*options, "--set", f"force_sensor.bus={bus}"]
-    with running(one, *mine, "--set", f"state_folder={one}") as daemon:
-        yield SimpleNamespace(
-            daemon=daemon,
-            bus=bus,
-            settings=[*options, "--set", f"force_sensor.bus={bus + 50}"],
-            folder=other,
-        )
-    for lock in ownership.FOLDER.glob(f"fishd-i2c-{bus}*.lock"):
-        lock.unlink()
-
-
-def test_pca9685_fishd_says_what_is_wrong_and_a_second_one_is_refused(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with fishd_on_a_board(site, tmp_path, monkeypatch) as first:
-        status, _, err = Daemon(first.folder, *first.settings).finish()
-        assert status == 1
-        pid = first.daemon.process.pid
-        assert f"another fishd (pid {pid}) drives /dev/i2c-{first.bus}; stop it" in err
-        assert "another servo.bus" in err
-        assert f"/dev/i2c-{first.bus} does not exist" in first.daemon.fishctl("status").stdout
-    with contextlib.suppress(OSError):
-        (ownership.FOLDER / f"fishd-i2c-{first.bus + 50}.lock").unlink()
-
-
-def test_pca9685_doctor_and_release_work_for_it(site: Path, tmp_path: Path) -> None:
-    settings = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
-    found = doctor(site, tmp_path, *settings)
-    assert found["drivers"]["message"].endswith("servo pca9685 of fishd-pca9685 0.1.0")
+def test_doctor_names_both_with_their_checks_and_release_works(site: Path, tmp_path: Path) -> None:
+    servo = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
+    found = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
+    assert found["drivers"]["message"] == (
+        "force_sensor hx711 of fishd-hx711 0.1.0, servo pca9685 of fishd-pca9685 0.1.0"
+    )
+    assert found["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
+    assert found["force"]["level"] == "FAIL"  # there are no pins on this machine
+    assert "adc" not in found
     assert found["pca9685"]["level"] == "FAIL"
     assert f"/dev/i2c-{BUS} does not exist" in found["pca9685"]["message"]
-    options = [word for each in settings for word in ("--set", each)]
-    done = fishctl(site, "release", *options, "--set", f"state_folder={tmp_path}")
+    done = fishctl(site, "release", *options(*servo, f"state_folder={tmp_path}"))
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith(f"fishctl: /dev/i2c-{BUS} does not exist")
     assert done.stderr.count("\n") == 1

@@ -1,82 +1,55 @@
-"""An emulated ADS1115 behind an emulated /dev/i2c-N in virtual time, and fishd's sensor on it."""
+"""Fishd's force sensor on an emulated ADS1115."""
 
 from collections.abc import Callable
 from typing import Any
 
 from fishd.core.calibration import ForceCalibration
-from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.force_sensor.sampler import Sampler
-from fishd.virtual.pi.ads1115 import Ads1115Chip
-from fishd.virtual.pi.faults import Faults
-from fishd.virtual.pi.i2c import I2cBus
-from fishd.virtual.pi.linux_i2c import LinuxI2c
+from rigs.ads1115_board import Board
 
 TICK = 0.05
-ABSENT_BUS = 201
-"""A bus that is there only while a rig is; a Pi may have a true bus 1."""
 STEP = 2.048 / 32768
 """Of the ADC at the default range [V]."""
 MUX = {"A0-A1": 0, "A0-A3": 1, "A1-A3": 2, "A2-A3": 3, "A0": 4, "A1": 5, "A2": 6, "A3": 7}
 
 
-class ForceRig:
-    """A bus with a chip at 0x48; a context manager, while which its device files exist."""
+class ForceRig(Board):
+    """A board with voltages on two pairs of inputs, and what reads them."""
 
-    def __init__(
-        self,
-        noise: float = 1.0,
-        speed: float = 400e3,
-        seed: int = 0,
-        clock: VirtualClock | SystemClock | None = None,
-    ) -> None:
-        self.clock: Any = clock or VirtualClock()
-        self.faults = Faults(self.clock, seed)
-        self.bus = I2cBus(self.clock, speed, self.faults)
+    def __init__(self, noise: float = 1.0, **options: Any) -> None:
+        super().__init__(noise=noise, **options)
         self.volts: dict[str, float | Callable[[float], float]] = {"A0-A1": 0.5, "A2-A3": -0.25}
-        self.chip = Ads1115Chip(self.clock, self._volts, self.faults, noise=noise, seed=seed)
-        self.bus.attach(0x48, self.chip)
-        self.device = LinuxI2c(self.bus.transfer, {1, ABSENT_BUS}, self._set_timeout)
 
-    def __enter__(self) -> "ForceRig":
-        self.device.install()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.device.remove()
-
-    def driver(self, **settings: Any) -> Ads1115:
+    def sensor_driver(self, **settings: Any) -> Ads1115:
         """A driver that somebody else calls."""
         return Ads1115(Ads1115Settings(**settings), self.clock)
 
     def sampler(self, **settings: Any) -> Sampler:
         """A sampler that somebody else steps."""
-        return Sampler(self.driver(**settings), self.clock)
+        return Sampler(self.sensor_driver(**settings), self.clock)
 
     def sensor(
         self, calibration: ForceCalibration | None = None, tick: float = TICK, **settings: Any
     ) -> SampledSensor:
         """A sensor that reads step."""
         return SampledSensor(
-            self.driver(**settings),
+            self.sensor_driver(**settings),
             calibration or ForceCalibration(),
             self.clock,
             threaded=False,
             tick=tick,
         )
 
-    def _volts(self, mux: int, start: float, end: float) -> float:
+    def input(self, mux: int, start: float, end: float) -> float:
         for channel, volts in self.volts.items():
             if MUX[channel] == mux:
                 return volts((start + end) / 2) if callable(volts) else volts
         raise AssertionError(f"nothing is wired to multiplexer {mux}")
-
-    def _set_timeout(self, seconds: float) -> None:
-        self.bus.timeout = seconds
 
 
 class Ticks:

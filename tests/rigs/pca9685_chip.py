@@ -1,13 +1,12 @@
 """A PCA9685 at the level of its registers, for an `I2cBus`; after its data sheet, NXP, Rev. 4."""
 
 import errno
-from collections.abc import Callable
 
 from fishd.core.clock import Clock
 from fishd.virtual.pi.i2c import kernel_error
 from fishd.virtual.pi.pulse_train import PulseTrain
 
-MODE1, MODE2, LED0, ALL_LED, PRE_SCALE = 0x00, 0x01, 0x06, 0xFA, 0xFE
+MODE1, MODE2, LED0, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
 RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10
 FULL = 0x10
 OSCILLATOR = 25e6
@@ -17,20 +16,18 @@ START_UP = 500e-6
 class Pca9685Chip:
     """Sixteen channels, of which one is looked at."""
 
-    def __init__(self, clock: Clock, channel: int = 0, oscillator: float = OSCILLATOR) -> None:
+    def __init__(self, clock: Clock, channel: int = 0) -> None:
         self.clock = clock
         self.channel = channel
-        self.oscillator = oscillator
         self.plugged_in = True
         self.refused: set[tuple[int, int]] = set()
         """Registers and values whose write is not acknowledged."""
-        self.on_write: Callable[[], None] = lambda: None
         self.pulses = PulseTrain()
         self.writes: list[bytes] = []
         self.reset()
 
     def reset(self) -> None:
-        """As after power-on, and after the general call 06."""
+        """As after power-on."""
         self.registers = bytearray(256)
         self.registers[MODE1], self.registers[MODE2] = SLEEP | 0x01, 0x04
         self.registers[PRE_SCALE] = 0x1E
@@ -49,15 +46,10 @@ class Pca9685Chip:
         """The pulse that is sent at a time [µs]; 0 for none."""
         return self.pulses.width(time)
 
-    def general_call(self, data: bytes) -> None:
-        if data == b"\x06":
-            self.reset()
-
     def write(self, data: bytes) -> None:
         self._need_power()
         if not data:
             return
-        self.on_write()
         self.writes.append(data)
         self._pointer = data[0]
         for value in data[1:]:
@@ -90,9 +82,6 @@ class Pca9685Chip:
                 self.registers[PRE_SCALE] = max(3, value)
         elif register == MODE1:
             self._set_mode(mode, value)
-        elif register >= ALL_LED:
-            for channel in range(16):
-                self.registers[LED0 + 4 * channel + register - ALL_LED] = value
         else:
             self.registers[register] = value
 
@@ -122,5 +111,5 @@ class Pca9685Chip:
         on, off = self._counts(self.channel)
         asleep = self.registers[MODE1] & (SLEEP | RESTART)
         counts = 0 if asleep or not self._on(self.channel) else (off - on) % 4096
-        step = (self.registers[PRE_SCALE] + 1) / self.oscillator
+        step = (self.registers[PRE_SCALE] + 1) / OSCILLATOR
         self.pulses.set(now, counts * step * 1e6, 4096 * step)

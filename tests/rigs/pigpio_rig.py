@@ -1,12 +1,13 @@
-"""What tests of the pigpio servo are built from: an emulated pigpiod in virtual time."""
+"""What tests of the pigpio servo are built from: an emulated pigpiod, and servos on it."""
 
 import contextlib
 from functools import partial
+from typing import Any
 
 import pigpio
 
 from fishd.core.calibration import ServoCalibration
-from fishd.core.clock import VirtualClock
+from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
@@ -21,11 +22,13 @@ FRAME = 0.02
 TICK = 0.05
 
 
-class PigpioBench:
-    """An emulated pigpiod, and servos on it."""
+class Bench:
+    """In virtual time, or in real time if that is what its clock shows."""
 
-    def __init__(self, stack: contextlib.ExitStack) -> None:
-        self.clock = VirtualClock()
+    def __init__(
+        self, stack: contextlib.ExitStack, clock: VirtualClock | SystemClock | None = None
+    ) -> None:
+        self.clock: Any = clock or VirtualClock()
         self.faults = Faults(self.clock)
         self.daemon = Pigpiod(self.clock, self.faults)
         self.daemon.start()
@@ -41,12 +44,13 @@ class PigpioBench:
         calibration: ServoCalibration | None = None,
         tick: float = TICK,
     ) -> CalibratedServo:
+        realtime = isinstance(self.clock, SystemClock)
         servo = CalibratedServo(
-            partial(Pigpio, standstill=self.daemon.stands_still),
+            Pigpio if realtime else partial(Pigpio, standstill=self.daemon.stands_still),
             settings or self.settings(),
             calibration or ServoCalibration(),
             self.clock,
-            threaded=False,
+            threaded=realtime,
             tick=tick,
         )
         self._stack.callback(self._close, servo)
@@ -65,7 +69,7 @@ class PigpioBench:
     @property
     def width(self) -> float:
         """The pulse one frame from now [µs]."""
-        return self.daemon.width(GPIO, self.clock.now + FRAME)
+        return self.daemon.width(GPIO, self.clock.monotonic() + FRAME)
 
     def wait(self, seconds: float) -> None:
         self.clock.sleep(seconds)
@@ -90,19 +94,23 @@ class PigpioBench:
                 return pigpio.PI_NOT_PERMITTED, b""
             return execute(time, number, p1, p2, extension)
 
-        commands.execute = refusing  # type: ignore[method-assign]
+        commands.execute = refusing
+
+    def hang_up(self) -> None:
+        """Pigpiod ends all connections; pulses go on."""
+        for connection in list(self.daemon._connections.values()):
+            connection.hang_up()
 
     def hang_up_in_next_sleep(self) -> None:
-        """Pigpiod ends all connections while fishd sleeps the next time; pulses go on."""
+        """As `hang_up`, while fishd sleeps the next time."""
         sleep = self.clock.sleep
 
         def hang_up(seconds: float) -> None:
-            self.clock.sleep = sleep  # type: ignore[method-assign]
-            for connection in list(self.daemon._connections.values()):
-                connection.hang_up()
+            self.clock.sleep = sleep
+            self.hang_up()
             sleep(seconds)
 
-        self.clock.sleep = hang_up  # type: ignore[method-assign]
+        self.clock.sleep = hang_up
 
     def changes_after(self, time: float) -> list[tuple[float, float]]:
         return [(when, width) for when, width in self.daemon.history(GPIO) if when > time]

@@ -9,13 +9,12 @@ import pigpio
 from fishd.core.clock import Clock, VirtualClock
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
+from rigs.processes import PATIENCE
 
 GPIO = 18
-PATIENCE = 20.0
-"""How long to wait for what another thread has to do, on a busy machine [s]."""
 
 
-class PigpiodBench:
+class Bench:
     """A pigpiod, on virtual time unless another clock is given, and its client."""
 
     def __init__(self, clock: Clock | None = None) -> None:
@@ -68,8 +67,8 @@ def dispose(pi: pigpio.pi) -> None:
 
 
 @contextlib.contextmanager
-def pigpiod_bench(clock: Clock | None = None) -> Iterator[PigpiodBench]:
-    bench = PigpiodBench(clock)
+def pigpiod_bench(clock: Clock | None = None) -> Iterator[Bench]:
+    bench = Bench(clock)
     try:
         yield bench
     finally:

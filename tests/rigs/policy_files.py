@@ -6,10 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+from onnx import TensorProto, helper
 
-from fishd.controllers.policy.card import Card, Feature, FeatureName, Provenance
+from fishd.controllers.policy import file
+from fishd.controllers.policy.card import KEY, Card, Feature, FeatureName, Provenance, encode
+from fishd.controllers.policy.checksum import sealed
 from fishd.controllers.policy.network import Layer, to_onnx
+from fishd.core.errors import PolicyError
 
 PROVENANCE = Provenance(
     created="2026-11-21T07:00:00+00:00",
@@ -62,6 +67,28 @@ def answer(layers: Sequence[Layer], activation: str, inputs: NDArray[Any]) -> fl
 
 FLIP = to_onnx(linear(-100.0, bias=1.0), "tanh", card())
 """To the other side of where the tail is, from neutral to plus: a square wave of two ticks."""
+
+
+def of_nodes(
+    nodes: Sequence[Any], weights: Sequence[Any] = (), about: Card | None = None, opset: int = 17
+) -> bytes:
+    """A policy of nodes that turn `observation` into `action`, both of shape [1, 1]."""
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
+        for name in (file.INPUT, file.OUTPUT)
+    ]
+    graph = helper.make_graph(list(nodes), "policy", *ends, list(weights))
+    model = helper.make_model(graph, ir_version=8, opset_imports=[helper.make_opsetid("", opset)])
+    helper.set_model_props(model, {KEY: encode(about or card())})
+    return sealed(model)
+
+
+def refusal(content: bytes) -> str:
+    """The one line that says why this is no policy."""
+    with pytest.raises(PolicyError) as caught:
+        file.parse(content)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def write(folder: Path, content: bytes = FLIP, name: str = "flip") -> Path:

@@ -10,8 +10,8 @@ import msgspec
 import zmq
 
 from rigs.harness import Rig
+from rigs.processes import PATIENCE
 
-PATIENCE = 20.0
 Answer = dict[str, Any] | bytes | None
 
 
@@ -92,6 +92,13 @@ def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]
             if message["session"] not in before:
                 return message
     raise AssertionError("no observation has come")
+
+
+def swim(rig: Rig, agent: ScriptedAgent, angle: float = 0.2) -> None:
+    """Tick until an action is in force."""
+    with agent.answering(lambda seen: agent.action(angle)):
+        while rig.run()[-1].phi_c == 0.0:
+            pass
 
 
 def reason(rig: Rig) -> str:

@@ -50,6 +50,10 @@ class SysfsPwm:
         self._clock = clock
         self._root = root
         self._udev_delay = udev_delay
+        self.unwritable: set[tuple[str, int]] = set()
+        """Names of files and numbers that they fail to take."""
+        self.unreadable: set[str] = set()
+        """Names of files that fail to be read."""
         self._chips = {
             device: [_Channel() for _ in range(channels)] for device, channels in chips.items()
         }
@@ -100,6 +104,8 @@ class SysfsPwm:
         device, channel, name = self._opened(fd)
         if channel is None:
             raise _error(errno.EIO)  # export and unexport can only be written to
+        if name in self.unreadable:
+            raise _error(errno.EIO)
         text = f"{getattr(self._chips[device][channel].state, name)}\n".encode()
         return text[offset : offset + length]
 
@@ -113,6 +119,8 @@ class SysfsPwm:
             value = int(data)
         except ValueError:
             raise _error(errno.EINVAL) from None
+        if (name, value) in self.unwritable:
+            raise _error(errno.EIO)
         if channel is not None:
             self._apply(self._chips[device][channel], name, value)
         elif not 0 <= value < len(self._chips[device]):

@@ -3,7 +3,6 @@
 import math
 import os
 from functools import partial
-from typing import Any
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
@@ -20,14 +19,9 @@ PI4 = "fe20c000.pwm"
 class Bench:
     """A Pi 5's kernel, or another one's, and servos on it."""
 
-    def __init__(
-        self,
-        chips: dict[str, int] | None = None,
-        udev_delay: float = 0.03,
-        kernel: type[SysfsPwmKernel] = SysfsPwmKernel,
-    ) -> None:
+    def __init__(self, chips: dict[str, int] | None = None, udev_delay: float = 0.03) -> None:
         self.clock = VirtualClock()
-        self.kernel: Any = kernel(
+        self.kernel = SysfsPwmKernel(
             self.clock, {FAN: 4, PI5: 4} if chips is None else chips, udev_delay=udev_delay
         )
 

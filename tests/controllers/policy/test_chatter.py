@@ -104,7 +104,7 @@ def test_a_policy_that_is_set_again_starts_anew(tmp_path: Path) -> None:
     assert rig.loop.active.fallback is None
 
 
-def test_the_tick_of_the_take_over_builds_nothing(
+def test_a_take_over_in_a_tick_builds_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = flipping(tmp_path)

@@ -3,7 +3,6 @@
 import io
 import os
 import pickle
-import threading
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from rigs.policy_files import FLIP, card, random_layers, write
+from rigs.policy_files import FLIP, card, random_layers, refusal, write
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.card import KEY, encode
@@ -37,13 +36,6 @@ def with_card(**values: Any) -> bytes:
     data = msgspec.json.decode(encode(card())) | values
     text = msgspec.json.encode({key: value for key, value in data.items() if value is not None})
     return changed(lambda model: helper.set_model_props(model, {KEY: text.decode()}))
-
-
-def refusal(content: bytes) -> str:
-    with pytest.raises(PolicyError) as caught:
-        file.parse(content)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 class Trap:
@@ -69,9 +61,7 @@ def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) 
     assert (tmp_path / "trace").exists()  # so it was a trap
 
 
-def test_an_archive_of_torch_or_stable_baselines_is_refused_and_never_unpickled(
-    tmp_path: Path,
-) -> None:
+def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_path: Path) -> None:
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as made:
         made.writestr("policy/data.pkl", pickle.dumps(Trap(tmp_path / "trace")))
@@ -88,11 +78,6 @@ def test_what_is_no_onnx_is_refused(content: bytes) -> None:
     assert refusal(b"\x01" + content) == (
         "this is not an ONNX model; export it with 'fishctl learn export'"
     )
-
-
-@pytest.mark.parametrize("kept", [0.2, 0.5, 0.9, 0.99])
-def test_a_file_that_was_cut_off_is_refused(kept: float) -> None:
-    assert refusal(FLIP[: int(kept * len(FLIP))])
 
 
 def test_a_file_without_a_card_is_refused() -> None:
@@ -232,7 +217,7 @@ def test_a_card_with_more_features_than_the_network_has_inputs_is_refused() -> N
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("layer", [0, 1, 2])
-def test_weights_that_are_not_finite_are_refused_even_where_tanh_hides_them(
+def test_weights_that_are_not_finite_are_refused_though_tanh_hides_them(
     bad: float, layer: int
 ) -> None:
     content = to_onnx(random_layers(1, 8, 8, 1), "tanh", card())
@@ -291,9 +276,7 @@ def test_a_path_that_leads_to_no_file_is_named(tmp_path: Path, name: str, messag
     assert str(caught.value) == f"{tmp_path / name}: {message}"
 
 
-def test_a_service_says_where_a_file_that_it_cannot_see_belongs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_service_says_where_a_file_it_cannot_see_belongs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/fishd")
     with pytest.raises(PolicyError) as caught:
         file.read(Path("/home/nobody-here/swim.onnx"))
@@ -301,22 +284,6 @@ def test_a_service_says_where_a_file_that_it_cannot_see_belongs(
         "/home/nobody-here/swim.onnx: no such file: this fishd is a service that sees no home "
         "folders; put the file into /var/lib/fishd/policies and give its name"
     )
-
-
-def test_a_pipe_does_not_hold_the_reader(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.onnx")
-    problems = []
-
-    def read() -> None:
-        try:
-            file.read(tmp_path / "pipe.onnx")
-        except PolicyError as error:
-            problems.append(str(error))
-
-    reader = threading.Thread(target=read, daemon=True)
-    reader.start()
-    reader.join(20.0)
-    assert problems == [f"{tmp_path / 'pipe.onnx'}: is a named pipe; a regular file is needed"]
 
 
 def test_a_file_that_is_far_too_large_is_refused_before_it_is_read(tmp_path: Path) -> None:

@@ -40,9 +40,7 @@ def test_the_folders_are_those_of_the_variable_the_state_the_system_and_the_pack
     assert library.folders()[2] == Path("/home/somebody/.local/state/fishd/policies")
 
 
-def test_the_first_folder_that_has_a_name_wins(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_first_folder_with_a_name_wins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("FISHD_POLICIES", str(tmp_path / "mine"))
     shipped = write(tmp_path / "shipped", name="swim")
     assert library.find("swim") == shipped

@@ -17,7 +17,7 @@ FEATURES = (("fy", 0.02), ("fy_rate", 0.3), ("instruction_angle", 0.42), ("fin_v
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("hidden", [(), (8,), (64, 64)])
-def test_onnxruntime_says_what_numpy_says(
+def test_onnx_agrees_with_numpy(
     activation: Literal["tanh", "relu"], hidden: tuple[int, ...]
 ) -> None:
     layers = random_layers(4, *hidden, 1)

@@ -2,7 +2,6 @@
 
 import re
 import time
-from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,9 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from rigs.policy_files import card, random_layers, write
+from rigs.policy_files import card, of_nodes, random_layers, refusal, write
 
 from fishd.controllers.policy import file, operators
-from fishd.controllers.policy.card import KEY, encode
 from fishd.controllers.policy.checksum import sealed
 from fishd.controllers.policy.network import to_onnx
 from fishd.controllers.policy.runtime import Network
@@ -25,33 +23,12 @@ TRUE = numpy_helper.from_array(np.array(True), "true")
 ENDLESS = numpy_helper.from_array(np.array(2**62), "endless")
 
 
-def policy(
-    nodes: Sequence[Any], weights: Sequence[Any] = (), opset: int = 17, tick: float = 0.05
-) -> bytes:
-    """A policy of these nodes, from `observation` to `action`, both of shape [1, 1]."""
-    ends = [
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
-        for name in (file.INPUT, file.OUTPUT)
-    ]
-    graph = helper.make_graph(list(nodes), "policy", *ends, list(weights))
-    model = helper.make_model(graph, ir_version=8, opset_imports=[helper.make_opsetid("", opset)])
-    helper.set_model_props(model, {KEY: encode(card(tick=tick))})
-    return sealed(model)
-
-
 def floats(name: str, *shape: int) -> Any:
     return numpy_helper.from_array(np.zeros(shape, np.float32), name)
 
 
 def integers(name: str, *values: int) -> Any:
     return numpy_helper.from_array(np.array(values, np.int64), name)
-
-
-def refusal(content: bytes) -> str:
-    with pytest.raises(PolicyError) as caught:
-        file.parse(content)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def body(*names: str) -> Any:
@@ -70,7 +47,7 @@ def body(*names: str) -> Any:
 def test_an_endless_loop_is_refused_with_what_is_permitted() -> None:
     loop = make("Loop", ["endless", "true", "observation"], ["action"], body=body())
     began = time.monotonic()
-    message = refusal(policy([loop], [ENDLESS, TRUE]))
+    message = refusal(of_nodes([loop], [ENDLESS, TRUE]))
     assert time.monotonic() - began < 5.0
     assert message.startswith("its operator Loop is not permitted; what is: Abs, Add, And, ")
     assert message.endswith(", Tanh, ThresholdedRelu, Transpose, Unsqueeze, Where")
@@ -90,13 +67,13 @@ def test_an_endless_loop_is_refused_with_what_is_permitted() -> None:
     ],
 )
 def test_other_operators_are_refused_by_name(node: Any, named: str) -> None:
-    message = refusal(policy([node], [TRUE]))
+    message = refusal(of_nodes([node], [TRUE]))
     assert re.match(f"its operator {named}.* is not permitted; what is: Abs, Add", message)
     assert message.isprintable()
 
 
 def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
-    model = onnx.load_model_from_string(policy([make("Tanh", ["observation"], ["action"])]))
+    model = onnx.load_model_from_string(of_nodes([make("Tanh", ["observation"], ["action"])]))
     own = helper.make_function(
         "", "Tanh", ["x"], ["y"], [make("Sin", ["x"], ["y"])], [helper.make_opsetid("", 17)]
     )
@@ -106,12 +83,12 @@ def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
 
 def test_a_graph_in_an_attribute_is_refused() -> None:
     node = make("Tanh", ["observation"], ["action"], inner=body())
-    assert refusal(policy([node])) == "its Tanh holds a graph of its own"
+    assert refusal(of_nodes([node])) == "its Tanh holds a graph of its own"
 
 
 @pytest.mark.parametrize("opset", [0, 1, 10, 99])
 def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> None:
-    content = policy([make("Tanh", ["observation"], ["action"])], opset=opset)
+    content = of_nodes([make("Tanh", ["observation"], ["action"])], opset=opset)
     assert refusal(content) == (
         f"its version of ONNX's operators: {opset}; one from 11 to 26 is needed"
     )
@@ -120,7 +97,7 @@ def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> 
 def test_more_operators_than_a_policy_needs_are_refused() -> None:
     names = ["observation", *(f"v{number}" for number in range(1000)), "action"]
     chain = [make("Tanh", [a], [b]) for a, b in pairwise(names)]
-    assert refusal(policy(chain)) == "it has 1001 operators; 1000 are the most"
+    assert refusal(of_nodes(chain)) == "it has 1001 operators; 1000 are the most"
 
 
 @pytest.mark.parametrize(
@@ -180,22 +157,20 @@ def test_a_network_that_would_take_all_memory_or_hours_is_refused_at_once(
     nodes: list[Any], weights: list[Any], message: str
 ) -> None:
     began = time.monotonic()
-    assert re.match(message, refusal(policy(nodes, weights)))
+    assert re.match(message, refusal(of_nodes(nodes, weights)))
     assert time.monotonic() - began < 5.0
 
 
 def test_a_size_that_the_file_only_claims_does_not_count() -> None:
     """What a file says of values in the middle of it is not believed."""
     nodes = [make("Add", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])]
-    content = policy(nodes, [floats("a", 100_000, 1), floats("b", 1, 100_000)])
+    content = of_nodes(nodes, [floats("a", 100_000, 1), floats("b", 1, 100_000)])
     model = onnx.load_model_from_string(content)
     model.graph.value_info.append(helper.make_tensor_value_info("c", TensorProto.FLOAT, [1, 1]))
     assert "its network computes 1e+10 values" in refusal(sealed(model))
 
 
-def test_a_network_that_takes_more_than_half_a_tick_is_refused_with_its_time(
-    tmp_path: Path,
-) -> None:
+def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path: Path) -> None:
     """80 products with the same weights: some 8 ms on a fast machine, for a tick of 2 ms."""
     names = ["wide", *(f"v{number}" for number in range(79)), "narrow"]
     chain = [make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)]
@@ -205,7 +180,7 @@ def test_a_network_that_takes_more_than_half_a_tick_is_refused_with_its_time(
         make("ReduceMean", ["narrow"], ["action"]),
     ]
     weights = [integers("s", 1, 1100), floats("w", 1100, 1100)]
-    path = write(tmp_path, policy(nodes, weights, tick=0.002))
+    path = write(tmp_path, of_nodes(nodes, weights, card(tick=0.002)))
     with pytest.raises(PolicyError) as caught:
         Network(file.read(path))
     expected = (
@@ -244,7 +219,7 @@ def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> 
         numpy_helper.from_array(np.array(value, np.float32), name)
         for name, value in (("low", -1.0), ("high", 1.0))
     ]
-    network = Network(file.read(write(tmp_path, policy(nodes, weights, opset=opset))))
+    network = Network(file.read(write(tmp_path, of_nodes(nodes, weights, opset=opset))))
     assert network.run() == 0.0
 
 

@@ -10,14 +10,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from rigs.harness import LIMITS, Rig, observe
-from rigs.policy_files import FLIP, answer, card, linear, random_layers, write
+from rigs.policy_files import FLIP, answer, card, linear, of_nodes, random_layers, write
 from rigs.processes import FISHCTL, call
 
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
-from fishd.controllers.policy.card import KEY, Card, encode
-from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.card import Card
 from fishd.controllers.policy.network import to_onnx
 from fishd.core.errors import ConfigError, ParameterError
 from fishd.simulation import simulate
@@ -44,12 +43,6 @@ def test_a_policy_in_the_loop_gives_exactly_the_angles_of_its_network(tmp_path: 
     assert angles == pytest.approx([0.42 * x for x in (1 / 4, 1 / 8, 3 / 16, 5 / 32, 11 / 64)])
     assert angles[0] == 0.42 * 0.25
     assert rig.mode == "running"
-
-
-def test_a_policy_that_flips_the_tail_swims_a_square_wave(tmp_path: Path) -> None:
-    rig = Rig("chatter.dwell=0")
-    rig.start("ppo", policy=str(write(tmp_path)))
-    assert [tick.phi_c for tick in rig.run(5)] == [0.42, -0.42, 0.42, -0.42, 0.42]
 
 
 def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) -> None:
@@ -88,28 +81,12 @@ def test_a_warm_up_changes_nothing(tmp_path: Path) -> None:
         warmed.warm_up()
 
 
-def hand_made(nodes: list[Any], numbers: dict[str, float], about: Card) -> bytes:
-    """A policy from nodes that turn `observation` into `action`, by one who knows ONNX."""
-    ends = [
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
-        for name in ("observation", "action")
-    ]
-    weights = [
-        numpy_helper.from_array(np.array([[value]], np.float32), name)
-        for name, value in numbers.items()
-    ]
-    graph = helper.make_graph(nodes, "by hand", *ends, weights)
-    opset = [helper.make_opsetid("", 13)]
-    model = helper.make_model(graph, ir_version=7, opset_imports=opset)
-    helper.set_model_props(model, {KEY: encode(about)})
-    return sealed(model)
-
-
 def root_of_what_is_left(largest: float, about: Card) -> bytes:
     """√(largest − x): not a number beyond."""
     left = helper.make_node("Sub", ["largest", "observation"], ["left"])
     root = helper.make_node("Sqrt", ["left"], ["action"])
-    return hand_made([left, root], {"largest": largest}, about)
+    weight = numpy_helper.from_array(np.array([[largest]], np.float32), "largest")
+    return of_nodes([left, root], [weight], about)
 
 
 def test_an_output_that_is_not_finite_in_the_tick_is_a_fault_at_neutral(tmp_path: Path) -> None:
@@ -127,7 +104,7 @@ def test_an_output_that_is_not_finite_in_the_tick_is_a_fault_at_neutral(tmp_path
 
 def test_an_infinite_output_is_a_fault_and_not_the_full_amplitude(tmp_path: Path) -> None:
     grow = helper.make_node("Exp", ["observation"], ["action"])
-    content = hand_made([grow], {}, card(("instruction_angle", 1e-6)))
+    content = of_nodes([grow], (), card(("instruction_angle", 1e-6)))
     with pytest.raises(ParameterError, match="its output is not finite for the input"):
         made(write(tmp_path, content))  # a probe of 1000 is enough for this one
 
@@ -145,7 +122,7 @@ def test_a_model_that_onnxruntime_cannot_run_is_refused(tmp_path: Path) -> None:
         helper.make_node("Tanh", ["short"], ["bent"]),  # there is none for such numbers
         helper.make_node("Cast", ["bent"], ["action"], to=TensorProto.FLOAT),
     ]
-    path = write(tmp_path, hand_made(nodes, {}, card()))
+    path = write(tmp_path, of_nodes(nodes))
     assert refusal(path).startswith(f"ppo: policy: {path}: onnxruntime cannot run it: ")
 
 

@@ -2,8 +2,6 @@
 
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,13 +11,11 @@ from pathlib import Path
 import pytest
 import zmq
 from rigs.harness import Rig
-from rigs.processes import running
+from rigs.processes import PATIENCE
 
-from fishd.client import Agent, Fish, FishError, NoDaemon
+from fishd.client import Agent, FishError, NoDaemon
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
-
-PATIENCE = 20.0
 
 
 @pytest.fixture
@@ -189,21 +185,6 @@ def test_an_address_in_use_is_named(agent: Agent) -> None:
         Agent(other.address)
 
 
-@contextmanager
-def holding(address: str) -> Iterator[int]:
-    """An agent in another process; its pid."""
-    code = "import sys; from fishd.client import Agent; a = Agent(sys.argv[1]); print(flush=True)"
-    with subprocess.Popen(
-        [sys.executable, "-c", f"{code}; sys.stdin.read()", address],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as process:
-        assert process.stdout
-        process.stdout.readline()
-        yield process.pid
-        process.kill()
-
-
 def test_a_second_agent_at_an_ipc_address_is_refused_and_the_first_goes_on(agent: Agent) -> None:
     with pytest.raises(FishError) as caught:
         Agent(agent.address)
@@ -218,24 +199,6 @@ def test_a_second_agent_at_an_ipc_address_is_refused_and_the_first_goes_on(agent
     assert ticks[0].phi_c == 0.1
 
 
-def test_the_address_of_an_agent_that_was_killed_is_free(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/agent"
-    with holding(address) as pid, pytest.raises(FishError, match=rf"\(pid {pid}\) already serves"):
-        Agent(address)
-    assert (tmp_path / "agent").is_socket()  # left behind
-    Agent(address).close()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_control_socket_of_a_fishd_is_not_taken_from_it(tmp_path: Path) -> None:
-    with running(tmp_path) as daemon, Fish(daemon.endpoint) as fish:
-        with pytest.raises(FishError, match=rf"\(pid {daemon.process.pid}\) already serves"):
-            Agent(daemon.endpoint)
-        assert fish.status().pid == daemon.process.pid
-        with Fish(daemon.endpoint) as another:
-            assert another.status().mode == "idle"
-
-
 def test_a_socket_that_anyone_listens_at_is_not_taken(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/agent"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -245,14 +208,6 @@ def test_a_socket_that_anyone_listens_at_is_not_taken(tmp_path: Path) -> None:
         Agent(address)
     assert [path.name for path in tmp_path.iterdir()] == ["agent"]
     context.destroy(linger=0)
-
-
-def test_a_file_is_not_taken_for_a_socket(tmp_path: Path) -> None:
-    notes = tmp_path / "notes"
-    notes.write_text("precious")
-    with pytest.raises(FishError, match="notes is there already and is no socket"):
-        Agent(f"ipc://{notes}")
-    assert notes.read_text() == "precious"
 
 
 @pytest.mark.parametrize(

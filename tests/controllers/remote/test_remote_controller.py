@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from rigs.harness import LIMITS, Rig
-from rigs.scripted_agent import ScriptedAgent, connect, reason
+from rigs.scripted_agent import ScriptedAgent, connect, reason, swim
 
 from fishd.config import load
 from fishd.controllers import registry
@@ -15,7 +15,7 @@ from fishd.controllers.remote.wire import Wire
 from fishd.core.errors import ConfigError, ParameterError
 
 
-def test_an_action_is_in_force_in_the_tick_whose_observation_it_answers(
+def test_an_action_is_in_force_in_the_tick_that_it_answers(
     still: Rig, agent: ScriptedAgent
 ) -> None:
     angles = {n: 0.4 * math.sin(n) for n in range(1, 51)}
@@ -52,9 +52,7 @@ def test_virtual_time_waits_for_a_slow_agent(still: Rig, agent: ScriptedAgent) -
 
 def test_silence_is_neutral_and_after_some_ticks_a_fault(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, deadline=0.03)
-    with agent.answering(lambda seen: agent.action(0.2)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     ticks = rig.run(4)
     assert [(tick.phi_c, tick.mode) for tick in ticks] == [(0.0, "running")] * 4
     assert rig.run()[-1].mode == "fault"
@@ -124,13 +122,9 @@ def test_ticks_without_an_observation_are_lost_too(rig: Rig, agent: ScriptedAgen
     assert agent.seen[0]["lost"] == rig.index - 1 >= 7
 
 
-def test_a_pause_is_neutral_and_silent_and_ends_when_it_is_told(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2)
-    with agent.answering(lambda seen: agent.action(0.2)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     agent.drain()
     agent.send(agent.pause(100.0))
     time.sleep(0.02)
@@ -160,9 +154,7 @@ def test_a_pause_in_place_of_an_action_ends_the_wait(rig: Rig, agent: ScriptedAg
 
 def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2, deadline=0.001)
-    with agent.answering(lambda seen: agent.action(0.2)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     agent.drain()
     agent.send(agent.pause(1.0))
     time.sleep(0.02)
@@ -187,9 +179,7 @@ def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) 
     assert [seen["seq"] for seen in agent.seen] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
 
 
-def test_each_take_over_has_a_session_of_its_own_whose_end_is_told(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_each_take_over_is_a_session_whose_end_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     first = connect(rig, agent)["session"]
     second = connect(rig, agent)["session"]
     rig.start("hold")
@@ -254,9 +244,7 @@ def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to(address: 
         load(None, ["start.controller=remote", f"start.parameters.agent='{address}'"])
 
 
-def test_deadlines_change_while_it_swims_but_the_agent_stays(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_deadlines_change_while_it_swims_the_agent_stays(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
     rig.retune(misses=7)
     assert rig.loop.active.controller.parameters.misses == 7

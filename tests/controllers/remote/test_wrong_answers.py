@@ -1,4 +1,4 @@
-"""Answers that are none, to the controller `remote`: what they do, and what the fault says."""
+"""Agents that do what they should not: answers that are none, and reversals in every tick."""
 
 import re
 import time
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from rigs.harness import Rig
-from rigs.scripted_agent import ScriptedAgent, connect, reason
+from rigs.scripted_agent import ScriptedAgent, connect, reason, swim
 
 
 def spoiled(**changes: Any) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("seq", [-3, 0, 2, 8, 10**18])
-def test_an_action_for_what_was_never_sent_is_a_fault(
+def test_an_action_for_what_was_not_sent_is_a_fault(
     rig: Rig, agent: ScriptedAgent, seq: int
 ) -> None:
     assert connect(rig, agent)["seq"] == 1
@@ -82,13 +82,9 @@ def test_an_action_for_what_was_never_sent_is_a_fault(
     assert f"an action for observation {seq}, which was never sent; the latest is 1" in reason(rig)
 
 
-def test_answers_that_name_another_session_are_told_from_late_ones(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
-    with agent.answering(lambda seen: agent.action(0.1)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    swim(rig, agent)
     with agent.answering(lambda seen: agent.action(0.3, session="0123")):
         assert {tick.phi_c for tick in rig.run(5)} == {0.0}
     assert rig.reason == "remote-silent"
@@ -98,9 +94,7 @@ def test_answers_that_name_another_session_are_told_from_late_ones(
     assert int(said[2]) >= 4
 
 
-def test_before_the_first_action_the_wrong_answers_are_counted_too(
-    rig: Rig, agent: ScriptedAgent
-) -> None:
+def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, first_action=2.0)
     with agent.answering(lambda seen: agent.action(0.3, session="0123")):
         rig.run(10)
@@ -119,3 +113,49 @@ def test_late_answers_from_the_session_before_do_no_harm(rig: Rig, agent: Script
     with agent.answering(lambda seen: {**now, "seq": seen["seq"]}):
         assert {tick.phi_c for tick in rig.run(5)} <= {0.0, 0.2}
     assert rig.mode == "running"
+
+
+def flip(agent: ScriptedAgent, seen: dict[str, float]) -> dict[str, object]:
+    return agent.action(0.42 if seen["instruction_angle"] <= 0.0 else -0.42)
+
+
+def test_without_a_dwell_an_agent_may_reverse_every_tick(still: Rig, agent: ScriptedAgent) -> None:
+    still.start("remote", agent=agent.address)
+    with agent.answering(lambda seen: flip(agent, seen)):
+        angles = [tick.phi_c for tick in still.run(100)]
+    assert angles == [0.42, -0.42] * 50
+    assert still.loop.active.name == "remote"
+
+
+def test_with_a_dwell_its_reversals_wait(still: Rig, agent: ScriptedAgent) -> None:
+    still.start("remote", agent=agent.address, dwell=0.15)
+    with agent.answering(lambda seen: flip(agent, seen)):
+        angles = [tick.phi_c for tick in still.run(9)]
+    assert angles == [0.42] * 3 + [-0.42] * 3 + [0.42] * 3
+    # The agent is shown the angle that was sent.
+    shown = [seen["instruction_angle"] for seen in agent.seen]
+    assert shown == [0.0, *angles[:-1]]
+
+
+def test_a_dwell_can_be_changed_in_flight(still: Rig, agent: ScriptedAgent) -> None:
+    still.start("remote", agent=agent.address)
+    with agent.answering(lambda seen: flip(agent, seen)):
+        still.run(10)
+        still.retune(dwell=0.1)
+        angles = [tick.phi_c for tick in still.run(8)]
+    assert angles == [0.42, 0.42, -0.42, -0.42] * 2
+
+
+def test_an_agent_that_insists_is_told_and_swing_takes_over(
+    still: Rig, agent: ScriptedAgent
+) -> None:
+    still.start("remote", agent=agent.address, dwell=0.2)
+    with agent.answering(lambda seen: flip(agent, seen)):
+        ticks = still.run(60)
+    assert ([tick.controller for tick in ticks].index("swing"), ticks[-1].mode) == (39, "running")
+    assert still.loop.active.fallback
+    assert still.loop.active.fallback.message.startswith(
+        "remote gave up: in 30 of the last 40 ticks"
+    )
+    agent.drain()
+    assert agent.seen[-1]["kind"] == "ended"

@@ -6,16 +6,15 @@ from rigs.force_rig import ForceRig, Ticks, measurements
 from fishd.core.calibration import ForceCalibration
 
 
-def test_a_frozen_channel_is_suspected_after_its_time_and_only_then() -> None:
-    with ForceRig() as rig:
-        ticks = Ticks(rig.sensor(frozen_after=1.0))
-        measurements(ticks.run(1.0))
-        rig.faults.inject("frozen-code", 1.5)
-        suspects = [measured.suspect for measured in measurements(ticks.run(1.5))]
-        assert not any(suspects[:19])
-        assert all(suspects[22:])
-        assert suspects[-1].startswith("F_x (channel A0-A1) has been frozen at +0.5")
-        assert not any(measured.suspect for measured in measurements(ticks.run(1.0))[1:])
+def test_a_frozen_channel_is_suspected_after_its_time_and_only_then(rig: ForceRig) -> None:
+    ticks = Ticks(rig.sensor(frozen_after=1.0))
+    measurements(ticks.run(1.0))
+    rig.faults.inject("frozen-code", 1.5)
+    suspects = [measured.suspect for measured in measurements(ticks.run(1.5))]
+    assert not any(suspects[:19])
+    assert all(suspects[22:])
+    assert suspects[-1].startswith("F_x (channel A0-A1) has been frozen at +0.5")
+    assert not any(measured.suspect for measured in measurements(ticks.run(1.0))[1:])
 
 
 def test_one_frozen_channel_is_told_from_the_other() -> None:
@@ -41,74 +40,63 @@ def test_a_code_that_is_the_same_after_a_gap_was_not_frozen_for_all_that_time() 
 
 
 @pytest.mark.parametrize(("volts", "end"), [(3.0, "+2.048"), (-3.0, "-2.048")])
-def test_a_clipped_channel_is_named_with_its_limit(volts: float, end: str) -> None:
-    with ForceRig() as rig:
-        rig.volts["A2-A3"] = volts
-        measured = Ticks(rig.sensor()).next()
+def test_a_clipped_channel_is_named_with_its_limit(rig: ForceRig, volts: float, end: str) -> None:
+    rig.volts["A2-A3"] = volts
+    measured = Ticks(rig.sensor()).next()
     assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"
 
 
-def test_a_single_clipped_sample_makes_its_window_suspect() -> None:
-    with ForceRig() as rig:
-        rig.volts["A0-A1"] = lambda t: 3.0 if 0.120 < t < 0.126 else 0.5
-        suspects = [measured.suspect for measured in measurements(Ticks(rig.sensor()).run(0.3))]
+def test_a_single_clipped_sample_makes_its_window_suspect(rig: ForceRig) -> None:
+    rig.volts["A0-A1"] = lambda t: 3.0 if 0.120 < t < 0.126 else 0.5
+    suspects = [measured.suspect for measured in measurements(Ticks(rig.sensor()).run(0.3))]
     assert [bool(suspect) for suspect in suspects] == [False, False, True, False, False, False]
 
 
 @pytest.mark.parametrize(("volts", "key"), [(3.28, "saturation_high"), (-3.28, "saturation_low")])
-def test_an_amplifier_at_its_supply_is_suspected_though_the_adc_does_not_clip(
-    volts: float, key: str
-) -> None:
-    with ForceRig() as rig:
-        rig.volts["A2-A3"] = volts
-        measured = Ticks(rig.sensor(full_scale=4.096)).next()
+def test_an_amplifier_at_its_supply_is_suspected(rig: ForceRig, volts: float, key: str) -> None:
+    rig.volts["A2-A3"] = volts
+    measured = Ticks(rig.sensor(full_scale=4.096)).next()
     assert measured.suspect.startswith("F_y (channel A2-A3) is at ")
     assert measured.suspect.endswith(f"the amplifier is at its end (force_sensor.{key})")
 
 
-def test_a_single_saturated_sample_makes_its_window_suspect_and_no_other() -> None:
-    with ForceRig() as rig:
-        rig.volts["A0-A1"] = lambda t: 3.28 if 0.120 < t < 0.126 else 3.1
-        ticks = Ticks(rig.sensor(full_scale=4.096))
-        suspects = [measured.suspect for measured in measurements(ticks.run(0.3))]
+def test_a_single_saturated_sample_makes_its_window_suspect_and_no_other(rig: ForceRig) -> None:
+    rig.volts["A0-A1"] = lambda t: 3.28 if 0.120 < t < 0.126 else 3.1
+    ticks = Ticks(rig.sensor(full_scale=4.096))
+    suspects = [measured.suspect for measured in measurements(ticks.run(0.3))]
     assert [bool(suspect) for suspect in suspects] == [False, False, True, False, False, False]
 
 
 @pytest.mark.parametrize(("low", "suspected"), [(0.1, True), (-3.2, False)])
-def test_an_amplifier_with_one_output_ends_at_ground_too(low: float, suspected: bool) -> None:
-    with ForceRig() as rig:
-        rig.volts = {"A0": 0.02, "A1": 1.65}
-        sensor = rig.sensor(channel_x="A0", channel_y="A1", full_scale=4.096, saturation_low=low)
-        suspect = Ticks(sensor).next().suspect
+def test_an_amplifier_with_one_output_ends_at_0(rig: ForceRig, low: float, suspected: bool) -> None:
+    rig.volts = {"A0": 0.02, "A1": 1.65}
+    sensor = rig.sensor(channel_x="A0", channel_y="A1", full_scale=4.096, saturation_low=low)
+    suspect = Ticks(sensor).next().suspect
     assert suspect.startswith("F_x (channel A0) is at +0.0") == suspected
     assert bool(suspect) == suspected
 
 
-def test_where_the_amplifier_has_another_supply_the_whole_range_is_believed() -> None:
-    with ForceRig() as rig:
-        rig.volts["A0-A1"] = 4.0
-        ends = {"saturation_low": None, "saturation_high": None}
-        ticks = Ticks(rig.sensor(full_scale=4.096, force_limit=100.0, **ends))
-        assert not any(measured.suspect for measured in measurements(ticks.run(0.5)))
+def test_where_the_amplifier_has_another_supply_the_whole_range_is_believed(rig: ForceRig) -> None:
+    rig.volts["A0-A1"] = 4.0
+    ends = {"saturation_low": None, "saturation_high": None}
+    ticks = Ticks(rig.sensor(full_scale=4.096, force_limit=100.0, **ends))
+    assert not any(measured.suspect for measured in measurements(ticks.run(0.5)))
 
 
-def test_a_force_beyond_the_limit_is_suspected_though_the_mean_is_within() -> None:
-    with ForceRig() as rig:
-        rig.volts["A2-A3"] = lambda t: -1.2 if 0.020 < t < 0.026 else 0.0
-        suspect = Ticks(rig.sensor(force_limit=1.0)).next().suspect
+def test_a_force_beyond_the_limit_is_suspected_though_the_mean_is_within(rig: ForceRig) -> None:
+    rig.volts["A2-A3"] = lambda t: -1.2 if 0.020 < t < 0.026 else 0.0
+    suspect = Ticks(rig.sensor(force_limit=1.0)).next().suspect
     assert suspect.startswith("F_y is -1.2 N, beyond force_sensor.force_limit, 1 N")
 
 
-def test_the_limit_is_of_forces_and_not_of_voltages() -> None:
-    with ForceRig() as rig:
-        ticks = Ticks(rig.sensor(ForceCalibration(xx=100.0), force_limit=10.0))
-        assert ticks.next().suspect.startswith("F_x is +50.")
+def test_the_limit_is_of_forces_and_not_of_voltages(rig: ForceRig) -> None:
+    ticks = Ticks(rig.sensor(ForceCalibration(xx=100.0), force_limit=10.0))
+    assert ticks.next().suspect.startswith("F_x is +50.")
 
 
-def test_a_suspicion_is_of_the_window_it_came_with_and_not_of_reads_without_a_sample() -> None:
-    with ForceRig() as rig:
-        rig.volts["A0-A1"] = lambda t: 3.0 if t < 0.1 else 0.5  # in the first conversion only
-        found = Ticks(rig.sensor(data_rate=8)).run(1.5)
+def test_a_suspicion_is_of_its_own_window_and_not_of_reads_without_a_sample(rig: ForceRig) -> None:
+    rig.volts["A0-A1"] = lambda t: 3.0 if t < 0.1 else 0.5  # in the first conversion only
+    found = Ticks(rig.sensor(data_rate=8)).run(1.5)
     read = [item for item in found if not isinstance(item, str)]
     assert "is clipped" in read[0].suspect
     assert [measured.samples for measured in read[1:4]] == [0, 0, 0]

@@ -55,17 +55,14 @@ def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
 
 
 @given(crosstalk, crosstalk, st.integers(0, 2**32 - 1))
-def test_with_noise_it_is_recovered_within_what_the_noise_permits(
+def test_with_noise_it_is_recovered_as_well_as_that_permits(
     cx: float, cy: float, seed: int
 ) -> None:
     noise = 1e-4
     loads = measured(PLAN * 8, sensor(1.0, 1.0, cx, cy), (0.5, -0.5), noise, seed)
     found = fit(loads)
     matrix = np.array(
-        [
-            [found.calibration.xx, found.calibration.xy],
-            [found.calibration.yx, found.calibration.yy],
-        ]
+        [[found.calibration.xx, found.calibration.xy], [found.calibration.yx, found.calibration.yy]]
     )
     # Six standard errors: 16 loads of 0.2 N and more along each axis, and a matrix of norm < 2.
     tolerance = 6 * 2 * 2 * noise / (0.2 * math.sqrt(16))
@@ -99,7 +96,7 @@ def test_voltages_that_have_nothing_to_do_with_the_loads_are_no_fit(seed: int) -
 
 
 @given(gains, gains, crosstalk, crosstalk, st.integers(0, 2**32 - 1))
-def test_a_sensor_with_some_noise_is_a_fit(
+def test_a_sensor_with_noise_is_a_fit(
     gx: float, gy: float, cx: float, cy: float, seed: int
 ) -> None:
     loads = measured(PLAN, sensor(gx, gy, cx, cy), noise=0.02 * 0.2 * min(gx, gy), seed=seed)
@@ -114,9 +111,7 @@ def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gai
 
 
 @given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
-def test_the_condition_number_depends_neither_on_units_nor_on_an_offset(
-    unit: float, offset: float
-) -> None:
+def test_the_condition_number_depends_on_no_unit_and_no_offset(unit: float, offset: float) -> None:
     plain = fit(measured(PLAN, sensor(1, 3))).calibration.condition
     zero = (offset * unit, offset * unit)
     scaled = fit(measured(PLAN, sensor(unit, 3 * unit), zero)).calibration.condition
@@ -127,18 +122,14 @@ def test_the_condition_number_depends_neither_on_units_nor_on_an_offset(
     ("left_out", "name"),
     [(0, "no load at all"), (1, "along +x"), (2, "along -x"), (3, "along +y"), (4, "along -y")],
 )
-def test_a_plan_without_one_of_its_loads_is_refused_by_the_name_of_that_load(
-    left_out: int, name: str
-) -> None:
+def test_a_plan_that_lacks_a_load_is_refused_by_the_name_of_it(left_out: int, name: str) -> None:
     plan = PLAN[:left_out] + PLAN[left_out + 1 :]
     with pytest.raises(PoorLoads, match=f"{name.replace('+', '[+]')}.* is missing"):
         fit(measured(plan, sensor(1, 1)))
 
 
 @given(st.floats(-3, 3), st.lists(st.floats(-1, 1), min_size=3, max_size=9))
-def test_loads_on_one_line_are_refused_whatever_its_direction(
-    angle: float, sizes: list[float]
-) -> None:
+def test_loads_on_one_line_in_any_direction_are_refused(angle: float, sizes: list[float]) -> None:
     line = [(size * math.cos(angle), size * math.sin(angle)) for size in (*sizes, 0.0, 1.0, -1.0)]
     assert missing_loads(line)
     with pytest.raises(PoorLoads):

@@ -1,10 +1,18 @@
-"""The sampler: every value is of the channel it claims to be of, and at the right time."""
+"""The sampler and its sensor: no sample lies whatever goes wrong, and each has its right time."""
 
+import math
 from typing import Any
 
 import pytest
-from rigs.force_rig import STEP, ForceRig, take_pairs, volts
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rigs.force_rig import STEP, ForceRig, Ticks, take_pairs, volts
 
+from fishd.core.calibration import ForceCalibration
+from fishd.core.signals import Measurement
+from fishd.hardware.driver import Pair
+from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
+from fishd.hardware.settings import ForceSensorSettings
 from fishd.virtual.pi.i2c import Write
 
 CONFIG = 1
@@ -26,12 +34,11 @@ def starts(rig: ForceRig) -> list[tuple[float, int]]:
     return found
 
 
-def test_the_channels_are_read_in_the_order_x_y_y_x() -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        found = starts(rig)
-        for _ in range(8):
-            sampler.step()
+def test_the_channels_are_read_in_the_order_x_y_y_x(rig: ForceRig) -> None:
+    sampler = rig.sampler()
+    found = starts(rig)
+    for _ in range(8):
+        sampler.step()
     assert [mux for _, mux in found] == [0, 3, 3, 0, 0, 3, 3, 0]
 
 
@@ -43,20 +50,19 @@ def test_the_order_cancels_the_lag_of_the_second_channel() -> None:
     assert abs(sum(differences[: len(differences) // 2 * 2])) <= 2
 
 
-def test_the_sampler_sleeps_through_a_conversion_and_asks_once() -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        sampler.step()
-        polls = 0
-        transfer = rig.device.transfer
+def test_the_sampler_sleeps_through_a_conversion_and_asks_once(rig: ForceRig) -> None:
+    sampler = rig.sampler()
+    sampler.step()
+    polls = 0
+    transfer = rig.device.transfer
 
-        def counted(address: int, messages: Any) -> list[bytes]:
-            nonlocal polls
-            polls += 1
-            return transfer(address, messages)
+    def counted(address: int, messages: Any) -> list[bytes]:
+        nonlocal polls
+        polls += 1
+        return transfer(address, messages)
 
-        rig.device.transfer = counted
-        sampler.step()
+    rig.device.transfer = counted
+    sampler.step()
     assert polls == 4  # start, config, pointer, conversion
 
 
@@ -70,9 +76,8 @@ def test_chips_at_either_end_of_the_tolerance_are_read_without_an_error(seed: in
 
 
 @pytest.mark.parametrize("data_rate", [8, 16, 32, 64, 128, 250, 475, 860])
-def test_every_data_rate_gives_right_values(data_rate: int) -> None:
-    with ForceRig() as rig:
-        pairs = take_pairs(rig.sampler(data_rate=data_rate), rig, 2.0)
+def test_every_data_rate_gives_right_values(rig: ForceRig, data_rate: int) -> None:
+    pairs = take_pairs(rig.sampler(data_rate=data_rate), rig, 2.0)
     assert len(pairs) >= 0.75 * data_rate * 2.0 / 2 * 0.7
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
 
@@ -121,23 +126,116 @@ def test_no_pair_is_made_of_samples_from_before_and_after_an_error() -> None:
         assert volts(sampler.pairs[0]) == pytest.approx((0.75, -0.25), abs=STEP)
 
 
-def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for() -> None:
-    with ForceRig() as rig:
-        rig.volts["A3"] = 1.9
-        rig.chip.write(bytes((1, 0b1111_0101, 0b0000_0011)))  # A3, 8 samples per second
-        sampler = rig.sampler()
-        pairs = take_pairs(sampler, rig, 1.0)
+def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for(rig: ForceRig) -> None:
+    rig.volts["A3"] = 1.9
+    rig.chip.write(bytes((1, 0b1111_0101, 0b0000_0011)))  # A3, 8 samples per second
+    sampler = rig.sampler()
+    pairs = take_pairs(sampler, rig, 1.0)
     assert sampler.errors > 0
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
     assert len(pairs) > 100
 
 
-def test_a_conversion_that_ends_when_a_stuck_chip_recovers_is_not_believed() -> None:
+def test_a_conversion_that_ends_when_a_stuck_chip_recovers_is_not_believed(rig: ForceRig) -> None:
     """The start was ignored while it was stuck, so the code is an old one, of the other channel."""
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        for _ in range(200):
-            rig.faults.inject("stuck-busy", 0.0047)
-            pairs = take_pairs(sampler, rig, 0.02)
-            assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
+    sampler = rig.sampler()
+    for _ in range(200):
+        rig.faults.inject("stuck-busy", 0.0047)
+        pairs = take_pairs(sampler, rig, 0.02)
+        assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
     assert sampler.errors >= 200
+
+
+FAULTS = ("nack", "timeout", "clock-stretch", "bus-owned", "arbitration-lost", "unplugged")
+
+codes = st.integers(-32767, 32766)
+numbers = st.floats(-100, 100)
+calibrations = st.builds(
+    ForceCalibration, xx=numbers, xy=numbers, x0=numbers, yx=numbers, yy=numbers, y0=numbers
+)
+windows = st.lists(st.tuples(codes, codes), min_size=1, max_size=30)
+
+
+def as_pairs(window: list[tuple[int, int]]) -> list[Pair]:
+    return [
+        Pair(1.0 + 3e-3 * index, 1.002 + 3e-3 * index, x * STEP, y * STEP)
+        for index, (x, y) in enumerate(window)
+    ]
+
+
+@pytest.mark.slow
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32),
+    error_rate=st.sampled_from((0.0, 0.02, 0.2)),
+    faults=st.lists(
+        st.tuples(st.sampled_from(FAULTS), st.floats(1e-4, 0.3), st.floats(0.0, 0.3)), max_size=5
+    ),
+)
+def test_each_measurement_is_right_none_is_of_the_future_and_it_recovers(
+    seed: int, error_rate: float, faults: list[tuple[str, float, float]]
+) -> None:
+    with ForceRig(seed=seed) as rig:
+        ticks = Ticks(rig.sensor())
+        rig.faults.error_rate = error_rate
+        found: list[Measurement | str] = []
+        for name, seconds, gap in faults:
+            rig.faults.inject(name, seconds)
+            found += ticks.run(seconds + gap)
+        rig.faults.clear()
+        found += ticks.run(0.7)
+    assert isinstance(found[-1], Measurement)
+    newest = -math.inf
+    for index, item in enumerate(found, 1):
+        if isinstance(item, Measurement):
+            assert newest <= item.time <= index * ticks.tick
+            newest = item.time
+            assert (item.fx, item.fy) == pytest.approx((0.5, -0.25), abs=6 * STEP)
+            assert item.suspect == ""
+
+
+@given(windows, calibrations)
+def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
+    window: list[tuple[int, int]], calibration: ForceCalibration
+) -> None:
+    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=1e4), ("F_x", "F_y"))
+    measured = evaluation.measure(as_pairs(window), calibration)
+    forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
+    assert measured.fx == pytest.approx(sum(fx for fx, _ in forces) / len(window), abs=1e-9)
+    assert measured.fy == pytest.approx(sum(fy for _, fy in forces) / len(window), abs=1e-9)
+    assert measured.samples == len(window)
+    assert measured.suspect == ""
+
+
+@given(windows, calibrations, st.floats(0.1, 100))
+def test_a_window_is_suspect_exactly_if_a_force_is_beyond_the_limit(
+    window: list[tuple[int, int]], calibration: ForceCalibration, limit: float
+) -> None:
+    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=limit), ("F_x", "F_y"))
+    measured = evaluation.measure(as_pairs(window), calibration)
+    forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
+    assert bool(measured.suspect) == any(max(abs(fx), abs(fy)) > limit for fx, fy in forces)
+
+
+@given(st.lists(windows, max_size=5))
+def test_a_watch_finds_mean_and_deviation_of_all_pairs(parts: list[list[tuple[int, int]]]) -> None:
+    watch = VoltageWatch(0.0, ForceCalibration())
+    for part in parts:
+        watch.add(as_pairs(part), "")
+    sample = watch.close()
+    xs = [x * STEP for part in parts for x, _ in part]
+    assert sample.pairs == len(xs)
+    if xs:
+        mean = sum(xs) / len(xs)
+        assert sample.vx == pytest.approx(mean, abs=1e-12)
+        deviation = math.sqrt(sum((x - mean) ** 2 for x in xs) / len(xs))
+        assert sample.vx_std == pytest.approx(deviation, abs=1e-12)
+
+
+@pytest.mark.parametrize("tick", [0.005, 0.01, 0.02, 0.05, 0.1, 0.2])
+def test_a_loop_of_any_tick_gets_most_of_the_possible_samples(rig: ForceRig, tick: float) -> None:
+    ticks = Ticks(rig.sensor(tick=tick), tick)
+    ticks.run(0.05)
+    found = ticks.run(2.0)
+    assert all(isinstance(item, Measurement) for item in found)
+    assert sum(item.samples for item in found if isinstance(item, Measurement)) >= 320

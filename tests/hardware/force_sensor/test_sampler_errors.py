@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.force_rig import ABSENT_BUS, STEP, ForceRig, take_pairs, volts
+from rigs.ads1115_board import ABSENT_BUS
+from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 
 from fishd.core.errors import MissingPackage
 from fishd.hardware.force_sensor.sampler import LONGEST_PAUSE
@@ -16,53 +17,51 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 
 @pytest.mark.parametrize("delay", [0.0, 2e-3, 6e-3, 8.6e-3])
-def test_a_reset_amid_a_conversion_gives_an_error_and_no_value(delay: float) -> None:
-    with ForceRig() as rig:
-        # These are the chip's own after a reset, so they do not show that there was one.
-        sampler = rig.sampler(data_rate=128, full_scale=2.048)
-        take_pairs(sampler, rig, 0.1)
-        sleep = rig.clock.sleep
+def test_a_reset_amid_a_conversion_gives_an_error_and_no_value(rig: ForceRig, delay: float) -> None:
+    # These are the chip's own after a reset, so they do not show that there was one.
+    sampler = rig.sampler(data_rate=128, full_scale=2.048)
+    take_pairs(sampler, rig, 0.1)
+    sleep = rig.clock.sleep
 
-        def break_down(seconds: float) -> None:
-            if seconds < 1 / 128:  # no conversion
-                sleep(seconds)
-                return
-            sleep(delay)
-            rig.faults.inject("brown-out")
-            sleep(seconds - delay)
+    def break_down(seconds: float) -> None:
+        if seconds < 1 / 128:  # no conversion
+            sleep(seconds)
+            return
+        sleep(delay)
+        rig.faults.inject("brown-out")
+        sleep(seconds - delay)
 
-        rig.clock.sleep = break_down
-        sampler.step()
-        assert sampler.trouble == "the ADS1115 was reset while it converted: check its power"
-        rig.clock.sleep = sleep
-        pairs = take_pairs(sampler, rig, 0.5)
+    rig.clock.sleep = break_down
+    sampler.step()
+    assert sampler.trouble == "the ADS1115 was reset while it converted: check its power"
+    rig.clock.sleep = sleep
+    pairs = take_pairs(sampler, rig, 0.5)
     assert sampler.trouble == ""
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
     assert len(pairs) > 15
 
 
 def test_a_transfer_that_the_kernel_gave_up_without_an_exception_is_an_error(
-    monkeypatch: pytest.MonkeyPatch,
+    rig: ForceRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A raw file's write returns None for EAGAIN; the driver would take the start for done."""
-    with ForceRig() as rig:
-        from Adafruit_PureIO import smbus
+    from Adafruit_PureIO import smbus
 
-        emulated = smbus.open
+    emulated = smbus.open
 
-        def as_python_does(*arguments: Any, **options: Any) -> Any:
-            file = emulated(*arguments, **options)
-            for name in ("read", "write"):
-                setattr(file, name, _without_blocking_error(getattr(file, name)))
-            return file
+    def as_python_does(*arguments: Any, **options: Any) -> Any:
+        file = emulated(*arguments, **options)
+        for name in ("read", "write"):
+            setattr(file, name, _without_blocking_error(getattr(file, name)))
+        return file
 
-        monkeypatch.setattr(smbus, "open", as_python_does)
-        sampler = rig.sampler()
-        take_pairs(sampler, rig, 0.1)
-        rig.faults.inject("arbitration-lost", 0.01)
-        sampler.step()
-        assert "error 11" in sampler.trouble
-        pairs = take_pairs(sampler, rig, 0.5)
+    monkeypatch.setattr(smbus, "open", as_python_does)
+    sampler = rig.sampler()
+    take_pairs(sampler, rig, 0.1)
+    rig.faults.inject("arbitration-lost", 0.01)
+    sampler.step()
+    assert "error 11" in sampler.trouble
+    pairs = take_pairs(sampler, rig, 0.5)
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
 
 
@@ -76,20 +75,19 @@ def _without_blocking_error(call: Any) -> Any:
     return as_raw_file
 
 
-def test_while_a_chip_is_away_the_pauses_between_attempts_grow_to_half_a_second() -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        take_pairs(sampler, rig, 0.1)
-        rig.faults.inject("unplugged")
-        pauses = []
-        for _ in range(20):
-            sampler.step()
-            pauses.append(sampler.ready_at - rig.clock.now)
-        assert pauses[0] == pytest.approx(1.25 / 860 + 1e-3)
-        assert pauses == pytest.approx(sorted(pauses))
-        assert pauses[-1] == pytest.approx(LONGEST_PAUSE)
-        rig.faults.clear()
-        assert take_pairs(sampler, rig, 1.0)
+def test_while_a_chip_is_away_pauses_between_attempts_grow_to_half_a_second(rig: ForceRig) -> None:
+    sampler = rig.sampler()
+    take_pairs(sampler, rig, 0.1)
+    rig.faults.inject("unplugged")
+    pauses = []
+    for _ in range(20):
+        sampler.step()
+        pauses.append(sampler.ready_at - rig.clock.now)
+    assert pauses[0] == pytest.approx(1.25 / 860 + 1e-3)
+    assert pauses == pytest.approx(sorted(pauses))
+    assert pauses[-1] == pytest.approx(LONGEST_PAUSE)
+    rig.faults.clear()
+    assert take_pairs(sampler, rig, 1.0)
     assert sampler.reconnects == 1
 
 
@@ -107,20 +105,19 @@ def test_while_a_chip_is_away_the_pauses_between_attempts_grow_to_half_a_second(
 )
 @pytest.mark.parametrize("from_the_start", [False, True])
 def test_the_trouble_is_one_line_that_says_what_to_check(
-    fault: str, line: str, from_the_start: bool
+    rig: ForceRig, fault: str, line: str, from_the_start: bool
 ) -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        if not from_the_start:
-            take_pairs(sampler, rig, 0.1)
-        rig.faults.inject(fault)
-        for _ in range(6):
-            sampler.step()
-            assert "\n" not in sampler.trouble
-        assert sampler.trouble.startswith(line)
-        rig.faults.clear()
-        assert take_pairs(sampler, rig, 1.0)
-        assert sampler.trouble == ""
+    sampler = rig.sampler()
+    if not from_the_start:
+        take_pairs(sampler, rig, 0.1)
+    rig.faults.inject(fault)
+    for _ in range(6):
+        sampler.step()
+        assert "\n" not in sampler.trouble
+    assert sampler.trouble.startswith(line)
+    rig.faults.clear()
+    assert take_pairs(sampler, rig, 1.0)
+    assert sampler.trouble == ""
 
 
 def test_a_bus_that_is_missing_is_named_and_used_once_it_is_there() -> None:
@@ -140,76 +137,72 @@ def test_a_bus_that_is_missing_is_named_and_used_once_it_is_there() -> None:
 
 
 @pytest.mark.parametrize("fault", ["stuck-busy", "nack"])
-def test_opening_the_bus_again_and_again_leaves_nothing_behind(fault: str) -> None:
+def test_opening_the_bus_again_and_again_leaves_nothing_behind(rig: ForceRig, fault: str) -> None:
     """Not even without the garbage collector, which the daemon keeps from running in a tick."""
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        take_pairs(sampler, rig, 0.1)
-        rig.faults.inject(fault)
-        gc.collect()
-        gc.disable()
-        try:
-            before = len(list(Path("/proc/self/fd").iterdir()))
-            for _ in range(100):
-                sampler.step()
-            assert len(list(Path("/proc/self/fd").iterdir())) <= before
-            assert gc.collect() == 0
-        finally:
-            gc.enable()
-
-
-def test_sampling_leaves_no_garbage() -> None:
-    """The driver's own combined transfers do, thousands of objects per second."""
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        take_pairs(sampler, rig, 0.1)
-        gc.collect()
-        gc.disable()
-        try:
-            take_pairs(sampler, rig, 1.0)
-            assert gc.collect() == 0
-        finally:
-            gc.enable()
-
-
-def test_a_bus_that_cannot_even_be_closed_is_opened_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with ForceRig() as rig:
-        from Adafruit_PureIO import smbus
-
-        emulated = smbus.open
-
-        def stubborn(*arguments: Any, **options: Any) -> Any:
-            file = emulated(*arguments, **options)
-            close = file.close
-
-            def fail() -> None:
-                close()
-                raise OSError(5, "Input/output error")
-
-            file.close = fail
-            return file
-
-        monkeypatch.setattr(smbus, "open", stubborn)
-        sampler = rig.sampler()
-        take_pairs(sampler, rig, 0.1)
-        rig.faults.inject("unplugged", 1.0)
-        for _ in range(10):
+    sampler = rig.sampler()
+    take_pairs(sampler, rig, 0.1)
+    rig.faults.inject(fault)
+    gc.collect()
+    gc.disable()
+    try:
+        before = len(list(Path("/proc/self/fd").iterdir()))
+        for _ in range(100):
             sampler.step()
-        assert sampler.trouble.startswith("nothing answers at 0x48")
-        assert take_pairs(sampler, rig, 2.0)
-        sampler.close()
+        assert len(list(Path("/proc/self/fd").iterdir())) <= before
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
 
 
-def test_a_hanging_bus_keeps_the_sampler_for_20_ms_and_not_for_the_kernels_whole_second() -> None:
-    with ForceRig() as rig:
-        sampler = rig.sampler()
-        take_pairs(sampler, rig, 0.1)
-        rig.faults.inject("timeout")
-        begun = rig.clock.now
+def test_sampling_leaves_no_garbage(rig: ForceRig) -> None:
+    """The driver's own combined transfers do, thousands of objects per second."""
+    sampler = rig.sampler()
+    take_pairs(sampler, rig, 0.1)
+    gc.collect()
+    gc.disable()
+    try:
+        take_pairs(sampler, rig, 1.0)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
+
+
+def test_a_bus_that_cannot_be_closed_is_reopened(
+    rig: ForceRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from Adafruit_PureIO import smbus
+
+    emulated = smbus.open
+
+    def stubborn(*arguments: Any, **options: Any) -> Any:
+        file = emulated(*arguments, **options)
+        close = file.close
+
+        def fail() -> None:
+            close()
+            raise OSError(5, "Input/output error")
+
+        file.close = fail
+        return file
+
+    monkeypatch.setattr(smbus, "open", stubborn)
+    sampler = rig.sampler()
+    take_pairs(sampler, rig, 0.1)
+    rig.faults.inject("unplugged", 1.0)
+    for _ in range(10):
         sampler.step()
-        assert rig.clock.now - begun < 0.03
+    assert sampler.trouble.startswith("nothing answers at 0x48")
+    assert take_pairs(sampler, rig, 2.0)
+    sampler.close()
+
+
+def test_a_hanging_bus_keeps_the_sampler_for_20_ms_not_the_kernels_second(rig: ForceRig) -> None:
+    sampler = rig.sampler()
+    take_pairs(sampler, rig, 0.1)
+    rig.faults.inject("timeout")
+    begun = rig.clock.now
+    sampler.step()
+    assert rig.clock.now - begun < 0.03
 
 
 def test_an_error_of_an_unknown_kind_is_passed_on_with_its_number() -> None:
@@ -223,9 +216,7 @@ def test_an_error_of_an_unknown_kind_is_passed_on_with_its_number() -> None:
     assert sampler.trouble == "a transfer on /dev/i2c-1 failed: Protocol error (error 71)"
 
 
-def test_without_the_driver_packages_the_message_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     single_shot = "fishd.hardware.force_sensor.ads1115_single_shot"
     monkeypatch.setitem(sys.modules, "adafruit_ads1x15", None)
     monkeypatch.delitem(sys.modules, single_shot, raising=False)

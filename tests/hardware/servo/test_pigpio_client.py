@@ -1,15 +1,19 @@
-"""The client's time limits and errors, against servers that answer badly."""
+"""The client of pigpiod against servers that answer badly, and a client that cannot be prepared."""
 
+import contextlib
 import socket
 import struct
 import threading
 
 import pytest
+from rigs.pigpio_rig import Bench
 from rigs.processes import PATIENCE
 
+from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.pigpio import PigpioSettings
-from fishd.hardware.servo.pigpio_client import opened
+from fishd.hardware.servo.pigpio_client import Client, opened
+from fishd.hardware.servo.pigpio_link import PigpioLink
 
 
 class Server:
@@ -50,15 +54,10 @@ HEADER = struct.pack("<IIII", 45, 0, 0, 44)
         (b"", True, "it closed the connection"),
     ],
 )
-def test_an_answer_that_breaks_off_is_an_error_not_a_loop_without_end(
-    answer: bytes, dies: bool, message: str
-) -> None:
+def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, message: str) -> None:
     server = Server(answer, dies=dies)
     try:
-        with (
-            pytest.raises(ServoError, match=message),
-            opened(server.settings, 0.2) as client,
-        ):
+        with pytest.raises(ServoError, match=message), opened(server.settings, 0.2) as client:
             client.script_status(0)
     finally:
         server.close()
@@ -69,5 +68,34 @@ def test_a_host_that_is_none_is_one_line_too(host: str) -> None:
     with (
         pytest.raises(ServoError, match=rf"^pigpiod at {host}:8888: [^\n]+$"),
         opened(PigpioSettings(host=host)),
+    ):
+        pass
+
+
+def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: Bench) -> None:
+    attempts: list[Client] = []
+
+    def prepare(client: Client) -> None:
+        attempts.append(client)
+        if len(attempts) == 1:
+            raise IndexError("out of range")
+
+    link = PigpioLink(bench.settings(), SystemClock(), prepare, threaded=True)
+    with contextlib.closing(link), link.session(last=True) as client:
+        assert client is attempts[1]
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            attempts[0].get_pigpio_version()
+
+
+def test_an_unforeseen_error_is_the_reason_why_there_is_no_connection(bench: Bench) -> None:
+    def prepare(client: Client) -> None:
+        raise IndexError("out of range")
+
+    with (
+        contextlib.closing(
+            PigpioLink(bench.settings(), VirtualClock(), prepare, threaded=False)
+        ) as link,
+        pytest.raises(ServoError, match="not connected: out of range"),
+        link.session(),
     ):
         pass

@@ -1,10 +1,10 @@
 """Whatever instant a process dies at, the pulses that it asked pigpiod for end by themselves."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
-from rigs.pigpio_rig import GPIO, PigpioBench, connect, script_of
+from rigs.pigpio_rig import GPIO, Bench, connect, script_of
 
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio_client import TimedSocket
@@ -39,15 +39,14 @@ def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     return kill_after
 
 
-def lose_connection(bench: PigpioBench, servo: CalibratedServo) -> None:
-    for connection in list(bench.daemon._connections.values()):
-        connection.hang_up()
+def lose_connection(bench: Bench, servo: CalibratedServo) -> None:
+    bench.hang_up()
     with contextlib.suppress(OSError):
         servo.write(0.5)
     bench.wait(0.6)
 
 
-def swim(bench: PigpioBench) -> CalibratedServo:
+def swim(bench: Bench) -> CalibratedServo:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(0.05)
@@ -55,31 +54,31 @@ def swim(bench: PigpioBench) -> CalibratedServo:
     return servo
 
 
-def write(bench: PigpioBench) -> None:
+def write(bench: Bench) -> None:
     swim(bench).write(-0.5)
 
 
-def first_write(bench: PigpioBench) -> None:
+def first_write(bench: Bench) -> None:
     servo = swim(bench)
     servo.release()
     bench.wait(0.05)
     servo.write(0.5)
 
 
-def release(bench: PigpioBench) -> None:
+def release(bench: Bench) -> None:
     swim(bench).release()
 
 
-def close(bench: PigpioBench) -> None:
+def close(bench: Bench) -> None:
     swim(bench).close()
 
 
-def start_after_a_kill(bench: PigpioBench) -> None:
+def start_after_a_kill(bench: Bench) -> None:
     swim(bench)
     connect(bench.servo())
 
 
-def reconnect(bench: PigpioBench) -> None:
+def reconnect(bench: Bench) -> None:
     servo = swim(bench)
     with bench.client() as other:  # so that the pulses are still on, and no countdown ends them
         for script in range(2):
@@ -88,12 +87,12 @@ def reconnect(bench: PigpioBench) -> None:
     connect(servo)
 
 
-def last_resort(bench: PigpioBench) -> None:
+def last_resort(bench: Bench) -> None:
     swim(bench)
     bench.last_resort()
 
 
-def last_resort_on_pulses_of_others(bench: PigpioBench) -> None:
+def last_resort_on_pulses_of_others(bench: Bench) -> None:
     with bench.client() as other:
         other.set_servo_pulsewidth(GPIO, 1800)
     bench.last_resort()
@@ -112,10 +111,7 @@ DEEDS = (
 
 
 def die_at(
-    n: int,
-    bench: PigpioBench,
-    deed: Callable[[PigpioBench], None],
-    kill_after: Callable[[int | None], None],
+    n: int, bench: Bench, deed: Callable[[Bench], None], kill_after: Callable[[int | None], None]
 ) -> bool:
     """True when it died; False when it had done everything before."""
     kill_after(n)
@@ -130,11 +126,11 @@ def die_at(
 
 @pytest.mark.parametrize("deed", DEEDS)
 def test_a_kill_between_any_two_commands_leaves_no_pulses(
-    deed: Callable[[PigpioBench], None], mortal: Callable[[int | None], None]
+    deed: Callable[[Bench], None], mortal: Callable[[int | None], None]
 ) -> None:
     for n in range(100):
         with contextlib.ExitStack() as stack:
-            bench = PigpioBench(stack)
+            bench = Bench(stack)
             died = die_at(n, bench, deed, mortal)
             bench.wait(SOON)
             # Pulses of others that nobody has touched yet are theirs.
@@ -146,65 +142,31 @@ def test_a_kill_between_any_two_commands_leaves_no_pulses(
     pytest.fail("it never came to its end")
 
 
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
-
-
-def test_bytes_of_a_killed_process_that_pigpiod_reads_late_do_not_stay_in_force(
-    bench: PigpioBench,
-) -> None:
+def swim_until_the_countdown_has_ended(bench: Bench) -> None:
     swim(bench)
-    successor = bench.servo()
-    connect(successor)  # which has put everything in order
-    with bench.client() as dead:
-        dead.set_servo_pulsewidth(GPIO, 1800)
     bench.wait(SOON)
     assert bench.width == 0
 
 
-def test_bytes_of_a_lost_connection_do_not_stay_in_force_after_a_release(
-    bench: PigpioBench,
+@pytest.mark.parametrize(
+    "past", [start_after_a_kill, reconnect, swim_until_the_countdown_has_ended]
+)
+def test_bytes_of_a_dead_process_or_connection_that_pigpiod_reads_late_do_not_stay_in_force(
+    bench: Bench, past: Callable[[Bench], None]
 ) -> None:
-    servo = swim(bench)
-    lose_connection(bench, servo)
-    connect(servo)
-    with bench.client() as lost:
-        lost.set_servo_pulsewidth(GPIO, 1800)
-    bench.wait(SOON)
+    past(bench)
+    with bench.client() as late:
+        late.set_servo_pulsewidth(GPIO, 1800)
+    bench.wait(0.1 if past is swim_until_the_countdown_has_ended else SOON)
     assert bench.width == 0
 
 
 def test_a_release_that_only_reaches_pigpiod_in_half_ends_the_pulses_at_once(
-    bench: PigpioBench, mortal: Callable[[int | None], None]
+    bench: Bench, mortal: Callable[[int | None], None]
 ) -> None:
     servo = swim(bench)
     with bench.client() as client:
         # The first of its two commands, as after a cable that broke in between.
         client.update_script(script_of(servo), [1, GPIO, 0])
     bench.wait(0.05)
-    assert bench.width == 0
-
-
-def test_a_servo_that_is_written_to_right_after_a_release_is_under_guard_at_once(
-    bench: PigpioBench,
-) -> None:
-    servo = swim(bench)
-    servo.release()
-    bench.wait(0.05)
-    servo.write(0.5)
-    bench.wait(0.25)
-    assert bench.width == 1500
-
-
-def test_a_pulse_that_arrives_after_its_countdown_has_ended_is_ended_at_once(
-    bench: PigpioBench,
-) -> None:
-    swim(bench).write(-0.5)
-    bench.wait(2.0)
-    assert bench.width == 0
-    with bench.client() as late:
-        late.set_servo_pulsewidth(GPIO, 1750)
-    bench.wait(0.1)
     assert bench.width == 0

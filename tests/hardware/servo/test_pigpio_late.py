@@ -2,29 +2,18 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from rigs.pigpio_rig import FRAME, GPIO, TICK, PigpioBench
+from rigs.pigpio_rig import FRAME, GPIO, TICK, Bench
 
-from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
-from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
-from fishd.virtual.pi.faults import Faults
-from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 
 
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
-
-
-def late_tick(bench: PigpioBench, servo: CalibratedServo, angle: float) -> None:
+def late_tick(bench: Bench, servo: CalibratedServo, angle: float) -> None:
     """A tick whose answer does not come in time, but before the next tick."""
     bench.faults.inject("pigpiod-frozen")
     try:
@@ -34,14 +23,14 @@ def late_tick(bench: PigpioBench, servo: CalibratedServo, angle: float) -> None:
     bench.wait(TICK)
 
 
-def thaw(bench: PigpioBench) -> None:
+def thaw(bench: Bench) -> None:
     """Pigpiod goes on, and has carried out all that it was sent when this returns."""
     bench.faults.clear()
     with bench.client() as client:
         client.get_pigpio_version()
 
 
-def test_a_late_answer_now_and_then_does_not_end_the_link(bench: PigpioBench) -> None:
+def test_a_late_answer_now_and_then_does_not_end_the_link(bench: Bench) -> None:
     servo = bench.servo()
     for _ in range(4):
         servo.write(0.5)
@@ -54,7 +43,7 @@ def test_a_late_answer_now_and_then_does_not_end_the_link(bench: PigpioBench) ->
     assert {width for _, width in bench.daemon.history(GPIO)} == {1800}
 
 
-def stall(bench: PigpioBench) -> None:
+def stall(bench: Bench) -> None:
     """The machine is so busy that the next command takes 0.3 s of real time."""
     commands = bench.daemon._commands
     execute = commands.execute
@@ -67,7 +56,7 @@ def stall(bench: PigpioBench) -> None:
     commands.execute = stalling  # type: ignore[method-assign]
 
 
-def test_in_virtual_time_no_answer_is_late_because_the_machine_is_busy(bench: PigpioBench) -> None:
+def test_in_virtual_time_no_answer_is_late_because_the_machine_is_busy(bench: Bench) -> None:
     servo = bench.servo()
     stall(bench)
     servo.write(0.5)  # which connects
@@ -77,7 +66,7 @@ def test_in_virtual_time_no_answer_is_late_because_the_machine_is_busy(bench: Pi
     assert servo.driver.counters() == {"servo_reconnects": 0, "servo_late_answers": 0}
 
 
-def test_the_third_late_answer_in_a_row_ends_it(bench: PigpioBench) -> None:
+def test_the_third_late_answer_in_a_row_ends_it(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     late_tick(bench, servo, 0.5)
@@ -86,9 +75,7 @@ def test_the_third_late_answer_in_a_row_ends_it(bench: PigpioBench) -> None:
         late_tick(bench, servo, 0.5)
 
 
-def test_where_the_next_tick_would_come_after_the_countdown_the_first_one_ends_it(
-    bench: PigpioBench,
-) -> None:
+def test_where_the_next_tick_would_come_after_the_countdown_the_first_ends_it(bench: Bench) -> None:
     servo = bench.servo(tick=0.2)  # and so a countdown of 0.6 s
     servo.write(0.5)
     bench.wait(0.45)
@@ -96,7 +83,7 @@ def test_where_the_next_tick_would_come_after_the_countdown_the_first_one_ends_i
         late_tick(bench, servo, 0.5)
 
 
-def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: PigpioBench) -> None:
+def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(TICK)
@@ -108,7 +95,7 @@ def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: PigpioBen
         servo.write(0.5)
 
 
-def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: PigpioBench) -> None:
+def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")
@@ -120,9 +107,7 @@ def test_pulses_end_as_ever_when_fishd_dies_while_an_answer_is_owed(bench: Pigpi
     assert bench.width == 0
 
 
-def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(
-    bench: PigpioBench,
-) -> None:
+def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")
@@ -138,15 +123,11 @@ def test_a_release_is_sent_though_an_answer_is_owed_and_says_that_it_waits(
 
 @pytest.mark.realtime
 def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() -> None:
-    clock = SystemClock()
-    faults = Faults(clock)
-    daemon = Pigpiod(clock, faults)
-    daemon.start()
-    settings = PigpioSettings(gpio=GPIO, port=daemon.port, timeout=0.03)
-    servo = CalibratedServo(Pigpio, settings, ServoCalibration(), clock, threaded=True, tick=TICK)
-    try:
+    with contextlib.ExitStack() as stack:
+        bench = Bench(stack, SystemClock())
+        servo = bench.servo(replace(bench.settings(), timeout=0.03))
         servo.write(0.5)
-        faults.inject("pigpiod-frozen")
+        bench.faults.inject("pigpiod-frozen")
         durations = []
         for _ in range(3):
             begun = time.monotonic()
@@ -154,13 +135,9 @@ def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() 
                 servo.write(0.5)
             durations.append(time.monotonic() - begun)
         assert max(durations) < 0.06  # twice the limit, for a machine that is busy
-    finally:
-        with contextlib.suppress(ServoError):
-            servo.close()
-        daemon.close()
 
 
-def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: PigpioBench) -> None:
+def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: Bench) -> None:
     settings = bench.settings()
     servo = bench.servo(replace(settings, countdown=1.0))
     servo.write(0.5)

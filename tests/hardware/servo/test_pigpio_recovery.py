@@ -1,26 +1,17 @@
 """What the pigpio servo does about a past: killed predecessors, a lost pigpiod, a last resort."""
 
-import contextlib
-from collections.abc import Iterator
-
 import pigpio
 import pytest
 from msgspec.structs import replace
-from rigs.pigpio_rig import FRAME, GPIO, PigpioBench, connect
+from rigs.pigpio_rig import FRAME, GPIO, Bench, connect
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ServoError
 
-
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
+ALT5 = 2
 
 
-def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(
-    bench: PigpioBench,
-) -> None:
+def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(bench: Bench) -> None:
     bench.servo().write(0.5)  # and is never heard of again
     bench.wait(0.1)
     bench.servo().release()
@@ -31,9 +22,7 @@ def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(
     assert all(width in (1500, 0) for _, width in bench.changes_after(started))
 
 
-def test_the_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(
-    bench: PigpioBench,
-) -> None:
+def test_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(bench: Bench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.05)
     with pytest.raises(ServoError, match="soft limits"):
@@ -46,7 +35,7 @@ def test_the_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(
     assert bench.width == 0
 
 
-def test_pulses_that_went_on_in_a_frozen_pigpiod_stop_once_it_is_back(bench: PigpioBench) -> None:
+def test_pulses_that_went_on_in_a_frozen_pigpiod_stop_once_it_is_back(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")
@@ -65,7 +54,7 @@ def test_pulses_that_went_on_in_a_frozen_pigpiod_stop_once_it_is_back(bench: Pig
     assert bench.width == 0
 
 
-def test_without_pigpiod_it_asks_at_most_twice_a_second_in_virtual_time(bench: PigpioBench) -> None:
+def test_without_pigpiod_it_asks_at_most_twice_a_second_in_virtual_time(bench: Bench) -> None:
     servo = bench.servo()
     bench.faults.inject("pigpiod-gone")
     with pytest.raises(ServoError, match="not connected: Connection refused"):
@@ -81,13 +70,13 @@ def test_without_pigpiod_it_asks_at_most_twice_a_second_in_virtual_time(bench: P
     assert servo.driver.counters() == {"servo_reconnects": 0, "servo_late_answers": 0}
 
 
-def test_killed_fishds_never_fill_pigpiod_with_scripts(bench: PigpioBench) -> None:
+def test_killed_fishds_never_fill_pigpiod_with_scripts(bench: Bench) -> None:
     for _ in range(40):
         bench.servo().write(0.1)
     assert bench.scripts() == 1
 
 
-def test_scripts_of_others_and_of_other_pins_stay(bench: PigpioBench) -> None:
+def test_scripts_of_others_and_of_other_pins_stay(bench: Bench) -> None:
     with bench.client() as client:
         script = client.store_script(b"tag 0 mils 10 jmp 0")
         bench.wait(0.01)
@@ -99,9 +88,7 @@ def test_scripts_of_others_and_of_other_pins_stay(bench: PigpioBench) -> None:
     neighbour.write(0.3)
 
 
-def test_the_last_resort_moves_a_swimming_servo_to_neutral_and_releases_it(
-    bench: PigpioBench,
-) -> None:
+def test_the_last_resort_moves_a_swimming_servo_to_neutral_and_releases_it(bench: Bench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.1)
     begun = bench.clock.now
@@ -112,7 +99,7 @@ def test_the_last_resort_moves_a_swimming_servo_to_neutral_and_releases_it(
     assert 0.29 <= bench.changes_after(begun)[-1][0] - begun <= 0.35
 
 
-def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: PigpioBench) -> None:
+def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: Bench) -> None:
     assert bench.last_resort() is False
     killed = bench.servo()
     killed.write(0.5)
@@ -124,7 +111,7 @@ def test_the_last_resort_leaves_a_servo_without_pulses_alone(bench: PigpioBench)
     assert bench.scripts() == 0
 
 
-def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: PigpioBench) -> None:
+def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: Bench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.1)
     bench.refuse(pigpio._PI_CMD_SERVO, 1500)
@@ -134,7 +121,7 @@ def test_the_last_resort_stops_the_pulses_though_neutral_is_refused(bench: Pigpi
     assert bench.scripts() == 0
 
 
-def test_the_last_resort_stops_the_pulses_though_its_connection_breaks(bench: PigpioBench) -> None:
+def test_the_last_resort_stops_the_pulses_though_its_connection_breaks(bench: Bench) -> None:
     bench.servo().write(0.5)
     bench.wait(0.1)
     bench.hang_up_in_next_sleep()
@@ -144,7 +131,7 @@ def test_the_last_resort_stops_the_pulses_though_its_connection_breaks(bench: Pi
     assert bench.scripts() == 0
 
 
-def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: PigpioBench) -> None:
+def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Bench) -> None:
     bench.servo().write(0.5)
 
     def interrupt(seconds: float) -> None:
@@ -157,28 +144,82 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Pi
     assert bench.width == 0
 
 
-def test_the_last_resort_says_in_one_line_that_pigpiod_is_gone(bench: PigpioBench) -> None:
+def test_the_last_resort_says_in_one_line_that_pigpiod_is_gone(bench: Bench) -> None:
     bench.faults.inject("pigpiod-gone")
     with pytest.raises(ServoError, match=r"^pigpiod at 127\.0\.0\.1:\d+: Connection refused$"):
         bench.last_resort()
 
 
-def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(
-    bench: PigpioBench,
-) -> None:
+def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     assert bench.last_resort() is True
-    with pytest.raises(ServoError, match="reconnecting"):
+    with pytest.raises(
+        ServoError, match=r"took fishd's script away, as 'fishctl release' does; reconnecting"
+    ):
         servo.write(0.5)
     assert bench.width == 0
 
 
-def test_a_fishd_whose_script_was_taken_away_says_so(bench: PigpioBench) -> None:
-    servo = bench.servo()
-    servo.write(0.5)
-    bench.last_resort()
-    with pytest.raises(
-        ServoError, match=r"took fishd's script away, as 'fishctl release' does; re"
-    ):
-        servo.write(0.5)
+def leave_pulses_of_the_peripheral(bench: Bench, width: float = 1740.0) -> None:
+    """As a fishd of old with hardware PWM, or another program, when it was killed."""
+    with bench.client() as client:
+        client.hardware_PWM(GPIO, 50, round(width * 50))
+    bench.wait(0.1)
+    assert bench.width == pytest.approx(width, abs=0.1)
+
+
+def test_pulses_of_the_peripheral_go_on_when_pigpiod_is_started_again(bench: Bench) -> None:
+    leave_pulses_of_the_peripheral(bench)
+    bench.faults.inject("pigpiod-restart")
+    bench.wait(1.0)
+    assert bench.width == pytest.approx(1740, abs=0.1)
+    with bench.client() as client, pytest.raises(pigpio.error, match="not in use for PWM"):
+        client.get_PWM_dutycycle(GPIO)
+    with bench.client() as client:
+        client.hardware_PWM(GPIO, 0, 0)  # of no use, as on a Pi
+    bench.wait(0.1)
+    assert bench.width == pytest.approx(1740, abs=0.1)
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_the_last_resort_ends_them_at_neutral_and_says_so(bench: Bench, restarted: bool) -> None:
+    leave_pulses_of_the_peripheral(bench)
+    if restarted:
+        bench.faults.inject("pigpiod-restart")
+    begun = bench.clock.now
+    assert bench.last_resort() is True
+    bench.wait(1.0)
+    assert bench.width == 0
+    assert 1500 in [width for _, width in bench.changes_after(begun)]
+    assert bench.last_resort() is False
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_fishd_that_starts_ends_them_at_neutral(bench: Bench, restarted: bool) -> None:
+    leave_pulses_of_the_peripheral(bench)
+    if restarted:
+        bench.faults.inject("pigpiod-restart")
+    connect(bench.servo())
+    bench.wait(0.05)
+    assert bench.width == 1500
+    bench.wait(1.0)
+    assert bench.width == 0
+
+
+def test_a_pin_that_is_the_peripherals_but_has_no_pulses_is_left_alone(bench: Bench) -> None:
+    with bench.client() as client:
+        client.set_mode(GPIO, ALT5)  # as the overlay of the kernel's PWM leaves it
+    assert bench.last_resort() is False
+    assert bench.daemon.history(GPIO) == []
+    with bench.client() as client:
+        assert client.get_mode(GPIO) == ALT5
+
+
+def test_software_pwm_of_another_program_counts_as_pulses_too(bench: Bench) -> None:
+    with bench.client() as client:
+        client.set_PWM_dutycycle(GPIO, 128)
+    bench.wait(0.1)
+    assert bench.last_resort() is True
+    bench.wait(0.1)
+    assert bench.width == 0

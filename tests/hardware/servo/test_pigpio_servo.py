@@ -1,24 +1,14 @@
 """The pigpio servo on the emulated pigpiod, with the true client, in virtual time."""
 
-import contextlib
-import math
-from collections.abc import Iterator
-
 import pytest
 from msgspec.structs import replace
-from rigs.pigpio_rig import FRAME, GPIO, TICK, PigpioBench
+from rigs.pigpio_rig import FRAME, GPIO, TICK, Bench
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ServoError
 
 
-@pytest.fixture
-def bench() -> Iterator[PigpioBench]:
-    with contextlib.ExitStack() as stack:
-        yield PigpioBench(stack)
-
-
-def test_a_write_makes_the_pulse_of_the_angle(bench: PigpioBench) -> None:
+def test_a_write_makes_the_pulse_of_the_angle(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     assert bench.width == 1800
@@ -27,59 +17,19 @@ def test_a_write_makes_the_pulse_of_the_angle(bench: PigpioBench) -> None:
     assert bench.width == 1200
 
 
-def test_a_pulse_is_rounded_to_the_microsecond_not_cut_off(bench: PigpioBench) -> None:
+def test_a_pulse_is_rounded_to_the_microsecond_not_cut_off(bench: Bench) -> None:
     bench.servo().write(0.4999)  # 1799.94 µs
     assert bench.width == 1800
 
 
-def test_trim_direction_and_scale_come_from_the_calibration(bench: PigpioBench) -> None:
-    servo = bench.servo(calibration=ServoCalibration(trim=20, direction=-1, scale=500))
-    servo.write(0.2)
-    assert bench.width == 1420
-
-
-def test_nothing_moves_before_the_first_write(bench: PigpioBench) -> None:
+def test_nothing_moves_before_the_first_write(bench: Bench) -> None:
     servo = bench.servo()
     servo.release()
     bench.wait(1.0)
     assert bench.width == 0
 
 
-@pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf, 1.3, -1.3])
-def test_an_angle_that_is_not_finite_or_out_of_limits_never_reaches_the_wire(
-    bench: PigpioBench, angle: float
-) -> None:
-    servo = bench.servo()
-    servo.write(0.1)
-    with pytest.raises(ServoError, match="soft limits"):
-        servo.write(angle)
-    assert bench.width == 1560
-    bench.wait(TICK)
-    servo.write(0.2)
-    assert bench.width == 1620
-
-
-def test_a_recalibration_counts_from_the_next_write(bench: PigpioBench) -> None:
-    servo = bench.servo()
-    servo.write(0.5)
-    servo.recalibrate(ServoCalibration(trim=30))
-    assert bench.width == 1800
-    servo.write(0.5)
-    assert bench.width == 1830
-    assert servo.calibration.trim == 30
-
-
-def test_a_calibration_whose_neutral_no_servo_takes_is_refused(bench: PigpioBench) -> None:
-    servo = bench.servo(replace(bench.settings(), centre=600.0))
-    with pytest.raises(ServoError, match="pulse of 200 µs"):
-        servo.recalibrate(ServoCalibration(trim=-400))
-    servo.write(0.0)
-    assert bench.width == 600
-
-
-def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_half_a_second_later(
-    bench: PigpioBench,
-) -> None:
+def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_after_0_5_more(bench: Bench) -> None:
     servo = bench.servo(calibration=ServoCalibration(trim=25))
     for _ in range(10):
         servo.write(0.5)
@@ -92,7 +42,7 @@ def test_silence_ends_in_neutral_after_0_2_s_and_in_no_pulses_half_a_second_late
     assert 0.49 <= off - neutral <= 0.54
 
 
-def test_the_countdown_knows_the_newest_neutral(bench: PigpioBench) -> None:
+def test_the_countdown_knows_the_newest_neutral(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     servo.recalibrate(ServoCalibration(trim=-40.4))
@@ -101,7 +51,7 @@ def test_the_countdown_knows_the_newest_neutral(bench: PigpioBench) -> None:
     assert bench.width == 1460
 
 
-def test_regular_writes_keep_the_countdown_from_ending(bench: PigpioBench) -> None:
+def test_regular_writes_keep_the_countdown_from_ending(bench: Bench) -> None:
     servo = bench.servo()
     for _ in range(100):
         servo.write(0.3)
@@ -109,26 +59,19 @@ def test_regular_writes_keep_the_countdown_from_ending(bench: PigpioBench) -> No
     assert [width for _, width in bench.daemon.history(GPIO)] == [1680]
 
 
-def test_a_slow_loop_has_three_ticks_before_the_countdown_ends(bench: PigpioBench) -> None:
-    servo = bench.servo(tick=0.2)
+@pytest.mark.parametrize(("tick", "countdown", "seconds"), [(0.2, 0.2, 0.6), (TICK, 1.0, 1.0)])
+def test_a_slow_loop_has_three_ticks_and_a_longer_countdown_forgives_longer_stalls(
+    bench: Bench, tick: float, countdown: float, seconds: float
+) -> None:
+    servo = bench.servo(replace(bench.settings(), countdown=countdown), tick=tick)
     servo.write(0.5)
-    bench.wait(0.55)
+    bench.wait(seconds - 0.05)
     assert bench.width == 1800
     bench.wait(0.1)
-    assert bench.width == 1500
+    assert (bench.width, servo.driver.countdown) == (1500, seconds)
 
 
-def test_a_longer_countdown_forgives_longer_stalls(bench: PigpioBench) -> None:
-    settings = bench.settings()
-    servo = bench.servo(replace(settings, countdown=1.0))
-    servo.write(0.5)
-    bench.wait(0.95)
-    assert bench.width == 1800
-    bench.wait(0.1)
-    assert (bench.width, servo.driver.countdown) == (1500, 1.0)
-
-
-def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench) -> None:
+def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.wait(0.4)
@@ -139,10 +82,11 @@ def test_a_write_during_the_hold_at_neutral_keeps_the_pulses(bench: PigpioBench)
         assert bench.width == 1800
 
 
-def test_a_release_stops_the_pulses_and_disarms_the_countdown(bench: PigpioBench) -> None:
+@pytest.mark.parametrize("while_it_is", [TICK, 0.4], ids=["swimming", "held at neutral"])
+def test_a_release_stops_pulses_and_disarms_the_countdown(bench: Bench, while_it_is: float) -> None:
     servo = bench.servo()
     servo.write(0.5)
-    bench.wait(TICK)
+    bench.wait(while_it_is)
     servo.release()
     servo.release()
     released = bench.clock.now
@@ -151,30 +95,21 @@ def test_a_release_stops_the_pulses_and_disarms_the_countdown(bench: PigpioBench
     assert [width for _, width in bench.changes_after(released - FRAME)] == [0]
 
 
-def test_a_release_during_the_hold_at_neutral_stays_released(bench: PigpioBench) -> None:
-    servo = bench.servo()
-    servo.write(0.5)
-    bench.wait(0.4)
-    servo.release()
-    assert bench.width == 0
-    bench.wait(2.0)
-    assert bench.width == 0
-
-
-def test_writing_after_a_release_brings_pulses_back_with_their_countdown(
-    bench: PigpioBench,
+@pytest.mark.parametrize("pause", [0.05, 1.0])
+def test_a_write_after_a_release_brings_pulses_and_countdown_back(
+    bench: Bench, pause: float
 ) -> None:
     servo = bench.servo()
     servo.write(0.5)
     servo.release()
-    bench.wait(1.0)
+    bench.wait(pause)
     servo.write(-0.5)
     assert bench.width == 1200
     bench.wait(0.3)
     assert bench.width == 1500
 
 
-def test_close_releases_and_leaves_no_script(bench: PigpioBench) -> None:
+def test_close_releases_and_leaves_no_script(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     servo.close()
@@ -185,7 +120,7 @@ def test_close_releases_and_leaves_no_script(bench: PigpioBench) -> None:
         servo.write(0.0)
 
 
-def test_close_says_when_pulses_may_still_be_on(bench: PigpioBench) -> None:
+def test_close_says_when_pulses_may_still_be_on(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
     bench.faults.inject("pigpiod-frozen")

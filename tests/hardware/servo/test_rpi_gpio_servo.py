@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,15 +30,14 @@ def pins() -> Iterator[Pins]:
 
 @pytest.fixture
 def servo(pins: Pins) -> Iterator[CalibratedServo]:
-    servo = opened(SETTINGS, ServoCalibration(), VirtualClock())
+    servo = opened()
     yield servo
     servo.close()
 
 
-def opened(
-    settings: RpiGpioSettings, calibration: ServoCalibration, clock: VirtualClock
-) -> CalibratedServo:
-    return CalibratedServo(RpiGpio, settings, calibration, clock, threaded=False, tick=0.05)
+def opened(settings: RpiGpioSettings = SETTINGS, clock: Any = None) -> CalibratedServo:
+    time = clock or VirtualClock()
+    return CalibratedServo(RpiGpio, settings, ServoCalibration(), time, threaded=False, tick=0.05)
 
 
 def width(pins: Pins, gpio: int = 18) -> float:
@@ -55,11 +55,7 @@ def test_an_angle_becomes_a_pulse(pins: Pins, servo: CalibratedServo) -> None:
 
 
 def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
-    fast = opened(
-        RpiGpioSettings(gpio=4, frequency=200.0),
-        ServoCalibration(),
-        VirtualClock(),
-    )
+    fast = opened(RpiGpioSettings(gpio=4, frequency=200.0))
     fast.write(0.5)
     assert width(pins, 4) == pytest.approx(1800.0)
     assert pins.pwm(4) == (200.0, pytest.approx(36.0))
@@ -72,9 +68,7 @@ def test_opening_claims_the_pin_low_without_pulses(pins: Pins, servo: Calibrated
     assert pins.pwm(18) is None
 
 
-def test_release_goes_on_without_pulses_and_write_begins_again(
-    pins: Pins, servo: CalibratedServo
-) -> None:
+def test_a_release_ends_pulses_and_a_write_begins_again(pins: Pins, servo: CalibratedServo) -> None:
     servo.write(0.5)
     servo.release()
     servo.release()
@@ -93,7 +87,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
     from RPi import GPIO
 
     clock = VirtualClock()
-    servo = opened(SETTINGS, ServoCalibration(), clock)
+    servo = opened(clock=clock)
     GPIO.setup(23, GPIO.OUT, initial=GPIO.HIGH)
     servo.write(0.5)
     before = clock.now
@@ -108,7 +102,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
 
 def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pins) -> None:
     pins.occupy(18)
-    servo = opened(SETTINGS, ServoCalibration(), VirtualClock())
+    servo = opened()
     for _ in range(2):
         with pytest.raises(ServoError, match=r"^servo on GPIO 18: GPIO busy$"):
             servo.write(0.0)
@@ -139,40 +133,12 @@ def test_the_last_resort_leaves_the_pin_low(pins: Pins, servo: CalibratedServo) 
     assert pins.level(18) == 0
 
 
-def test_another_calibration_holds_from_the_next_write_on(
-    pins: Pins, servo: CalibratedServo
-) -> None:
-    servo.write(0.2)
-    servo.recalibrate(ServoCalibration(direction=-1, trim=20.0))
-    servo.write(0.2)
-    assert width(pins) == pytest.approx(1400.0)
-    with pytest.raises(ServoError, match="needs a pulse of 2700 µs"):
-        opened(
-            RpiGpioSettings(gpio=4, centre=2400.0),
-            ServoCalibration(trim=300.0),
-            VirtualClock(),
-        )
-
-
-def test_an_angle_beyond_the_limits_changes_nothing(pins: Pins, servo: CalibratedServo) -> None:
-    servo.write(0.2)
-    with pytest.raises(ServoError, match="soft limits"):
-        servo.write(1.3)
-    with pytest.raises(ServoError, match="soft limits"):
-        servo.write(float("nan"))
-    assert width(pins) == pytest.approx(1620.0)
-    servo.write(0.1)
-    assert servo.driver.counters() == {"servo_reconnects": 0}
-
-
 def test_it_says_that_its_pulses_jitter(servo: CalibratedServo) -> None:
     (line,) = servo.driver.degraded
     assert "jitter" in line
 
 
-def test_a_warning_of_the_library_becomes_a_line_of_the_log(
-    pins: Pins, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_librarys_warnings_are_logged(pins: Pins, caplog: pytest.LogCaptureFixture) -> None:
     from fishd.hardware import header
 
     caplog.set_level("INFO")
@@ -190,7 +156,7 @@ class TestALibraryThatCannotBeUsed:
 
     def start(self) -> str:
         with pytest.raises(StartupError) as caught:
-            opened(SETTINGS, ServoCalibration(), VirtualClock())
+            opened()
         assert "\n" not in str(caught.value)
         return str(caught.value)
 

@@ -22,7 +22,6 @@ def test_an_angle_becomes_a_pulse_on_the_channel_of_its_pin(bench: Bench) -> Non
     servo = bench.servo()
     assert bench.write(servo, 0.5) == pytest.approx(1800.0)
     assert bench.write(servo, -0.5) == pytest.approx(1200.0)
-    servo.close()
 
 
 def test_opening_moves_nothing(bench: Bench) -> None:
@@ -38,7 +37,6 @@ def test_pulses_come_at_the_configured_frequency(bench: Bench, frequency: float)
     servo = bench.servo(SysfsPwmSettings(frequency=frequency))
     assert bench.write(servo, 1.2) == pytest.approx(2220.0)
     assert bench.kernel.pulses(PI5, 2).at(bench.clock.now).frame == pytest.approx(1 / frequency)
-    servo.close()
 
 
 def test_release_ends_the_last_pulse_and_write_begins_again(bench: Bench) -> None:
@@ -81,7 +79,6 @@ def test_a_release_stops_pulses_that_a_killed_fishd_left_behind(bench: Bench) ->
     servo.release()
     bench.clock.sleep(0.02)
     assert bench.width() == 0.0
-    servo.close()
 
 
 def test_a_channel_that_the_kernel_only_believes_to_be_on_gets_pulses(bench: Bench) -> None:
@@ -92,7 +89,6 @@ def test_a_channel_that_the_kernel_only_believes_to_be_on_gets_pulses(bench: Ben
     assert bench.width() == 0.0
     servo = bench.servo()
     assert bench.write(servo, 0.0) == 1500.0
-    servo.close()
 
 
 def test_the_last_resort_moves_to_neutral_then_stops(bench: Bench) -> None:
@@ -119,7 +115,6 @@ def test_a_living_fishd_notices_the_last_resort(bench: Bench) -> None:
     assert bench.exported() == ["pwm2"]  # fishd still holds it
     with pytest.raises(ServoError, match="switched off from outside"):
         servo.write(0.5)
-    servo.close()
 
 
 def test_close_goes_on_when_a_step_fails(bench: Bench) -> None:
@@ -130,28 +125,6 @@ def test_close_goes_on_when_a_step_fails(bench: Bench) -> None:
     with pytest.raises(ServoError):
         servo.close()
     assert bench.exported() == []
-    servo.close()
-
-
-def test_another_calibration_holds_from_the_next_write_on(bench: Bench) -> None:
-    servo = bench.servo(calibration=ServoCalibration(trim=20.0, scale=500.0))
-    assert bench.write(servo, 0.2) == 1620.0
-    servo.recalibrate(ServoCalibration(direction=-1, highest=0.3))
-    assert bench.write(servo, 0.2) == 1380.0
-    assert servo.calibration.direction == -1
-    with pytest.raises(ServoError, match="soft limits"):
-        servo.write(0.4)
-    assert bench.width() == 1380.0  # a bad angle is no lost servo
-    servo.close()
-
-
-def test_a_calibration_without_a_neutral_pulse_is_refused(bench: Bench) -> None:
-    high = SysfsPwmSettings(centre=2400.0)
-    servo = bench.servo(high)
-    with pytest.raises(ServoError, match="2700 µs"):
-        servo.recalibrate(ServoCalibration(trim=300.0))
-    assert servo.calibration == ServoCalibration()
-    servo.close()
 
 
 @pytest.fixture

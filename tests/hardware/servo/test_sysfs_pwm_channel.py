@@ -1,7 +1,8 @@
 """How the servo's channel of the kernel's PWM is found, waited for, lost and found again."""
 
+from typing import Any
+
 import pytest
-from rigs.sysfs_pwm_kernel import SysfsPwm
 from rigs.sysfs_pwm_rig import FAN, PI4, PI5, Bench
 
 from fishd.core.errors import ServoError
@@ -14,34 +15,24 @@ def bench() -> Bench:
 
 
 @pytest.mark.parametrize(
-    ("chips", "gpio", "device", "channel"),
+    ("chips", "settings", "device", "channel"),
     [
-        ({FAN: 4, PI5: 4}, 18, PI5, 2),
-        ({PI5: 4, FAN: 4}, 19, PI5, 3),
-        ({PI5: 4}, 13, PI5, 1),
-        ({PI4: 2}, 18, PI4, 0),
-        ({PI4: 2}, 13, PI4, 1),
-        ({"3f20c000.pwm": 2}, 12, "3f20c000.pwm", 0),
+        ({FAN: 4, PI5: 4}, {"gpio": 18}, PI5, 2),
+        ({PI5: 4, FAN: 4}, {"gpio": 19}, PI5, 3),
+        ({PI5: 4}, {"gpio": 13}, PI5, 1),
+        ({PI4: 2}, {"gpio": 18}, PI4, 0),
+        ({PI4: 2}, {"gpio": 13}, PI4, 1),
+        ({"3f20c000.pwm": 2}, {"gpio": 12}, "3f20c000.pwm", 0),
+        ({PI5: 4, "soc:pwm": 1}, {"gpio": 4, "chip": "soc:pwm", "channel": 0}, "soc:pwm", 0),
     ],
 )
-def test_the_chip_is_found_by_its_device_whatever_its_number(
-    chips: dict[str, int], gpio: int, device: str, channel: int
+def test_the_chip_is_found_by_its_device_or_name_whatever_its_number(
+    chips: dict[str, int], settings: dict[str, Any], device: str, channel: int
 ) -> None:
     bench = Bench(chips)
-    servo = bench.servo(SysfsPwmSettings(gpio=gpio))
-    servo.write(0.0)
+    bench.servo(SysfsPwmSettings(**settings)).write(0.0)
     bench.clock.sleep(0.02)
     assert bench.width(channel, device) == 1500.0
-    servo.close()
-
-
-def test_chip_and_channel_can_be_named() -> None:
-    bench = Bench({PI5: 4, "soc:pwm": 1})
-    servo = bench.servo(SysfsPwmSettings(gpio=4, chip="soc:pwm", channel=0))
-    servo.write(0.0)
-    bench.clock.sleep(0.02)
-    assert bench.width(0, "soc:pwm") == 1500.0
-    servo.close()
 
 
 def test_a_start_waits_for_udev_but_a_tick_does_not() -> None:
@@ -58,7 +49,6 @@ def test_a_start_waits_for_udev_but_a_tick_does_not() -> None:
     assert bench.clock.now == before
     bench.clock.sleep(1.6)
     assert bench.write(servo, 0.0) == 1500.0
-    servo.close()
 
 
 def test_permissions_that_never_come_are_an_error_of_each_write() -> None:
@@ -84,7 +74,6 @@ def test_an_unexported_channel_is_an_error_and_then_opened_again(bench: Bench) -
     bench.clock.sleep(0.05)
     assert bench.write(servo, 0.2) == 1620.0
     assert servo.driver.counters() == {"servo_reconnects": 1}
-    servo.close()
 
 
 def test_a_reloaded_driver_is_found_under_its_new_number(bench: Bench) -> None:
@@ -115,7 +104,6 @@ def test_a_servo_that_is_not_there_at_start_is_found_later(bench: Bench) -> None
         servo.write(0.0)
     bench.clock.sleep(0.05)
     assert bench.write(servo, 0.0) == 1500.0
-    servo.close()
 
 
 @pytest.mark.parametrize(
@@ -144,8 +132,7 @@ def test_a_servo_that_is_not_there_at_start_is_found_later(bench: Bench) -> None
 def test_a_mistake_is_named_with_what_would_be_right(
     chips: dict[str, int], settings: SysfsPwmSettings, message: str
 ) -> None:
-    bench = Bench()
-    bench.kernel = SysfsPwm(bench.clock, chips)
+    bench = Bench(chips)
     servo = bench.servo(settings)
     with pytest.raises(ServoError, match=message) as caught:
         servo.write(0.0)

@@ -19,7 +19,7 @@ def faults(clock: VirtualClock) -> Faults:
     return Faults(clock)
 
 
-def test_a_fault_lasts_until_it_is_cleared_or_for_the_time_given(
+def test_a_fault_lasts_till_it_is_cleared_or_for_its_time(
     faults: Faults, clock: VirtualClock
 ) -> None:
     assert faults.listing() == {}
@@ -51,16 +51,14 @@ def test_clearing_all_ends_random_errors_too(faults: Faults) -> None:
 
 
 @pytest.mark.parametrize("call", [Faults.inject, Faults.clear])
-def test_an_unknown_name_is_answered_with_the_nearest_one(
+def test_an_unknown_name_gets_the_nearest(
     faults: Faults, call: Callable[[Faults, str], None]
 ) -> None:
     with pytest.raises(ValueError, match="no fault is called 'brownout'; did you mean 'brown-out'"):
         call(faults, "brownout")
 
 
-def test_a_fault_that_happens_at_once_tells_its_listeners_and_does_not_last(
-    faults: Faults,
-) -> None:
+def test_a_fault_that_happens_at_once_tells_its_listeners_and_is_over(faults: Faults) -> None:
     for name in INSTANTANEOUS:
         heard: list[str] = []
         faults.listen(name, partial(heard.append, name))

@@ -68,10 +68,7 @@ def test_a_decrement_sets_the_flag_and_wraps_as_a_c_int_does() -> None:
 
 def test_delays_are_exact() -> None:
     rig = Rig("s 18 1 mils 20 s p1 2 mils p2 s 18 3", 0, 13, 5).run(0.02499)
-    assert rig.pulses == [
-        (0.0, 18, 1),
-        (pytest.approx(0.02, abs=5 * INSTRUCTION_TIME), 13, 2),
-    ]
+    assert rig.pulses == [(0.0, 18, 1), (pytest.approx(0.02, abs=5 * INSTRUCTION_TIME), 13, 2)]
     assert rig.run(0.02501).pulses[2:] == [(pytest.approx(0.025, abs=1e-5), 18, 3)]
 
 

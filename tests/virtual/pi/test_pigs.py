@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from rigs.pigpiod_client import GPIO, PATIENCE, PigpiodBench, eventually, pigpiod_bench
+from rigs.pigpiod_client import GPIO, PATIENCE, Bench, eventually, pigpiod_bench
 
 from fishd.core.clock import SystemClock, VirtualClock
 
@@ -19,29 +19,25 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture
-def bench() -> Iterator[PigpiodBench]:
+def bench() -> Iterator[Bench]:
     with pigpiod_bench(SystemClock()) as bench:
         yield bench
 
 
-def pigs(bench: PigpiodBench, *arguments: str) -> subprocess.CompletedProcess[str]:
+def pigs(bench: Bench, *arguments: str) -> subprocess.CompletedProcess[str]:
     assert PIGS is not None
     return subprocess.run(
-        [PIGS, *arguments],
-        env=environment(bench),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
+        [PIGS, *arguments], env=environment(bench), capture_output=True, text=True, timeout=PATIENCE
     )
 
 
-def environment(bench: PigpiodBench) -> dict[str, str]:
+def environment(bench: Bench) -> dict[str, str]:
     """Where pigs finds the daemon."""
     return os.environ | {"PIGPIO_ADDR": "127.0.0.1", "PIGPIO_PORT": str(bench.daemon.port)}
 
 
 @contextlib.contextmanager
-def pigs_under_way(bench: PigpiodBench, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+def pigs_under_way(bench: Bench, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     assert PIGS is not None
     with subprocess.Popen([PIGS, *arguments], env=environment(bench)) as process:
         try:
@@ -50,14 +46,14 @@ def pigs_under_way(bench: PigpiodBench, *arguments: str) -> Iterator[subprocess.
             process.kill()
 
 
-def told(bench: PigpiodBench, *arguments: str) -> str:
+def told(bench: Bench, *arguments: str) -> str:
     """What pigs prints when all goes well."""
     done = pigs(bench, *arguments)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout.strip()
 
 
-def test_the_last_resort_moves_the_servo_to_neutral_and_lets_go(bench: PigpiodBench) -> None:
+def test_the_last_resort_moves_the_servo_to_neutral_and_lets_go(bench: Bench) -> None:
     bench.pi.set_servo_pulsewidth(GPIO, 1700)
     assert eventually(lambda: bench.width == 1700)
     begun = time.monotonic()
@@ -69,7 +65,7 @@ def test_the_last_resort_moves_the_servo_to_neutral_and_lets_go(bench: PigpiodBe
     assert off[0] - neutral[0] >= 0.3 - 0.02
 
 
-def test_a_delay_of_one_client_holds_up_no_other(bench: PigpiodBench) -> None:
+def test_a_delay_of_one_client_holds_up_no_other(bench: Bench) -> None:
     with pigs_under_way(bench, "s", "18", "1500", "mils", "60000") as waiting:
         assert eventually(lambda: bench.width == 1500)
         assert bench.pi.set_servo_pulsewidth(GPIO, 1600) == 0
@@ -91,23 +87,7 @@ def test_a_delay_is_one_of_the_daemons_clock() -> None:
         assert second[0] - first[0] >= 60.0
 
 
-def test_values_are_read_back(bench: PigpiodBench) -> None:
-    told(bench, "s", "18", "1504", "m", "4", "w", "w", "4", "1")
-    assert told(bench, "gpw", "18", "mg", "4", "r", "4", "pigpv").split() == [
-        "1504",
-        "1",
-        "1",
-        "79",
-    ]
-
-
-def test_hardware_pwm_is_set(bench: PigpiodBench) -> None:
-    told(bench, "hp", "18", "333", str(333 * 1500))
-    assert told(bench, "gdc", "18") == str(333 * 1500)
-    assert eventually(lambda: bench.width == pytest.approx(1500, abs=0.01))
-
-
-def test_scripts_are_stored_run_watched_and_deleted(bench: PigpiodBench) -> None:
+def test_scripts_are_stored_run_watched_and_deleted(bench: Bench) -> None:
     number = told(bench, "proc", "tag 0 mils 10 lda p0 cmp 0 jz 0 dcr p0 jnz 0 s p1 p2 jmp 0")
     assert number == "0"
     told(bench, "procr", number, "5", "18", "1500")
@@ -133,9 +113,7 @@ def test_scripts_are_stored_run_watched_and_deleted(bench: PigpiodBench) -> None
         ("i2co 1 0x48 0", "-88", "unknown command"),
     ],
 )
-def test_errors_are_told_and_make_its_exit_status(
-    bench: PigpiodBench, command: str, number: str, message: str
-) -> None:
+def test_errors_are_its_exit_status(bench: Bench, command: str, number: str, message: str) -> None:
     done = pigs(bench, *command.split(" ", 1 if command.startswith("proc ") else -1))
     assert done.returncode != 0
     assert done.stdout.strip() == number

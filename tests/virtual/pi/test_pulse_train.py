@@ -23,9 +23,7 @@ def test_a_new_width_takes_effect_with_the_next_frame(train: PulseTrain) -> None
 
 
 @pytest.mark.parametrize("frame", [1, 95, 12_345_679])
-def test_a_change_at_the_beginning_of_a_frame_takes_effect_at_once(
-    train: PulseTrain, frame: int
-) -> None:
+def test_a_change_as_a_frame_begins_takes_effect_at_once(train: PulseTrain, frame: int) -> None:
     time = frame / 50
     train.set(time, 1500.0)
     assert train.width(time) == 1500.0

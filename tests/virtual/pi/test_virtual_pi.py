@@ -3,57 +3,72 @@
 import errno
 import math
 import socket
+from typing import Any, Self
 
 import pytest
-from rigs.virtual_pi_rig import BUS, GPIO, TICK, VirtualPiRig
+from adafruit_ads1x15 import ADS1115, AnalogIn
+from adafruit_extended_bus import ExtendedI2C
+from rigs.processes import PATIENCE
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import StartupError
+from fishd.hardware.servo.pigpio_client import Client
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.lgpio import EmulatedLgpio
+from fishd.virtual.pi.linux_i2c import LinuxI2c
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.virtual_pi import VirtualPi
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
+TICK = 0.05
+BUS = 203
+"""A bus that no machine has."""
+GPIO = 18
 AMPLITUDE = 0.4  # 240 µs, a whole number of pigpiod's steps
-HALF_PERIOD = 0.24  # a whole number of servo frames
 
 
-@pytest.mark.slow
-def test_a_fish_that_is_told_to_beat_is_seen_to_swim() -> None:
-    fish = TetheredFish(PlantParameters())
-    with VirtualPiRig() as rig:
-        for half in range(20):
-            angle = AMPLITUDE if half % 2 == 0 else -AMPLITUDE
-            rig.clock.now = max(rig.clock.now, half * HALF_PERIOD - 0.005)
-            rig.steer(angle)
-            thrust, lateral = rig.forces_until((half + 1) * HALF_PERIOD - 0.006)
-            expected = fish.advance(angle, HALF_PERIOD, 1)
-            if half >= 2:
-                assert thrust == pytest.approx(expected.thrust, rel=0.05)
-                assert lateral == pytest.approx(expected.lateral_force, rel=0.05)
-                assert math.copysign(1, lateral) == -math.copysign(1, angle)
-        rig.clock.now = 20 * HALF_PERIOD
-        rig.pi.tank.catch_up(rig.clock.now)
-        assert rig.pi.tank.truth().alpha == pytest.approx(fish.state.alpha, abs=1e-3)
-        assert rig.pi.tank.take_window().fin_peak > 0.15
+class VirtualPiRig:
+    """A context manager, while which /dev/i2c-203 exists in this process."""
 
+    def __init__(self, simulation: dict[str, Any] | None = None, **settings: Any) -> None:
+        self.clock = VirtualClock()
+        self.pi = VirtualPi(
+            VirtualPiSettings(bus=BUS, pigpio_port=0, **settings),
+            PlantParameters(),
+            SimulationSettings(**{"noise": 0.0, **(simulation or {})}),
+            TICK,
+            self.clock,
+        )
+        self.device = LinuxI2c(self.pi.bus.transfer, {BUS}, self._set_timeout)
 
-def test_a_pulse_waits_for_the_next_frame_up_to_20_ms() -> None:
-    with VirtualPiRig() as rig:
-        delays = []
-        for k in range(50):
-            rig.clock.now = 1.0 + k * 0.0537
-            rig.steer(0.1 if k % 2 else -0.1)
-            rig.clock.now += 0.025
-            rig.x.voltage  # noqa: B018
-            effective, width = rig.pi.pigpiod.history(GPIO)[-1]
-            assert width == (1560 if k % 2 else 1440)
-            delays.append(effective - 1.0 - k * 0.0537)
-        assert min(delays) >= -1e-9
-        assert max(delays) <= 0.02
-        assert max(delays) - min(delays) > 0.015
+    def __enter__(self) -> Self:
+        self.pi.start()
+        self.device.install()
+        self.pigpio = Client("127.0.0.1", self.pi.pigpiod.port, PATIENCE)
+        self.ads = ADS1115(ExtendedI2C(BUS, frequency=None), data_rate=860, gain=8)
+        self.x, self.y = AnalogIn(self.ads, 0, 1), AnalogIn(self.ads, 2, 3)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pigpio.close()
+        self.device.remove()
+        self.pi.close()
+
+    def steer(self, angle: float) -> None:
+        self.pigpio.within(PATIENCE)
+        self.pigpio.set_servo_pulsewidth(GPIO, 1500 + 600 * angle)
+
+    def forces_until(self, time: float) -> tuple[float, float]:
+        """Mean voltages at x and y from now to a time [s]."""
+        xs, ys = [], []
+        while self.clock.now < time:
+            xs.append(self.x.voltage)
+            ys.append(self.y.voltage)
+        return math.fsum(xs) / len(xs), math.fsum(ys) / len(ys)
+
+    def _set_timeout(self, seconds: float) -> None:
+        self.pi.bus.timeout = seconds
 
 
 @pytest.mark.slow

@@ -1,3 +1,5 @@
+"""The best square wave, and swinging control with the true fin velocity, by reference numbers."""
+
 import math
 from collections.abc import Callable
 
@@ -45,7 +47,7 @@ def test_square_waves_make_the_reference_thrust_at_every_frequency(reference: Re
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wave", [sine, triangle])
-def test_smooth_waves_make_the_reference_thrust_at_every_frequency(
+def test_smooth_waves_make_the_reference_thrust(
     reference: Reference, wave: Callable[[float], float]
 ) -> None:
     rows = [r for r in reference("thrust_vs_frequency") if r["waveform"] == wave.__name__]
@@ -107,3 +109,55 @@ def test_a_servo_that_follows_at_once_makes_the_closed_form_thrust(xi: float) ->
 def test_the_closed_form_does_not_overflow_at_low_frequencies() -> None:
     slow, slower = (fast_servo_thrust(DEFAULT, 0.4, frequency) for frequency in (2e-3, 1e-3))
     assert slow == pytest.approx(2.0 * slower, rel=1e-9)
+
+
+STEP = 0.004  # s
+
+
+def half_swing(fish: TetheredFish, command: float, threshold: float) -> tuple[float, float]:
+    """Hold the command until the fin slows to `threshold` × its highest speed that way.
+
+    Returns the duration (s) and the impulse of the thrust (N s) until that instant.
+    """
+    sign = 1.0 if command > 0.0 else -1.0
+    highest = duration = impulse = 0.0
+    while True:
+        before = fish.state
+        window = fish.advance(command, STEP, 1)
+        speed = sign * fish.state.alpha_rate
+        highest = max(highest, speed)
+        if highest > 0.0 and speed <= threshold * highest:
+            break
+        duration += STEP
+        impulse += STEP * window.thrust
+    early, late = 0.0, STEP
+    for _ in range(12):
+        middle = 0.5 * (early + late)
+        fish.state = before
+        window = fish.advance(command, middle, 1)
+        if sign * fish.state.alpha_rate <= threshold * highest:
+            late = middle
+        else:
+            early = middle
+    return duration + middle, impulse + middle * window.thrust
+
+
+def swing_thrust(p: PlantParameters, amplitude: float, threshold: float) -> float:
+    """Return the mean thrust (N) of swinging control with the true fin velocity."""
+    fish = TetheredFish(p)
+    swings = [half_swing(fish, amplitude if k % 2 else -amplitude, threshold) for k in range(26)]
+    settled = swings[-6:]
+    return sum(impulse for _, impulse in settled) / sum(duration for duration, _ in settled)
+
+
+def test_swinging_control_has_the_reference_efficiency_at_every_threshold(
+    reference: Callable[[str], list[dict[str, str]]],
+) -> None:
+    p = PlantParameters()
+    best = {}
+    for row in reference("swing_efficiency"):
+        amplitude, threshold = float(row["Phi_rad"]), float(row["C"])
+        if amplitude not in best:
+            best[amplitude] = best_square_wave(p, amplitude).thrust
+        efficiency = swing_thrust(p, amplitude, threshold) / best[amplitude]
+        assert efficiency == pytest.approx(float(row["efficiency"]), abs=0.002), row

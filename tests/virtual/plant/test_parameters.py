@@ -24,8 +24,7 @@ def test_every_parameter_has_bounds_a_unit_and_a_description() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"xi": -0.1}, {"servo_lag": 0.0}, {"omega0": "fast"}, {"xi": 21.0}, {"damping": 1.0}],
+    "wrong", [{"xi": -0.1}, {"servo_lag": 0.0}, {"omega0": "fast"}, {"xi": 21.0}, {"damping": 1.0}]
 )
 def test_a_fish_that_cannot_exist_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(msgspec.ValidationError):

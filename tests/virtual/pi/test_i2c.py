@@ -1,10 +1,11 @@
-"""What the true drivers meet at the emulated /dev/i2c-N."""
+"""The emulated I2C bus: its transfers, and what the true drivers meet at its /dev/i2c-N."""
 
 import array
 import errno
 import fcntl
 import os
 import termios
+import threading
 from collections.abc import Iterator
 
 import adafruit_extended_bus
@@ -12,12 +13,15 @@ import pytest
 from adafruit_extended_bus import ExtendedI2C
 from Adafruit_PureIO import smbus
 from rigs.ads1115_board import ABSENT_BUS, Board
+from rigs.processes import PATIENCE
 
+from fishd.core.clock import VirtualClock
 from fishd.virtual.pi.ads1115 import RESET_CONFIG, Ads1115Chip
+from fishd.virtual.pi.faults import TRANSFER_ERRORS, Faults
+from fishd.virtual.pi.i2c import I2cBus, Read, Write
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 RESET_WORD = 0x8000 | RESET_CONFIG
-I2C_TIMEOUT = 0x0702
 
 
 @pytest.fixture
@@ -32,36 +36,96 @@ def pureio(board: Board) -> Iterator[smbus.SMBus]:
         yield bus
 
 
-@pytest.mark.parametrize(
-    ("fault", "number", "kind"),
-    [
-        ("nack", 121, OSError),
-        ("timeout", 110, TimeoutError),
-        ("clock-stretch", 5, OSError),
-        ("bus-owned", 16, OSError),
-        ("arbitration-lost", 11, BlockingIOError),
-    ],
-)
-def test_errors_reach_the_driver_with_the_kernels_numbers_and_classes(
-    board: Board, fault: str, number: int, kind: type[OSError]
-) -> None:
-    bus = ExtendedI2C(ABSENT_BUS, frequency=None)
-    board.faults.inject(fault)
-    for call in (
-        lambda: bus.writeto(0x48, b"\x01"),
-        lambda: bus.readfrom_into(0x48, bytearray(2)),
-        lambda: bus.writeto_then_readfrom(0x48, b"\x01", bytearray(2)),
-    ):
-        with pytest.raises(OSError, match="Errno") as caught:
-            call()
-        assert (type(caught.value), caught.value.errno) == (kind, number)
-    board.faults.clear()
-    word = bytearray(2)
-    bus.writeto_then_readfrom(0x48, b"\x01", word)
-    assert word == RESET_WORD.to_bytes(2, "big")
+def duration(board: Board, *messages: Write | Read) -> float:
+    begun = board.clock.now
+    board.bus.transfer(0x48, messages)
+    return board.clock.now - begun
 
 
-def test_a_hanging_bus_costs_a_second_unless_the_kernel_is_told_otherwise(
+def test_a_transfer_takes_nine_bits_per_byte_and_the_kernels_time() -> None:
+    for speed in (100e3, 400e3):
+        board = Board(speed)
+        write = duration(board, Write(b"\x01\x85\x83"))
+        assert write == pytest.approx((4 * 9 + 2) / speed + I2cBus.OVERHEAD)
+        combined = duration(board, Write(b"\x01"), Read(2))
+        assert combined == pytest.approx((5 * 9 + 3) / speed + I2cBus.OVERHEAD)
+
+
+def test_a_transfer_answers_each_of_its_reads(board: Board) -> None:
+    replies = board.bus.transfer(0x48, [Write(b"\x01"), Read(2), Write(b"\x03"), Read(2)])
+    assert replies == [RESET_WORD.to_bytes(2, "big"), b"\x7f\xff"]
+
+
+@pytest.mark.parametrize("address", [0x00, 0x49])
+def test_nobody_acknowledges_an_address_without_a_chip(board: Board, address: int) -> None:
+    for message in (Write(b""), Write(b"\x06"), Read(1)):
+        with pytest.raises(OSError, match="Errno 121"):
+            board.bus.transfer(address, [message])
+
+
+def test_an_address_takes_one_chip_only(board: Board) -> None:
+    with pytest.raises(ValueError, match="0x48 is taken"):
+        board.bus.attach(0x48, board.chip)
+
+
+def test_transfers_from_several_threads_queue() -> None:
+    class Watched(VirtualClock):
+        inside = 0
+        most = 0
+
+        def sleep(self, seconds: float) -> None:
+            self.inside += 1
+            self.most = max(self.most, self.inside)
+            threading.Event().wait(0.001)
+            super().sleep(seconds)
+            self.inside -= 1
+
+    clock = Watched()
+    faults = Faults(clock)
+    bus = I2cBus(clock, 400e3, faults)
+    bus.attach(0x48, Ads1115Chip(clock, lambda *_: 0.0, faults))
+    together = threading.Barrier(4)
+    replies: list[bytes] = []
+
+    def work() -> None:
+        together.wait(PATIENCE)
+        for _ in range(5):
+            replies.extend(bus.transfer(0x48, [Write(b"\x01"), Read(2)]))
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert replies == [RESET_WORD.to_bytes(2, "big")] * 20
+    assert clock.most == 1
+
+
+def test_a_failed_transfer_may_have_reached_the_chip_all_the_same(board: Board) -> None:
+    outcomes: dict[str, set[bool]] = {}
+    for fault in TRANSFER_ERRORS:
+        for _ in range(50):
+            board.chip.reset()
+            board.faults.inject(fault)
+            with pytest.raises(OSError, match="Errno"):
+                board.bus.transfer(0x48, [Write(b"\x02\x12\x34")])
+            board.faults.clear()
+            board.bus.transfer(0x48, [Write(b"\x02")])
+            stored = board.bus.transfer(0x48, [Read(2)]) == [b"\x12\x34"]
+            outcomes.setdefault(fault, set()).add(stored)
+    assert outcomes == {
+        "nack": {False},
+        "timeout": {False, True},
+        "clock-stretch": {False, True},
+        "bus-owned": {False},
+        "arbitration-lost": {False, True},
+    }
+
+
+I2C_TIMEOUT = 0x0702
+
+
+def test_a_hanging_bus_costs_a_second_or_what_is_asked_for(
     board: Board, pureio: smbus.SMBus
 ) -> None:
     board.faults.inject("timeout")

@@ -1,16 +1,18 @@
-"""The configuration reference in docs/ and the program that writes it."""
+"""The references in docs/ and the programs that write them."""
 
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from rigs.documents import ROOT
 
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError
 from fishd.core.schema import leaves
+from fishd.core.signals import EVENTS, EventKind
 
-ROOT = Path(__file__).parents[2]
 REFERENCE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
 
 
@@ -47,3 +49,13 @@ def test_the_complaints_in_the_configuration_reference_are_those_of_fishd(
         load(Path("fish.yaml"))
     assert str(refusal.value) == line
     assert f"fishd: {line}\n" in REFERENCE
+
+
+def test_the_committed_tables_are_what_the_code_says() -> None:
+    program = [sys.executable, str(ROOT / "tools" / "protocol_reference.py"), "--check"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_kind_of_event_is_described() -> None:
+    assert {kind for kind, *_ in EVENTS} == set(get_args(EventKind))

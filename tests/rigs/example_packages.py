@@ -1,5 +1,6 @@
-"""The packages in docs/example-drivers, installed, and fish that swim with them in virtual time."""
+"""The example packages of docs/, installed, and fish that swim with them in virtual time."""
 
+import os
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -24,18 +25,28 @@ from rigs.documents import ROOT
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.lockstep_rig import LockstepRig
 from rigs.pca9685_chip import Pca9685Chip
+from rigs.processes import FISHCTL
 
 MILLIVOLTS_PER_NEWTON = 20.0
 BUS = 204
 """A bus that no machine has."""
 
 
-def install(folder: Path) -> None:
-    """Build both packages, as their reader would, without the network."""
+def install(folder: Path, examples: str) -> None:
+    """Build the packages in docs/`examples`, as their reader would, without the network."""
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-cache-dir", "--no-index"]
-    packages = [str(path.parent) for path in (ROOT / "docs" / "example-drivers").rglob("*.toml")]
+    packages = [str(path.parent) for path in (ROOT / "docs" / examples).rglob("pyproject.toml")]
     offline = ["--no-build-isolation", "--no-deps", "--target", str(folder)]
     subprocess.run([*pip, *offline, *packages], check=True)
+
+
+def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Where the packages of a folder are installed, and no daemon runs."""
+    mine = {"PYTHONPATH": str(site), "XDG_RUNTIME_DIR": str(site), "COLUMNS": "100"}
+    command = [FISHCTL, *arguments]
+    return subprocess.run(
+        command, env=os.environ | mine, capture_output=True, text=True, check=False
+    )
 
 
 def forget_drivers() -> None:
