@@ -127,6 +127,14 @@ class Daemon(Process):
         with Fish(self.endpoint, timeout=timeout) as fish:
             return fish.status()
 
+    def at_rest(self) -> Self:
+        """The same one as at its start, whatever a controller or an emergency stop has done."""
+        with Fish(self.endpoint) as fish:
+            fish.stop()
+            fish.clear_fault()
+            wait_until(lambda: _rests(fish.status()))
+        return self
+
     def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """What fishctl says of this daemon."""
         return fishctl("--endpoint", self.endpoint, *arguments)
@@ -146,6 +154,10 @@ class Daemon(Process):
     def kill(self) -> None:
         self.process.kill()
         self.process.wait(PATIENCE)
+
+
+def _rests(status: Status) -> bool:
+    return status.mode == "idle" and status.servo_on and status.phi_c == 0.0
 
 
 @contextlib.contextmanager
