@@ -6,14 +6,13 @@ import os
 import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rigs.documents import ROOT
-from rigs.processes import PATIENCE, Daemon, Subscriber, call, running, wait_until
+from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
 from fishd.client import Fish
 
@@ -22,8 +21,23 @@ ATTACKERS = ROOT / "tools" / "reliability" / "attackers.py"
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    """A fishd that swims, for a test that harms its gateways."""
     with running(tmp_path, "--set", "start.controller=swing") as daemon:
         yield daemon
+
+
+@pytest.fixture(scope="module")
+def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """A fishd for all tests that leave its gateways as they are."""
+    with running(tmp_path_factory.mktemp("daemon")) as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def swimming(lasting: Daemon) -> Daemon:
+    """It, swimming whatever was done before."""
+    assert lasting.at_rest().fishctl("set-controller", "swing").returncode == 0
+    return lasting
 
 
 def gateways(daemon: Daemon) -> dict[str, int]:
@@ -109,9 +123,14 @@ def test_a_signal_for_the_whole_group_leaves_the_gateways_to_fishd(daemon: Daemo
         assert subscriber.until(kind="mode")["message"] == "running → idle"
 
 
+def attacker(name: str, daemon: Daemon, seconds: float) -> list[str]:
+    """The command that attacks a fishd for so long."""
+    addresses = (daemon.telemetry, daemon.endpoint)
+    return [sys.executable, str(ATTACKERS), name, *addresses, str(seconds)]
+
+
 def attack(name: str, daemon: Daemon, seconds: float) -> None:
-    attacker = (sys.executable, ATTACKERS, name, daemon.telemetry, daemon.endpoint, str(seconds))
-    call(*attacker, check=True, timeout=3 * PATIENCE)
+    call(*attacker(name, daemon, seconds), check=True, timeout=3 * PATIENCE)
 
 
 def memory(daemon: Daemon) -> float:
@@ -134,8 +153,8 @@ def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(daemon: Daemon
         assert subscriber.message()["mode"] == "running"
 
 
-def test_a_frame_that_announces_8_gb_ends_its_connection(daemon: Daemon) -> None:
-    host, _, port = daemon.telemetry.removeprefix("tcp://").rpartition(":")
+def test_a_frame_that_announces_8_gb_ends_its_connection(swimming: Daemon) -> None:
+    host, _, port = swimming.telemetry.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((host, int(port)), PATIENCE) as connection:
         greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16) + b"\x00" + bytes(31)
         connection.sendall(greeting + b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB")
@@ -143,7 +162,7 @@ def test_a_frame_that_announces_8_gb_ends_its_connection(daemon: Daemon) -> None
         with contextlib.suppress(ConnectionError):
             while connection.recv(4096):
                 pass
-    assert daemon.status().mode == "running"
+    assert swimming.status().mode == "running"
 
 
 @pytest.mark.realtime
@@ -159,21 +178,21 @@ def test_a_thousand_idle_connections_end_nothing(tmp_path: Path) -> None:
 
 
 def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: Daemon) -> None:
-    attacker = threading.Thread(target=attack, args=("silent-dealers", daemon, 5.0))
-    attacker.start()
-    time.sleep(2.0)
-    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        state = fish.estop()
-    assert attacker.is_alive()
-    attacker.join()
-    assert state.mode == "estop"
-    assert memory(daemon) < 150.0
+    clients = Process(*attacker("silent-dealers", daemon, 60.0))
+    try:
+        time.sleep(2.0)
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+            assert fish.estop().mode == "estop"
+        assert clients.process.poll() is None
+        assert memory(daemon) < 150.0
+    finally:
+        clients.end(signal.SIGKILL)
 
 
 def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are_not(
-    daemon: Daemon,
+    swimming: Daemon,
 ) -> None:
-    with daemon.socket() as hasty, Fish(daemon.endpoint, timeout=PATIENCE) as calm:
+    with swimming.socket() as hasty, Fish(swimming.endpoint, timeout=PATIENCE) as calm:
         for number in range(1500):
             hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
         assert calm.status().mode == "running"
@@ -196,9 +215,9 @@ def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
 
 
 def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_one(
-    daemon: Daemon,
+    swimming: Daemon,
 ) -> None:
-    with daemon.socket() as client:
+    with swimming.socket() as client:
         client.send(b'{"v":1,"id":1,"op":"%s"}' % (b"x" * 16_000))
         error = json.loads(client.recv())["error"]
     assert error["code"] == "bad-request"
@@ -216,7 +235,7 @@ def test_replies_longer_than_the_link_has_room_for_arrive_whole_and_hold_up_no_e
         (folder / f"copy{number}.onnx").symlink_to(shipped)
     variables = ("env", f"FISHD_POLICIES={folder}")
     with running(tmp_path, under=variables) as daemon, Fish(daemon.endpoint, timeout=60) as fish:
-        for _ in range(3):
+        for _ in range(2):
             found = [policy.name for policy in fish.policies()]
             assert len([name for name in found if name.startswith("copy")]) == 300
         assert fish.estop().mode == "estop"
