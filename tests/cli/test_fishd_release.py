@@ -129,12 +129,14 @@ def test_without_a_sound_recipe_it_does_what_fishctl_does(
         assert ended.stdout == "pulses were on: neutral, then off\n"
         assert "click" in ended.stderr
 
+    assert release_recipe.read(str(file))
     for damaged in ("", "{}", "[1]", '{"config": 3}', "\0", "nul" * 30_000):
         path.write_text(damaged)
-        check()
+        assert release_recipe.read(str(file)) is None
+    check()
     path.write_text(sound)
     path.chmod(0o666)  # others may have written it
-    check()
+    assert release_recipe.read(str(file)) is None
     path.unlink()
     check()
 
