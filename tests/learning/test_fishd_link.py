@@ -29,11 +29,6 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 
 @pytest.fixture
-def daemon(shared_daemon: Daemon) -> Daemon:
-    return shared_daemon.at_rest()
-
-
-@pytest.fixture
 def fish(daemon: Daemon) -> Iterator[Fish]:
     with Fish(daemon.endpoint) as fish:
         yield fish

@@ -4,14 +4,13 @@ import pty
 import re
 import signal
 import subprocess
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running, sets
+from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line
 from rigs.swimming import brief_job, rows, wait_for, while_it_trains
 
 from fishd.cli.learn.ppo import report
@@ -206,18 +205,6 @@ def test_on_a_terminal_it_shows_a_bar(
     assert "128/128" in text.result()
     assert "tank 0:0" in text.result()
     assert "left" in text.result()
-
-
-@pytest.fixture(scope="module")
-def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    settings = sets("simulation.noise=0.001", "tick=0.05")
-    with running(tmp_path_factory.mktemp("daemon"), *settings) as found:
-        yield found
-
-
-@pytest.fixture
-def daemon(shared_daemon: Daemon) -> Daemon:
-    return shared_daemon.at_rest()
 
 
 @pytest.fixture
