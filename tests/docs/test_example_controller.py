@@ -4,48 +4,32 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
+from rigs.documents import ROOT
+from rigs.processes import FISHCTL, call
 
-ROOT = Path(__file__).parents[2]
-FISHCTL = str(Path(sys.executable).with_name("fishctl"))
-
-
-class Laptop:
-    """Where the example is installed, and no daemon runs."""
-
-    def __init__(self, folder: Path) -> None:
-        self.environment = {
-            **os.environ,
-            "PYTHONPATH": str(folder),
-            "XDG_RUNTIME_DIR": str(folder),
-            "COLUMNS": "100",
-        }
-
-    def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [FISHCTL, *arguments],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+Fishctl = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(scope="module")
-def laptop(tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+def fishctl(tmp_path_factory: pytest.TempPathFactory) -> Fishctl:
+    """fishctl where the example is installed, and no daemon runs."""
     folder = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-cache-dir"]
     offline = ["--no-index", "--no-build-isolation", "--no-deps"]
     example = ROOT / "docs" / "example-controller"
-    subprocess.run([*pip, *offline, "--target", str(folder), str(example)], check=True)
-    return Laptop(folder)
+    subprocess.run([*pip, *offline, "--target", folder, example], check=True)
+    place = {"PYTHONPATH": str(folder), "XDG_RUNTIME_DIR": str(folder), "COLUMNS": "100"}
+    return partial(call, FISHCTL, env=os.environ | place)
 
 
-def test_the_example_swims_in_virtual_time_and_sweeps_its_frequency(laptop: Laptop) -> None:
+def test_the_example_swims_in_virtual_time_and_sweeps_its_frequency(fishctl: Fishctl) -> None:
     def frequency(*run: str) -> float:
-        done = laptop.fishctl("simulate", "chirp", "--json", *run)
+        done = fishctl("simulate", "chirp", "--json", *run)
         assert done.returncode == 0, done.stderr
         report = json.loads(done.stdout)
         assert report["mode"] == "running"
@@ -60,17 +44,15 @@ def test_the_example_swims_in_virtual_time_and_sweeps_its_frequency(laptop: Lapt
     assert on_the_way_down == pytest.approx(1.0, abs=0.1)
 
 
-def test_its_options_show_bounds_units_and_defaults(laptop: Laptop) -> None:
-    shown = " ".join(laptop.fishctl("simulate", "chirp", "--help").stdout.split())
+def test_its_options_show_bounds_units_and_defaults(fishctl: Fishctl) -> None:
+    shown = " ".join(fishctl("simulate", "chirp", "--help").stdout.split())
     assert "Sweep a square wave's frequency up and down" in shown
     assert "--lowest NUMBER Frequency at which the sweep begins. A number in (0, 10] Hz" in shown
     assert "--sweep-time NUMBER Time from lowest to highest. A number in [1, 3600] s;" in shown
 
 
-def test_it_is_listed_beside_the_controllers_that_come_with_fishd(laptop: Laptop) -> None:
-    known = {
-        info["name"]: info for info in json.loads(laptop.fishctl("controllers", "--json").stdout)
-    }
+def test_it_is_listed_beside_the_controllers_that_come_with_fishd(fishctl: Fishctl) -> None:
+    known = {info["name"]: info for info in json.loads(fishctl("controllers", "--json").stdout)}
     assert {"chirp", "square", "swing"} <= set(known)
     parameters = {field["name"]: field for field in known["chirp"]["parameters"]}
     assert parameters["highest"]["unit"] == "Hz"
@@ -78,10 +60,10 @@ def test_it_is_listed_beside_the_controllers_that_come_with_fishd(laptop: Laptop
     assert parameters["amplitude"]["optional"]
 
 
-def test_it_can_be_named_in_the_configuration(laptop: Laptop, tmp_path: Path) -> None:
+def test_it_can_be_named_in_the_configuration(fishctl: Fishctl, tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("start:\n  controller: chirp\n  parameters:\n    sweep_time: 120\n")
-    assert laptop.fishctl("config", "check", str(file)).returncode == 0
+    assert fishctl("config", "check", str(file)).returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -94,21 +76,19 @@ def test_it_can_be_named_in_the_configuration(laptop: Laptop, tmp_path: Path) ->
     ids=["out of its bounds", "at odds with another", "beyond the robot"],
 )
 def test_a_bad_parameter_is_refused_in_one_line(
-    laptop: Laptop, option: str, complaint: str
+    fishctl: Fishctl, option: str, complaint: str
 ) -> None:
-    done = laptop.fishctl("simulate", "chirp", option)
+    done = fishctl("simulate", "chirp", option)
     assert done.returncode == 1
     assert done.stderr.startswith(f"fishctl: {complaint}")
     assert done.stderr.count("\n") == 1
     assert not done.stdout
 
 
-def test_the_page_about_it_shows_what_a_run_prints(laptop: Laptop) -> None:
+def test_the_page_about_it_shows_what_a_run_prints(fishctl: Fishctl) -> None:
     page = (ROOT / "docs" / "writing-a-controller.md").read_text(encoding="utf-8")
     shown = page.partition("$ fishctl simulate chirp --seconds 130\n")[2].partition("timing ")[0]
-    assert (
-        shown == laptop.fishctl("simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
-    )
+    assert shown == fishctl("simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
 
 
 @pytest.mark.parametrize("name", ["fishd_chirp.py", "pyproject.toml"])

@@ -12,7 +12,16 @@ from typing import get_type_hints
 import msgspec
 import pytest
 from rigs.documents import ROOT
-from rigs.processes import FISHD, PATIENCE, Daemon, Subscriber, running, sets, wait_until
+from rigs.processes import (
+    FISHD,
+    PATIENCE,
+    Daemon,
+    Subscriber,
+    addresses,
+    running,
+    sets,
+    wait_until,
+)
 
 from fishd.core.signals import Tick
 from fishd.core.unix_sockets import is_deserted
@@ -195,9 +204,8 @@ def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:
 def test_a_ctrl_c_at_any_moment_of_the_start_ends_it_without_a_traceback_or_a_beat(
     tmp_path: Path, delay: float
 ) -> None:
-    own = sets(f"control.address=ipc://{tmp_path}/control", "telemetry.address=tcp://127.0.0.1:0")
     process = subprocess.Popen(
-        [FISHD, "--config", SHIPPED, *own],
+        [FISHD, "--config", SHIPPED, *addresses(tmp_path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -62,6 +62,11 @@ def sets(*pairs: str) -> list[str]:
     return [word for pair in pairs for word in ("--set", pair)]
 
 
+def addresses(folder: Path) -> list[str]:
+    """Those of a fishd of its own: options of a command line."""
+    return sets(f"control.address=ipc://{folder}/control", "telemetry.address=tcp://127.0.0.1:0")
+
+
 def install(site: Path, modules: Mapping[str, str], **controllers: str) -> None:
     """Put a package of controllers into a folder of PYTHONPATH, as pip would.
 
@@ -110,8 +115,7 @@ class Daemon(Process):
     def __init__(self, folder: Path, *arguments: str, under: Sequence[str] = ()) -> None:
         """under: a command that starts the daemon, `setpriv` say."""
         self.endpoint = f"ipc://{folder}/control"
-        own = sets(f"control.address={self.endpoint}", "telemetry.address=tcp://127.0.0.1:0")
-        super().__init__(*under, FISHD, *own, *arguments)
+        super().__init__(*under, FISHD, *addresses(folder), *arguments)
 
     def wait_until_up(self) -> Self:
         deadline = time.monotonic() + PATIENCE
