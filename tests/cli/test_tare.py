@@ -3,13 +3,12 @@
 import math
 import re
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 from rigs.operator_rig import Bench, fishctl_alone, forces
-from rigs.processes import FISHCTL, PATIENCE, Daemon, running
+from rigs.processes import FISHCTL, Daemon, Process, running
 
 
 def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(
@@ -42,12 +41,9 @@ def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(rig: Bench, daemon
 def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
     rig: Bench, daemon: Daemon, how: int
 ) -> None:
-    command = [FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", "3"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    tare = Process(FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", "3")
     time.sleep(1.5)  # it measures
-    process.send_signal(how)
-    process.communicate(timeout=PATIENCE)
-    assert process.returncode != 0
+    assert tare.end(how)[0] != 0
     time.sleep(3.0)  # its measurement would have ended
     assert math.hypot(*forces(daemon)) > 0.3
     assert rig.files("force") == []

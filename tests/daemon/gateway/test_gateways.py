@@ -21,23 +21,8 @@ ATTACKERS = ROOT / "tools" / "reliability" / "attackers.py"
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Daemon]:
-    """A fishd that swims, for a test that harms its gateways."""
     with running(tmp_path, "--set", "start.controller=swing") as daemon:
         yield daemon
-
-
-@pytest.fixture(scope="module")
-def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A fishd for all tests that leave its gateways as they are."""
-    with running(tmp_path_factory.mktemp("daemon")) as daemon:
-        yield daemon
-
-
-@pytest.fixture
-def swimming(lasting: Daemon) -> Daemon:
-    """It, swimming whatever was done before."""
-    assert lasting.at_rest().fishctl("set-controller", "swing").returncode == 0
-    return lasting
 
 
 def gateways(daemon: Daemon) -> dict[str, int]:
@@ -153,8 +138,8 @@ def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(daemon: Daemon
         assert subscriber.message()["mode"] == "running"
 
 
-def test_a_frame_that_announces_8_gb_ends_its_connection(swimming: Daemon) -> None:
-    host, _, port = swimming.telemetry.removeprefix("tcp://").rpartition(":")
+def test_a_frame_that_announces_8_gb_ends_its_connection(daemon: Daemon) -> None:
+    host, _, port = daemon.telemetry.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((host, int(port)), PATIENCE) as connection:
         greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16) + b"\x00" + bytes(31)
         connection.sendall(greeting + b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB")
@@ -162,7 +147,7 @@ def test_a_frame_that_announces_8_gb_ends_its_connection(swimming: Daemon) -> No
         with contextlib.suppress(ConnectionError):
             while connection.recv(4096):
                 pass
-    assert swimming.status().mode == "running"
+    assert daemon.status().mode == "running"
 
 
 @pytest.mark.realtime
@@ -190,9 +175,9 @@ def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: 
 
 
 def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are_not(
-    swimming: Daemon,
+    daemon: Daemon,
 ) -> None:
-    with swimming.socket() as hasty, Fish(swimming.endpoint, timeout=PATIENCE) as calm:
+    with daemon.socket() as hasty, Fish(daemon.endpoint, timeout=PATIENCE) as calm:
         for number in range(1500):
             hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
         assert calm.status().mode == "running"
@@ -215,9 +200,9 @@ def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
 
 
 def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_one(
-    swimming: Daemon,
+    daemon: Daemon,
 ) -> None:
-    with swimming.socket() as client:
+    with daemon.socket() as client:
         client.send(b'{"v":1,"id":1,"op":"%s"}' % (b"x" * 16_000))
         error = json.loads(client.recv())["error"]
     assert error["code"] == "bad-request"
