@@ -12,6 +12,8 @@ from rigs.doctor_tree import Examine, examiner
 from rigs.operator_rig import Bench, Dialogue, Talk, bench, pi_process
 from rigs.processes import Daemon
 
+Shared = tuple[Bench, Daemon]
+
 
 @pytest.fixture(autouse=True)
 def _no_service(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,14 +44,29 @@ def process() -> Iterator[Any]:
 
 @pytest.fixture
 def pi(process: Any, tmp_path: Path) -> Iterator[Bench]:
+    """A virtual Pi on which no fishd runs yet."""
     with bench(process, tmp_path) as found:
         yield found
 
 
+@pytest.fixture(scope="module")
+def shared(process: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+    with bench(process, tmp_path_factory.mktemp("bench")) as rig, rig.daemon() as daemon:
+        yield rig, daemon
+
+
 @pytest.fixture
-def daemon(pi: Bench) -> Iterator[Daemon]:
-    with pi.daemon() as daemon:
-        yield daemon
+def daemon(shared: Shared) -> Daemon:
+    """One for all tests of a module, on `rig`, as after its start whatever was done before."""
+    rig, daemon = shared
+    rig.renew(daemon)
+    return daemon
+
+
+@pytest.fixture
+def rig(shared: Shared) -> Bench:
+    """The virtual Pi of `daemon`."""
+    return shared[0]
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import re
 import signal
+from pathlib import Path
 
 import pytest
 from rigs.operator_rig import (
@@ -22,47 +23,47 @@ GRAM = 9.80665e-3
 PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
 
-def measure(dialogue: Dialogue, pi: Bench, fx: float, fy: float, size: str | None = None) -> None:
+def measure(dialogue: Dialogue, rig: Bench, fx: float, fy: float, size: str | None = None) -> None:
     """Hang a load when it is asked for, and let it be measured."""
     if size is not None:
         dialogue.answer("load [", size)
     dialogue.expect("Enter when it is still")
-    pi.pi.load(fx, fy)
+    rig.pi.load(fx, fy)
     dialogue.answer(":")
     dialogue.answer("r to measure it again:")
 
 
 def test_five_guided_loads_make_true_forces_of_voltages(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
-    record = pi.folder / "loads.csv"
+    record = tmp_path / "loads.csv"
     dialogue = talk(
         daemon, "calibrate", "force", "--unit", "g", "--seconds", "0.3", "--record", str(record)
     )
     plan = dialogue.expect("-y")
     assert all(name in plan for name in ("zero", "+x", "-x", "+y"))
-    measure(dialogue, pi, 0.0, 0.0)
-    measure(dialogue, pi, +20 * GRAM, 0.0, "20")
-    measure(dialogue, pi, -20 * GRAM, 0.0, "")  # as before
-    measure(dialogue, pi, 0.0, +30 * GRAM, "30")
-    measure(dialogue, pi, 0.0, -30 * GRAM, "30")
+    measure(dialogue, rig, 0.0, 0.0)
+    measure(dialogue, rig, +20 * GRAM, 0.0, "20")
+    measure(dialogue, rig, -20 * GRAM, 0.0, "")  # as before
+    measure(dialogue, rig, 0.0, +30 * GRAM, "30")
+    measure(dialogue, rig, 0.0, -30 * GRAM, "30")
     dialogue.answer("Another load", "10 10")
-    measure(dialogue, pi, 10 * GRAM, 10 * GRAM)
+    measure(dialogue, rig, 10 * GRAM, 10 * GRAM)
     dialogue.answer("Another load", "")
     fit = dialogue.answer("save it?", "y")
     assert dialogue.finish() == 0
     assert "over 6 loads" in fit
     assert float(re.search(r"residual ([\d.]+) mN", fit)[1]) < 2.0  # type: ignore[index]
     assert float(re.search(r"condition number ([\d.]+)", fit)[1]) < 3.0  # type: ignore[index]
-    assert dialogue.text.endswith(f"saved in {pi.files('force')[-1]}\n")
+    assert dialogue.text.endswith(f"saved in {rig.files('force')[-1]}\n")
     for load in ((0.1, -0.2), (-0.05, 0.05), (0.0, 0.0)):
-        pi.pi.load(*load)
+        rig.pi.load(*load)
         assert forces(daemon) == pytest.approx(load, abs=3e-3)
     assert len(record.read_text().splitlines()) == 7
 
 
 def test_a_doubtful_load_is_pointed_out_and_measured_again_and_none_is_lost(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     still, again = "Enter when it is still:", "r to measure it again:"
     dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.6")
@@ -72,22 +73,22 @@ def test_a_doubtful_load_is_pointed_out_and_measured_again_and_none_is_lost(
     dialogue.answer(again, "x")
     dialogue.expect("Error: Enter or r is needed, not 'x'")
     dialogue.answer(again, "R")
-    measure(dialogue, pi, 0.0, 0.0)
+    measure(dialogue, rig, 0.0, 0.0)
     dialogue.answer("load [N]", "0.2")
-    pi.pi.load(0.0, 0.0, shaking=0.1)
+    rig.pi.load(0.0, 0.0, shaking=0.1)
     dialogue.answer(still)
     assert "not still" in dialogue.answer(again, "r")
     dialogue.answer("load [N]", "")
-    pi.pi.load(2.0, 0.0)  # clipped
+    rig.pi.load(2.0, 0.0)  # clipped
     dialogue.answer(still)
     assert "not to be believed" in dialogue.answer(again, "r")
     dialogue.answer("load [N]", "")
-    pi.pi.load(0.2, 0.0)
-    pi.pi.inject("unplugged")
+    rig.pi.load(0.2, 0.0)
+    rig.pi.inject("unplugged")
     dialogue.answer(still)
     dialogue.expect("not measured: the force sensor gave nothing")
-    pi.pi.clear()
-    measure(dialogue, pi, 0.2, 0.0, "")
+    rig.pi.clear()
+    measure(dialogue, rig, 0.2, 0.0, "")
     assert "warning" not in dialogue.expect("backward")
     dialogue.process.send_signal(signal.SIGINT)
     assert dialogue.finish() == 130
@@ -95,44 +96,44 @@ def test_a_doubtful_load_is_pointed_out_and_measured_again_and_none_is_lost(
 
 
 def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
-    record = pi.folder / "loads.csv"
+    record = tmp_path / "loads.csv"
     dialogue = talk(
         daemon, "calibrate", "force", "--seconds", "0.3", "--yes", "--record", str(record)
     )
-    measure(dialogue, pi, 0.0, 0.0)
-    measure(dialogue, pi, -0.2, 0.0, "0.2")  # pulled the wrong way
-    measure(dialogue, pi, -0.2, 0.0, "")
-    measure(dialogue, pi, 0.0, 0.2, "")
-    measure(dialogue, pi, 0.0, -0.2, "")
+    measure(dialogue, rig, 0.0, 0.0)
+    measure(dialogue, rig, -0.2, 0.0, "0.2")  # pulled the wrong way
+    measure(dialogue, rig, -0.2, 0.0, "")
+    measure(dialogue, rig, 0.0, 0.2, "")
+    measure(dialogue, rig, 0.0, -0.2, "")
     dialogue.answer("Another load", "7 7")
-    measure(dialogue, pi, 0.0, 0.0)
+    measure(dialogue, rig, 0.0, 0.0)
     dialogue.answer("Another load", "")
     dialogue.expect("do not follow the loads")
-    assert pi.files("force") == []
+    assert rig.files("force") == []
     dialogue.answer("Another load", "+z")
     dialogue.expect("or one of zero, +x, -x, +y, -y, (7, 7) N is needed")
     dialogue.answer("Another load", "drop (7, 7) N")
     dialogue.answer("Another load", "+x")
-    measure(dialogue, pi, 0.2, 0.0, "")
+    measure(dialogue, rig, 0.2, 0.0, "")
     dialogue.answer("Another load", "")
     dialogue.expect("over 5 loads")
     assert dialogue.finish() == 0
     assert len(record.read_text().splitlines()) == 6
-    pi.pi.load(0.1, -0.1)
+    rig.pi.load(0.1, -0.1)
     assert forces(daemon) == pytest.approx((0.1, -0.1), abs=3e-3)
 
 
 def test_a_load_beyond_what_the_sensor_is_believed_is_refused_where_it_is_typed(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.2")
-    measure(dialogue, pi, 0.0, 0.0)
+    measure(dialogue, rig, 0.0, 0.0)
     dialogue.answer("load [N]", "20")
     dialogue.expect("20 N is beyond force_sensor.force_limit, 10 N; did you mean --unit g?")
     for _ in range(4):
-        measure(dialogue, pi, 0.0, 0.0, "0.2")
+        measure(dialogue, rig, 0.0, 0.0, "0.2")
     dialogue.answer("Another load", "5 -15")
     dialogue.expect("-15 N is beyond force_sensor.force_limit, 10 N; did you mean --unit g?")
     dialogue.expect("Another load")
@@ -141,10 +142,10 @@ def test_a_load_beyond_what_the_sensor_is_believed_is_refused_where_it_is_typed(
 
 @pytest.mark.parametrize("how", ["ctrl-c", "end of input", "no"])
 def test_whoever_does_not_say_yes_changes_nothing(
-    talk: Talk, pi: Bench, daemon: Daemon, how: str
+    talk: Talk, rig: Bench, daemon: Daemon, how: str
 ) -> None:
     before = calibrations(daemon)
-    measured = pi.folder / "measured.csv"
+    measured = rig.folder / "measured.csv"
     measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
     dialogue = talk(daemon, "calibrate", "force", "--loads", str(measured))
     dialogue.expect("save it?")
@@ -156,20 +157,20 @@ def test_whoever_does_not_say_yes_changes_nothing(
     assert dialogue.finish() == (1 if how == "no" else 130)
     assert "nothing was changed" in dialogue.text
     assert calibrations(daemon) == before
-    assert pi.files("force") == []
+    assert rig.files("force") == []
 
 
 def test_a_plan_of_ones_own_is_gone_through_load_by_load(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
-    plan = pi.folder / "plan.csv"
+    plan = rig.folder / "plan.csv"
     plan.write_text("fx,fy\n" + "".join(f"{x / GRAM},{y / GRAM}\n" for x, y in PLAN))
     dialogue = talk(
         daemon, "calibrate", "force", "--loads", str(plan), "--unit", "g", "--seconds", "0.3",
         "--yes",
     )  # fmt: skip
     for load in PLAN:
-        measure(dialogue, pi, *load)
+        measure(dialogue, rig, *load)
     dialogue.answer("Another load")
     assert dialogue.finish() == 0
     with Fish(daemon.endpoint) as fish:

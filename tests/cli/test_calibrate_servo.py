@@ -13,20 +13,20 @@ from fishd.core.protocol import LEASE
 
 
 def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.answer("trim +25 µs> ", "+")
     dialogue.answer("trim +30 µs> ", "?")
     assert "is needed" in dialogue.expect("trim +30 µs> ")
-    pi.wait_for_pulse(1529, 1531)
+    rig.wait_for_pulse(1529, 1531)
     dialogue.answer("", "ok")
     dialogue.expect("y, n, or a for again: ")
-    pi.wait_for_pulse(1589, 1591)
+    rig.wait_for_pulse(1589, 1591)
     dialogue.answer("", "n")
     dialogue.expect("y, n, or a for again: ")
-    pi.wait_for_pulse(1469, 1471)
+    rig.wait_for_pulse(1469, 1471)
     dialogue.answer("", "y")
     dialogue.answer("highest +0.00 rad> ", "++")
     dialogue.answer("highest +0.10 rad> ", "+")
@@ -38,25 +38,25 @@ def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
     dialogue.answer("", "ok")
     assert "lowest stays at -1.2" in dialogue.answer("Save it?", "y")
     assert dialogue.finish() == 0
-    assert dialogue.text.endswith(f"saved in {pi.files('servo')[-1]}\n")
+    assert dialogue.text.endswith(f"saved in {rig.files('servo')[-1]}\n")
     with Fish(daemon.endpoint) as fish:
         found = fish.calibrations()
         assert (found.servo.trim, found.servo.direction) == (30.0, -1)
         assert (found.servo.lowest, found.servo.highest) == (-1.2, 0.1)
         assert fish.status().mode == "idle"
-    pi.wait_for_pulse(1529, 1531)
+    rig.wait_for_pulse(1529, 1531)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM, None])
 def test_an_interrupted_servo_calibration_leaves_neutral_and_what_was_in_force(
-    talk: Talk, pi: Bench, daemon: Daemon, how: int | None
+    talk: Talk, rig: Bench, daemon: Daemon, how: int | None
 ) -> None:
     before = calibrations(daemon)
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.answer("trim +25 µs> ", "ok")
     dialogue.expect("again: ")
-    pi.wait_for_pulse(1584, 1586)
+    rig.wait_for_pulse(1584, 1586)
     if how is not None:
         dialogue.process.send_signal(how)
         dialogue.process.wait(20)
@@ -64,14 +64,14 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_what_was_in_force(
     assert "the servo is at neutral; its calibration is as before\n" in dialogue.text
     assert "Traceback" not in dialogue.text
     assert calibrations(daemon) == before
-    assert pi.files("servo") == []
+    assert rig.files("servo") == []
     with Fish(daemon.endpoint) as fish:
         assert fish.status().mode == "idle"
-    pi.wait_for_pulse(1499, 1501)
+    rig.wait_for_pulse(1499, 1501)
 
 
 def test_a_calibration_whose_fishctl_is_killed_is_taken_back_by_fishd(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     before = calibrations(daemon)
     with Subscriber(daemon.telemetry, b"event") as events:
@@ -79,15 +79,15 @@ def test_a_calibration_whose_fishctl_is_killed_is_taken_back_by_fishd(
         dialogue.answer("trim +0 µs> ", "++")
         dialogue.answer("trim +25 µs> ", "ok")
         dialogue.expect("again: ")
-        pi.wait_for_pulse(1584, 1586)
+        rig.wait_for_pulse(1584, 1586)
         dialogue.process.kill()
         assert "not renewed" in events.until(kind="calibration", level="warning")["message"]
-    pi.wait_for_pulse(1499, 1501)
+    rig.wait_for_pulse(1499, 1501)
     assert calibrations(daemon) == before
 
 
 def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
@@ -151,13 +151,13 @@ def test_a_lease_that_ends_of_itself_is_told_at_the_prompt(
 
 
 def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_before(
-    talk: Talk, pi: Bench, daemon: Daemon
+    talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     before = calibrations(daemon)
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.expect("trim +25 µs> ")
-    pi.pi.inject("unplugged")
+    rig.pi.inject("unplugged")
     with Fish(daemon.endpoint) as fish:
         for status in iter(fish.status, None):
             if status.mode == "fault":
@@ -169,15 +169,15 @@ def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_befor
         r"fishctl: fishd is in fault: [^\n]+clear-fault'\n$",
         dialogue.text,
     )
-    assert pi.pi.pulse() == 0
+    assert rig.pi.pulse() == 0
     assert calibrations(daemon) == before
 
 
-def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench, daemon: Daemon) -> None:
-    dialogue = talk(daemon, "calibrate", "servo")
-    dialogue.expect("trim +0 µs> ")
-    daemon.process.kill()
-    daemon.process.wait(PATIENCE)
+def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        dialogue = talk(daemon, "calibrate", "servo")
+        dialogue.expect("trim +0 µs> ")
+        daemon.kill()
     dialogue.answer("", "+")
     assert dialogue.finish() == 1
     assert re.search(
@@ -186,7 +186,7 @@ def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench, daem
 
 
 def test_the_servo_is_not_calibrated_while_the_fish_swims_or_after_a_fault(
-    pi: Bench, daemon: Daemon
+    rig: Bench, daemon: Daemon
 ) -> None:
     daemon.fishctl("set-controller", "swing")
     swimming = daemon.fishctl("calibrate", "servo")

@@ -3,7 +3,6 @@
 import os
 import re
 import resource
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from pathlib import Path
 import pigpio
 import pytest
 from rigs.operator_rig import Bench
-from rigs.processes import PATIENCE, fishctl
+from rigs.processes import call, fishctl
 
 from fishd.client import Fish
 from fishd.core.calibration import ServoCalibration
@@ -77,19 +76,11 @@ def kill_one(pi: Bench, file: Path, calibration: ServoCalibration | None = None)
         if calibration:
             with Fish(daemon.endpoint) as fish:
                 fish.calibrate_servo(calibration, save=True)
-        daemon.process.send_signal(signal.SIGKILL)
-        daemon.process.wait(PATIENCE)
+        daemon.kill()
 
 
 def release(*words: str, **env: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", SOURCE, *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE,
-        env=os.environ | env,
-    )
+    return call(sys.executable, "-c", SOURCE, *words, env=os.environ | env)
 
 
 def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
@@ -98,16 +89,24 @@ def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
 
 
 @pytest.mark.usefixtures("killed")
-def test_it_ends_pulses_at_neutral_and_loads_next_to_nothing(pi: Bench, file: Path) -> None:
+def test_it_ends_pulses_at_neutral_and_costs_next_to_nothing(pi: Bench, file: Path) -> None:
     ended = release("--config", str(file), SERVICE_RESULT="signal")
     assert ended.returncode == 0
     assert ended.stderr == "loaded:\n"
     assert ended.stdout == ("the service ended with 'signal': pulses were on: neutral, then off\n")
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
     assert release("--config", str(file)).stdout == "there were no pulses\n"
+    assert min(cpu_of_a_release(file) for _ in range(5)) < CPU
 
 
-@pytest.mark.usefixtures("killed")
+def cpu_of_a_release(file: Path) -> float:
+    """CPU time of one, with the start of Python [s]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    call(sys.executable, "-m", "fishd.cli.fishd_release", "--config", str(file), check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
 def test_neutral_is_that_of_a_calibration_made_while_it_ran(pi: Bench, file: Path) -> None:
     kill_one(pi, file, ServoCalibration(trim=-40.0))
     with pulses_of_another(pi):
@@ -130,12 +129,14 @@ def test_without_a_sound_recipe_it_does_what_fishctl_does(
         assert ended.stdout == "pulses were on: neutral, then off\n"
         assert "click" in ended.stderr
 
+    assert release_recipe.read(str(file))
     for damaged in ("", "{}", "[1]", '{"config": 3}', "\0", "nul" * 30_000):
         path.write_text(damaged)
-        check()
+        assert release_recipe.read(str(file)) is None
+    check()
     path.write_text(sound)
     path.chmod(0o666)  # others may have written it
-    check()
+    assert release_recipe.read(str(file)) is None
     path.unlink()
     check()
 
@@ -204,19 +205,3 @@ def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int, recipe: b
     assert ended.stdout.startswith("pulses were on" if enabled else "there were no pulses")
     duty, on = ((channel / name).read_text().split()[0] for name in ("duty_cycle", "enable"))
     assert (int(duty), int(on)) == ((0, 0) if enabled else (1_800_000, 0))
-
-
-@pytest.mark.usefixtures("killed")
-def test_it_costs_little(pi: Bench, file: Path) -> None:
-    used = []
-    for _ in range(5):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run(
-            [sys.executable, "-m", "fishd.cli.fishd_release", "--config", str(file)],
-            check=True,
-            capture_output=True,
-            timeout=PATIENCE,
-        )
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        used.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    assert min(used) < CPU

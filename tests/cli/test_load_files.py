@@ -15,9 +15,9 @@ PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
 @pytest.mark.parametrize("volts", ["", ",0,0"])
 def test_a_load_beyond_what_the_sensor_is_believed_is_refused_in_a_file(
-    pi: Bench, daemon: Daemon, volts: str
+    rig: Bench, daemon: Daemon, volts: str
 ) -> None:
-    loads = pi.folder / "loads.csv"
+    loads = rig.folder / "loads.csv"
     lines = [f"{100 * x:g},{100 * y:g}{volts}" for x, y in PLAN]
     header = "fx_N,fy_N" + (",vx_V,vy_V" if volts else "")
     loads.write_text("\n".join([header, *lines, ""]))
@@ -47,10 +47,10 @@ def test_what_was_measured_earlier_cannot_be_recorded(tmp_path: Path) -> None:
 
 
 def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(
-    pi: Bench, daemon: Daemon
+    rig: Bench, daemon: Daemon
 ) -> None:
     noise = [(0.3, 0.1), (-0.2, 0.3), (0.4, -0.2), (0.1, 0.4), (-0.3, -0.3)]
-    measured = pi.folder / "noise.csv"
+    measured = rig.folder / "noise.csv"
     lines = [f"{x},{y},{vx},{vy}" for (x, y), (vx, vy) in zip(PLAN, noise, strict=True)]
     measured.write_text("\n".join(["fx_N,fy_N,vx_V,vy_V", *lines, ""]))
     ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
@@ -60,11 +60,11 @@ def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(
         r"fishctl: the voltages do not follow the loads: [^\n]+ measure load \d again first\n",
         ended.stderr,
     )
-    assert pi.files("force") == []
+    assert rig.files("force") == []
 
 
-def test_loads_measured_earlier_are_fitted_without_a_question(pi: Bench, daemon: Daemon) -> None:
-    measured = pi.folder / "measured.csv"
+def test_loads_measured_earlier_are_fitted_without_a_question(rig: Bench, daemon: Daemon) -> None:
+    measured = rig.folder / "measured.csv"
     lines = [f"{x / GRAM}, {y / GRAM}, {2 * x + 0.3}, {1.5 * y - 0.2}, ignored" for x, y in PLAN]
     measured.write_text("\n".join(["fx_g, fy_g, vx_V, vy_V, remark", *lines, ""]))
     ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")

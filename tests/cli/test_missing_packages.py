@@ -3,12 +3,11 @@
 import json
 import os
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
 from rigs.operator_rig import Bench
-from rigs.processes import FISHCTL, FISHD, PATIENCE
+from rigs.processes import FISHCTL, FISHD, addresses, call, sets
 
 from fishd.hardware import ownership, packages
 
@@ -29,19 +28,8 @@ def env(tmp_path: Path) -> dict[str, str]:
     return without(tmp_path, *MODULES)
 
 
-def call(env: dict[str, str], *command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=PATIENCE, env=env
-    )
-
-
-def own(folder: Path) -> list[str]:
-    settings = (f"control.address=ipc://{folder}/control", "telemetry.address=tcp://127.0.0.1:0")
-    return [word for setting in settings for word in ("--set", setting)]
-
-
 def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, env: dict[str, str]) -> None:
-    ended = call(env, FISHD, *pi.settings, *own(pi.folder))
+    ended = call(FISHD, *pi.settings, *addresses(pi.folder), env=env)
     assert ended.returncode == 1
     assert re.fullmatch(ONE_LINE % "adafruit-extended-bus", ended.stderr)
 
@@ -50,7 +38,7 @@ def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, env: dict[str, str])
     ("gpio", "modules", "settings", "complaint"),
     [
         (7, MODULES, [], ONE_LINE % "adafruit-circuitpython-ads1x15"),
-        (8, ["RPi"], ["--set", "panel.estop_gpio=9"],
+        (8, ["RPi"], ["panel.estop_gpio=9"],
          r"[^\n]*the pins of the header need[^\n]*\n"),
     ],
 )  # fmt: skip
@@ -58,9 +46,9 @@ def test_fishd_on_a_pi_does_not_start_without_what_it_needs(
     tmp_path: Path, gpio: int, modules: list[str], settings: list[str], complaint: str
 ) -> None:
     bus = 100 + os.getpid() % 50  # that no machine has
-    pi = ("--set", "robot=pi", "--set", f"force_sensor.bus={bus}", "--set", f"servo.gpio={gpio}")
-    state = ("--set", f"state_folder={tmp_path}")
-    ended = call(without(tmp_path, *modules), FISHD, *pi, *settings, *state, *own(tmp_path))
+    pi = sets("robot=pi", f"force_sensor.bus={bus}", f"servo.gpio={gpio}", *settings)
+    own = [*sets(f"state_folder={tmp_path}"), *addresses(tmp_path)]
+    ended = call(FISHD, *pi, *own, env=without(tmp_path, *modules))
     for lock in (f"fishd-i2c-{bus}.lock", f"fishd-gpio{gpio}.lock"):
         (ownership.FOLDER / lock).unlink(missing_ok=True)
     assert ended.returncode == 1
@@ -68,21 +56,19 @@ def test_fishd_on_a_pi_does_not_start_without_what_it_needs(
 
 
 def test_release_names_the_package(tmp_path: Path, env: dict[str, str]) -> None:
-    settings = ("--set", "robot=pi", "--set", f"state_folder={tmp_path}")
-    ended = call(env, FISHCTL, "release", *settings)
+    ended = call(FISHCTL, "release", *sets("robot=pi", f"state_folder={tmp_path}"), env=env)
     assert (ended.returncode, ended.stdout) == (1, "")
     assert re.fullmatch(ONE_LINE % "pigpio", ended.stderr)
 
 
 def test_a_simulation_of_the_virtual_pi_names_the_package(env: dict[str, str]) -> None:
-    ended = call(env, FISHCTL, "simulate", "hold", "--set", "robot=virtual-pi")
+    ended = call(FISHCTL, "simulate", "hold", "--set", "robot=virtual-pi", env=env)
     assert ended.returncode == 1
     assert re.fullmatch(ONE_LINE % "adafruit-extended-bus", ended.stderr)
 
 
 def test_no_check_of_doctor_breaks_off(pi: Bench, env: dict[str, str]) -> None:
-    doctor = (FISHCTL, "doctor", "--json", *pi.settings, *own(pi.folder))
-    ended = call(env, *doctor)
+    ended = call(FISHCTL, "doctor", "--json", *pi.settings, *addresses(pi.folder), env=env)
     assert (ended.returncode, ended.stderr) == (1, "")
     found = {line["check"]: line for line in json.loads(ended.stdout)}
     for name in ("adc", "force", "pigpiod"):
@@ -105,8 +91,8 @@ def test_a_package_that_is_there_but_broken_is_not_called_missing() -> None:
 def test_training_without_the_extra_names_it_in_one_line(
     tmp_path: Path, missing: list[str]
 ) -> None:
-    run = str(tmp_path / "run")
-    found = call(without(tmp_path, *missing), FISHCTL, "learn", "ppo", "--folder", run)
+    env = without(tmp_path, *missing)
+    found = call(FISHCTL, "learn", "ppo", "--folder", tmp_path / "run", env=env)
     assert found.returncode == 1
     assert re.fullmatch(
         r"fishctl: \w+ is not installed; where the sources of fishd are: pip install [^\n]+ "
@@ -114,5 +100,5 @@ def test_training_without_the_extra_names_it_in_one_line(
         found.stderr,
     )
     assert not (tmp_path / "run").exists()
-    shown = call(without(tmp_path, *missing), FISHCTL, "learn", "ppo", "--help")
+    shown = call(FISHCTL, "learn", "ppo", "--help", env=env)
     assert (shown.returncode, "--resume" in shown.stdout) == (0, True)

@@ -3,54 +3,50 @@
 import math
 import re
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 from rigs.operator_rig import Bench, fishctl_alone, forces
-from rigs.processes import FISHCTL, PATIENCE, Daemon, running
+from rigs.processes import FISHCTL, Daemon, Process, running
 
 
 def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(
-    pi: Bench, daemon: Daemon
+    rig: Bench, daemon: Daemon
 ) -> None:
     before = forces(daemon)
     assert math.hypot(*before) > 0.3  # the voltages of the bridge without a load
     ended = daemon.fishctl("tare", "--seconds", "0.3")
     assert (ended.returncode, ended.stderr) == (0, "")
     assert re.search(r"before +x0 +\+0\.00 mN", ended.stdout)
-    assert str(pi.files("force")[-1]) in ended.stdout
+    assert str(rig.files("force")[-1]) in ended.stdout
     assert forces(daemon) == pytest.approx((0.0, 0.0), abs=2e-3)
 
 
-def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(pi: Bench, daemon: Daemon) -> None:
-    pi.pi.load(0.0, 0.0, shaking=0.1)
+def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(rig: Bench, daemon: Daemon) -> None:
+    rig.pi.load(0.0, 0.0, shaking=0.1)
     restless = daemon.fishctl("tare", "--seconds", "1.2")
-    pi.pi.load(0.5, 0.0)
+    rig.pi.load(0.5, 0.0)
     large = daemon.fishctl("tare", "--seconds", "0.3")
-    pi.pi.load(0.0, 0.0)
+    rig.pi.load(0.0, 0.0)
     daemon.fishctl("set-controller", "swing")
     swimming = daemon.fishctl("tare", "--seconds", "0.3")
     for ended, code in ((restless, "not-still"), (large, "too-large"), (swimming, "running")):
         assert (ended.returncode, ended.stdout) == (1, "")
         assert re.fullmatch(rf"fishctl: [^\n]+ \[{code}\]\n", ended.stderr)
-    assert pi.files("force") == []
+    assert rig.files("force") == []
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
-    pi: Bench, daemon: Daemon, how: int
+    rig: Bench, daemon: Daemon, how: int
 ) -> None:
-    command = [FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", "3"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    tare = Process(FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", "3")
     time.sleep(1.5)  # it measures
-    process.send_signal(how)
-    process.communicate(timeout=PATIENCE)
-    assert process.returncode != 0
+    assert tare.end(how)[0] != 0
     time.sleep(3.0)  # its measurement would have ended
     assert math.hypot(*forces(daemon)) > 0.3
-    assert pi.files("force") == []
+    assert rig.files("force") == []
 
 
 def test_a_simulated_fish_has_nothing_to_tare_or_to_calibrate(tmp_path: Path) -> None:

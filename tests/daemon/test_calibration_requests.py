@@ -24,11 +24,12 @@ from fishd.wiring import state_folder
 
 ANOTHER_BUS = ("force_sensor.bus=2", "virtual_pi.bus=2")
 BRIEFLY = SampleForce(seconds=0.2)
+FISH = ("virtual_pi.zero_x=0.2", "simulation.noise=0.0002", "force_sensor.data_rate=128")
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[LockstepRig]:
-    with lockstep_rig(tmp_path, "virtual_pi.zero_x=0.2", "simulation.noise=0.0002") as rig:
+    with lockstep_rig(tmp_path, *FISH) as rig:
         rig.run_for(0.5)
         yield rig
 

@@ -58,7 +58,8 @@ async def watched() -> None:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[LockstepRig]:
-    with lockstep_rig(tmp_path, "servo.lowest=-0.2", "servo.highest=0.2") as rig:
+    narrow = ("servo.lowest=-0.2", "servo.highest=0.2")
+    with lockstep_rig(tmp_path, *narrow, "force_sensor.data_rate=128") as rig:
         rig.run_for(0.5)
         yield rig
 

@@ -6,14 +6,19 @@ from rigs.processes import Daemon, running
 
 
 @pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Daemon]:
-    """A real daemon on the simulated fish, at rest."""
+def own_daemon(tmp_path: Path) -> Iterator[Daemon]:
+    """A real daemon on the simulated fish, at rest, for a test that ends it."""
     with running(tmp_path) as found:
         yield found
 
 
 @pytest.fixture(scope="module")
-def idle_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A real daemon at rest, for tests of one module that all leave it as it is."""
+def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     with running(tmp_path_factory.mktemp("daemon")) as found:
         yield found
+
+
+@pytest.fixture
+def daemon(shared_daemon: Daemon) -> Daemon:
+    """One for all tests of a module, at rest whatever the test before has done with it."""
+    return shared_daemon.at_rest()

@@ -22,15 +22,15 @@ SWING = {"name": "swing", "parameters": {"C": 7}}
 
 
 @pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
-def test_both_kinds_of_socket_get_an_answer_with_their_id(idle_daemon: Daemon, kind: int) -> None:
-    with idle_daemon.socket(kind) as socket:
+def test_both_kinds_of_socket_get_an_answer_with_their_id(daemon: Daemon, kind: int) -> None:
+    with daemon.socket(kind) as socket:
         reply = ask(socket, b'{"v":1,"id":"a1","op":"status","args":{}}')
     assert (reply["v"], reply["id"], reply["ok"]) == (1, "a1", True)
     assert reply["result"]["mode"] == "idle"
 
 
-def test_many_requests_sent_at_once_are_all_answered(idle_daemon: Daemon) -> None:
-    with idle_daemon.socket() as socket:
+def test_many_requests_sent_at_once_are_all_answered(daemon: Daemon) -> None:
+    with daemon.socket() as socket:
         for number in range(60):
             socket.send(b'{"v":1,"id":%d,"op":"stop"}' % number)
         answered = {json.loads(socket.recv())["id"] for _ in range(60)}
@@ -54,9 +54,9 @@ def test_many_requests_sent_at_once_are_all_answered(idle_daemon: Daemon) -> Non
     ],
 )
 def test_a_bad_request_gets_an_error_that_says_what_is_wrong(
-    idle_daemon: Daemon, request_: dict[str, Any], code: str, message: str
+    daemon: Daemon, request_: dict[str, Any], code: str, message: str
 ) -> None:
-    with idle_daemon.socket() as socket:
+    with daemon.socket() as socket:
         reply = ask(socket, msgspec.json.encode({"v": 1, "id": 1} | request_))
     assert (reply["ok"], reply["id"], reply["error"]["code"]) == (False, 1, code)
     assert message in reply["error"]["message"]
@@ -72,8 +72,8 @@ def test_a_bad_request_gets_an_error_that_says_what_is_wrong(
         b"\xff\xfe\x00",
     ],
 )
-def test_what_is_no_json_gets_an_error_without_an_id(idle_daemon: Daemon, payload: bytes) -> None:
-    with idle_daemon.socket() as socket:
+def test_what_is_no_json_gets_an_error_without_an_id(daemon: Daemon, payload: bytes) -> None:
+    with daemon.socket() as socket:
         reply = ask(socket, payload)
     assert (reply["ok"], reply["id"], reply["error"]["code"]) == (False, None, "bad-request")
 
@@ -110,19 +110,19 @@ def shoot(daemon: Daemon, seconds: float) -> None:
 
 
 @pytest.mark.realtime
-def test_a_flood_of_requests_and_garbage_costs_no_tick(daemon: Daemon) -> None:
-    with Subscriber(daemon.telemetry, b"tick") as subscriber:
+def test_a_flood_of_requests_and_garbage_costs_no_tick(own_daemon: Daemon) -> None:
+    with Subscriber(own_daemon.telemetry, b"tick") as subscriber:
         before = subscriber.message()
-        shooter = threading.Thread(target=shoot, args=(daemon, 3.0))
+        shooter = threading.Thread(target=shoot, args=(own_daemon, 3.0))
         shooter.start()
         while shooter.is_alive():
             during = subscriber.message()
         shooter.join(PATIENCE)
     assert during["missed"] == before["missed"]
     assert during["seq"] - before["seq"] >= 40
-    done = daemon.fishctl("status")
+    done = own_daemon.fishctl("status")
     assert done.returncode == 0, done.stderr
-    _, _, errors = daemon.end()
+    _, _, errors = own_daemon.end()
     assert "Traceback" not in errors
 
 

@@ -75,11 +75,11 @@ def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> 
         asyncio.run(call())
 
 
-def test_telemetry_that_ends_is_noticed(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint, timeout=1.0) as fish:
+def test_telemetry_that_ends_is_noticed(own_daemon: Daemon) -> None:
+    with Fish(own_daemon.endpoint, timeout=1.0) as fish:
         ticks = fish.ticks()
         next(ticks)
-        daemon.end()
+        own_daemon.end()
         with pytest.raises(NoDaemon, match="no telemetry within 1 s"):
             list(ticks)
 

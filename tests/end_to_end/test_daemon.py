@@ -12,7 +12,16 @@ from typing import get_type_hints
 import msgspec
 import pytest
 from rigs.documents import ROOT
-from rigs.processes import FISHD, PATIENCE, Daemon, Subscriber, running, sets, wait_until
+from rigs.processes import (
+    FISHD,
+    PATIENCE,
+    Daemon,
+    Subscriber,
+    addresses,
+    running,
+    sets,
+    wait_until,
+)
 
 from fishd.core.signals import Tick
 from fishd.core.unix_sockets import is_deserted
@@ -27,8 +36,8 @@ TICK_FIELDS = {
 }
 
 
-def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(idle_daemon: Daemon) -> None:
-    with Subscriber(idle_daemon.telemetry, b"tick") as subscriber:
+def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
         for _ in range(5):
             topic, payload = subscriber.socket.recv_multipart()
             assert topic == b"tick"
@@ -37,8 +46,8 @@ def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(idle_daemo
             assert b"null" not in payload
 
 
-def test_ticks_are_numbered_without_gaps_and_timed_without_drift(idle_daemon: Daemon) -> None:
-    with Subscriber(idle_daemon.telemetry, b"tick") as subscriber:
+def test_ticks_are_numbered_without_gaps_and_timed_without_drift(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as subscriber:
         ticks = [subscriber.message() for _ in range(40)]
     assert [t["seq"] for t in ticks] == list(range(ticks[0]["seq"], ticks[0]["seq"] + 40))
     starts = [t["t"] - t["lateness_us"] * 1e-6 - (t["seq"] + t["missed"]) * 0.05 for t in ticks]
@@ -46,16 +55,16 @@ def test_ticks_are_numbered_without_gaps_and_timed_without_drift(idle_daemon: Da
     assert max(starts) - min(starts) < 0.05
 
 
-def test_the_three_topics_can_be_told_apart_by_prefix(idle_daemon: Daemon) -> None:
-    with Subscriber(idle_daemon.telemetry, b"status") as status:
+def test_the_three_topics_can_be_told_apart_by_prefix(daemon: Daemon) -> None:
+    with Subscriber(daemon.telemetry, b"status") as status:
         assert status.message()["robot"] == "simulated"
     with (
-        Subscriber(idle_daemon.telemetry, b"event") as events,
-        Subscriber(idle_daemon.telemetry) as every,
+        Subscriber(daemon.telemetry, b"event") as events,
+        Subscriber(daemon.telemetry) as every,
     ):
         every.message()  # connected
-        idle_daemon.fishctl("mark", "first")
-        idle_daemon.fishctl("mark", "second")
+        daemon.fishctl("mark", "first")
+        daemon.fishctl("mark", "second")
         assert events.until(kind="mark")["message"] in ("first", "second")
 
 
@@ -103,7 +112,7 @@ def test_a_bad_configuration_exits_with_78_and_one_line(tmp_path: Path) -> None:
 
 
 def test_a_second_daemon_on_the_same_address_says_so_and_exits(
-    tmp_path: Path, idle_daemon: Daemon
+    tmp_path: Path, daemon: Daemon
 ) -> None:
     with running(tmp_path, *sets(f"telemetry.address=ipc://{tmp_path}/telemetry")) as first:
         rival = f"another fishd (pid {first.process.pid}) already serves"
@@ -114,7 +123,7 @@ def test_a_second_daemon_on_the_same_address_says_so_and_exits(
         assert first.fishctl("status").returncode == 0
     assert not (tmp_path / "telemetry").exists()
     assert not (tmp_path / "control").exists()
-    tcp = idle_daemon.telemetry
+    tcp = daemon.telemetry
     in_use = f"telemetry.address: cannot listen on {tcp}: it is in use"
     assert in_use in refused(tmp_path, f"telemetry.address={tcp}")
 
@@ -195,9 +204,8 @@ def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:
 def test_a_ctrl_c_at_any_moment_of_the_start_ends_it_without_a_traceback_or_a_beat(
     tmp_path: Path, delay: float
 ) -> None:
-    own = sets(f"control.address=ipc://{tmp_path}/control", "telemetry.address=tcp://127.0.0.1:0")
     process = subprocess.Popen(
-        [FISHD, "--config", SHIPPED, *own],
+        [FISHD, "--config", SHIPPED, *addresses(tmp_path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -78,15 +78,14 @@ def test_a_mark_arrives_as_an_event(daemon: Daemon) -> None:
 
 
 def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(
-    idle_daemon: Daemon,
+    daemon: Daemon,
 ) -> None:
-    text = idle_daemon.fishctl("controllers").stdout
+    text = daemon.fishctl("controllers").stdout
     assert "swing  Reverse the tail" in text
     assert "--longest-half-period" in text
     assert "A number in (0, 10] s; default 1.0." in text
     known = {
-        info["name"]: info
-        for info in json.loads(idle_daemon.fishctl("controllers", "--json").stdout)
+        info["name"]: info for info in json.loads(daemon.fishctl("controllers", "--json").stdout)
     }
     assert {"hold", "square", "sine", "triangle", "swing"} <= set(known)
     assert known["swing"]["parameters"][0] == {
@@ -158,28 +157,28 @@ def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None
     ],
 )
 def test_a_mistake_gets_one_line_that_says_what_to_do(
-    idle_daemon: Daemon, arguments: tuple[str, ...], message: str
+    daemon: Daemon, arguments: tuple[str, ...], message: str
 ) -> None:
-    done = idle_daemon.fishctl(*arguments)
+    done = daemon.fishctl(*arguments)
     assert done.returncode in (1, 2)
     assert message in one_line(done)
     assert done.stderr.startswith("fishctl: ")
 
 
-def test_the_configuration_can_be_checked_shown_and_explained(idle_daemon: Daemon) -> None:
-    shown = idle_daemon.fishctl("config", "show", "--set", "plant.xi=0.5").stdout
+def test_the_configuration_can_be_checked_shown_and_explained(daemon: Daemon) -> None:
+    shown = daemon.fishctl("config", "show", "--set", "plant.xi=0.5").stdout
     assert "  xi: 0.5" in shown
-    running = json.loads(idle_daemon.fishctl("config", "show", "--running", "--json").stdout)
-    assert running["control"]["address"] == idle_daemon.endpoint
-    done = idle_daemon.fishctl("config", "show", "--running", "--set", "plant.xi=0.5")
+    running = json.loads(daemon.fishctl("config", "show", "--running", "--json").stdout)
+    assert running["control"]["address"] == daemon.endpoint
+    done = daemon.fishctl("config", "show", "--running", "--set", "plant.xi=0.5")
     assert done.returncode == 2
-    schema = json.loads(idle_daemon.fishctl("config", "schema").stdout)
+    schema = json.loads(daemon.fishctl("config", "schema").stdout)
     assert "tick" in schema["$defs"]["Config"]["properties"]
-    done = idle_daemon.fishctl("config", "check", "nowhere.yaml")
+    done = daemon.fishctl("config", "check", "nowhere.yaml")
     assert (done.returncode, done.stderr[:30]) == (78, "fishctl: nowhere.yaml: no such")
 
 
-def test_help_and_completion_need_no_daemon(idle_daemon: Daemon) -> None:
-    assert "--C NUMBER" in idle_daemon.fishctl("set-controller", "swing", "--help").stdout
-    assert "_fishctl_completion" in idle_daemon.fishctl("completion", "bash").stdout
-    assert "set-controller" in idle_daemon.fishctl("--help").stdout
+def test_help_and_completion_need_no_daemon(daemon: Daemon) -> None:
+    assert "--C NUMBER" in daemon.fishctl("set-controller", "swing", "--help").stdout
+    assert "_fishctl_completion" in daemon.fishctl("completion", "bash").stdout
+    assert "set-controller" in daemon.fishctl("--help").stdout

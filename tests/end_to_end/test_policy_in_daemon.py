@@ -13,20 +13,21 @@ from fishd.client import Fish, Refused
 from fishd.controllers.policy.network import to_onnx
 
 
-@pytest.fixture
-def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder of policies that the daemon and fishctl both look into."""
-    folder = tmp_path / "policies"
-    monkeypatch.setenv("FISHD_POLICIES", str(folder))
+    folder = tmp_path_factory.mktemp("fishd") / "policies"
     write(folder, FLIP, "flip")
     write(folder, to_onnx(linear(1.0), "tanh", card(tick=0.02)), "quick")
     write(folder, pickle.dumps({}), "torch")
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FISHD_POLICIES", str(folder))
+        yield folder
 
 
-@pytest.fixture
-def daemon(folder: Path, tmp_path: Path) -> Iterator[Daemon]:
-    with running(tmp_path, "--set", "chatter.dwell=0") as found:
+@pytest.fixture(scope="module")
+def shared_daemon(folder: Path) -> Iterator[Daemon]:
+    with running(folder.parent, "--set", "chatter.dwell=0") as found:
         yield found
 
 
@@ -136,16 +137,17 @@ def test_a_fishd_without_a_policy_loads_nothing_of_training(daemon: Daemon) -> N
 
 
 def test_fishd_starts_with_a_policy_of_its_configuration(folder: Path, tmp_path: Path) -> None:
+    write(folder, FLIP, "first")
     file = tmp_path / "fishd.yaml"
     file.write_text(
-        "start:\n  controller: ppo\n  parameters:\n    policy: flip\nchatter:\n  dwell: 0\n"
+        "start:\n  controller: ppo\n  parameters:\n    policy: first\nchatter:\n  dwell: 0\n"
     )
     with running(tmp_path, "--config", str(file)) as daemon, Fish(daemon.endpoint) as fish:
-        assert (fish.status().mode, fish.status().parameters) == ("running", {"policy": "flip"})
-    (folder / "flip.onnx").unlink()
+        assert (fish.status().mode, fish.status().parameters) == ("running", {"policy": "first"})
+    (folder / "first.onnx").unlink()
     status, _, errors = Daemon(tmp_path, "--config", str(file)).finish()
     assert status == 78
-    assert f"fishd: {file}:4: start.parameters.policy: ppo: policy: no policy is named 'flip'" in (
+    assert f"fishd: {file}:4: start.parameters.policy: ppo: policy: no policy is named 'first'" in (
         errors
     )
 

@@ -75,14 +75,22 @@ CONTROLLERS = {
 }
 
 
-@pytest.fixture
-def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    """A daemon on a machine where a package of bad controllers is installed."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of packages, in which one of bad controllers is installed."""
+    folder = tmp_path_factory.mktemp("packages") / "site"
     modules = {"manners": MODULE, "quitter": QUITTER, "untyped": UNTYPED}
-    install(tmp_path / "site", modules, **CONTROLLERS)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
-    with running(tmp_path) as found:
-        yield found
+    install(folder, modules, **CONTROLLERS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shared_daemon(site: Path) -> Iterator[Daemon]:
+    """A daemon on a machine with these packages."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(site))
+        with running(site.parent) as found:
+            yield found
 
 
 def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> None:
@@ -114,10 +122,10 @@ def test_one_that_cannot_start_says_why_in_one_line(
     assert message in one_line(done)
 
 
-def test_one_that_is_installed_while_fishd_runs_is_found(daemon: Daemon, tmp_path: Path) -> None:
+def test_one_that_is_installed_while_fishd_runs_is_found(daemon: Daemon, site: Path) -> None:
     assert daemon.fishctl_apart("set-controller", "still").returncode == 1
     late = "from fishd.controllers.hold import Hold\nclass Late(Hold):\n    'Comes late.'\n"
-    install(tmp_path / "site", {"late": late}, late="late:Late")
+    install(site, {"late": late}, late="late:Late")
     assert daemon.fishctl_apart("set-controller", "late").stdout.startswith("running: late")
     known = [info["name"] for info in json.loads(daemon.fishctl("controllers", "--json").stdout)]
     assert "late" in known
@@ -125,9 +133,9 @@ def test_one_that_is_installed_while_fishd_runs_is_found(daemon: Daemon, tmp_pat
 
 
 def test_one_that_was_installed_since_and_cannot_be_imported_needs_a_restart(
-    daemon: Daemon, tmp_path: Path
+    daemon: Daemon, site: Path
 ) -> None:
-    install(tmp_path / "site", {}, hidden="hidden:Hidden")
+    install(site, {}, hidden="hidden:Hidden")
     with Fish(daemon.endpoint) as fish, pytest.raises(Refused) as refusal:
         fish.set_controller("hidden")
     assert str(refusal.value) == (

@@ -21,35 +21,49 @@ CONFIG = [Write(b"\x01"), Read(2)]
 
 
 @pytest.fixture
-def pi(tmp_path: Path) -> Iterator[Pi]:
+def own_pi(tmp_path: Path) -> Iterator[Pi]:
+    """For a test of its start, its pulses or its end."""
     with virtual_pi(tmp_path) as found:
         yield found
+
+
+@pytest.fixture(scope="module")
+def shared_pi(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pi]:
+    with virtual_pi(tmp_path_factory.mktemp("pi")) as found:
+        yield found
+
+
+@pytest.fixture
+def pi(shared_pi: Pi) -> Pi:
+    """One for all tests of a module, without a fault."""
+    shared_pi.control("clear")
+    return shared_pi
 
 
 def faults(pi: Pi) -> list[str]:
     return list(json.loads(pi.control("status", "--json"))["faults"])
 
 
-def test_it_says_where_it_listens_and_answers_there(pi: Pi) -> None:
-    assert pi.greeting == (
-        f"virtual Pi on {pi.path}: ADS1115 0x48 on I2C bus 1, "
-        f"pigpiod on 127.0.0.1:{pi.port} with the servo on GPIO 18\n"
+def test_it_says_where_it_listens_and_answers_there(own_pi: Pi) -> None:
+    assert own_pi.greeting == (
+        f"virtual Pi on {own_pi.path}: ADS1115 0x48 on I2C bus 1, "
+        f"pigpiod on 127.0.0.1:{own_pi.port} with the servo on GPIO 18\n"
     )
-    with RemotePi(pi.path) as remote:
+    with RemotePi(own_pi.path) as remote:
         assert remote.transfer(0x48, CONFIG) == [b"\x85\x83"]
-    status = json.loads(pi.control("status", "--json"))
-    assert status["pigpio_port"] == pi.port
+    status = json.loads(own_pi.control("status", "--json"))
+    assert status["pigpio_port"] == own_pi.port
     assert (status["pulse"], status["angle"], status["faults"]) == (0.0, None, {})
 
 
-def test_a_pulse_moves_the_fish(pi: Pi) -> None:
-    with contextlib.closing(Client("127.0.0.1", pi.port, PATIENCE)) as client:
+def test_a_pulse_moves_the_fish(own_pi: Pi) -> None:
+    with contextlib.closing(Client("127.0.0.1", own_pi.port, PATIENCE)) as client:
         client.set_servo_pulsewidth(18, 1740)
-    with RemotePi(pi.path) as remote:  # nobody reads the sensor, and still the fish swims
+    with RemotePi(own_pi.path) as remote:  # nobody reads the sensor, and still the fish swims
         wait_until(lambda: remote.state().truth.alpha > 0.15)
-    text = pi.control("status")
+    text = own_pi.control("status")
     assert "pulses      1740 µs, +0.400 rad" in text
-    assert f"pigpiod     127.0.0.1:{pi.port}" in text
+    assert f"pigpiod     127.0.0.1:{own_pi.port}" in text
 
 
 def test_faults_are_injected_shown_and_cleared(pi: Pi) -> None:
@@ -121,11 +135,11 @@ def test_a_wrong_configuration_is_exit_78(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it_cleanly(pi: Pi, number: int) -> None:
-    with RemotePi(pi.path):
-        code, _, err = pi.end(number)
+def test_a_signal_ends_it_cleanly(own_pi: Pi, number: int) -> None:
+    with RemotePi(own_pi.path):
+        code, _, err = own_pi.end(number)
         assert (code, err) == (0, "")
-        assert not pi.path.exists()
+        assert not own_pi.path.exists()
 
 
 def test_one_that_was_killed_leaves_nothing_in_the_way(tmp_path: Path) -> None:

@@ -89,36 +89,45 @@ def files(disk: Path) -> set[str]:
     return {str(path.relative_to(disk)) for path in found if "__pycache__" not in path.parts}
 
 
-def test_what_is_installed_is_where_the_units_look_for_it(pi: Pi) -> None:
+def test_what_is_installed_is_where_the_units_look_for_it(installed: Pi) -> None:
     for unit in ("fishd.service", "fishd-failure.service"):
-        text = (pi.disk / "etc/systemd/system" / unit).read_text()
+        text = (installed.disk / "etc/systemd/system" / unit).read_text()
         commands = re.findall(r"^Exec\w+=[-+]*/(opt/\S+) --config /(\S+)$", text, re.MULTILINE)
         assert commands
         for program, config in commands:
-            assert os.access(pi.disk / program, os.X_OK), program
+            assert os.access(installed.disk / program, os.X_OK), program
             assert config == CONFIG
-    assert (pi.disk / CONFIG).read_text() == (CHECKOUT / "config/pi.yaml").read_text()
-    assert (pi.disk / "usr/local/bin/fishctl").readlink() == Path("/opt/fishd/bin/fishctl")
+    assert (installed.disk / CONFIG).read_text() == (CHECKOUT / "config/pi.yaml").read_text()
+    assert (installed.disk / "usr/local/bin/fishctl").readlink() == Path("/opt/fishd/bin/fishctl")
 
 
-def test_the_installed_programs_run_from_their_final_place(pi: Pi) -> None:
-    first = (pi.disk / "opt/fishd/bin/fishd").read_text().partition("\n")[0]
+def test_the_installed_programs_run_from_their_final_place(installed: Pi) -> None:
+    first = (installed.disk / "opt/fishd/bin/fishd").read_text().partition("\n")[0]
     assert first.startswith("#!/opt/fishd/bin/python")
-    python = pi.disk / "opt/fishd/bin/python"
+    python = installed.disk / "opt/fishd/bin/python"
     where = subprocess.check_output([python, "-I", "-c", "import fishd; print(fishd.__file__)"])
-    assert str(pi.disk) in where.decode()
+    assert str(installed.disk) in where.decode()
 
 
-def test_every_file_under_systemd_is_installed(pi: Pi) -> None:
+def test_every_file_under_systemd_is_installed(installed: Pi) -> None:
     shipped = {path.name for path in (CHECKOUT / "systemd").rglob("*") if path.is_file()}
-    assert shipped <= {Path(name).name for name in files(pi.disk)}
+    assert shipped <= {Path(name).name for name in files(installed.disk)}
 
 
-def test_installing_twice_changes_nothing(pi: Pi) -> None:
+def test_installing_again_without_the_gpio_package_adds_nothing_and_says_what_is_missing(
+    pi: Pi, tmp_path: Path
+) -> None:
     before = files(pi.disk)
-    said = pi.run("install_pi.sh")
+    sdist(tmp_path / "sources", "rpi_lgpio", 'raise SystemExit("error: swig failed")')
+    options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
+    said = pi.run("install_pi.sh", **options)
     assert files(pi.disk) == before
     assert said[0].startswith("/opt/fishd: has Python 3.")
+    text = "\n".join(said)
+    assert "E-stop button and status light are NOT available: no rpi-lgpio" in text
+    assert "sudo apt install swig gcc python3-dev; then: sudo make install-pi" in text
+    assert "network" not in text
+    assert "/etc/systemd/system/fishd.service: installed" in text
 
 
 @pytest.mark.parametrize("renewed", [False, True])
@@ -144,9 +153,11 @@ def test_a_config_that_nobody_edited_is_renewed(pi: Pi) -> None:
     assert (pi.disk / CONFIG).read_text() == (CHECKOUT / "config/pi.yaml").read_text()
 
 
-def test_a_python_that_is_gone_is_replaced(pi: Pi) -> None:
-    subprocess.run([pi.disk / "opt/fishd/bin/python3", "-I", "-c", "import fishd"], check=True)
-    assert not (pi.disk / "opt/fishd/lib/python3.9").exists()
+def test_a_python_that_is_gone_is_replaced(installed: Pi) -> None:
+    subprocess.run(
+        [installed.disk / "opt/fishd/bin/python3", "-I", "-c", "import fishd"], check=True
+    )
+    assert not (installed.disk / "opt/fishd/lib/python3.9").exists()
 
 
 def test_uninstalling_leaves_nothing(pi: Pi) -> None:
@@ -242,28 +253,9 @@ def build_wheel(folder, settings=None, metadata=None):
             tar.addfile(info, io.BytesIO(text.encode()))
 
 
-def test_a_gpio_package_that_cannot_be_built_does_not_keep_fishd_from_being_installed(
+def test_a_gpio_package_is_built_as_its_sources_want_and_only_then_the_other_goes(
     pi: Pi, tmp_path: Path
 ) -> None:
-    sdist(tmp_path / "sources", "rpi_lgpio", 'raise SystemExit("error: swig failed")')
-    options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
-    said = "\n".join(pi.run("install_pi.sh", **options))
-    assert "E-stop button and status light are NOT available: no rpi-lgpio" in said
-    assert "sudo apt install swig gcc python3-dev; then: sudo make install-pi" in said
-    assert "network" not in said
-    assert "/etc/systemd/system/fishd.service: installed" in said
-
-
-def test_the_gpio_package_is_built_with_what_its_sources_want(pi: Pi, tmp_path: Path) -> None:
-    sdist(tmp_path / "sources", "rpi_lgpio", 'assert os.environ["PYPI"] == "1"')
-    install = ("install_gpio", "rpi-lgpio")
-    built = "rpi-lgpio: installed, for E-stop button and status light"
-    assert built in pi.run(*install, PIP_FIND_LINKS=str(tmp_path / "sources"))
-    # The second time it is there, and is neither fetched nor built.
-    assert "rpi-lgpio: there, for E-stop button and status light" in pi.run(*install)
-
-
-def test_the_other_gpio_package_goes_only_once_the_new_one_is_built(pi: Pi, tmp_path: Path) -> None:
     sources, install = tmp_path / "sources", ("install_gpio", "rpi-lgpio")
     (site,) = (pi.disk / "opt/fishd/lib").glob("python3*/site-packages")
     with zipfile.ZipFile(wheel_of(tmp_path, "RPi.GPIO")) as other:
@@ -271,12 +263,14 @@ def test_the_other_gpio_package_goes_only_once_the_new_one_is_built(pi: Pi, tmp_
     sdist(sources, "rpi_lgpio", 'raise SystemExit("error: swig failed")')
     pi.run(*install, PIP_FIND_LINKS=str(sources))
     assert (site / "RPi.GPIO-0.6.dist-info").exists()
-    wheel_of(sources, "rpi_lgpio")
-    assert "RPi.GPIO: removed, it excludes rpi-lgpio" in pi.run(
-        *install, PIP_FIND_LINKS=str(sources)
-    )
+    sdist(sources, "rpi_lgpio", 'assert os.environ["PYPI"] == "1"')
+    said = pi.run(*install, PIP_FIND_LINKS=str(sources))
+    assert "RPi.GPIO: removed, it excludes rpi-lgpio" in said
+    assert "rpi-lgpio: installed, for E-stop button and status light" in said
     assert not (site / "RPi.GPIO-0.6.dist-info").exists()
     subprocess.run([pi.disk / "opt/fishd/bin/python", "-I", "-c", "import RPi"], check=True)
+    # The second time it is there, and is neither fetched nor built.
+    assert "rpi-lgpio: there, for E-stop button and status light" in pi.run(*install)
 
 
 def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_path: Path) -> None:

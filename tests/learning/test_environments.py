@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from rigs.processes import Daemon, running
+from rigs.processes import Daemon
 from rigs.swimming import BRIEF, Resting, brief_job
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
 
@@ -145,12 +145,6 @@ def test_the_pause_asked_for_follows_the_longest_so_far(monkeypatch: pytest.Monk
     assert asked == [120.0, 10.0, 20.0, 20.0, 120.0]
     env.pause(300.0)
     assert asked[-1] == 300.0
-
-
-@pytest.fixture
-def daemon(tmp_path: Path):  # type: ignore[no-untyped-def]
-    with running(tmp_path, "--set", "simulation.noise=0.001") as found:
-        yield found
 
 
 def test_the_environment_on_a_running_fishd_passes_both_checkers(daemon: Daemon) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rigs.processes import Daemon, Subscriber, running
+from rigs.processes import Daemon, Subscriber, running, sets
 
 from fishd.client import Agent, Fish, FishError, NoDaemon
 from fishd.config import load
@@ -21,14 +21,10 @@ FISH = ["simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.seed=7"
 HALF = np.full(1, 0.5, np.float32)
 
 
-def options(*settings: str) -> list[str]:
-    return [word for setting in settings for word in ("--set", setting)]
-
-
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Daemon]:
+@pytest.fixture(scope="module")
+def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     """A fishd in real time, in which an agent on a busy machine may lose ticks but no training."""
-    with running(tmp_path, *options("tick=0.1")) as found:
+    with running(tmp_path_factory.mktemp("daemon"), *sets("tick=0.1")) as found:
         yield found
 
 
@@ -102,7 +98,7 @@ def test_a_fishd_in_lockstep_gives_the_numbers_of_a_fish_in_process(
 ) -> None:
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
     settings = ("lockstep=true", "start.controller=remote", agent, *FISH)
-    with running(tmp_path, *options(*settings)) as daemon:  # its first tick waits for the agent
+    with running(tmp_path, *sets(*settings)) as daemon:  # its first tick waits for the agent
         there = history(FishdLink(daemon.endpoint), 300, pause_every)
     assert there == history(SimulatedLink(load(None, FISH)), 300, pause_every)
 
@@ -233,19 +229,19 @@ def test_a_reset_in_a_pause_ends_it(env: SwimEnv) -> None:
 
 
 def test_a_fishd_that_is_gone_or_was_restarted_ends_it(tmp_path: Path) -> None:
-    with running(tmp_path, *options("tick=0.1")) as first:
+    with running(tmp_path, *sets("tick=0.1")) as first:
         env = env_on(first)
         env.reset()
         first.process.kill()
         first.process.wait()
         with losing("no fishd at ipc://"):
             swim_for_ever(env.link)
-    with running(tmp_path, *options("tick=0.1")) as second:
+    with running(tmp_path, *sets("tick=0.1")) as second:
         env.reset()
         assert swims(env)
         second.process.kill()
         second.process.wait()
-    with running(tmp_path, *options("tick=0.1")) as third:
+    with running(tmp_path, *sets("tick=0.1")) as third:
         pids = f"it is process {third.process.pid} now, and was {second.process.pid}"
         with losing(f"^fishd was restarted: {pids}$"):
             swim_for_ever(env.link)

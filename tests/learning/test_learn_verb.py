@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running
+from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line
 from rigs.swimming import brief_job, rows, wait_for, while_it_trains
 
 from fishd.cli.learn.ppo import report
@@ -205,14 +205,6 @@ def test_on_a_terminal_it_shows_a_bar(
     assert "128/128" in text.result()
     assert "tank 0:0" in text.result()
     assert "left" in text.result()
-
-
-@pytest.fixture
-def daemon(tmp_path: Path):  # type: ignore[no-untyped-def]
-    folder = tmp_path / "daemon"
-    folder.mkdir()
-    with running(folder, "--set", "simulation.noise=0.001", "--set", "tick=0.05") as found:
-        yield found
 
 
 @pytest.fixture

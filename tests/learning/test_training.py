@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from msgspec.structs import replace
-from rigs.processes import Subscriber, running
+from rigs.processes import Subscriber, running, sets
 from rigs.swimming import BRIEF, NOISY, Failing, Losing, Resting, brief_job, rows
 from stable_baselines3.common.save_util import load_from_zip_file
 
@@ -335,26 +335,22 @@ def test_networks_with_other_scales_or_sizes_are_refused(
 
 
 def test_in_lockstep_it_gives_the_numbers_of_a_training_in_process(tmp_path: Path) -> None:
-    here = train(brief_job(tmp_path / "here", steps=1024, evaluation=never()))
-    settings = [
-        "lockstep=true",
-        "start.controller=remote",
-        f"start.parameters.agent=ipc://{tmp_path}/agent",
-        *NOISY,
-    ]
-    with running(tmp_path, *(word for setting in settings for word in ("--set", setting))) as fishd:
-        job = brief_job(tmp_path / "there", steps=1024, evaluation=never())
+    here = train(brief_job(tmp_path / "here", steps=512, evaluation=never()))
+    agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
+    settings = sets("lockstep=true", "start.controller=remote", agent, *NOISY)
+    with running(tmp_path, *settings) as fishd:
+        job = brief_job(tmp_path / "there", steps=512, evaluation=never())
         there = train(replace(job, on="robot", endpoint=fishd.endpoint))
         with Fish(fishd.endpoint) as fish:
             assert fish.status().mode == "idle"
-    assert (there.steps, there.tank_time) == (1024, here.tank_time)
+    assert (there.steps, there.tank_time) == (512, here.tank_time)
     tables = [(outcome.folder / "progress.csv").read_text() for outcome in (here, there)]
     assert tables[0] == tables[1]
 
 
 def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
     elsewhere = f"ipc://{tmp_path}/elsewhere"
-    settings = [word for setting in ("lockstep=true", *NOISY) for word in ("--set", setting)]
+    settings = sets("lockstep=true", *NOISY)
     with running(tmp_path, *settings) as fishd, Subscriber(fishd.telemetry, b"event") as events:
         job = brief_job(tmp_path / "run", steps=128, evaluation=never())
         train(replace(job, on="robot", endpoint=fishd.endpoint, agent=elsewhere))

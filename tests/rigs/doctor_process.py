@@ -2,10 +2,9 @@
 
 import json
 import os
-import subprocess
 from pathlib import Path
 
-from rigs.processes import FISHCTL, PATIENCE, fishctl
+from rigs.processes import FISHCTL, call, fishctl
 
 Findings = dict[str, tuple[str, str]]
 
@@ -15,17 +14,8 @@ def doctor(
 ) -> tuple[int, Findings]:
     """Exit status, and level and message of each check; a FAIL or warning says how to mend it."""
     verb = ("doctor", "--json", "--set", f"control.address=ipc://{folder}/control", *settings)
-    if under or env:
-        ended = subprocess.run(
-            [*under, FISHCTL, *verb],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=PATIENCE,
-            env=os.environ | env,
-        )
-    else:
-        ended = fishctl(*verb)
+    apart = bool(under or env)
+    ended = call(*under, FISHCTL, *verb, env=os.environ | env) if apart else fishctl(*verb)
     assert ended.stderr == ""
     findings = json.loads(ended.stdout)
     assert all(bool(f["mend"]) == (f["level"] in ("warning", "FAIL")) for f in findings)

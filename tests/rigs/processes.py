@@ -62,6 +62,11 @@ def sets(*pairs: str) -> list[str]:
     return [word for pair in pairs for word in ("--set", pair)]
 
 
+def addresses(folder: Path) -> list[str]:
+    """Those of a fishd of its own: options of a command line."""
+    return sets(f"control.address=ipc://{folder}/control", "telemetry.address=tcp://127.0.0.1:0")
+
+
 def install(site: Path, modules: Mapping[str, str], **controllers: str) -> None:
     """Put a package of controllers into a folder of PYTHONPATH, as pip would.
 
@@ -110,8 +115,7 @@ class Daemon(Process):
     def __init__(self, folder: Path, *arguments: str, under: Sequence[str] = ()) -> None:
         """under: a command that starts the daemon, `setpriv` say."""
         self.endpoint = f"ipc://{folder}/control"
-        own = sets(f"control.address={self.endpoint}", "telemetry.address=tcp://127.0.0.1:0")
-        super().__init__(*under, FISHD, *own, *arguments)
+        super().__init__(*under, FISHD, *addresses(folder), *arguments)
 
     def wait_until_up(self) -> Self:
         deadline = time.monotonic() + PATIENCE
@@ -126,6 +130,14 @@ class Daemon(Process):
     def status(self, timeout: float = PATIENCE) -> Status:
         with Fish(self.endpoint, timeout=timeout) as fish:
             return fish.status()
+
+    def at_rest(self) -> Self:
+        """The same one as at its start, whatever a controller or an emergency stop has done."""
+        with Fish(self.endpoint) as fish:
+            fish.stop()
+            fish.clear_fault()
+            wait_until(lambda: _rests(fish.status()))
+        return self
 
     def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """What fishctl says of this daemon."""
@@ -146,6 +158,10 @@ class Daemon(Process):
     def kill(self) -> None:
         self.process.kill()
         self.process.wait(PATIENCE)
+
+
+def _rests(status: Status) -> bool:
+    return status.mode == "idle" and status.servo_on and status.phi_c == 0.0
 
 
 @contextlib.contextmanager

@@ -18,12 +18,11 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
-from fishd.learning.run_folder import checkpoints
-from fishd.learning.run_folder.runs import make_folder
-from fishd.learning.run_folder.tables import write_summary
 from fishd.learning.train.cluster import pack, scheduler, stop_requested, unpack
 from fishd.learning.train.jobs import Job, Outcome
-from fishd.learning.train.training import on_signal, train
+
+# What brings torch is imported where it is used: a process that is told to stop before it has
+# begun ends without it, seconds sooner.
 
 STOP = "stop"
 """A file of this name in the run folder ends the trainings in it."""
@@ -57,6 +56,9 @@ def train_seeds(
     SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
     the folder is in use, and `FishdError` where there is no scheduler.
     """
+    from fishd.learning.run_folder.runs import make_folder
+    from fishd.learning.run_folder.tables import write_summary
+
     folder = job.folder.absolute()
     waiting = [_job_of(job, folder, index) for index in range(seeds)]
     outcomes: dict[int, Outcome] = {}
@@ -160,6 +162,9 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
     """Train, or resume what a killed process has begun; an exception is an outcome, too."""
     if stop():
         return Outcome(folder=job.folder, ended="interrupted", message="it had not begun")
+    from fishd.learning.run_folder import checkpoints
+    from fishd.learning.train.training import train
+
     try:
         if checkpoints.all_in(job.folder):
             job = replace(job, resume=True, parent=None)
@@ -178,6 +183,7 @@ def _failed(job: Job, message: str) -> Outcome:
 @contextmanager
 def _stop_on_signal(file: Path, event: Any) -> Iterator[None]:
     """While this lasts, signals tell all of them to stop."""
+    from fishd.learning.train.training import on_signal
 
     def ask() -> None:
         if event:

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import REST, PlantState, TetheredFish, Window
@@ -46,6 +45,7 @@ def integrate(
     p: PlantParameters, state: PlantState, command: float | None, duration: float, samples: int
 ) -> tuple[PlantState, Window]:
     """The equations as they stand, given to an adaptive solver."""
+    from scipy.integrate import solve_ivp  # takes long to load, in every worker of pytest
 
     if command is not None:  # the wheel stops at the edge of the dead zone
         command = state.phi + dead_band(command - state.phi, p.servo_dead_zone)
