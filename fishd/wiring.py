@@ -27,8 +27,7 @@ from fishd.hardware.base import CalibratedParts, Panel, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.driver import ServoDriver
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.hardware.packages import driver_packages
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio

@@ -9,8 +9,7 @@ from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.hardware.force_sensor.sampler import Sampler
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor, Sampler
 from fishd.virtual.pi.ads1115 import Ads1115Chip
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.i2c import I2cBus

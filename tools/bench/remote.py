@@ -21,8 +21,7 @@ from msgspec import Struct
 from common.machine import PRIORITY, fifo_permitted, machine_in_short, priorities, scheduling
 from common.report import Options, Report, progress, table
 from fishd.config import Config, load
-from fishd.controllers.remote.controller import Remote
-from fishd.controllers.remote.parameters import RemoteParameters
+from fishd.controllers.remote.controller import Remote, RemoteParameters
 from fishd.core.clock import SystemClock, Ticker
 from fishd.core.signals import Observation
 from fishd.daemon import realtime

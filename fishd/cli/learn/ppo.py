@@ -1,5 +1,6 @@
 """The verb that trains."""
 
+import statistics
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -118,9 +119,7 @@ def ppo(
     changed = {name: value for name, value in given.items() if value is not None}
     job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     if seeds is not None:
-        from fishd.cli.learn.seeds import train_seeds
-
-        return train_seeds(job, seeds, jobs, cluster)
+        return _train_seeds(job, seeds, jobs, cluster)
     return _train(job)
 
 
@@ -251,3 +250,37 @@ def _run_of(path: Path) -> Path:
         what = "a policy file has no value network" if path.exists() else "no such folder"
         raise ConfigError(f"--from {path}: {what}; give a run folder or one of its checkpoints")
     return path if (path / SETTINGS).exists() else path.parent
+
+
+def _train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) -> int:
+    """Train them all, a line as each ends, and a summary; the exit status."""
+    from fishd.learning.train import seeds as training
+
+    click.echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps")
+    outcomes = training.train_seeds(job, seeds, jobs, cluster, _print_seed)
+    for name, evaluations in (
+        ("latest", [outcome.latest_evaluation for outcome in outcomes]),
+        ("best", [outcome.best_evaluation for outcome in outcomes]),
+    ):
+        shares = [evaluation.efficiency for evaluation in evaluations if evaluation]
+        if shares:
+            click.echo(
+                f"{name} policies of {len(shares)} seeds: median {statistics.median(shares):.1%} "
+                f"[{min(shares):.1%} – {max(shares):.1%}]"
+            )
+    click.echo(f"curves: {job.folder / 'seeds.csv'}")
+    ends = {outcome.ended for outcome in outcomes}
+    if ends - {"finished", "interrupted"}:
+        return 1
+    return INTERRUPTED if "interrupted" in ends else 0
+
+
+def _print_seed(seed: int, outcome: "Outcome") -> None:
+    from fishd.learning.train.progress import described
+
+    latest = outcome.latest_evaluation
+    swims = f": {described(latest).strip()}" if latest else ""
+    is_finished = outcome.ended == "finished"
+    ended = "" if is_finished else f" {outcome.ended}"
+    why = f" ({outcome.message})" if outcome.message else ""
+    click.echo(f"seed {seed}{ended}{why}{swims}", err=not is_finished)

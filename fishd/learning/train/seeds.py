@@ -4,14 +4,18 @@ Each seed trains in a folder seed-0, seed-1, ... of the run folder. A seed that 
 and does not affect the others; one whose process was killed is resumed in another.
 """
 
+import io
 import shutil
 import signal
 import tempfile
 import threading
+import time
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -21,7 +25,6 @@ from fishd.core.errors import FishdError
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.runs import make_folder
 from fishd.learning.run_folder.tables import write_summary
-from fishd.learning.train.cluster import pack, scheduler, stop_requested, unpack
 from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.training import on_signal, train
 
@@ -190,3 +193,59 @@ def _stop_on_signal(file: Path, event: Any) -> Iterator[None]:
             yield
     finally:
         file.unlink(missing_ok=True)
+
+
+CONNECT = 10.0
+"""How long to wait for a scheduler that does not answer [s]."""
+_POLL = 1.0
+"""How often a worker asks the scheduler whether to stop [s]."""
+
+
+@contextmanager
+def scheduler(address: str | None) -> Iterator[Any]:
+    """A connection to the scheduler, and an event there that means stop; None without address."""
+    if address is None:
+        yield None
+        return
+    from distributed import Client, Event
+
+    try:
+        client = Client(address, timeout=CONNECT, name="fishctl learn")
+    except (OSError, ValueError, TypeError, TimeoutError) as error:
+        raise FishdError(f"no Dask scheduler answers at {address}: {error}") from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise FishdError(f"the Dask scheduler at {address} has no workers")
+        yield Event(f"fishd-stop-{uuid4().hex}", client=client)
+
+
+def stop_requested(name: str) -> Callable[[], bool]:
+    """A function, for use on a Dask worker, that tells whether an event of this name was set."""
+    from distributed import Event, get_client
+
+    event = Event(name, client=get_client())
+    was_set, next_look = False, 0.0
+
+    def stop() -> bool:
+        nonlocal was_set, next_look
+        if not was_set and time.monotonic() >= next_look:
+            was_set = event.is_set()
+            next_look = time.monotonic() + _POLL
+        return was_set
+
+    return stop
+
+
+def pack(folder: Path) -> bytes:
+    """All files of a folder as one zip archive."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder))
+    return buffer.getvalue()
+
+
+def unpack(files: bytes, folder: Path) -> None:
+    """Write the files of such an archive into a folder."""
+    with zipfile.ZipFile(io.BytesIO(files)) as archive:
+        archive.extractall(folder)

@@ -25,7 +25,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.simulated_link import SimulatedLink
-from fishd.learning.ppo.model import (
+from fishd.learning.ppo import (
     DeterministicPolicy,
     is_finite,
     learning_rate,

@@ -9,8 +9,8 @@ import pytest
 from rigs.force_rig import ABSENT_BUS, STEP, ForceRig, take_pairs, volts
 
 from fishd.core.errors import MissingPackage
-from fishd.hardware.force_sensor.sampler import LONGEST_PAUSE
-from fishd.hardware.packages import driver_packages
+from fishd.hardware.force_sensor.sampled_sensor import LONGEST_PAUSE
+from fishd.hardware.registry import driver_packages
 from fishd.virtual.pi.i2c import Message
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 

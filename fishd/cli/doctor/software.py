@@ -6,10 +6,10 @@ import stat
 import sys
 from importlib import metadata
 
-from fishd.cli.doctor.checks.base import Context, sudo_unless
+from fishd.cli.doctor.base import Context, sudo_unless
 from fishd.hardware import header
 from fishd.hardware.checks import Check, Result, fail, ok, warning
-from fishd.hardware.packages import PACKAGES
+from fishd.hardware.registry import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
     "adafruit-blinka": "adafruit_blinka",  # not one of its own, such as board, which looks for pins
