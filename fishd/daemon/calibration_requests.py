@@ -28,8 +28,11 @@ from fishd.core.protocol import (
 )
 from fishd.core.schema import Problem
 from fishd.daemon.background_calls import BackgroundCalls
-from fishd.daemon.trial_calibration import TrialCalibration, calibrated_parts_at_rest
-from fishd.hardware.base import CalibratedParts
+from fishd.daemon.trial_calibration import (
+    TrialCalibration,
+    calibrated_parts,
+    calibrated_parts_at_rest,
+)
 from fishd.hardware.calibration_files import CalibrationFolder, check
 
 MOST_SAMPLES = 4
@@ -80,7 +83,7 @@ class CalibrationRequests:
         return self._servo.lease is not None
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
-        parts = self._calibrated_parts()
+        parts = calibrated_parts(self._loop)
         return Calibrations(
             force=parts.sensor.calibration,
             force_file=self._force_file,
@@ -187,7 +190,7 @@ class CalibrationRequests:
         calibrated_parts_at_rest(self._loop)
         saved, path = await self._save(calibration)
         # The newest file is used from the next start on, so it is now, whatever else began.
-        self._calibrated_parts().sensor.recalibrate(saved)
+        calibrated_parts(self._loop).sensor.recalibrate(saved)
         self._force_file = str(path)
         self._announce("force sensor", path)
         return await self._calibrations(NoArguments())
@@ -213,14 +216,6 @@ class CalibrationRequests:
     async def _end_lease(self, wanted: ServoLease) -> Calibrations:
         self._servo.end(wanted.lease)
         return await self._calibrations(NoArguments())
-
-    def _calibrated_parts(self) -> CalibratedParts:
-        parts = self._loop.robot.calibrated
-        if parts is None:
-            raise Refused(
-                "simulated", "a simulated fish has nothing to calibrate; see robot: virtual-pi"
-            )
-        return parts
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:
@@ -258,5 +253,4 @@ def _sensible(calibration: C) -> C:
     try:
         return check(calibration)
     except Problem as problem:
-        where = ".".join(problem.path) + ": " if problem.path else ""
-        raise Refused("bad-arguments", f"{where}{problem}") from None
+        raise Refused("bad-arguments", problem.located({})) from None

@@ -51,8 +51,7 @@ class CalibrationFolder:
         except strict_yaml.YamlProblem as problem:
             raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
         except Problem as problem:
-            where = ".".join(problem.path) + ": " if problem.path else ""
-            raise ConfigError(f"{path}: {where}{problem}; {_REMEDY}") from None
+            raise ConfigError(f"{path}: {problem.located({})}; {_REMEDY}") from None
         except files.FileProblem as problem:
             raise ConfigError(f"{path}: {problem}; {_REMEDY}") from None
 

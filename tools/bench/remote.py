@@ -25,7 +25,7 @@ from fishd.controllers.remote.controller import Remote, RemoteParameters
 from fishd.core.clock import SystemClock, Ticker
 from fishd.core.signals import Observation
 from fishd.daemon import realtime
-from fishd.daemon.telemetry import unheard
+from fishd.daemon.telemetry import Telemetry
 from fishd.daemon.warm_up import mock_ticks
 from fishd.virtual.fish import SimulatedFish
 from fishd.wiring import build_loop
@@ -102,7 +102,7 @@ async def swim(controller: TimedRemote, config: Config, trips: int) -> None:
     """Tick as the daemon does until there are so many round trips."""
     realtime.enter(PRIORITY if fifo_permitted() else 0, lock_memory=False)
     fish = SimulatedFish(config.plant, config.simulation, config.tick)
-    loop = build_loop(config, fish.robot(), SystemClock(), unheard())
+    loop = build_loop(config, fish.robot(), SystemClock(), Telemetry(lambda message: None))
     loop.set_controller("remote", controller)
     ticker = Ticker(config.tick, mock_ticks(config))
     realtime.quiet_garbage_collector()

@@ -206,7 +206,7 @@ def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
     from fishd.hardware.servo.pigpio_client import opened
 
     try:
-        with opened(settings) as client:
+        with opened(settings.host, settings.port) as client:
             began = time.monotonic()
             version = client.get_pigpio_version()
             took = time.monotonic() - began

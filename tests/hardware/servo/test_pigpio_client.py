@@ -57,7 +57,7 @@ def test_an_answer_that_breaks_off_is_an_error_not_a_loop_without_end(
     try:
         with (
             pytest.raises(ServoError, match=message),
-            opened(server.settings, 0.2) as client,
+            opened(server.settings.host, server.settings.port, 0.2) as client,
         ):
             client.script_status(0)
     finally:
@@ -68,6 +68,6 @@ def test_an_answer_that_breaks_off_is_an_error_not_a_loop_without_end(
 def test_a_host_that_is_none_is_one_line_too(host: str) -> None:
     with (
         pytest.raises(ServoError, match=rf"^pigpiod at {host}:8888: [^\n]+$"),
-        opened(PigpioSettings(host=host)),
+        opened(host, 8888),
     ):
         pass

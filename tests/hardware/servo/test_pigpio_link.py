@@ -156,7 +156,7 @@ def test_the_countdown_is_there_again_after_a_reconnection(bench: Bench, fault: 
     bench.write_until_it_works(0.5)
     eventually(lambda: bench.width == 1500, 2.0)
     eventually(lambda: bench.width == 0, 2.0)
-    with opened(PigpioSettings(port=bench.daemon.port)) as client:
+    with opened("127.0.0.1", bench.daemon.port) as client:
         assert sum(bool(client.script_status(script)[1]) for script in range(32)) == 1
 
 
