@@ -8,12 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from fishd.cli.completion import active_parameters, complete_pair
-from fishd.cli.options import (
-    ControllerGroup,
-    ParameterType,
-    daemon_options,
-    describe,
-)
+from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
 from fishd.cli.output import echo, echo_rows, made_printable, print_json, spelled
 from fishd.client import Fish
 from fishd.controllers import registry

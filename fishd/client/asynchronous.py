@@ -21,11 +21,7 @@ class AsyncFish(Connection):
     """`Fish` for asyncio: the same requests, to be awaited."""
 
     def __init__(
-        self,
-        endpoint: str | None = None,
-        *,
-        timeout: float = TIMEOUT,
-        telemetry: str | None = None,
+        self, endpoint: str | None = None, *, timeout: float = TIMEOUT, telemetry: str | None = None
     ) -> None:
         """Takes the arguments of `Fish`."""
         super().__init__(endpoint, timeout, telemetry)

@@ -118,9 +118,7 @@ def _force_of_daemon(context: Context) -> Result:
             "fishctl watch; check the wires if this goes on",
         )
     return _enough(
-        tick.samples,
-        context,
-        f"the newest {tick.age_ms:.0f} ms old, {survived or 'no errors'}",
+        tick.samples, context, f"the newest {tick.age_ms:.0f} ms old, {survived or 'no errors'}"
     )
 
 

@@ -115,8 +115,7 @@ class Remote(Controller[RemoteParameters]):
         complaint = why_not_connected(parameters.agent)
         if complaint:
             raise ParameterError(
-                f"agent: '{parameters.agent}' is not valid: {complaint}",
-                ("agent",),
+                f"agent: '{parameters.agent}' is not valid: {complaint}", ("agent",)
             )
         longest = LONGEST_DEADLINE * limits.tick
         if parameters.deadline is not None and parameters.deadline > longest:

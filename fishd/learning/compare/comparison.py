@@ -135,11 +135,7 @@ def refusal(config: Config, contestant: Contestant) -> FishdError | None:
 
 
 def compare(
-    config: Config,
-    contestants: Sequence[Contestant],
-    seconds: float,
-    settle: float,
-    runs: int = 1,
+    config: Config, contestants: Sequence[Contestant], seconds: float, settle: float, runs: int = 1
 ) -> tuple[list[Standing], list[Trace]]:
     """Let each swim the fish of `config`; standings and last traces, in the order given.
 
