@@ -245,9 +245,7 @@ def to_yaml(config: Config | dict[str, Any]) -> str:
     """The whole configuration, defaults included, as YAML that `load` reads back."""
     import yaml
 
-    return yaml.safe_dump(
-        msgspec.to_builtins(config), sort_keys=False, allow_unicode=True, default_flow_style=False
-    )
+    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False, allow_unicode=True)
 
 
 def json_schema() -> dict[str, Any]:

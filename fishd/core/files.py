@@ -50,7 +50,8 @@ def read(path: Path, longest: int, reader: str) -> bytes:
     except ValueError:
         raise NoFile("no such file: a name has no zero byte") from None
     if content is None or len(content) > longest:
-        raise FileProblem(f"is longer than {_size(longest)}, far more than {reader} needs")
+        size = f"{longest / 2**20:g} MB" if longest >= 2**20 else f"{longest // 2**10} kB"
+        raise FileProblem(f"is longer than {size}, far more than {reader} needs")
     return content
 
 
@@ -67,11 +68,6 @@ def _check_kind(found: os.stat_result) -> None:
     if not stat.S_ISREG(found.st_mode):
         kind = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
         raise FileProblem(f"is {kind}; a regular file is needed")
-
-
-def _size(longest: int) -> str:
-    megabytes = longest / 2**20
-    return f"{megabytes:g} MB" if megabytes >= 1 else f"{longest // 2**10} kB"
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

@@ -222,7 +222,7 @@ class CalibrationRequests:
             return await self._calls.call(
                 "the calibration has not been written",
                 partial(self._folder.save, calibration, self._date()),
-                late=_withdraw,
+                late=lambda saved: saved[1].unlink(),  # not to be used from the next start on
                 interrupt=False,  # between the file's coming into being and its name in the result
             )
         except ConfigError as error:
@@ -241,11 +241,6 @@ class CalibrationRequests:
 
     def _announce(self, what: str, path: Path) -> None:
         self._loop.reporter.event("calibration", f"{what}: {path}", file=str(path))
-
-
-def _withdraw(saved: tuple[C, Path]) -> None:
-    """Remove a file that came too late: it must not be used from the next start on."""
-    saved[1].unlink()
 
 
 def _sensible(calibration: C) -> C:

@@ -195,7 +195,11 @@ class Operations:
         loop = self._loop
         for field in fields_of(loop.active.controller.Parameters):
             if field.file and field.name in values:  # no tick waits for a file
-                raise ParameterError(_why_not_in_flight(loop.active.name, field.name))
+                name, option = loop.active.name, field.name.replace("_", "-")
+                raise ParameterError(
+                    f"{name}: {field.name}: it cannot change in flight; start the controller "
+                    f"again: 'fishctl set-controller {name} --{option} …'"
+                )
         return registry.merged(loop.active.controller, loop.active.name, values)
 
     async def _stop(self, _: protocol.NoArguments) -> State:
@@ -265,10 +269,3 @@ def _refusal(name: str, what: str, error: Exception) -> Refused:
     if isinstance(error, ParameterError):
         return Refused("bad-parameter", text.said(error))
     return Refused("controller-error", f"controller '{name}' {what}: {text.named(error)}")
-
-
-def _why_not_in_flight(controller: str, parameter: str) -> str:
-    return (
-        f"{controller}: {parameter}: it cannot change in flight; start the controller again: "
-        f"'fishctl set-controller {controller} --{parameter.replace('_', '-')} …'"
-    )

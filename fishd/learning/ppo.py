@@ -12,7 +12,6 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
-from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
@@ -157,11 +156,6 @@ def learning_rate(ppo: PpoSettings, steps: int) -> float:
     """The rate of the update that comes `steps` control steps after the start of the training."""
     share = min(1.0, steps / ppo.decay_steps)
     return ppo.learning_rate + share * (ppo.final_learning_rate - ppo.learning_rate)
-
-
-def set_learning_rate(model: PPO, rate: float) -> None:
-    """Set the rate of the next updates, whatever share of the training is done."""
-    model.lr_schedule = FloatSchedule(rate)
 
 
 def layers_of(policy: ActorCriticPolicy) -> Layers:

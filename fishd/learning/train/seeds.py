@@ -26,7 +26,7 @@ from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.runs import make_folder
 from fishd.learning.run_folder.tables import write_summary
 from fishd.learning.train.jobs import Job, Outcome
-from fishd.learning.train.training import on_signal, train
+from fishd.learning.train.training import handled, on_signal, train
 
 STOP = "stop"
 """A file of this name in the run folder ends the trainings in it."""
@@ -118,25 +118,10 @@ def _run(
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         workers = min(jobs or joblib.cpu_count(), len(tasks))
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-        with _ignoring_the_terminal():
+        # Its processes ignore Ctrl-C and hang-up, which a child inherits: they are told to stop.
+        with handled((signal.SIGINT, signal.SIGHUP), signal.SIG_IGN):
             outcomes = parallel(joblib.delayed(_train_here)(task) for task in tasks)
         yield from outcomes
-
-
-@contextmanager
-def _ignoring_the_terminal() -> Iterator[None]:
-    """Processes that are started in here ignore Ctrl-C and hang-up: this one tells them to stop."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    # A child inherits that a signal is ignored, unlike its handlers.
-    signals = (signal.SIGINT, signal.SIGHUP)
-    former = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
 
 
 def _train_here(task: _Task) -> tuple[int, Outcome, bytes]:
