@@ -42,7 +42,6 @@ class Operations:
         telemetry: str,
         realtime: bool,
         counters: Callable[[], dict[str, int]] = dict,
-        loading: float = protocol.LOADING,
     ) -> None:
         """
         config: what fishd was started with
@@ -50,7 +49,6 @@ class Operations:
         telemetry: the address that clients are told
         realtime: does the loop run under SCHED_FIFO?
         counters: what was survived outside of the robot, since start
-        loading: how long a controller may take to load [s]
         """
         self._loop = loop
         self._clock = clock
@@ -62,7 +60,7 @@ class Operations:
         self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
         self._started = clock.monotonic()
         self._decisions = 0
-        self._calls = BackgroundCalls(loading)
+        self._calls = BackgroundCalls(protocol.LOADING)
         self._controllers = controllers
         self._at_start = set(registry.names())
         self._handlers: Handlers = {

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from fishd.config import Config, Start
 from fishd.core.clock import VirtualClock, VirtualTicker
+from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.gateway.link import pair
-from fishd.daemon.telemetry import Telemetry
 from fishd.virtual.fish import SimulatedFish
 from fishd.wiring import build_loop
 

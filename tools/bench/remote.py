@@ -25,7 +25,7 @@ from fishd.controllers.remote.controller import Remote, RemoteParameters
 from fishd.core.clock import SystemClock, Ticker
 from fishd.core.signals import Observation
 from fishd.daemon import realtime
-from fishd.daemon.telemetry import Telemetry
+from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.warm_up import mock_ticks
 from fishd.virtual.fish import SimulatedFish
 from fishd.wiring import build_loop

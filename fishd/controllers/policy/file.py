@@ -43,10 +43,12 @@ class PolicyFile(NamedTuple):
 def read(path: Path) -> PolicyFile:
     """The policy in a file; raises `PolicyError` that names it."""
     try:
-        content = _content(path)
+        content = files.read(path, LARGEST, "a policy")
         return PolicyFile(path, content, parse(content))
-    except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+    except files.NoFile as problem:
+        raise PolicyError(f"{path}: {problem}{_why_hidden(path)}") from None
+    except (files.FileProblem, PolicyError) as problem:
+        raise PolicyError(f"{path}: {problem}") from None
 
 
 def parse(content: bytes) -> Card:
@@ -70,15 +72,6 @@ def _checked(content: bytes, model: "ModelProto") -> Card:
     _check_numbers(model.graph)
     operators.check(model)
     return card
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return files.read(path, LARGEST, "a policy")
-    except files.NoFile as problem:
-        raise PolicyError(f"{problem}{_why_hidden(path)}") from None
-    except files.FileProblem as problem:
-        raise PolicyError(str(problem)) from None
 
 
 def _why_hidden(path: Path) -> str:

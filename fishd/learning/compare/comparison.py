@@ -140,7 +140,6 @@ def compare(
     """Let each swim the fish of `config`; standings and last traces, in the order given.
 
     runs: each contestant swims so many times, with noise of seed, seed + 1, ...
-    done: called after every run
     Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
     `UnknownController`, before anything swims.
     """
