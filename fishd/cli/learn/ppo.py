@@ -109,10 +109,7 @@ def ppo(
         _refuse("is for several trainings, of --seeds", {"--jobs": jobs, "--cluster": cluster})
     elif on == "robot":
         raise click.UsageError("--seeds is for simulated fish: there is only one robot")
-    if resume:
-        job = _resumed(resume, on, endpoint)
-    else:
-        job = _new(on, file, overrides, settings_file, folder, parent, endpoint)
+    job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
     given = {"steps": steps, "seed": seed}
@@ -129,71 +126,49 @@ def _refuse(why: str, options: dict[str, Any]) -> None:
         raise click.UsageError(f"{given[0]} cannot be given here: this {why}")
 
 
-def _new(
+def _job(
     on: Literal["simulation", "robot"] | None,
     file: Path | None,
     overrides: tuple[str, ...],
     settings_file: Path | None,
     folder: Path | None,
+    resume: Path | None,
     parent: Path | None,
     endpoint: str | None,
 ) -> "Job":
-    """A new run, with the settings of its parent where none are given; raises `ConfigError`."""
+    """The run to resume, or a new one, with the settings of its parent where none are given.
+
+    Raises `ConfigError` and `CheckpointError`.
+    """
     from fishd.learning import settings as training
-    from fishd.learning.env.fishd_link import config_of
+    from fishd.learning.env.fishd_link import config_of, other_plant
     from fishd.learning.run_folder import checkpoints, runs
     from fishd.learning.train.jobs import Job
 
-    of_parent = runs.read(_run_of(parent))[1] if parent else None
-    settings = of_parent if of_parent and not settings_file else training.load(settings_file)
-    if on == "robot":
-        running = config_of(endpoint)
-        plant = dict(running["plant"])
-        config = load(file, overrides) if file else adopt(running, overrides)
+    if resume:
+        config, settings = runs.read(resume)
+        on = on or checkpoints.read_state(checkpoints.newest(resume)).on
     else:
-        config = load(file, overrides)
-    job = Job(
-        config=config,
-        settings=settings,
-        folder=folder or runs.default_folder(),
-        on=on or "simulation",
-        endpoint=endpoint,
-        parent=checkpoints.find(parent) if parent else None,
-    )
-    if job.on == "robot":
-        _warn_of_other_plant(job, plant)
-    return job
-
-
-def _resumed(
-    folder: Path, on: Literal["simulation", "robot"] | None, endpoint: str | None
-) -> "Job":
-    """The run in a folder; raises `ConfigError` and `CheckpointError`."""
-    from fishd.learning.env.fishd_link import config_of
-    from fishd.learning.run_folder import checkpoints, runs
-    from fishd.learning.train.jobs import Job
-
-    config, settings = runs.read(folder)
-    on = on or checkpoints.read_state(checkpoints.newest(folder)).on
-    job = Job(
-        config=config, settings=settings, folder=folder, on=on, endpoint=endpoint, resume=True
-    )
-    if job.on == "robot":
-        _warn_of_other_plant(job, config_of(endpoint)["plant"])
-    return job
-
-
-def _warn_of_other_plant(job: "Job", plant: dict[str, Any]) -> None:
-    """The inputs are scaled by the plant, and fishd's is most likely meant; plant: of fishd"""
-    from fishd.learning.env.fishd_link import other_plant
-
-    other = other_plant(job.config, plant)
-    if other:
+        of_parent = runs.read(_run_of(parent))[1] if parent else None
+        settings = of_parent if of_parent and not settings_file else training.load(settings_file)
+        of_fishd = on == "robot" and not file
+        config = adopt(config_of(endpoint), overrides) if of_fishd else load(file, overrides)
+    # The inputs are scaled by the plant, and fishd's is most likely meant.
+    if on == "robot" and (other := other_plant(config, config_of(endpoint)["plant"])):
         click.echo(
             "fishctl: careful: scales and efficiency are made for another plant than that of the "
             f"fishd that runs: {other}",
             err=True,
         )
+    return Job(
+        config=config,
+        settings=settings,
+        folder=resume or folder or runs.default_folder(),
+        on=on or "simulation",
+        endpoint=endpoint,
+        resume=resume is not None,
+        parent=checkpoints.find(parent) if parent else None,
+    )
 
 
 def _train(job: "Job") -> int:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from fishd.config import Config, Start
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
-from fishd.core.clock import Slot, VirtualClock, VirtualTicker
+from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Tick
 from fishd.learning.env.link import LinkLost, StepResult
 from fishd.learning.settings import Randomisation
@@ -140,5 +140,5 @@ class SimulatedLink:
         fish = SimulatedFish(config.plant, config.simulation, config.tick)
         self._loop = build_loop(config, fish.robot(), clock, NullPublisher())
         self._loop.set_controller("agent", FunctionController(config, lambda _: self._angle))
-        self._slots = iter(VirtualTicker(clock, config.tick))
+        self._slots = virtual_slots(clock, config.tick)
         self._turn = self._loop.observe(next(self._slots))
