@@ -69,11 +69,7 @@ def gpio_package(context: Context) -> Result | None:
         header.PACKAGE in plugins.find(settings.driver).packages
         for _, plugins, settings in context.drivers
     )
-    installed = {
-        name
-        for d in metadata.distributions()
-        if (name := d.name.lower().replace(".", "-")) in _GPIO
-    }
+    installed = header.installed()
     pip = f"{sys.executable} -m pip"
     if len(installed) > 1:
         right = "rpi-lgpio" if "Raspberry Pi 5" in context.model else "the one for this Pi"
@@ -89,15 +85,12 @@ def gpio_package(context: Context) -> Result | None:
             "sudo make install-pi, which says what it takes; without the service "
             f"{pip} install 'fishd[rpi-lgpio]' (Pi 5, Debian 13) or 'fishd[rpi-gpio]'",
         )
-    if "rpi-gpio" in installed and "Raspberry Pi 5" in context.model:
+    if "RPi.GPIO" in installed and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
             f"{pip} uninstall RPi.GPIO; {pip} install 'fishd[rpi-lgpio]'",
         )
-    return ok(" and ".join(sorted(_GPIO[name] for name in installed)))
-
-
-_GPIO = {"rpi-gpio": "RPi.GPIO", "rpi-lgpio": "rpi-lgpio"}
+    return ok(installed[0])
 
 
 def _problem(name: str, bounds: str) -> str:
