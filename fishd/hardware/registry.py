@@ -1,4 +1,4 @@
-"""Finds drivers by name, fishd's own and those of other packages."""
+"""Finds drivers by name, fishd's own and those of other packages; says which library is missing."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +30,6 @@ SERVOS: Plugins[ServoDriver[Any]] = Plugins(
     UnknownDriver,
 )
 
-
 PACKAGES = {
     "adafruit_ads1x15": "adafruit-circuitpython-ads1x15",
     "adafruit_bus_device": "adafruit-circuitpython-busdevice",
@@ -55,14 +54,14 @@ def driver_packages(driver: str = "") -> Iterator[None]:
     except FishdError:
         raise
     except ImportError as error:
-        raise MissingPackage(describe(error, driver)) from None
+        raise MissingPackage(why_not_imported(error, driver)) from None
     except Exception as error:
         if not driver:
             raise
         raise StartupError(f"driver '{driver}' cannot start: {text.named(error)}") from error
 
 
-def describe(error: ImportError, driver: str = "") -> str:
+def why_not_imported(error: ImportError, driver: str = "") -> str:
     """One line that names the package to blame for a failed import."""
     module = (error.name or "").partition(".")[0]
     package = PACKAGES.get(module, module)

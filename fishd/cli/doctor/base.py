@@ -26,6 +26,8 @@ from fishd.hardware import ownership
 from fishd.hardware.checks import Machine, Result, skipped
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS
 
+INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
+"""Mends a missing driver."""
 PATIENCE = 1.0
 """How long a daemon may take to answer [s]."""
 
@@ -107,10 +109,6 @@ def _calibrations(fish: Fish) -> Calibrations | None:
         return fish.calibrations()
     except Refused:
         return None
-
-
-INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
-"""Mends a missing driver."""
 
 
 @dataclass

@@ -30,8 +30,12 @@ from fishd.learning.train.training import handled, on_signal, train
 
 STOP = "stop"
 """A file of this name in the run folder ends the trainings in it."""
-
+CONNECT = 10.0
+"""How long to wait for a scheduler that does not answer [s]."""
+_POLL = 1.0
+"""How often a worker asks the scheduler whether to stop [s]."""
 _ATTEMPTS = 3
+"""How often what is left is begun, where a process was killed."""
 
 
 class _Task(NamedTuple):
@@ -178,12 +182,6 @@ def _stop_on_signal(file: Path, event: Any) -> Iterator[None]:
             yield
     finally:
         file.unlink(missing_ok=True)
-
-
-CONNECT = 10.0
-"""How long to wait for a scheduler that does not answer [s]."""
-_POLL = 1.0
-"""How often a worker asks the scheduler whether to stop [s]."""
 
 
 @contextmanager
