@@ -148,13 +148,15 @@ def _job(
     if resume:
         config, settings = runs.read(resume)
         on = on or checkpoints.read_state(checkpoints.newest(resume)).on
-    else:
+    running = config_of(endpoint) if on == "robot" else {}
+    plant = dict(running.get("plant", {}))  # to adopt it changes it
+    if not resume:
         of_parent = runs.read(_run_of(parent))[1] if parent else None
         settings = of_parent if of_parent and not settings_file else training.load(settings_file)
-        of_fishd = on == "robot" and not file
-        config = adopt(config_of(endpoint), overrides) if of_fishd else load(file, overrides)
+        adopts = running and not file
+        config = adopt(running, overrides) if adopts else load(file, overrides)
     # The inputs are scaled by the plant, and fishd's is most likely meant.
-    if on == "robot" and (other := other_plant(config, config_of(endpoint)["plant"])):
+    if running and (other := other_plant(config, plant)):
         click.echo(
             "fishctl: careful: scales and efficiency are made for another plant than that of the "
             f"fishd that runs: {other}",
