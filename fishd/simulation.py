@@ -16,7 +16,7 @@ from fishd.config import Config
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, amplitude_of
-from fishd.core.clock import VirtualClock, VirtualTicker
+from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Event, Reason, Tick
 from fishd.hardware.base import Robot
@@ -223,7 +223,7 @@ def judge(
         loop = build_loop(config, robot, clock, publisher)
         stack.callback(loop.close)
         loop.set_controller(name, controller)
-        for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
+        for slot in itertools.islice(virtual_slots(clock, config.tick), ticks):
             if slot.index == first:  # the first ticks build what later ones reuse
                 begun = time.perf_counter()
             angle = loop.applied

@@ -23,18 +23,18 @@ from fishd.core.clock import Clock, SystemClock, VirtualClock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Truth
 from fishd.hardware import ownership, release_recipe
-from fishd.hardware.base import CalibratedParts, Panel, Robot
+from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.driver import ServoDriver
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.hardware.packages import driver_packages
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
 from fishd.virtual.fish import SimulatedFish
 
 if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
+    from fishd.hardware.panel import RpiGpioPanel
     from fishd.virtual.pi.virtual_pi import VirtualPi
 
 log = logging.getLogger(__name__)
@@ -259,7 +259,7 @@ def _cut_by_calibration(config: Config, servo: CalibratedServo) -> str:
     )
 
 
-def _open_panel(config: Config, clock: Clock, stack: ExitStack) -> Panel | None:
+def _open_panel(config: Config, clock: Clock, stack: ExitStack) -> "RpiGpioPanel | None":
     if not _has_panel(config):
         return None
     from fishd.hardware.panel import RpiGpioPanel

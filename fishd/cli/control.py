@@ -8,12 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from fishd.cli.completion import active_parameters, complete_pair
-from fishd.cli.options import (
-    ControllerGroup,
-    ParameterType,
-    daemon_options,
-    describe,
-)
+from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
 from fishd.cli.output import echo, echo_rows, made_printable, print_json, spelled
 from fishd.client import Fish
 from fishd.controllers import registry
@@ -168,11 +163,13 @@ def _change(endpoint: str | None, as_json: bool, change: Callable[[Fish], State]
 def _status_rows(status: Status) -> list[tuple[str, str]]:
     """The fish first, the daemon last."""
     mode = [("mode", status.mode)]
-    if status.reason:
+    if reason := status.reason:
+        remedy = f"{reason.remedy or 'mend the cause'} ({_HELP}, {reason.code})"
         mode = [
-            ("mode", f"{status.mode} ({_why(status.reason)})"),
-            ("to do", f"{_remedy(status.reason)}; then: fishctl clear-fault"),
+            ("mode", f"{status.mode} ({_why(reason)})"),
+            ("to do", f"{remedy}; then: fishctl clear-fault"),
         ]
+    thrust = "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
     uptime = datetime.timedelta(seconds=int(status.uptime))
     survived = {name: count for name, count in status.counters.items() if count}
     missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
@@ -182,7 +179,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
-        ("thrust", f"{_thrust(status)} m{status.force_unit} at {status.frequency:.2f} Hz"),
+        ("thrust", f"{thrust} m{status.force_unit} at {status.frequency:.2f} Hz"),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
         *([("survived", spelled(survived))] if survived else []),
@@ -190,10 +187,6 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]
-
-
-def _remedy(reason: Reason) -> str:
-    return f"{reason.remedy or 'mend the cause'} ({_HELP}, {reason.code})"
 
 
 def _timing_rows(status: Status) -> list[tuple[str, str]]:
@@ -206,10 +199,6 @@ def _timing_rows(status: Status) -> list[tuple[str, str]]:
         ("busy", _percentiles(timing.busy)),
         *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
     ]
-
-
-def _thrust(status: Status) -> str:
-    return "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
 
 
 def _angle(status: Status) -> str:

@@ -111,5 +111,4 @@ def _as_text(info: PolicyInfo) -> str:
         {**head, **problem, **(info.card or {})},
         sort_keys=False,
         allow_unicode=True,
-        default_flow_style=False,
     )

@@ -18,14 +18,10 @@ T = TypeVar("T")
 
 
 class AsyncFish(Connection):
-    """`Fish` for asyncio: the same requests, to be awaited."""
+    """`Fish` for asyncio: the same requests, to be awaited; there is more about each."""
 
     def __init__(
-        self,
-        endpoint: str | None = None,
-        *,
-        timeout: float = TIMEOUT,
-        telemetry: str | None = None,
+        self, endpoint: str | None = None, *, timeout: float = TIMEOUT, telemetry: str | None = None
     ) -> None:
         """Takes the arguments of `Fish`."""
         super().__init__(endpoint, timeout, telemetry)
@@ -59,10 +55,7 @@ class AsyncFish(Connection):
         return await self._call(dict[str, Any], "config")
 
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Select another controller; parameters left out take their defaults.
-
-        It may take `protocol.LOADING` seconds to load, beyond the time-out.
-        """
+        """Select another controller; parameters left out take their defaults."""
         return await self._call(
             State, "set-controller", patience=LOADING, name=name, parameters=parameters
         )
@@ -96,10 +89,7 @@ class AsyncFish(Connection):
         return await self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
 
     async def tare(self, seconds: float = 2.0) -> Calibrations:
-        """Measure for a while and call that zero force; refused unless all is still.
-
-        Nothing changes where that is given up while it measures.
-        """
+        """Measure for a while and call that zero force; refused unless all is still."""
         sample = await self.sample_force(seconds)
         return await self._call(Calibrations, "tare", sample=sample.number)
 
@@ -110,11 +100,7 @@ class AsyncFish(Connection):
     async def calibrate_servo(
         self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
     ) -> Calibrations:
-        """Apply another calibration of the servo, and save it or not.
-
-        One that is not saved is a lease, the `lease` of the answer: it ends after `protocol.LEASE`
-        seconds unless it is renewed. Name it in further changes, and to save.
-        """
+        """Apply another calibration of the servo, and save it or not."""
         return await self._call(
             Calibrations, "calibrate-servo", calibration=calibration, save=save, lease=lease
         )
@@ -124,10 +110,7 @@ class AsyncFish(Connection):
         return await self._call(Calibrations, "renew-lease", lease=lease)
 
     async def end_lease(self, lease: str) -> Calibrations:
-        """Begin to end a lease: neutral, then the calibration of before is used again.
-
-        That is done when `calibrations` says no `lease` any more.
-        """
+        """Begin to end a lease: neutral, then the calibration of before is used again."""
         return await self._call(Calibrations, "end-lease", lease=lease)
 
     def ticks(self) -> AsyncIterator[Tick]:

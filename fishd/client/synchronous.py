@@ -24,11 +24,7 @@ class Fish(Connection):
     """
 
     def __init__(
-        self,
-        endpoint: str | None = None,
-        *,
-        timeout: float = TIMEOUT,
-        telemetry: str | None = None,
+        self, endpoint: str | None = None, *, timeout: float = TIMEOUT, telemetry: str | None = None
     ) -> None:
         """
         endpoint: address of the control socket; None looks for the daemon of this machine

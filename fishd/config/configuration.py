@@ -15,8 +15,7 @@ from fishd.config import consistency as config_checks
 from fishd.config import drivers
 from fishd.config.overrides import apply_overrides
 from fishd.control.estimators.lateral_force import EstimatorSettings
-from fishd.controllers.base import Limits
-from fishd.controllers.chatter import ChatterSettings
+from fishd.controllers.base import ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, leaves, note, unit, without_empty_sections
@@ -245,9 +244,7 @@ def to_yaml(config: Config | dict[str, Any]) -> str:
     """The whole configuration, defaults included, as YAML that `load` reads back."""
     import yaml
 
-    return yaml.safe_dump(
-        msgspec.to_builtins(config), sort_keys=False, allow_unicode=True, default_flow_style=False
-    )
+    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False, allow_unicode=True)
 
 
 def json_schema() -> dict[str, Any]:

@@ -2,13 +2,38 @@
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 from msgspec import Meta, Struct
 
-from fishd.controllers.chatter import ChatterSettings
 from fishd.core.errors import ParameterError
+from fishd.core.schema import note, unit
 from fishd.core.signals import Observation
+
+LONGEST_DWELL = 2.0
+"""[s]"""
+
+
+class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What becomes of a policy that reverses too fast."""
+
+    dwell: Annotated[
+        float,
+        unit(
+            "s",
+            "Shortest time between two reversals of ppo, in whole ticks, rounded up; those that "
+            "would come sooner are held back. 0 holds none back.",
+            ge=0,
+            le=LONGEST_DWELL,
+        ),
+    ] = 0.2
+    patience: Annotated[
+        float, unit("s", "Who insists on such reversals for so long loses command.", ge=0.2, le=600)
+    ] = 2.0
+    fallback: Annotated[
+        Literal["swing", "fault"], note("What comes then: swing takes over, or mode fault.")
+    ] = "swing"
+
 
 Amplitude = Annotated[float, Meta(gt=0, le=math.pi)] | None
 """Type of a parameter `amplitude` [rad]; None for all that the robot grants: see `amplitude_of`."""

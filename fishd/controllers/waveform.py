@@ -19,8 +19,7 @@ class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     frequency: Annotated[float, unit("Hz", "Frequency of the waveform.", gt=0, le=10)] = 1.8
     amplitude: Annotated[
-        Amplitude,
-        unit("rad", "Largest instruction angle; null: the robot's amplitude_limit."),
+        Amplitude, unit("rad", "Largest instruction angle; null: the robot's amplitude_limit.")
     ] = None
 
 

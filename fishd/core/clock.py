@@ -6,6 +6,7 @@ that have passed meanwhile are skipped and counted, and the phase is kept.
 
 import asyncio
 import ctypes
+import itertools
 import math
 import os
 import time
@@ -69,21 +70,11 @@ class VirtualClock:
         self.now += max(0.0, seconds)
 
 
-class VirtualTicker:
-    """Ticks of virtual time, never late; moves its clock."""
-
-    def __init__(self, clock: VirtualClock, period: float) -> None:
-        self._clock = clock
-        self._period = period
-        self._index = 0
-
-    def __iter__(self) -> Iterator[Slot]:
-        """Yield slots for ever; a second iteration goes on where the first one stopped."""
-        while True:
-            deadline = self._index * self._period
-            self._clock.now = deadline
-            yield Slot(self._index, deadline, deadline, 0)
-            self._index += 1
+def virtual_slots(clock: VirtualClock, period: float) -> Iterator[Slot]:
+    """Slots of virtual time for ever, never late; moves the clock. period: [s]"""
+    for index in itertools.count():
+        clock.now = index * period
+        yield Slot(index, clock.now, clock.now, 0)
 
 
 _CLOCK_MONOTONIC = 1

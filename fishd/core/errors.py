@@ -1,31 +1,13 @@
 """The exceptions that fishd raises on purpose.
 
-    FishdError
-    ├── ConfigError      (ValueError)   the configuration file or a --set is wrong
-    ├── ParameterError   (ValueError)   a controller's parameter is wrong
-    ├── UnknownController (LookupError) no controller has that name
-    ├── UnknownDriver    (LookupError)  no driver has that name
-    ├── PolicyError      (ValueError)   a policy file cannot be used
-    ├── ControllerFault  (RuntimeError) a controller cannot go on, and knows why; see its `code`
-    ├── StartupError     (RuntimeError) the daemon cannot start, such as address in use
-    │   └── MissingPackage              a driver's library is not installed
-    ├── SensorError      (OSError)      the force sensor cannot be read
-    ├── ServoError       (OSError)      the servo cannot be driven
-    └── FishError                       raised by the client, `fishd.client`
-        ├── NoDaemon     (ConnectionError) nothing answers at the endpoint
-        │   └── Untrusted                  somebody else would, who is not asked
-        └── Refused      (RuntimeError)    the daemon answered with an error; see its `code`
-
 Each message is one line that says what is wrong, where, and what would be right.
-
-    Escaped                             a controller raised what is no Exception, such as SystemExit
 """
 
 from typing import Any
 
 
 class FishdError(Exception):
-    """Root of the tree."""
+    """Any of them, but for `Escaped`."""
 
 
 class ConfigError(FishdError, ValueError):

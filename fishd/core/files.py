@@ -5,6 +5,7 @@ Whatever a name leads to, a pipe, a device or a file without an end, the answer 
 
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 SETTINGS = 64 * 2**10
@@ -50,7 +51,8 @@ def read(path: Path, longest: int, reader: str) -> bytes:
     except ValueError:
         raise NoFile("no such file: a name has no zero byte") from None
     if content is None or len(content) > longest:
-        raise FileProblem(f"is longer than {_size(longest)}, far more than {reader} needs")
+        size = f"{longest / 2**20:g} MB" if longest >= 2**20 else f"{longest // 2**10} kB"
+        raise FileProblem(f"is longer than {size}, far more than {reader} needs")
     return content
 
 
@@ -69,14 +71,10 @@ def _check_kind(found: os.stat_result) -> None:
         raise FileProblem(f"is {kind}; a regular file is needed")
 
 
-def _size(longest: int) -> str:
-    megabytes = longest / 2**20
-    return f"{megabytes:g} MB" if megabytes >= 1 else f"{longest // 2**10} kB"
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> None:
     """Write a file, or replace it; a full disk or a kill leaves the old one, never half a file.
 
+    new: there must be none of that name
     Raises OSError.
     """
     part = path.with_name(f".{path.name}.part")
@@ -86,7 +84,10 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
+        if new:
+            path.hardlink_to(part)  # unlike a rename, never onto another file
+        else:
+            part.replace(path)
+    finally:
+        with suppress(OSError):  # what went wrong before is to be told
+            part.unlink(missing_ok=True)

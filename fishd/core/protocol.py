@@ -233,21 +233,16 @@ OPERATIONS = {
 }
 """All operations, by name."""
 
-_request_decoder = msgspec.json.Decoder(Request)
-_id_decoder = msgspec.json.Decoder(OnlyId)
-_reply_decoder = msgspec.json.Decoder(Reply)
-_encoder = msgspec.json.Encoder()
-
-
-def encode(message: Any) -> bytes:
-    """A message as JSON."""
-    return _encoder.encode(message)
+encode = msgspec.json.Encoder().encode
+decode_reply = msgspec.json.Decoder(Reply).decode
+_decode_request = msgspec.json.Decoder(Request).decode
+_decode_id = msgspec.json.Decoder(OnlyId).decode
 
 
 def decode_request(payload: bytes) -> Request:
     """The request in `payload`; raises `Refused` with code `bad-request` or `version`."""
     try:
-        request = _request_decoder.decode(payload)
+        request = _decode_request(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused("bad-request", f"not a request: {error}") from None
     if request.v != VERSION:
@@ -260,14 +255,9 @@ def decode_request(payload: bytes) -> Request:
 def request_id(payload: bytes) -> RequestId:
     """The id of a request that may be broken otherwise; None where it cannot be told."""
     try:
-        return _id_decoder.decode(payload).id
+        return _decode_id(payload).id
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
-
-
-def decode_reply(payload: bytes) -> Reply:
-    """The reply in `payload`; raises msgspec.DecodeError."""
-    return _reply_decoder.decode(payload)
 
 
 def success(identity: RequestId, result: Any) -> bytes:

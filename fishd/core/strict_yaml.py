@@ -161,8 +161,7 @@ class _Builder:
 def _check_count(count: int, line: int) -> None:
     if count > _MOST:
         raise YamlProblem(
-            line,
-            f"more than {_MOST} values and keys, each alias counted as all that it stands for",
+            line, f"more than {_MOST} values and keys, each alias counted as all that it stands for"
         )
 
 

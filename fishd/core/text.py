@@ -18,7 +18,9 @@ def line(text: str, longest: int = LONGEST) -> str:
 
 def block(text: str, longest: int = LONGEST) -> str:
     """The same, but with its line breaks and indentation."""
-    text = _cut(text, longest)
+    if len(text) > longest:  # what is in the middle is left out
+        end = longest // 3
+        text = f"{text[: longest - end - 1]}…{text[-end:]}"
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -47,11 +49,3 @@ def named(error: BaseException) -> str:
         return what
     kind = quoted(type(error).__name__)
     return f"{kind}: {what}" if what else kind
-
-
-def _cut(text: str, longest: int) -> str:
-    """The beginning and the end, where the whole is too long."""
-    if len(text) <= longest:
-        return text
-    end = longest // 3
-    return f"{text[: longest - end - 1]}…{text[-end:]}"

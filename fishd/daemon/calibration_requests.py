@@ -28,8 +28,11 @@ from fishd.core.protocol import (
 )
 from fishd.core.schema import Problem
 from fishd.daemon.background_calls import BackgroundCalls
-from fishd.daemon.trial_calibration import TrialCalibration, calibrated_parts_at_rest
-from fishd.hardware.base import CalibratedParts
+from fishd.daemon.trial_calibration import (
+    TrialCalibration,
+    calibrated_parts,
+    calibrated_parts_at_rest,
+)
 from fishd.hardware.calibration_files import CalibrationFolder, check
 
 MOST_SAMPLES = 4
@@ -80,7 +83,7 @@ class CalibrationRequests:
         return self._servo.lease is not None
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
-        parts = self._calibrated_parts()
+        parts = calibrated_parts(self._loop)
         return Calibrations(
             force=parts.sensor.calibration,
             force_file=self._force_file,
@@ -187,7 +190,7 @@ class CalibrationRequests:
         calibrated_parts_at_rest(self._loop)
         saved, path = await self._save(calibration)
         # The newest file is used from the next start on, so it is now, whatever else began.
-        self._calibrated_parts().sensor.recalibrate(saved)
+        calibrated_parts(self._loop).sensor.recalibrate(saved)
         self._force_file = str(path)
         self._announce("force sensor", path)
         return await self._calibrations(NoArguments())
@@ -214,20 +217,12 @@ class CalibrationRequests:
         self._servo.end(wanted.lease)
         return await self._calibrations(NoArguments())
 
-    def _calibrated_parts(self) -> CalibratedParts:
-        parts = self._loop.robot.calibrated
-        if parts is None:
-            raise Refused(
-                "simulated", "a simulated fish has nothing to calibrate; see robot: virtual-pi"
-            )
-        return parts
-
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:
             return await self._calls.call(
                 "the calibration has not been written",
                 partial(self._folder.save, calibration, self._date()),
-                late=_withdraw,
+                late=lambda saved: saved[1].unlink(),  # not to be used from the next start on
                 interrupt=False,  # between the file's coming into being and its name in the result
             )
         except ConfigError as error:
@@ -248,15 +243,9 @@ class CalibrationRequests:
         self._loop.reporter.event("calibration", f"{what}: {path}", file=str(path))
 
 
-def _withdraw(saved: tuple[C, Path]) -> None:
-    """Remove a file that came too late: it must not be used from the next start on."""
-    saved[1].unlink()
-
-
 def _sensible(calibration: C) -> C:
     """The same calibration; raises `Refused` where it is one that a file could not hold."""
     try:
         return check(calibration)
     except Problem as problem:
-        where = ".".join(problem.path) + ": " if problem.path else ""
-        raise Refused("bad-arguments", f"{where}{problem}") from None
+        raise Refused("bad-arguments", problem.located({})) from None

@@ -8,7 +8,7 @@ from typing import Self
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.controllers.remote.controller import Remote
-from fishd.core.clock import Slot, Ticker, VirtualClock, VirtualTicker
+from fishd.core.clock import Slot, Ticker, VirtualClock, virtual_slots
 
 POLL = 0.02
 """How soon a wait notices that another controller is active, or that fishd ends [s]."""
@@ -24,7 +24,7 @@ class Lockstep:
     def __init__(self, loop: ControlLoop, clock: VirtualClock, period: float) -> None:
         """Must be made inside a running asyncio loop."""
         self._loop = loop
-        self._slots = iter(VirtualTicker(clock, period))
+        self._slots = virtual_slots(clock, period)
         self._pace = Ticker(period)
         self._events = asyncio.get_running_loop()
         self._news = asyncio.Event()

@@ -28,21 +28,13 @@ _LONGEST_TRACEBACK = 10_000
 """Longer ones are cut [characters]."""
 
 
-class _Formatter(logging.Formatter):
-    """Makes everything that is logged safe to read."""
-
-    def message(self, record: logging.LogRecord) -> str:
-        """The message, in one line."""
-        return text.line(record.getMessage(), _LONGEST_MESSAGE)
-
-    def traceback(self, record: logging.LogRecord) -> str:
-        """The traceback, where there is one."""
-        if not record.exc_info:
-            return ""
-        return text.block(self.formatException(record.exc_info), _LONGEST_TRACEBACK)
+def _safe(formatter: logging.Formatter, record: logging.LogRecord) -> tuple[str, str]:
+    """The message in one line, and the traceback where there is one, both safe to read."""
+    trace = formatter.formatException(record.exc_info) if record.exc_info else ""
+    return text.line(record.getMessage(), _LONGEST_MESSAGE), text.block(trace, _LONGEST_TRACEBACK)
 
 
-class TextFormatter(_Formatter):
+class TextFormatter(logging.Formatter):
     """`12:00:00.123 warning fishd.daemon.main: text`, with journald's prefix in a journal."""
 
     def __init__(self, journal: bool) -> None:
@@ -51,28 +43,29 @@ class TextFormatter(_Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, and the traceback where there is one."""
-        what = f"{record.name}: {self.message(record)}"
+        message, trace = _safe(self, record)
         if self._journal:  # journald stamps the time itself
             head = f"<{_JOURNAL_LEVELS.get(record.levelname, 6)}>"
         else:
             clock = time.strftime("%H:%M:%S", time.localtime(record.created))
             head = f"{clock}.{int(record.msecs):03d} {record.levelname.lower()} "
-        return "\n".join(part for part in (head + what, self.traceback(record)) if part)
+        return "\n".join(filter(None, (f"{head}{record.name}: {message}", trace)))
 
 
-class JsonFormatter(_Formatter):
+class JsonFormatter(logging.Formatter):
     """One JSON object a line: t, level, logger, message, and traceback where there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One line."""
+        message, trace = _safe(self, record)
         fields = {
             "t": record.created,
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": self.message(record),
+            "message": message,
         }
-        if record.exc_info:
-            fields["traceback"] = self.traceback(record)
+        if trace:
+            fields["traceback"] = trace
         return msgspec.json.encode(fields).decode()
 
 

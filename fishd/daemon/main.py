@@ -26,13 +26,12 @@ from fishd.core.errors import ConfigError, FishdError, ServoError
 from fishd.daemon import realtime
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
-from fishd.daemon.gateway.gateways import Gateways
+from fishd.daemon.gateway.gateways import Gateways, Telemetry
 from fishd.daemon.lockstep import Lockstep
 from fishd.daemon.logs import LogWriter
 from fishd.daemon.requests import Operations
 from fishd.daemon.shutdown import Shutdown, leave
 from fishd.daemon.systemd_notify import SystemdNotifier
-from fishd.daemon.telemetry import Telemetry
 from fishd.daemon.warm_up import mock_ticks
 from fishd.hardware.servo.pulses import REST
 
@@ -131,9 +130,6 @@ class Daemon:
             self._gateways.telemetry.address,
         )
         realtime.quiet_garbage_collector()
-        await self._tick_until(stopping)
-
-    async def _tick_until(self, stopping: asyncio.Event) -> None:
         clock = self._clock
         lockstep = (
             Lockstep(self._loop, clock, self._config.tick)

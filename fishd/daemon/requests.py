@@ -42,7 +42,6 @@ class Operations:
         telemetry: str,
         realtime: bool,
         counters: Callable[[], dict[str, int]] = dict,
-        loading: float = protocol.LOADING,
     ) -> None:
         """
         config: what fishd was started with
@@ -50,7 +49,6 @@ class Operations:
         telemetry: the address that clients are told
         realtime: does the loop run under SCHED_FIFO?
         counters: what was survived outside of the robot, since start
-        loading: how long a controller may take to load [s]
         """
         self._loop = loop
         self._clock = clock
@@ -62,7 +60,7 @@ class Operations:
         self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
         self._started = clock.monotonic()
         self._decisions = 0
-        self._calls = BackgroundCalls(loading)
+        self._calls = BackgroundCalls(protocol.LOADING)
         self._controllers = controllers
         self._at_start = set(registry.names())
         self._handlers: Handlers = {
@@ -196,7 +194,11 @@ class Operations:
         loop = self._loop
         for field in fields_of(loop.active.controller.Parameters):
             if field.file and field.name in values:  # no tick waits for a file
-                raise ParameterError(_why_not_in_flight(loop.active.name, field.name))
+                name, option = loop.active.name, field.name.replace("_", "-")
+                raise ParameterError(
+                    f"{name}: {field.name}: it cannot change in flight; start the controller "
+                    f"again: 'fishctl set-controller {name} --{option} …'"
+                )
         return registry.merged(loop.active.controller, loop.active.name, values)
 
     async def _stop(self, _: protocol.NoArguments) -> State:
@@ -266,10 +268,3 @@ def _refusal(name: str, what: str, error: Exception) -> Refused:
     if isinstance(error, ParameterError):
         return Refused("bad-parameter", text.said(error))
     return Refused("controller-error", f"controller '{name}' {what}: {text.named(error)}")
-
-
-def _why_not_in_flight(controller: str, parameter: str) -> str:
-    return (
-        f"{controller}: {parameter}: it cannot change in flight; start the controller again: "
-        f"'fishctl set-controller {controller} --{parameter.replace('_', '-')} …'"
-    )

@@ -22,13 +22,19 @@ _WATCH = 0.1
 """Time between two looks at a lease [s]."""
 
 
-def calibrated_parts_at_rest(loop: ControlLoop) -> CalibratedParts:
-    """What can be calibrated, while nothing swims; `hold` may be active. Raises `Refused`."""
+def calibrated_parts(loop: ControlLoop) -> CalibratedParts:
+    """What can be calibrated; raises `Refused` for a simulated fish."""
     parts = loop.robot.calibrated
     if parts is None:
         raise Refused(
             "simulated", "a simulated fish has nothing to calibrate; see robot: virtual-pi"
         )
+    return parts
+
+
+def calibrated_parts_at_rest(loop: ControlLoop) -> CalibratedParts:
+    """The same while nothing swims; `hold` may be active. Raises `Refused`."""
+    parts = calibrated_parts(loop)
     if loop.supervisor.mode is Mode.RUNNING and loop.active.name != "hold":
         raise Refused(
             "running", f"{loop.active.name} is the active controller; stop it with 'fishctl stop'"
@@ -170,8 +176,7 @@ class TrialCalibration:
         return angle == 0.0 or (not self._loop.servo.on and lowest <= angle <= highest)
 
     def _put(self, calibration: ServoCalibration) -> None:
-        parts = self._loop.robot.calibrated
-        assert parts
+        parts = calibrated_parts(self._loop)
         parts.servo.recalibrate(calibration)
         parts.recalibrated(calibration)
         self._loop.guard.restrict(*parts.servo.reach)

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from fishd.config import Config, Start
-from fishd.core.clock import VirtualClock, VirtualTicker
+from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.gateway.link import pair
-from fishd.daemon.telemetry import Telemetry
 from fishd.virtual.fish import SimulatedFish
 from fishd.wiring import build_loop
 
@@ -34,7 +34,7 @@ def mock_ticks(config: Config) -> Callable[[], None] | None:
     clock = VirtualClock()
     fish = SimulatedFish(config.plant, config.simulation, config.tick)
     loop = build_loop(replace(config, start=Start()), fish.robot(), clock, Telemetry(publish))
-    slots = iter(VirtualTicker(clock, config.tick))
+    slots = virtual_slots(clock, config.tick)
 
     def warm_up(ticks: int = _AT_ONCE) -> None:
         for _ in range(ticks):

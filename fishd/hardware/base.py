@@ -10,6 +10,7 @@ from fishd.core.signals import Measurement, Truth
 
 if TYPE_CHECKING:
     from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+    from fishd.hardware.panel import RpiGpioPanel
     from fishd.hardware.servo.calibrated_servo import CalibratedServo
 
 
@@ -46,22 +47,6 @@ class Servo(Protocol):
         """Release the servo and let go of it; may be called twice."""
 
 
-class Panel(Protocol):
-    """The operator's panel: an E-stop button and a status light."""
-
-    on_press: Callable[[], None]
-    """Called from any thread as soon as the button is pressed, without waiting for a tick."""
-
-    def update(self, mode: str, now: float) -> bool:
-        """Show the mode on the light; True while the button is pressed. Called in every tick.
-
-        Raises OSError when the button cannot be read.
-        """
-
-    def close(self) -> None:
-        """Switch the light off and let go of the pins; may be called twice."""
-
-
 @dataclass(frozen=True)
 class Robot:
     """All that the loop reads from and writes to."""
@@ -71,7 +56,7 @@ class Robot:
     servo: Servo
     truth: Callable[[], Truth] | None = None
     """The true state at the latest read, where the fish is simulated."""
-    panel: Panel | None = None
+    panel: "RpiGpioPanel | None" = None
     calibrated: "CalibratedParts | None" = None
     """What can be calibrated; None for a simulated fish, which has nothing to calibrate."""
     degraded: Callable[[], tuple[str, ...]] = tuple

@@ -7,7 +7,6 @@ import datetime
 import math
 import os
 import re
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +50,7 @@ class CalibrationFolder:
         except strict_yaml.YamlProblem as problem:
             raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
         except Problem as problem:
-            where = ".".join(problem.path) + ": " if problem.path else ""
-            raise ConfigError(f"{path}: {where}{problem}; {_REMEDY}") from None
+            raise ConfigError(f"{path}: {problem.located({})}; {_REMEDY}") from None
         except files.FileProblem as problem:
             raise ConfigError(f"{path}: {problem}; {_REMEDY}") from None
 
@@ -72,16 +70,7 @@ class CalibrationFolder:
             stem = f"{Path(names[-1]).stem}+"
         path = self.folder / f"{stem}.yaml"
         text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
-        temporary = path.with_suffix(".part")
-        try:
-            with temporary.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            path.hardlink_to(temporary)  # unlike a rename, never onto another file
-        finally:
-            with suppress(OSError):  # what went wrong before is to be told
-                temporary.unlink()
+        files.write_atomically(path, text, new=True)
         folder = os.open(self.folder, os.O_RDONLY)
         try:
             os.fsync(folder)  # else a power cut takes the name away again

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from contextlib import suppress
 from importlib import metadata
 from typing import Any
 
@@ -15,12 +16,22 @@ _PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
 _EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
 
 
+def installed() -> list[str]:
+    """Which of the two packages are installed; one would be right."""
+    found = []
+    for name in _PROVIDERS:
+        with suppress(metadata.PackageNotFoundError):
+            metadata.distribution(name)
+            found.append(name)
+    return found
+
+
 def load() -> Any:
     """The module RPi.GPIO, set to Broadcom numbers; raises `StartupError`.
 
     Imported only here, because that fails on whatever is not a Raspberry Pi.
     """
-    if all(map(_is_installed, _PROVIDERS)):
+    if len(installed()) > 1:
         raise StartupError(
             "RPi.GPIO and rpi-lgpio are both installed and overwrite each other: "
             f"uninstall both, then install {_EXTRAS}"
@@ -65,11 +76,3 @@ def claim(gpio_module: Any, gpio: int, direction: int, **options: int) -> None:
 def one_line(error: Exception) -> str:
     """What an error says; lgpio puts its text in quotes."""
     return " ".join(str(error).strip("'").split()).rstrip(".!") or type(error).__name__
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        metadata.distribution(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True

@@ -82,12 +82,11 @@ def _claim(part: Part, stack: ExitStack) -> None:
     for attempt in range(1, TRIES + 1):
         try:
             stack.enter_context(locked(part.path, shared=True))
+            return
         except Taken as taken:
             if attempt == TRIES:
                 raise StartupError(
                     f"another fishd (pid {taken.pid}) drives {part.what}; stop it, or give this "
                     f"one another {part.key}"
                 ) from None
-        else:
-            return
         time.sleep(PAUSE)

@@ -27,6 +27,7 @@ class RpiGpioPanel:
     def __init__(self, settings: PanelSettings, clock: Clock) -> None:
         """Claim the pins; raises `StartupError` where that is not possible."""
         self.on_press: Callable[[], None] = _nothing
+        """Called from any thread as soon as the button is pressed, without waiting for a tick."""
         self._settings = settings
         self._pressed = False
         self._released_polls = 0

@@ -1,8 +1,11 @@
-"""Finds drivers by name, fishd's own and those of other packages."""
+"""Finds drivers by name, fishd's own and those of other packages; says which library is missing."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from fishd.core.errors import UnknownDriver
+from fishd.core import text
+from fishd.core.errors import FishdError, MissingPackage, StartupError, UnknownDriver
 from fishd.core.plugins import Plugins
 from fishd.hardware.driver import ForceSensorDriver, ServoDriver
 
@@ -26,3 +29,44 @@ SERVOS: Plugins[ServoDriver[Any]] = Plugins(
     },
     UnknownDriver,
 )
+
+PACKAGES = {
+    "adafruit_ads1x15": "adafruit-circuitpython-ads1x15",
+    "adafruit_bus_device": "adafruit-circuitpython-busdevice",
+    "adafruit_extended_bus": "adafruit-extended-bus",
+    "Adafruit_PureIO": "Adafruit-PureIO",
+    "board": "Adafruit-Blinka",
+    "busio": "Adafruit-Blinka",
+    "pigpio": "pigpio",
+}
+"""The package of each module that a driver of fishd imports."""
+
+
+@contextmanager
+def driver_packages(driver: str = "") -> Iterator[None]:
+    """Import and open a driver inside of this.
+
+    Raises `MissingPackage` where a library is not installed, and `StartupError` for whatever else
+    a driver, if it is named, raises that is no error of fishd's.
+    """
+    try:
+        yield
+    except FishdError:
+        raise
+    except ImportError as error:
+        raise MissingPackage(why_not_imported(error, driver)) from None
+    except Exception as error:
+        if not driver:
+            raise
+        raise StartupError(f"driver '{driver}' cannot start: {text.named(error)}") from error
+
+
+def why_not_imported(error: ImportError, driver: str = "") -> str:
+    """One line that names the package to blame for a failed import."""
+    module = (error.name or "").partition(".")[0]
+    package = PACKAGES.get(module, module)
+    if driver and package not in PACKAGES.values():
+        return f"driver '{driver}' needs the package {package or 'that it imports'}: {error}"
+    if isinstance(error, ModuleNotFoundError) and package:
+        return f"the package {package} is missing; install fishd[pi]"
+    return f"the package {package or 'of a driver'} cannot be imported ({error}); install fishd[pi]"

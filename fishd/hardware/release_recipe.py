@@ -47,7 +47,7 @@ def write(config: str, function: str, neutral: float, arguments: dict[str, Any])
     path = _path(config)
     temporary = f"{path}.{os.getpid()}"
     with suppress(OSError):
-        text = json.dumps(recipe | {"config": _absolute(config), "file": _signature(config)})
+        text = json.dumps(recipe | {"config": os.path.realpath(config), "file": _signature(config)})
         os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
         if not _ours(os.lstat(os.path.dirname(path)), stat.S_ISDIR):
             return
@@ -82,7 +82,7 @@ def read(config: str) -> dict[str, Any] | None:
         finally:
             os.close(file)
         good = (
-            found["config"] == _absolute(config)
+            found["config"] == os.path.realpath(config)
             and isinstance(found["function"], str)
             and isinstance(found["arguments"], dict)
             and _SHORTEST <= found["neutral"] <= _LONGEST
@@ -93,11 +93,7 @@ def read(config: str) -> dict[str, Any] | None:
 
 
 def _path(config: str) -> str:
-    return f"{runtime_folder()}/release-{crc32(os.fsencode(_absolute(config))):08x}.json"
-
-
-def _absolute(config: str) -> str:
-    return os.path.realpath(config)
+    return f"{runtime_folder()}/release-{crc32(os.fsencode(os.path.realpath(config))):08x}.json"
 
 
 def _signature(config: str) -> list[int]:

@@ -20,9 +20,9 @@ from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation, in_simulation
-from fishd.learning.ppo.model import DeterministicPolicy, activation_of, layers_of
+from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
-from fishd.learning.run_folder.provenance import make_card
+from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 from fishd.virtual.plant.parameters import PlantParameters
 

@@ -144,7 +144,7 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
 
 def to_yaml(settings: TrainingSettings) -> str:
     """All settings, defaults included, as YAML that `load` reads back."""
-    return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False, default_flow_style=False)
+    return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False)
 
 
 def _check(settings: TrainingSettings) -> None:

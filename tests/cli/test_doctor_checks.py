@@ -243,7 +243,7 @@ def test_a_button_that_nothing_can_read_is_not_passed_over(
     examine: Examine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The installation goes on without its package, and nobody may take that for a working one."""
-    monkeypatch.setattr("fishd.cli.doctor.checks.software.metadata.distributions", lambda: iter(()))
+    monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ())
     assert examine("gpio package") == ("", "", "")
     level, message, mend = examine("gpio package", "panel.estop_gpio=17")
     assert (level, message.startswith("neither RPi.GPIO nor rpi-lgpio is")) == ("FAIL", True)

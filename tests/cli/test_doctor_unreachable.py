@@ -9,8 +9,8 @@ from rigs.doctor_process import doctor, free_telemetry
 from rigs.doctor_tree import unprivileged
 from rigs.operator_rig import Bench
 
-from fishd.cli.doctor.checks import examine
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor import examine
+from fishd.cli.doctor.base import Context
 from fishd.config import load
 
 HARDWARE = ("adc", "force", "pwm", "gpio pins")

@@ -9,7 +9,7 @@ import pytest
 from rigs.operator_rig import Bench
 from rigs.processes import FISHCTL, FISHD, addresses, call, sets
 
-from fishd.hardware import ownership, packages
+from fishd.hardware import ownership, registry
 
 MODULES = ("pigpio", "adafruit_extended_bus", "adafruit_ads1x15", "Adafruit_PureIO")
 ONE_LINE = r"[^\n]*the package %s is missing; install fishd\[pi\]\n"
@@ -81,7 +81,7 @@ def test_no_check_of_doctor_breaks_off(pi: Bench, env: dict[str, str]) -> None:
 
 def test_a_package_that_is_there_but_broken_is_not_called_missing() -> None:
     error = ImportError("cannot import name 'ADS1115'", name="adafruit_ads1x15.ads1115")
-    assert packages.describe(error) == (
+    assert registry.why_not_imported(error) == (
         "the package adafruit-circuitpython-ads1x15 cannot be imported (cannot import name "
         "'ADS1115'); install fishd[pi]"
     )

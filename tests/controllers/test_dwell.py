@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rigs.harness import LIMITS
 
-from fishd.controllers.base import Limits
-from fishd.controllers.chatter import ChatterSettings
+from fishd.controllers.base import ChatterSettings, Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.core.errors import ControllerFault
 

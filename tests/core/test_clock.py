@@ -7,7 +7,7 @@ from itertools import islice, pairwise
 
 import pytest
 
-from fishd.core.clock import Slot, Ticker, TimerFd, VirtualClock, VirtualTicker
+from fishd.core.clock import Slot, Ticker, TimerFd, VirtualClock, virtual_slots
 
 PERIOD = 0.02
 
@@ -33,7 +33,7 @@ async def slots(
 
 def test_virtual_time_is_never_late_and_moves_its_clock() -> None:
     clock = VirtualClock()
-    turns = [(slot, clock.now) for slot in islice(VirtualTicker(clock, 0.05), 3)]
+    turns = [(slot, clock.now) for slot in islice(virtual_slots(clock, 0.05), 3)]
     assert turns == [(Slot(k, k * 0.05, k * 0.05, 0), k * 0.05) for k in range(3)]
 
 

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from rigs.documents import DOCS, FENCE, ROOT, code_of, first_cells, prose_of, text_of
 
-from fishd.cli.doctor.checks import checks
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor import checks
+from fishd.cli.doctor.base import Context
 from fishd.cli.main import fishctl
 from fishd.config import Config, keys, load
 from fishd.controllers.policy import checksum, file, library, operators

@@ -15,8 +15,7 @@ from fishd.learning.compare.comparison import best_on_grid
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import in_simulation, judge, on_link, worst_of_others
 from fishd.learning.env.link import StepResult
-from fishd.learning.env.randomisation import at_edge, drawn
-from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.env.simulated_link import SimulatedLink, at_edge, drawn
 from fishd.learning.settings import (
     EnvironmentSettings,
     EvaluationSettings,

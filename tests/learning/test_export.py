@@ -14,13 +14,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from fishd.cli.main import fishctl
 from fishd.controllers import registry
-from fishd.controllers.base import Limits
-from fishd.controllers.chatter import ChatterSettings
+from fishd.controllers.base import ChatterSettings, Limits
 from fishd.controllers.policy.card import Layout
 from fishd.controllers.policy.file import read
 from fishd.core.errors import ParameterError, PolicyError
 from fishd.learning.export import export, export_model
-from fishd.learning.ppo.model import DeterministicPolicy
+from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings

@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from fishd.controllers.policy.card import Feature, Layout
 from fishd.learning.env.environment import spaces
-from fishd.learning.ppo.model import (
+from fishd.learning.ppo import (
     DeterministicPolicy,
     Rollout,
     layers_of,

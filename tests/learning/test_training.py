@@ -15,8 +15,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from fishd.client import Fish
 from fishd.controllers.policy.card import Layout
 from fishd.core.errors import ConfigError
+from fishd.learning.env.environment import features, thrust_scale
 from fishd.learning.env.evaluation import Evaluation
-from fishd.learning.env.scales import features, thrust_scale
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings

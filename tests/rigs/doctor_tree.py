@@ -5,8 +5,8 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from fishd.cli.doctor.checks import checks
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor import checks
+from fishd.cli.doctor.base import Context
 from fishd.config import load
 
 Examine = Callable[..., tuple[str, str, str]]

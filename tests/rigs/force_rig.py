@@ -8,8 +8,7 @@ from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.hardware.force_sensor.sampler import Sampler
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor, Sampler
 from rigs.ads1115_board import Board
 
 TICK = 0.05

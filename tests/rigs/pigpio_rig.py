@@ -75,7 +75,7 @@ class Bench:
         self.clock.sleep(seconds)
 
     def client(self) -> contextlib.AbstractContextManager[Client]:
-        return opened(PigpioSettings(port=self.daemon.port))
+        return opened("127.0.0.1", self.daemon.port)
 
     def scripts(self) -> int:
         """How many scripts pigpiod holds."""

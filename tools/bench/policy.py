@@ -25,7 +25,7 @@ from fishd.control.loop import ControlLoop
 from fishd.controllers import registry
 from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.controllers.policy.network import to_onnx
-from fishd.core.clock import VirtualClock, VirtualTicker
+from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Percentiles, Tick
 from fishd.virtual.fish import SimulatedFish
 from fishd.wiring import build_loop
@@ -90,7 +90,7 @@ class Swimmer:
         self.times: list[int] = []
         controller.update = self._timed(controller.update)  # type: ignore[method-assign]
         self._loop.set_controller(name, controller)
-        self._slots = iter(VirtualTicker(clock, config.tick))
+        self._slots = virtual_slots(clock, config.tick)
 
     def swim(self, ticks: int) -> None:
         """Turn the loop."""

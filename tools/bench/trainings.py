@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from common.report import DOCS, progress
 from fishd.config import Config, load
 from fishd.learning import settings as training
+from fishd.learning.env.environment import features
 from fishd.learning.env.evaluation import Evaluation, judge
-from fishd.learning.env.scales import features
-from fishd.learning.ppo.model import DeterministicPolicy
+from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder.checkpoints import load_policy
 from fishd.learning.run_folder.tables import best_so_far, read_evaluations
 from fishd.learning.settings import TrainingSettings

@@ -93,7 +93,7 @@ PHASES = {
     "update": ("fishd.controllers.waveform", "Square", "update"),
     "guard": ("fishd.control.guard", "Guard", "apply"),
     "write": ("fishd.hardware.servo.pigpio", "Pigpio", "write"),
-    "publish": ("fishd.daemon.telemetry", "Telemetry", "tick"),
+    "publish": ("fishd.daemon.gateway.gateways", "Telemetry", "tick"),
     "statistics": ("fishd.control.statistics", "Statistics", "add"),
     "between ticks": ("fishd.daemon.requests", "Operations", "status"),
 }

@@ -28,7 +28,7 @@ from common.report import BrokenPromise, Options, Report, progress
 from fishd.config import Config, load
 from fishd.control.loop import ControlLoop
 from fishd.core.calibration import ForceCalibration
-from fishd.core.clock import Slot, VirtualClock, VirtualTicker
+from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.errors import SensorError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
@@ -93,7 +93,7 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
         memory = Memory(ticks, long_run=VIRTUAL_PI_TICKS)
         injected: Counter[str] = Counter()
         width_limits = (1500 - 600 * 0.42 - 6, 1500 + 600 * 0.42 + 6)
-        for slot in itertools.islice(VirtualTicker(clock, config.tick), ticks):
+        for slot in itertools.islice(virtual_slots(clock, config.tick), ticks):
             loop.tick(slot)
             check(loop)
             width = pi.pigpiod.width(config.virtual_pi.servo_gpio, slot.deadline)

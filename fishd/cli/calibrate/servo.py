@@ -11,10 +11,9 @@ from typing import Any
 import click
 from msgspec.structs import replace
 
-from fishd.cli.calibrate.prompts import choose
 from fishd.cli.calibrate.servo_lease import renewed
 from fishd.cli.options import endpoint_option
-from fishd.cli.output import echo
+from fishd.cli.output import choose, echo
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.calibration import ServoCalibration

@@ -1,17 +1,21 @@
 """`fishctl doctor`: looks at everything that fishd needs, and says how to mend what is wrong."""
 
+import sys
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 
 from fishd.cli.config import load_service, service_option, set_option
-from fishd.cli.doctor.checks import examine
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor import computer, drivers, service, software, timing
+from fishd.cli.doctor.base import INSTALL, Context
 from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import counted, echo, print_json
 from fishd.core import text
-from fishd.hardware.checks import Result
+from fishd.core.errors import MissingPackage
+from fishd.hardware.checks import Check, Result, fail
+from fishd.hardware.registry import driver_packages
 
 _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "bright_black"}
 
@@ -56,3 +60,34 @@ def _print(name: str, result: Result) -> None:
     click.echo(f"{level} {name:<14} {result.message}")
     if result.mend:
         echo(f"{'':<24}{result.mend}")
+
+
+def checks(context: Context) -> Iterator[Check]:
+    """Those that concern the configured robot, in the order in which they are made."""
+    every = (
+        *software.CHECKS,
+        *computer.CHECKS,
+        *timing.CHECKS,
+        *(drivers.checks(context) if context.robot != "simulated" else ()),
+        *service.CHECKS,
+    )
+    return (check for check in every if context.robot in check.robots)
+
+
+def examine(context: Context) -> Iterator[tuple[str, Result]]:
+    """Make every check that concerns the configured robot: its name and what came out.
+
+    A check that fails to be made is itself a failure, and does not keep the others from being made.
+    """
+    for check in checks(context):
+        try:
+            with driver_packages():
+                result = check.function(context)
+        except MissingPackage as error:
+            mend = INSTALL if "fishd[pi]" in str(error) else f"{sys.executable} -m pip install it"
+            result = fail(str(error), mend)
+        except Exception as error:
+            what = f"this check broke off: {type(error).__name__}: {error}"
+            result = fail(what, "please report this, with the output of 'fishctl doctor --json'")
+        if result is not None:
+            yield check.name, result

@@ -22,10 +22,7 @@ _HEADS = ("mN", "Hz", "|φ_c|/Φ", "square")
 
 @click.command()
 @click.argument(
-    "contestants",
-    nargs=-1,
-    metavar="[POLICY|CONTROLLER]...",
-    shell_complete=complete_contestant,
+    "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
 @run_options
 @click.option(

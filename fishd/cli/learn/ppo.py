@@ -1,5 +1,6 @@
 """The verb that trains."""
 
+import statistics
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -108,19 +109,14 @@ def ppo(
         _refuse("is for several trainings, of --seeds", {"--jobs": jobs, "--cluster": cluster})
     elif on == "robot":
         raise click.UsageError("--seeds is for simulated fish: there is only one robot")
-    if resume:
-        job = _resumed(resume, on, endpoint)
-    else:
-        job = _new(on, file, overrides, settings_file, folder, parent, endpoint)
+    job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
     given = {"steps": steps, "seed": seed}
     changed = {name: value for name, value in given.items() if value is not None}
     job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     if seeds is not None:
-        from fishd.cli.learn.seeds import train_seeds
-
-        return train_seeds(job, seeds, jobs, cluster)
+        return _train_seeds(job, seeds, jobs, cluster)
     return _train(job)
 
 
@@ -130,71 +126,51 @@ def _refuse(why: str, options: dict[str, Any]) -> None:
         raise click.UsageError(f"{given[0]} cannot be given here: this {why}")
 
 
-def _new(
+def _job(
     on: Literal["simulation", "robot"] | None,
     file: Path | None,
     overrides: tuple[str, ...],
     settings_file: Path | None,
     folder: Path | None,
+    resume: Path | None,
     parent: Path | None,
     endpoint: str | None,
 ) -> "Job":
-    """A new run, with the settings of its parent where none are given; raises `ConfigError`."""
+    """The run to resume, or a new one, with the settings of its parent where none are given.
+
+    Raises `ConfigError` and `CheckpointError`.
+    """
     from fishd.learning import settings as training
-    from fishd.learning.env.fishd_link import config_of
+    from fishd.learning.env.fishd_link import config_of, other_plant
     from fishd.learning.run_folder import checkpoints, runs
     from fishd.learning.train.jobs import Job
 
-    of_parent = runs.read(_run_of(parent))[1] if parent else None
-    settings = of_parent if of_parent and not settings_file else training.load(settings_file)
-    if on == "robot":
-        running = config_of(endpoint)
-        plant = dict(running["plant"])
-        config = load(file, overrides) if file else adopt(running, overrides)
-    else:
-        config = load(file, overrides)
-    job = Job(
-        config=config,
-        settings=settings,
-        folder=folder or runs.default_folder(),
-        on=on or "simulation",
-        endpoint=endpoint,
-        parent=checkpoints.find(parent) if parent else None,
-    )
-    if job.on == "robot":
-        _warn_of_other_plant(job, plant)
-    return job
-
-
-def _resumed(
-    folder: Path, on: Literal["simulation", "robot"] | None, endpoint: str | None
-) -> "Job":
-    """The run in a folder; raises `ConfigError` and `CheckpointError`."""
-    from fishd.learning.env.fishd_link import config_of
-    from fishd.learning.run_folder import checkpoints, runs
-    from fishd.learning.train.jobs import Job
-
-    config, settings = runs.read(folder)
-    on = on or checkpoints.read_state(checkpoints.newest(folder)).on
-    job = Job(
-        config=config, settings=settings, folder=folder, on=on, endpoint=endpoint, resume=True
-    )
-    if job.on == "robot":
-        _warn_of_other_plant(job, config_of(endpoint)["plant"])
-    return job
-
-
-def _warn_of_other_plant(job: "Job", plant: dict[str, Any]) -> None:
-    """The inputs are scaled by the plant, and fishd's is most likely meant; plant: of fishd"""
-    from fishd.learning.env.fishd_link import other_plant
-
-    other = other_plant(job.config, plant)
-    if other:
+    if resume:
+        config, settings = runs.read(resume)
+        on = on or checkpoints.read_state(checkpoints.newest(resume)).on
+    running = config_of(endpoint) if on == "robot" else {}
+    plant = dict(running.get("plant", {}))  # to adopt it changes it
+    if not resume:
+        of_parent = runs.read(_run_of(parent))[1] if parent else None
+        settings = of_parent if of_parent and not settings_file else training.load(settings_file)
+        adopts = running and not file
+        config = adopt(running, overrides) if adopts else load(file, overrides)
+    # The inputs are scaled by the plant, and fishd's is most likely meant.
+    if running and (other := other_plant(config, plant)):
         click.echo(
             "fishctl: careful: scales and efficiency are made for another plant than that of the "
             f"fishd that runs: {other}",
             err=True,
         )
+    return Job(
+        config=config,
+        settings=settings,
+        folder=resume or folder or runs.default_folder(),
+        on=on or "simulation",
+        endpoint=endpoint,
+        resume=resume is not None,
+        parent=checkpoints.find(parent) if parent else None,
+    )
 
 
 def _train(job: "Job") -> int:
@@ -251,3 +227,37 @@ def _run_of(path: Path) -> Path:
         what = "a policy file has no value network" if path.exists() else "no such folder"
         raise ConfigError(f"--from {path}: {what}; give a run folder or one of its checkpoints")
     return path if (path / SETTINGS).exists() else path.parent
+
+
+def _train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) -> int:
+    """Train them all, a line as each ends, and a summary; the exit status."""
+    from fishd.learning.train import seeds as training
+
+    click.echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps")
+    outcomes = training.train_seeds(job, seeds, jobs, cluster, _print_seed)
+    for name, evaluations in (
+        ("latest", [outcome.latest_evaluation for outcome in outcomes]),
+        ("best", [outcome.best_evaluation for outcome in outcomes]),
+    ):
+        shares = [evaluation.efficiency for evaluation in evaluations if evaluation]
+        if shares:
+            click.echo(
+                f"{name} policies of {len(shares)} seeds: median {statistics.median(shares):.1%} "
+                f"[{min(shares):.1%} – {max(shares):.1%}]"
+            )
+    click.echo(f"curves: {job.folder / 'seeds.csv'}")
+    ends = {outcome.ended for outcome in outcomes}
+    if ends - {"finished", "interrupted"}:
+        return 1
+    return INTERRUPTED if "interrupted" in ends else 0
+
+
+def _print_seed(seed: int, outcome: "Outcome") -> None:
+    from fishd.learning.train.progress import described
+
+    latest = outcome.latest_evaluation
+    swims = f": {described(latest).strip()}" if latest else ""
+    is_finished = outcome.ended == "finished"
+    ended = "" if is_finished else f" {outcome.ended}"
+    why = f" ({outcome.message})" if outcome.message else ""
+    click.echo(f"seed {seed}{ended}{why}{swims}", err=not is_finished)

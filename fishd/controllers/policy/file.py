@@ -12,6 +12,7 @@ import numpy as np
 
 from fishd.controllers.policy import checksum, operators, size_check
 from fishd.controllers.policy.card import KEY, Card, decode
+from fishd.controllers.policy.size_check import EXPORT, NOT_ONNX
 from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.text import named, quoted
@@ -27,7 +28,6 @@ MISSING = (
     "32-bit ARM"
 )
 
-_EXPORT = "export it with 'fishctl learn export'"
 _HIDDEN = ("/home/", "/root/", "/run/user/")
 """What systemd's ProtectHome= hides from a service."""
 
@@ -43,29 +43,23 @@ class PolicyFile(NamedTuple):
 def read(path: Path) -> PolicyFile:
     """The policy in a file; raises `PolicyError` that names it."""
     try:
-        content = _content(path)
+        content = files.read(path, LARGEST, "a policy")
         return PolicyFile(path, content, parse(content))
-    except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+    except files.NoFile as problem:
+        raise PolicyError(f"{path}: {problem}{_why_hidden(path)}") from None
+    except (files.FileProblem, PolicyError) as problem:
+        raise PolicyError(f"{path}: {problem}") from None
 
 
 def parse(content: bytes) -> Card:
     """The card of a policy file whose content is valid; raises `PolicyError`."""
     _refuse_pickles(content)
-    try:
-        size_check.check(content)
-    except size_check.TooMuch:
-        raise PolicyError(
-            f"more than {size_check.MOST // 2**10} kB of it are not raw weights, far more than a "
-            "policy needs; save weights as raw data"
-        ) from None
-    except size_check.Broken:
-        raise PolicyError(f"this is not an ONNX model; {_EXPORT}") from None
+    size_check.check(content)
     model = _model(content)
     try:
         return _checked(content, model)
     except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 comes as bytes
-        raise PolicyError(f"this is not a complete ONNX model; {_EXPORT}") from None
+        raise PolicyError(f"this is not a complete ONNX model; {EXPORT}") from None
 
 
 def _checked(content: bytes, model: "ModelProto") -> Card:
@@ -80,15 +74,6 @@ def _checked(content: bytes, model: "ModelProto") -> Card:
     return card
 
 
-def _content(path: Path) -> bytes:
-    try:
-        return files.read(path, LARGEST, "a policy")
-    except files.NoFile as problem:
-        raise PolicyError(f"{problem}{_why_hidden(path)}") from None
-    except files.FileProblem as problem:
-        raise PolicyError(str(problem)) from None
-
-
 def _why_hidden(path: Path) -> str:
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not (state and str(path).startswith(_HIDDEN)):
@@ -101,11 +86,11 @@ def _why_hidden(path: Path) -> str:
 
 def _refuse_pickles(content: bytes) -> None:
     if content.startswith(b"\x80"):
-        raise PolicyError(f"this is a pickle, which could run any code; {_EXPORT}")
+        raise PolicyError(f"this is a pickle, which could run any code; {EXPORT}")
     if content.startswith(b"PK"):
         raise PolicyError(
             "this is a zip archive as torch writes, with a pickle, which could run any code; "
-            f"{_EXPORT}"
+            f"{EXPORT}"
         )
 
 
@@ -120,7 +105,7 @@ def _model(content: bytes) -> "ModelProto":
         model = None
     # Almost any bytes are some message of protobuf, with fields that nobody knows.
     if model is None or not (model.ir_version and model.opset_import and model.graph.node):
-        raise PolicyError(f"this is not an ONNX model; {_EXPORT}")
+        raise PolicyError(NOT_ONNX)
     return model
 
 
@@ -129,7 +114,7 @@ def _card(model: "ModelProto") -> str:
     if not cards:
         raise PolicyError(
             "this ONNX file does not say for which observation, tick and Φ it was trained: its "
-            f"metadata lacks {KEY}; {_EXPORT}"
+            f"metadata lacks {KEY}; {EXPORT}"
         )
     if len(cards) > 1:
         raise PolicyError(f"it has {len(cards)} cards that may contradict one another")
@@ -139,7 +124,7 @@ def _card(model: "ModelProto") -> str:
 def _check_ends(graph: "GraphProto", features: int) -> None:
     given = {tensor.name for tensor in graph.initializer}
     inputs = [value for value in graph.input if value.name not in given]
-    wanted = f"one float32 {{}} of shape [1, {{}}] named '{{}}' is needed; {_EXPORT}"
+    wanted = f"one float32 {{}} of shape [1, {{}}] named '{{}}' is needed; {EXPORT}"
     for what, found, name, width in (
         ("inputs", inputs, INPUT, features),
         ("outputs", list(graph.output), OUTPUT, 1),

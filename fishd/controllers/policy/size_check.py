@@ -7,6 +7,10 @@ only their own size.
 
 from collections.abc import Iterator
 
+from fishd.core.errors import PolicyError
+
+EXPORT = "export it with 'fishctl learn export'"
+NOT_ONNX = f"this is not an ONNX model; {EXPORT}"
 MOST = 256 * 2**10
 """Largest size of everything but weights: the card, the names, the layers [bytes]."""
 
@@ -16,21 +20,16 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _FIXED = {_FIXED64: 8, _FIXED32: 4}
 
 
-class TooMuch(Exception):
-    """More than MOST is not weights."""
-
-
-class Broken(Exception):
-    """The content is not a protobuf message."""
-
-
 def check(content: bytes) -> None:
-    """Raises `TooMuch` or `Broken`."""
+    """Raises `PolicyError` for more than MOST, and for what is not a protobuf message."""
     left = MOST
     for size in _overheads(content, 0, len(content), (_GRAPH, _INITIALIZER, _RAW_DATA)):
         left -= size
         if left < 0:
-            raise TooMuch
+            raise PolicyError(
+                f"more than {MOST // 2**10} kB of it are not raw weights, far more than a policy "
+                "needs; save weights as raw data"
+            )
 
 
 def _overheads(content: bytes, begin: int, end: int, path: tuple[int, ...]) -> Iterator[int]:
@@ -58,9 +57,9 @@ def _fields(content: bytes, begin: int, end: int) -> Iterator[tuple[int, int, in
         elif kind in _FIXED:
             stop = value + _FIXED[kind]
         else:
-            raise Broken
+            raise PolicyError(NOT_ONNX)
         if stop > end:
-            raise Broken
+            raise PolicyError(NOT_ONNX)
         yield number, value, stop, stop - at
         at = stop
 
@@ -70,10 +69,10 @@ def _varint(content: bytes, at: int, end: int) -> tuple[int, int]:
     number = 0
     for shift in range(0, 70, 7):
         if at >= end:
-            raise Broken
+            raise PolicyError(NOT_ONNX)
         byte = content[at]
         at += 1
         number |= (byte & 0x7F) << shift
         if byte < 0x80:
             return number, at
-    raise Broken
+    raise PolicyError(NOT_ONNX)

@@ -2,18 +2,62 @@
 
 import secrets
 import time
-from typing import Any
+from typing import Annotated, Any
 
+from msgspec import Meta, Struct
 from msgspec.structs import astuple
 
-from fishd.controllers.base import Controller, Limits
+from fishd.controllers.base import LONGEST_DWELL, Controller, Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.controllers.remote.messages import Ended, FromAgent, Observed, Pause, encode
-from fishd.controllers.remote.parameters import RemoteParameters
 from fishd.controllers.remote.wire import Wire
 from fishd.core.addresses import why_not_connected
 from fishd.core.errors import ControllerFault, ParameterError
+from fishd.core.schema import unit
 from fishd.core.signals import Observation
+
+
+class RemoteParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Parameters of `remote`."""
+
+    agent: Annotated[
+        str,
+        unit(
+            "1",
+            "ZeroMQ address that the agent has bound and that fishd connects to: tcp://HOST:PORT "
+            "or ipc://PATH.",
+            min_length=1,
+            max_length=200,
+        ),
+    ] = "tcp://127.0.0.1:9873"
+    deadline: Annotated[
+        Annotated[float, Meta(gt=0, le=0.1)] | None,
+        unit("s", "How long each tick waits for the agent's action; null: 0.4 of the tick."),
+    ] = None
+    misses: Annotated[
+        int,
+        unit("ticks", "Ticks in a row without an action in time that are a fault.", ge=1, le=1000),
+    ] = 5
+    first_action: Annotated[
+        float,
+        unit(
+            "s",
+            "How long the agent may take for its first action; neutral until then.",
+            gt=0,
+            le=3600,
+        ),
+    ] = 10.0
+    dwell: Annotated[
+        float,
+        unit(
+            "s",
+            "Shortest time between two reversals, in whole ticks, rounded up; those that would "
+            "come sooner are held back. 0 holds none back.",
+            ge=0,
+            le=LONGEST_DWELL,
+        ),
+    ] = 0.0
+
 
 DEADLINE = 0.4
 """Time for the agent's action by default, as a share of the tick."""
@@ -71,8 +115,7 @@ class Remote(Controller[RemoteParameters]):
         complaint = why_not_connected(parameters.agent)
         if complaint:
             raise ParameterError(
-                f"agent: '{parameters.agent}' is not valid: {complaint}",
-                ("agent",),
+                f"agent: '{parameters.agent}' is not valid: {complaint}", ("agent",)
             )
         longest = LONGEST_DEADLINE * limits.tick
         if parameters.deadline is not None and parameters.deadline > longest:

@@ -9,11 +9,14 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 
+import msgspec
+
 from fishd.control.reporting import Reporter
 from fishd.core import addresses
 from fishd.core.errors import StartupError
+from fishd.core.signals import Event, Status, Tick
 from fishd.daemon.control_server import ControlServer
-from fishd.daemon.gateway.link import CONTROL, END, LONGEST, NOTICE, TELEMETRY, pair
+from fishd.daemon.gateway.link import CONTROL, END, LONGEST, NOTICE, TELEMETRY, pair, published
 
 PAUSES = 0.05, 2.0
 """Shortest and longest pause before a gateway is started again [s]."""
@@ -232,3 +235,24 @@ def _open(kind: str, address: str, stack: ExitStack) -> Gateway:
 def _tell_restart(reporter: Reporter, kind: str, why: str) -> None:
     message = f"the gateway of {kind} was started again: {why}"
     reporter.event("gateway", message, "warning", gateway=kind)
+
+
+class Telemetry:
+    """Publishes ticks, events and status: a topic and one JSON object each; waits for nobody."""
+
+    def __init__(self, send: Callable[[bytes], object]) -> None:
+        """send: takes a message for the gateway, without waiting"""
+        self._encode = msgspec.json.Encoder().encode
+        self._send = send
+
+    def tick(self, tick: Tick) -> None:
+        """Publish on topic `tick`."""
+        self._send(published(b"tick", self._encode(tick)))
+
+    def event(self, event: Event) -> None:
+        """Publish on topic `event`."""
+        self._send(published(b"event", self._encode(event)))
+
+    def status(self, status: Status) -> None:
+        """Publish on topic `status`."""
+        self._send(published(b"status", self._encode(status)))

@@ -73,11 +73,7 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
     """An ADS1115 on the I2C bus."""
 
     Settings = Ads1115Settings
-    packages = (
-        "adafruit-blinka",
-        "adafruit-circuitpython-ads1x15",
-        "adafruit-extended-bus",
-    )
+    packages = ("adafruit-blinka", "adafruit-circuitpython-ads1x15", "adafruit-extended-bus")
     on_virtual_pi = True
     transport = "i2c"
 

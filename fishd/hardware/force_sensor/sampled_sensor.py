@@ -5,6 +5,7 @@ In virtual time there is no thread: a read samples until its clock has come to t
 
 import math
 import threading
+from collections import deque
 from typing import Any
 
 from msgspec.structs import replace
@@ -14,8 +15,72 @@ from fishd.core.clock import Clock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import ForceSensorDriver, Pair
-from fishd.hardware.force_sensor.sampler import Sampler
 from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
+
+REMEMBERED = 4096
+"""Pairs that are kept until somebody takes them; the oldest are dropped."""
+FEW = 3
+"""After so many failures in a row the hardware is opened anew."""
+LONGEST_PAUSE = 0.5
+"""Between two attempts [s]."""
+_SHORTEST_PAUSE = 1e-3
+
+
+class Sampler:
+    """Owns a driver; only one thread may call it, save for what says otherwise."""
+
+    def __init__(self, driver: ForceSensorDriver[Any], clock: Clock) -> None:
+        """Opens nothing yet."""
+        self._driver = driver
+        self._clock = clock
+        self.pairs: deque[Pair] = deque(maxlen=REMEMBERED)
+        """What came in, for another thread to take with `popleft`."""
+        self.trouble = ""
+        """Why the latest attempt failed, one line; empty if it did not. For any thread."""
+        self.errors = 0
+        """Attempts that failed, since start. For any thread."""
+        self.reconnects = 0
+        """How often the hardware was opened anew and samples came again. For any thread."""
+        self.ready_at = -math.inf
+        """No attempt begins earlier [s, monotonic]."""
+        self._failures = 0
+        self._open = False
+
+    def step(self) -> None:
+        """Make one attempt; never raises. Takes as long as it takes, on its clock."""
+        wait = self.ready_at - self._clock.monotonic()
+        if wait > 0.0:
+            self._clock.sleep(wait)
+        try:
+            if not self._open:
+                self._driver.open()
+                self._open = True
+            pair = self._driver.sample()
+        except Exception as error:  # the layers of drivers raise all kinds
+            self._recover(error)
+        else:
+            if pair is not None:
+                self.pairs.append(pair)
+                self.reconnects += self._failures >= FEW
+                self._failures = 0
+                self.trouble = ""
+
+    def close(self) -> None:
+        """Let go of the hardware; never raises, may be called twice."""
+        self._open = False
+        self._driver.close()
+
+    def _recover(self, error: Exception) -> None:
+        """Leave the hardware time to settle, and more after several failures."""
+        self.trouble = self._driver.explain(error)
+        self.errors += 1
+        self._failures += 1
+        pause = max(self._driver.settling, _SHORTEST_PAUSE)
+        if self._failures >= FEW:
+            self.close()
+            pause = min(LONGEST_PAUSE, pause * 2.0 ** min(self._failures - FEW, 10))
+        self.ready_at = self._clock.monotonic() + pause
+
 
 HOLD = 2.2e-3
 """How long before a read all conversions have ended, at most an eighth of a tick [s].

@@ -6,7 +6,6 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Protocol
 
 import pigpio
 
@@ -28,18 +27,6 @@ _UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
 _TAKEN_AWAY = "somebody else took fishd's script away, as 'fishctl release' does"
 _SCRIPT_STATUS = 45
 _ANSWER = struct.Struct("<3Ii")
-
-
-class Place(Protocol):
-    """Where a pigpiod is; the driver's settings are one."""
-
-    @property
-    def host(self) -> str:
-        """Its name or address."""
-
-    @property
-    def port(self) -> int:
-        """Its TCP port."""
 
 
 class TimedSocket:
@@ -189,9 +176,9 @@ class Client(pigpio.pi):  # type: ignore[misc]
         self._socket.close()
 
 
-def where(place: Place) -> str:
+def where(host: str, port: int) -> str:
     """How messages name this pigpiod."""
-    return f"pigpiod at {place.host}:{place.port}"
+    return f"pigpiod at {host}:{port}"
 
 
 def reason(error: BaseException, limit: float) -> str:
@@ -204,17 +191,17 @@ def reason(error: BaseException, limit: float) -> str:
 
 
 @contextlib.contextmanager
-def opened(place: Place, limit: float = ANSWER) -> Iterator[Client]:
+def opened(host: str, port: int, limit: float = ANSWER) -> Iterator[Client]:
     """A client for a few commands, each `within` or all within `limit` [s].
 
     Raises `ServoError` with one line for whatever fails inside.
     """
     client = None
     try:
-        client = Client(place.host, place.port, limit)
+        client = Client(host, port, limit)
         yield client
     except FAILURES as error:
-        raise ServoError(f"{where(place)}: {reason(error, limit)}") from None
+        raise ServoError(f"{where(host, port)}: {reason(error, limit)}") from None
     finally:
         if client:
             client.close()

@@ -59,6 +59,7 @@ class PigpioLink:
         self.late_answers = 0
         """How many sessions ended without an answer in time."""
         self._settings = settings
+        self._where = where(settings.host, settings.port)
         self._clock = clock
         self._prepare = prepare
         self._standstill = standstill
@@ -99,7 +100,7 @@ class PigpioLink:
         patience = self._patience(limit)
         deadline = time.monotonic() + patience
         if not self._lock.acquire(timeout=patience):
-            raise ServoError(f"{where(self._settings)}: busy for more than {limit * 1e3:g} ms")
+            raise ServoError(f"{self._where}: busy for more than {limit * 1e3:g} ms")
         try:
             client = self._current(outlook)
             client.within(deadline - time.monotonic())
@@ -116,12 +117,12 @@ class PigpioLink:
                     return
                 else:
                     outlook = "; waiting for it"
-                raise ServoError(f"{where(self._settings)}: {why}{outlook}") from None
+                raise ServoError(f"{self._where}: {why}{outlook}") from None
             except BaseException as error:
                 self._drop(client, reason(error, limit))
                 if not isinstance(error, FAILURES):
                     raise
-                raise ServoError(f"{where(self._settings)}: {self._reason}{outlook}") from None
+                raise ServoError(f"{self._where}: {self._reason}{outlook}") from None
         finally:
             self._lock.release()
 
@@ -144,13 +145,13 @@ class PigpioLink:
 
     def _current(self, outlook: str) -> Client:
         if self._closed.is_set():
-            raise ServoError(f"{where(self._settings)}: closed")
+            raise ServoError(f"{self._where}: closed")
         now = self._clock.monotonic()
         if not self._client and not self._thread and now >= self._next_attempt:
             self._next_attempt = now + VIRTUAL_PAUSE
             self._connect(ANSWER, 2.0 * ANSWER)
         if not self._client:
-            raise ServoError(f"{where(self._settings)}: not connected: {self._reason}{outlook}")
+            raise ServoError(f"{self._where}: not connected: {self._reason}{outlook}")
         return self._client
 
     def _drop(self, client: Client, why: str) -> None:

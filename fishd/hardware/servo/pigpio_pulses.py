@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import SimpleNamespace
 
 import pigpio
 
@@ -120,12 +119,11 @@ def neutralise(
     still lives gets a fault. Raises `ServoError` when a step fails; the pulses are stopped all the
     same, if they can be.
     """
-    place = SimpleNamespace(host=host, port=port)
     try:
-        with opened(place) as client:
+        with opened(host, port) as client:
             return _neutralise(client, gpio, neutral, sleep)
     except BaseException:
-        with suppress(ServoError), opened(place) as client:
+        with suppress(ServoError), opened(host, port) as client:
             client.set_servo_pulsewidth(gpio, OFF)
             remove(client, countdowns(client, gpio))
         raise

@@ -56,12 +56,7 @@ def switch_off(channel: PwmChannel, period: float, sleep: Callable[[float], None
 
 
 def neutralise(
-    neutral: float,
-    *,
-    frequency: float,
-    files: Files = os,
-    clock: Clock = time,
-    **wires: Any,
+    neutral: float, *, frequency: float, files: Files = os, clock: Clock = time, **wires: Any
 ) -> bool:
     """Send a servo that gets pulses to neutral [µs] and stop them; False where there are none.
 

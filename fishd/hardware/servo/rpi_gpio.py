@@ -15,8 +15,7 @@ class RpiGpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw
 
     gpio: Annotated[Gpio, note("Pin of the servo's signal, Broadcom number.")] = 18
     frequency: Annotated[
-        float,
-        unit("Hz", "Pulses per second; more than 50 for digital servos only.", ge=40, le=333),
+        float, unit("Hz", "Pulses per second; more than 50 for digital servos only.", ge=40, le=333)
     ] = 50.0
 
 

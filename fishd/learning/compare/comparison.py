@@ -135,16 +135,11 @@ def refusal(config: Config, contestant: Contestant) -> FishdError | None:
 
 
 def compare(
-    config: Config,
-    contestants: Sequence[Contestant],
-    seconds: float,
-    settle: float,
-    runs: int = 1,
+    config: Config, contestants: Sequence[Contestant], seconds: float, settle: float, runs: int = 1
 ) -> tuple[list[Standing], list[Trace]]:
     """Let each swim the fish of `config`; standings and last traces, in the order given.
 
     runs: each contestant swims so many times, with noise of seed, seed + 1, ...
-    done: called after every run
     Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
     `UnknownController`, before anything swims.
     """

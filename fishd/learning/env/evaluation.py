@@ -13,8 +13,7 @@ from fishd import simulation
 from fishd.config import Config, Start
 from fishd.core.signals import Observation
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.randomisation import at_edge
-from fishd.learning.env.simulated_link import FunctionController, NullPublisher
+from fishd.learning.env.simulated_link import FunctionController, NullPublisher, at_edge
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 from fishd.simulation import Report
 

@@ -14,6 +14,8 @@ from fishd.core.errors import FishError, NoDaemon, Refused
 from fishd.core.signals import Observation, Status
 from fishd.learning.env.link import LinkLost, StepResult
 
+PATIENCE = 10.0
+"""How long the fish may take to begin, or to go on [s]."""
 SILENCE = 1.0
 """After so long without an observation, fishd is asked for its status [s]."""
 
@@ -46,14 +48,12 @@ class FishdLink:
         endpoint: str | None = None,
         *,
         address: str | None = None,
-        patience: float = 10.0,
         deadline: float | None = None,
     ) -> None:
         """
         endpoint: control socket of the fishd; None looks for that of this machine
         address: where that fishd can reach this program, as for `Agent`; None: where fishd waits
             for an agent already, else any free port of this machine
-        patience: how long the fish may take to begin, or to go on [s]
         deadline: how long a tick waits for an action [s]; None for fishd's default
 
         Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop, and
@@ -72,7 +72,6 @@ class FishdLink:
         except FishError:
             self._fish.close()
             raise
-        self._patience = patience
         self._deadline = deadline
         self._begun = self._paused = self._closed = False
         self._known = status
@@ -166,7 +165,7 @@ class FishdLink:
     def _next(self, *, begun: bool = True) -> Observed:
         """The next observation, of the same session if one had begun."""
         before = self._agent.latest
-        deadline = time.monotonic() + self._patience
+        deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             found = self._agent.poll(SILENCE)
             if found:
@@ -220,7 +219,7 @@ class FishdLink:
         if self._is_ours(status):
             return LinkLost(
                 f"fishd at {self._fish.endpoint} has sent no observation to {self._agent.address} "
-                f"within {self._patience:g} s"
+                f"within {PATIENCE:g} s"
             )
         if _waits_for_an_agent(status):
             return LinkLost(f"another agent has taken command: {status.parameters['agent']}")

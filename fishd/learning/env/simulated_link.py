@@ -1,20 +1,55 @@
 """A simulated fish in this process, on the virtual clock: the robot's own loop, far faster."""
 
+import math
 from collections.abc import Callable, Iterator
 
+import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.config import Config, Start
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
-from fishd.core.clock import Slot, VirtualClock, VirtualTicker
+from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Tick
 from fishd.learning.env.link import LinkLost, StepResult
-from fishd.learning.env.randomisation import drawn
 from fishd.learning.settings import Randomisation
 from fishd.virtual.fish import SimulatedFish
 from fishd.wiring import build_loop
+
+_VARIED = ("omega0", "xi", "servo_speed", "coupling")
+"""Parameters of the plant that a randomisation has a share for."""
+
+
+def drawn(config: Config, spread: Randomisation, seed: int) -> Config:
+    """A fish and a rig from anywhere in the range, to train on for a fish that is not known."""
+    draw = np.random.default_rng(seed)
+    return _varied(config, spread, lambda: draw.uniform(-1.0, 1.0), int(draw.integers(2**31)))
+
+
+def at_edge(config: Config, spread: Randomisation, seed: int) -> Config:
+    """A fish and a rig with every varied parameter at one end of its range, to evaluate on."""
+    draw = np.random.default_rng(seed)
+    return _varied(config, spread, lambda: float(draw.choice((-1.0, 1.0))), config.simulation.seed)
+
+
+def _varied(
+    config: Config, spread: Randomisation, place: Callable[[], float], noise_seed: int
+) -> Config:
+    """place: draws for one parameter its place in the range, from -1 to 1"""
+
+    def varied(value: float, share: float) -> float:
+        return value * math.exp(place() * math.log1p(share))
+
+    plant, rig = config.plant, config.simulation
+    changed = {name: varied(getattr(plant, name), getattr(spread, name)) for name in _VARIED}
+    noise = varied(rig.noise, spread.noise)
+    offset_y = rig.offset_y + spread.offset * place()
+    return replace(
+        config,
+        plant=replace(plant, **changed),
+        simulation=replace(rig, noise=noise, offset_y=offset_y, seed=noise_seed),
+    )
 
 
 class _NoParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,5 +140,5 @@ class SimulatedLink:
         fish = SimulatedFish(config.plant, config.simulation, config.tick)
         self._loop = build_loop(config, fish.robot(), clock, NullPublisher())
         self._loop.set_controller("agent", FunctionController(config, lambda _: self._angle))
-        self._slots = iter(VirtualTicker(clock, config.tick))
+        self._slots = virtual_slots(clock, config.tick)
         self._turn = self._loop.observe(next(self._slots))

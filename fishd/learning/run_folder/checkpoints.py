@@ -25,7 +25,7 @@ from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
 from fishd.core.errors import FishdError, PolicyError
 from fishd.learning.env.evaluation import Evaluation
-from fishd.learning.ppo.model import make_policy
+from fishd.learning.ppo import make_policy
 from fishd.learning.settings import TrainingSettings
 
 MODEL, CARD, STATE = "model.zip", "card.json", "state.json"

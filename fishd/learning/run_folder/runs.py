@@ -1,16 +1,22 @@
 """The folder of a training: its configuration and settings, written before the first step."""
 
-from datetime import datetime
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 
+import msgspec
 from msgspec import Struct
 
+from fishd import __version__
 from fishd import config as configuration
 from fishd.config import Config
+from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.files import write_atomically
 from fishd.learning import settings as training
+from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import TrainingSettings
 
@@ -72,3 +78,42 @@ def _check_complete(file: Path, kind: type[Struct]) -> None:
     missing = [key for key in kind.__struct_fields__ if key not in data]
     if missing:
         raise ConfigError(f"{file}: incomplete: the key {missing[0]} is missing")
+
+
+_LIBRARIES = ("torch", "stable-baselines3", "gymnasium", "numpy")
+
+
+def make_card(
+    config: Config,
+    settings: TrainingSettings,
+    features: tuple[Feature, ...],
+    on: str,
+    steps: int,
+    evaluation: Evaluation | None,
+    note: str,
+) -> Card:
+    """
+    on: simulation, robot or another word for what swam
+    steps: control steps that it has learned from
+    evaluation: the latest
+    """
+    libraries = {name: version(name) for name in _LIBRARIES}
+    return Card(
+        observation=features,
+        tick=config.tick,
+        amplitude=config.amplitude_limit,
+        provenance=Provenance(
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            fishd=__version__,
+            algorithm="PPO",
+            on=on,
+            steps=steps,
+            seed=settings.seed,
+            settings=msgspec.to_builtins(settings),
+            plant=msgspec.to_builtins(config.plant),
+            libraries={"python": platform.python_version(), **libraries},
+            efficiency=evaluation.efficiency if evaluation else None,
+            frequency=evaluation.frequency if evaluation else None,
+            note=note,
+        ),
+    )

@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import beat_frequency
 from fishd.learning.env.link import LinkLost
-from fishd.learning.ppo.model import Rollout
+from fishd.learning.ppo import Rollout
 from fishd.learning.train.progress import Display
 
 

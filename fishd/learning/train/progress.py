@@ -37,18 +37,14 @@ class LineDisplay(Display):
 
     def begin(self, steps: int, target: int, text: str) -> None:
         """Print where the run is."""
-        self._print(text)
+        click.echo(text)
 
     def evaluated(self, evaluation: "Evaluation") -> None:
         """Print one line; it is called the best only where the figure shown is higher, too."""
         merit = round(evaluation.merit, 3)
         better = evaluation.best and merit > self._best
         self._best = merit if better else self._best
-        self._print(described(evaluation) + (", the best so far" if better else ""))
-
-    def _print(self, text: str) -> None:
-        click.echo(text)
-        sys.stdout.flush()
+        click.echo(described(evaluation) + (", the best so far" if better else ""))
 
 
 class BarDisplay(Display):

@@ -16,7 +16,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError, State
-from fishd.learning.run_folder.provenance import make_card
+from fishd.learning.run_folder.runs import make_card
 from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, ProgressWriter, Table
 from fishd.learning.train.jobs import Job
 

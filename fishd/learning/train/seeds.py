@@ -4,21 +4,24 @@ Each seed trains in a folder seed-0, seed-1, ... of the run folder. A seed that 
 and does not affect the others; one whose process was killed is resumed in another.
 """
 
+import io
 import shutil
 import signal
 import tempfile
 import threading
+import time
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
-from fishd.learning.train.cluster import pack, scheduler, stop_requested, unpack
 from fishd.learning.train.jobs import Job, Outcome
 
 # What brings torch is imported where it is used: a process that is told to stop before it has
@@ -26,8 +29,12 @@ from fishd.learning.train.jobs import Job, Outcome
 
 STOP = "stop"
 """A file of this name in the run folder ends the trainings in it."""
-
+CONNECT = 10.0
+"""How long to wait for a scheduler that does not answer [s]."""
+_POLL = 1.0
+"""How often a worker asks the scheduler whether to stop [s]."""
 _ATTEMPTS = 3
+"""How often what is left is begun, where a process was killed."""
 
 
 class _Task(NamedTuple):
@@ -117,25 +124,12 @@ def _run(
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         workers = min(jobs or joblib.cpu_count(), len(tasks))
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-        with _ignoring_the_terminal():
+        from fishd.learning.train.training import handled
+
+        # Its processes ignore Ctrl-C and hang-up, which a child inherits: they are told to stop.
+        with handled((signal.SIGINT, signal.SIGHUP), signal.SIG_IGN):
             outcomes = parallel(joblib.delayed(_train_here)(task) for task in tasks)
         yield from outcomes
-
-
-@contextmanager
-def _ignoring_the_terminal() -> Iterator[None]:
-    """Processes that are started in here ignore Ctrl-C and hang-up: this one tells them to stop."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    # A child inherits that a signal is ignored, unlike its handlers.
-    signals = (signal.SIGINT, signal.SIGHUP)
-    former = {number: signal.signal(number, signal.SIG_IGN) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
 
 
 def _train_here(task: _Task) -> tuple[int, Outcome, bytes]:
@@ -196,3 +190,53 @@ def _stop_on_signal(file: Path, event: Any) -> Iterator[None]:
             yield
     finally:
         file.unlink(missing_ok=True)
+
+
+@contextmanager
+def scheduler(address: str | None) -> Iterator[Any]:
+    """A connection to the scheduler, and an event there that means stop; None without address."""
+    if address is None:
+        yield None
+        return
+    from distributed import Client, Event
+
+    try:
+        client = Client(address, timeout=CONNECT, name="fishctl learn")
+    except (OSError, ValueError, TypeError, TimeoutError) as error:
+        raise FishdError(f"no Dask scheduler answers at {address}: {error}") from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise FishdError(f"the Dask scheduler at {address} has no workers")
+        yield Event(f"fishd-stop-{uuid4().hex}", client=client)
+
+
+def stop_requested(name: str) -> Callable[[], bool]:
+    """A function, for use on a Dask worker, that tells whether an event of this name was set."""
+    from distributed import Event, get_client
+
+    event = Event(name, client=get_client())
+    was_set, next_look = False, 0.0
+
+    def stop() -> bool:
+        nonlocal was_set, next_look
+        if not was_set and time.monotonic() >= next_look:
+            was_set = event.is_set()
+            next_look = time.monotonic() + _POLL
+        return was_set
+
+    return stop
+
+
+def pack(folder: Path) -> bytes:
+    """All files of a folder as one zip archive."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder))
+    return buffer.getvalue()
+
+
+def unpack(files: bytes, folder: Path) -> None:
+    """Write the files of such an archive into a folder."""
+    with zipfile.ZipFile(io.BytesIO(files)) as archive:
+        archive.extractall(folder)

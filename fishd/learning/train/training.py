@@ -9,7 +9,7 @@ record     a row in the tables, a checkpoint where one is due, another where it 
 import shlex
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from msgspec.structs import replace
 from numpy.typing import NDArray
+from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.core.errors import FishdError
@@ -25,13 +26,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.simulated_link import SimulatedLink
-from fishd.learning.ppo.model import (
-    DeterministicPolicy,
-    is_finite,
-    learning_rate,
-    make_learner,
-    set_learning_rate,
-)
+from fishd.learning.ppo import DeterministicPolicy, is_finite, learning_rate, make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.train.callbacks import RolloutCallback
@@ -78,21 +73,26 @@ def on_signal(ask: Callable[[], object]) -> Iterator[None]:
 
     Only the main thread receives signals; in any other nothing happens.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def heard(number: int, _: object) -> None:
         signal.signal(number, former[number])
         ask()
 
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    former: dict[int, Any] = {number: signal.signal(number, heard) for number in signals}
-    try:
+    with handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), heard) as former:
         yield
+
+
+@contextmanager
+def handled(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
+    """While this lasts, these go to `handler`, in the main thread; yields who had them before."""
+    former: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        former = {number: signal.signal(number, handler) for number in signals}
+    try:
+        yield former
     finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
+        for number, before in former.items():
+            signal.signal(number, before)
 
 
 class Training:
@@ -170,7 +170,8 @@ class Training:
             self._start_with(self._env.resume()[np.newaxis])
             self._paused = False
         before = recorder.steps
-        set_learning_rate(model, learning_rate(settings.ppo, before + settings.ppo.n_steps))
+        rate = learning_rate(settings.ppo, before + settings.ppo.n_steps)
+        model.lr_schedule = FloatSchedule(rate)  # whatever share of the training is done
         try:
             model.learn(
                 settings.ppo.n_steps, self._callback, log_interval=_NEVER, reset_num_timesteps=False

@@ -57,7 +57,8 @@ HEADER = struct.pack("<IIII", 45, 0, 0, 44)
 def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, message: str) -> None:
     server = Server(answer, dies=dies)
     try:
-        with pytest.raises(ServoError, match=message), opened(server.settings, 0.2) as client:
+        host, port = server.settings.host, server.settings.port
+        with pytest.raises(ServoError, match=message), opened(host, port, 0.2) as client:
             client.script_status(0)
     finally:
         server.close()
@@ -67,7 +68,7 @@ def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, messag
 def test_a_host_that_is_none_is_one_line_too(host: str) -> None:
     with (
         pytest.raises(ServoError, match=rf"^pigpiod at {host}:8888: [^\n]+$"),
-        opened(PigpioSettings(host=host)),
+        opened(host, 8888),
     ):
         pass
 

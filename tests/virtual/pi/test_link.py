@@ -17,7 +17,7 @@ from rigs.processes import PATIENCE
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import StartupError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampler import Sampler
+from fishd.hardware.force_sensor.sampled_sensor import Sampler
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.i2c import Read, Write, kernel_error
 from fishd.virtual.pi.link import RemotePi

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from fishd.cli.doctor.checks.base import Context
-from fishd.cli.doctor.checks.daemon import Running, Unreachable
+from fishd.cli.doctor.base import Context, Running, Unreachable
 from fishd.core import addresses
 from fishd.core.errors import StartupError
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning

@@ -6,7 +6,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor.base import Context
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder

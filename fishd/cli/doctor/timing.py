@@ -6,7 +6,7 @@ import resource
 import subprocess
 import sys
 
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor.base import Context
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
 _TRY = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"

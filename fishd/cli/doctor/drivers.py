@@ -9,15 +9,14 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 
-from fishd.cli.doctor.checks.base import Context
+from fishd.cli.doctor.base import Context
 from fishd.config.drivers import claims_of
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import SystemClock
 from fishd.core.errors import MissingPackage, SensorError, ServoError, StartupError
 from fishd.hardware.checks import START_VIRTUAL_PI, Check, Result, fail, ok, skipped, warning
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.hardware.packages import driver_packages
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 from fishd.wiring import open_sensor
 
@@ -119,9 +118,7 @@ def _force_of_daemon(context: Context) -> Result:
             "fishctl watch; check the wires if this goes on",
         )
     return _enough(
-        tick.samples,
-        context,
-        f"the newest {tick.age_ms:.0f} ms old, {survived or 'no errors'}",
+        tick.samples, context, f"the newest {tick.age_ms:.0f} ms old, {survived or 'no errors'}"
     )
 
 

@@ -6,10 +6,10 @@ import stat
 import sys
 from importlib import metadata
 
-from fishd.cli.doctor.checks.base import Context, sudo_unless
+from fishd.cli.doctor.base import Context, sudo_unless
 from fishd.hardware import header
 from fishd.hardware.checks import Check, Result, fail, ok, warning
-from fishd.hardware.packages import PACKAGES
+from fishd.hardware.registry import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
     "adafruit-blinka": "adafruit_blinka",  # not one of its own, such as board, which looks for pins
@@ -69,11 +69,7 @@ def gpio_package(context: Context) -> Result | None:
         header.PACKAGE in plugins.find(settings.driver).packages
         for _, plugins, settings in context.drivers
     )
-    installed = {
-        name
-        for d in metadata.distributions()
-        if (name := d.name.lower().replace(".", "-")) in _GPIO
-    }
+    installed = header.installed()
     pip = f"{sys.executable} -m pip"
     if len(installed) > 1:
         right = "rpi-lgpio" if "Raspberry Pi 5" in context.model else "the one for this Pi"
@@ -89,15 +85,12 @@ def gpio_package(context: Context) -> Result | None:
             "sudo make install-pi, which says what it takes; without the service "
             f"{pip} install 'fishd[rpi-lgpio]' (Pi 5, Debian 13) or 'fishd[rpi-gpio]'",
         )
-    if "rpi-gpio" in installed and "Raspberry Pi 5" in context.model:
+    if "RPi.GPIO" in installed and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
             f"{pip} uninstall RPi.GPIO; {pip} install 'fishd[rpi-lgpio]'",
         )
-    return ok(" and ".join(sorted(_GPIO[name] for name in installed)))
-
-
-_GPIO = {"rpi-gpio": "RPi.GPIO", "rpi-lgpio": "rpi-lgpio"}
+    return ok(installed[0])
 
 
 def _problem(name: str, bounds: str) -> str:
