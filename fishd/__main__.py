@@ -1,8 +1,11 @@
 """Where the commands begin: a Ctrl-C while they are still being loaded ends them quietly."""
 
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+try:
+    import signal
+    from collections.abc import Iterator
+    from contextlib import contextmanager
+except KeyboardInterrupt:
+    raise SystemExit(130) from None
 
 
 def fishd() -> None:

@@ -185,12 +185,9 @@ def assemble(
     """
     panel = _open_panel(config, clock, stack)
     folder = CalibrationFolder(state_folder(config))
-    found = folder.newest(ForceCalibration)
     for line in folder.ignored():
         log.warning("%s", line)
-    sensor = open_sensor(
-        config, found[0] if found else ForceCalibration(), clock, threaded=threaded
-    )
+    sensor = open_sensor(config, clock, threaded=threaded)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -221,7 +218,8 @@ def assemble(
     def degraded() -> tuple[str, ...]:
         lines = servo.driver.degraded
         if sensor.calibration.untouched:
-            lines += ("the force is not calibrated, volts are shown: fishctl calibrate force",)
+            shown = f"the force is not calibrated, and shown in {sensor.unit}"
+            lines += (f"{shown}: fishctl calibrate force",)
         cut = _cut_by_calibration(config, servo)
         return (*lines, cut) if cut else lines
 
@@ -238,11 +236,14 @@ def assemble(
     )
 
 
-def open_sensor(
-    config: Config, calibration: ForceCalibration, clock: Clock, *, threaded: bool
-) -> SampledSensor:
-    """The force sensor alone; raises `StartupError` when a package is missing."""
+def open_sensor(config: Config, clock: Clock, *, threaded: bool) -> SampledSensor:
+    """The force sensor alone, with the calibration that was saved last.
+
+    Raises `StartupError` when a package is missing, and `ConfigError` for a damaged calibration.
+    """
     settings = config.force_sensor
+    found = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
+    calibration = found[0] if found else ForceCalibration()
     with driver_packages(settings.driver):
         driver = FORCE_SENSORS.find(settings.driver)(settings, clock)
     return SampledSensor(driver, calibration, clock, threaded=threaded, tick=config.tick)

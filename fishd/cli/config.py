@@ -35,7 +35,7 @@ def fish_options(function: F) -> F:
     option = click.option(
         "--config",
         "file",
-        type=click.Path(path_type=Path),
+        type=click.Path(path_type=Path, readable=False),
         help="YAML file, as for fishd; without it, the defaults.",
     )
     return option(set_option(function))
@@ -44,7 +44,7 @@ def fish_options(function: F) -> F:
 service_option = click.option(
     "--config",
     "file",
-    type=click.Path(path_type=Path),
+    type=click.Path(path_type=Path, readable=False),
     help=f"YAML file of the daemon; default: ${FILE_VARIABLE}, else {SERVICE_FILE} where there is "
     "one, else the defaults.",
 )
@@ -57,7 +57,7 @@ def config() -> None:
 
 
 @config.command()
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=click.Path(path_type=Path, readable=False))
 @set_option
 def check(file: Path, overrides: tuple[str, ...]) -> None:
     """Check a configuration file.
@@ -72,7 +72,7 @@ def check(file: Path, overrides: tuple[str, ...]) -> None:
 
 
 @config.command()
-@click.argument("file", type=click.Path(path_type=Path), required=False)
+@click.argument("file", type=click.Path(path_type=Path, readable=False), required=False)
 @set_option
 @click.option("--running", is_flag=True, help="What the fishd that runs was started with, instead.")
 @endpoint_option

@@ -15,6 +15,7 @@ from fishd.controllers import registry
 from fishd.core.addresses import ENDPOINT_VARIABLE
 from fishd.core.errors import NoDaemon
 from fishd.core.protocol import State
+from fishd.core.schema import Field
 from fishd.core.signals import Percentiles, Reason, Status
 
 T = TypeVar("T")
@@ -94,23 +95,34 @@ def set_parameter(words: tuple[str, ...], endpoint: str | None, as_json: bool) -
         known = active_parameters(fish)
         # The daemon refuses a name that the controller does not have, and says which it has.
         values = {
-            name: ParameterType(known[name]).convert(text, None, None) if name in known else text
-            for name, text in pairs
+            name: _converted(known[name], text) if name in known else text for name, text in pairs
         }
         return fish.set_parameters(**values)
 
     _change(endpoint, as_json, change)
 
 
+def _converted(field: Field, text: str) -> Any:
+    try:
+        return ParameterType(field).convert(text, None, None)
+    except click.BadParameter as error:
+        error.param_hint = f"'{field.name}'"
+        raise
+
+
 def _pairs(words: Iterable[str]) -> Iterator[tuple[str, str]]:
     """Names and values of `NAME VALUE`, `NAME=VALUE` and `--NAME VALUE`, in any mixture."""
-    rest = iter(words)
+    rest, given = iter(words), set[str]()
     for word in rest:
         name, equals, text = word.partition("=")
         value = text if equals else next(rest, None)
         if value is None:
             raise click.UsageError(f"every NAME needs a VALUE, such as: {name} 0.7, or {name}=0.7")
-        yield name.lstrip("-").replace("-", "_"), value
+        name = name.lstrip("-").replace("-", "_")
+        if name in given:
+            raise click.UsageError(f"{name} is given twice")
+        given.add(name)
+        yield name, value
 
 
 @click.command()

@@ -116,6 +116,21 @@ def describe(field: Field) -> str:
     return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
 
 
+class _ControllerCommand(click.Command):
+    """Takes a parameter as `NAME=VALUE`, too."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """A word that begins as a name and `=` is an option whose dashes were left out."""
+        pairs = (word.partition("=") for word in args)
+        return super().parse_args(
+            ctx,
+            [
+                f"--{name.replace('_', '-')}={value}" if equals and name.isidentifier() else word
+                for word, (name, equals, value) in zip(args, pairs, strict=True)
+            ],
+        )
+
+
 class ControllerGroup(click.Group):
     """A verb whose sub-commands are the controllers, each with its parameters as options.
 
@@ -155,7 +170,9 @@ class ControllerGroup(click.Group):
             return self._action(info.name, given_parameters(ctx, values), **values)
 
         decorated = self._options(cast(Any, callback))
-        command = click.command(cmd_name, help=info.summary, short_help=info.summary)(decorated)
+        command = click.command(
+            cmd_name, _ControllerCommand, help=info.summary, short_help=info.summary
+        )(decorated)
         command.params = parameter_options(info) + command.params
         return command
 

@@ -180,7 +180,7 @@ def _is_there(path: Path) -> bool:
 def claimed(
     address: str,
     rival: str = "another fishd",
-    advice: str = "stop it, or give this one another control.address and telemetry.address",
+    advice: str = "end it, or give this one another control.address and telemetry.address",
 ) -> AbstractContextManager[None]:
     """Make sure that nobody else serves an ipc address: `unix_sockets.claimed`."""
     path = socket_path(address)
@@ -236,7 +236,7 @@ def _why(address: str, error: Exception) -> str:
     if not isinstance(error, OSError):
         return str(error)
     if error.errno == errno.EADDRINUSE:
-        return "it is in use, by another fishd perhaps; stop that, or choose another address"
+        return "it is in use, by another fishd perhaps; end that, or choose another address"
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     if unknown and isinstance(where := parse(address), Tcp):
         return (

@@ -1,4 +1,4 @@
-"""The one place that calls code of other packages, such as a controller's.
+"""How code of other packages is called, such as a controller's or a driver's.
 
 Such code may raise anything, and may never return.
 """

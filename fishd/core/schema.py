@@ -195,7 +195,7 @@ def nested_too_deeply(data: Any, levels: int = 20) -> bool:
 
 def nearest(word: str, words: list[str], *, listed: str = "valid") -> str:
     """A did-you-mean for `word`, or the list of what there is, introduced by `listed`."""
-    close = _close(word, words)
+    close = [known for known in words if known.lower() == word.lower()] or _close(word, words)
     if not close:  # 'noise' for 'simulation.noise'
         close = [known for known in words if known.rpartition(".")[2] == word]
     if close:

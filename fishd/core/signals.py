@@ -280,5 +280,7 @@ class Status(Struct, frozen=True):
     phi_c: Annotated[float, unit("rad", "As in `tick`.")] = 0.0
     force_unit: Annotated[
         str,
-        note("`N`; `V` where the sensor is not calibrated: then forces and thrust are voltages."),
+        note(
+            "Unit of forces and thrust: `N`; `V`, or the driver's, until the sensor is calibrated."
+        ),
     ] = "N"

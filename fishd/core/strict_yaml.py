@@ -56,9 +56,7 @@ def read(
     except YamlProblem as problem:
         raise ConfigError(f"{file}:{problem.line}: {problem}") from None
     except files.NoFile as problem:
-        raise ConfigError(
-            f"{file}: {problem}; give the path of a YAML file, or none for the defaults"
-        ) from None
+        raise ConfigError(f"{file}: {problem}; give the path of a YAML file") from None
     except files.FileProblem as problem:
         raise ConfigError(f"{file}: {problem}") from None
     if not isinstance(data, dict):

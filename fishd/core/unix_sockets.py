@@ -135,7 +135,7 @@ def claimed(path: Path, name: str, rival: str, advice: str) -> Iterator[None]:
         except OSError as error:
             raise StartupError(
                 f"{lock_path(path)}: cannot be made: {error.strerror}; "
-                "choose an address in a folder that exists"
+                "choose an address in a folder that exists and that you may write to"
             ) from None
         given_up = time.monotonic() + LEAVING
         while path.is_socket() and not is_deserted(path):

@@ -227,7 +227,7 @@ async def swim(
 @click.option(
     "--config",
     "path",
-    type=click.Path(path_type=Path),
+    type=click.Path(path_type=Path, readable=False),
     help="YAML file; without it, a simulated fish at rest.",
 )
 @click.option(

@@ -68,8 +68,8 @@ class Robot:
 
     @property
     def force_unit(self) -> str:
-        """`N`; `V` where the sensor was never calibrated, so that volts count as newtons."""
-        return "V" if self.calibrated and self.calibrated.sensor.calibration.untouched else "N"
+        """`N`; that of the sensor's driver where it was never calibrated."""
+        return self.calibrated.sensor.unit if self.calibrated else "N"
 
 
 @dataclass(frozen=True)

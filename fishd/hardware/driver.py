@@ -95,7 +95,7 @@ class Pair(NamedTuple):
     time: float
     """When the later one was complete."""
     vx: float
-    """Voltage that stands for F_x [V]; any other unit will do that is proportional to it."""
+    """What stands for F_x: a voltage [V], or what `raw_unit` says, in proportion to the force."""
     vy: float
     clipped: str = ""
     """Why the two cannot be believed, as they are at an end of the range; empty where they can."""
@@ -108,6 +108,8 @@ class ForceSensorDriver(Driver[F]):
     """What errors are counted as: `i2c` makes `i2c_errors`."""
     settling: float = 0.0
     """How long to leave the hardware alone after an error [s]."""
+    raw_unit: ClassVar[str] = "V"
+    """Unit of the pairs, in which forces are shown until the sensor is calibrated."""
     names: tuple[str, str] = ("F_x", "F_y")
     """What messages call the two, such as `F_x (channel A0-A1)`."""
 

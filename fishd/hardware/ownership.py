@@ -86,7 +86,7 @@ def _claim(part: Part, stack: ExitStack) -> None:
         except Taken as taken:
             if attempt == TRIES:
                 raise StartupError(
-                    f"another fishd (pid {taken.pid}) drives {part.what}; stop it, or give this "
+                    f"another fishd (pid {taken.pid}) drives {part.what}; end it, or give this "
                     f"one another {part.key}"
                 ) from None
         time.sleep(PAUSE)

@@ -1,5 +1,6 @@
 """`fishctl doctor` as a user meets it: on real processes, a virtual Pi and a broken one."""
 
+import datetime
 import os
 import socket
 from pathlib import Path
@@ -8,6 +9,9 @@ import pytest
 from rigs.doctor_process import doctor, free_telemetry
 from rigs.operator_rig import Bench
 from rigs.processes import fishctl
+
+from fishd.core.calibration import ForceCalibration
+from fishd.hardware.calibration_files import CalibrationFolder
 
 WELL = ("ok", "warning")
 """Levels of what is timed: a busy machine may give fewer samples than a healthy bus."""
@@ -55,6 +59,17 @@ def test_a_healthy_virtual_pi_is_all_well_with_and_without_a_daemon(pi: Bench) -
         assert daemon.fishctl("status", "--json").stdout.count('"idle"') == 1
     _, after = doctor(pi.folder, *pi.settings, *free_telemetry())
     assert after["adc"][1].endswith("as fishd left it")
+
+
+def test_the_force_is_judged_by_the_calibration_that_fishd_would_use(pi: Bench) -> None:
+    settings = (*pi.settings, "--set", "force_sensor.force_limit=1e-4", *free_telemetry())
+    _, findings = doctor(pi.folder, *settings)
+    assert "not to be believed in" in findings["force"][1]
+    assert "(not calibrated: 1 V counts as 1 N)" in findings["force"][1]
+    folder = CalibrationFolder(pi.folder / "state" / "virtual-pi")
+    folder.save(ForceCalibration(xx=1e-6, yy=1e-6, loads=5), datetime.datetime.now(datetime.UTC))
+    _, findings = doctor(pi.folder, *settings)
+    assert "not clipped, not frozen" in findings["force"][1]
 
 
 @pytest.mark.parametrize(

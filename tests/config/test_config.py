@@ -133,7 +133,7 @@ start:
   controller: swing
   parameters:
     c: 0.5
-=> fish.yaml:4: start.parameters.c: unknown parameter 'c' of controller swing; it has:
+=> fish.yaml:4: start.parameters.c: unknown parameter 'c' of controller swing; did you mean 'C'?
 
 start:
   controller: swing

@@ -124,8 +124,8 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
         ({"amplitude": True}, r"swing: amplitude: true is .* rad \(or null\) is needed$"),
         ({"longest_half_period": 24}, r"swing: longest_half_period: 24 is .* s is needed$"),
         (
-            {"c": 0.6},
-            "^unknown parameter 'c' of controller swing; "
+            {"frequency": 0.6},
+            "^unknown parameter 'frequency' of controller swing; "
             "it has: C, amplitude, longest_half_period$",
         ),
         (

@@ -72,7 +72,7 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
 
 
 def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> None:
-    not_calibrated = "the force is not calibrated, volts are shown: fishctl calibrate force"
+    not_calibrated = "the force is not calibrated, and shown in V: fishctl calibrate force"
     asked = subject(rig)
     perform(rig, asked, ("tare", BRIEFLY))
     assert not_calibrated in rig.robot.degraded()

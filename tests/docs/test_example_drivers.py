@@ -204,7 +204,7 @@ PCA9685 = ["servo.driver=pca9685", "servo.bus=177", "force_sensor.bus=178"]
     ("settings", "part", "complaint"),
     [
         (HX711, 0, r"drives the HX711's PD_SCK on GPIO 25; .*sensor\.clock"),
-        (PCA9685, 1, r"drives /dev/i2c-177; stop it.* another servo\.bus"),
+        (PCA9685, 1, r"drives /dev/i2c-177; end it.* another servo\.bus"),
     ],
     ids=["hx711", "pca9685"],
 )

@@ -49,7 +49,19 @@ def test_parameters_change_together_or_not_at_all(daemon: Daemon, words: tuple[s
         "fishctl: unknown parameter 'frequency' of controller swing; "
         "it has: C, amplitude, longest_half_period [bad-parameter]\n"
     )
+    done = daemon.fishctl("set-parameter", "c", "0.5")
+    assert "unknown parameter 'c' of controller swing; did you mean 'C'?" in done.stderr
+    done = daemon.fishctl("set-parameter", "C=0.5", "amplitude=24deg")
+    assert "Invalid value for 'amplitude': '24deg' is not valid: a number in" in done.stderr
     assert daemon.status().parameters["C"] == 0.4
+
+
+@pytest.mark.parametrize("word", ["--C=0.4", "C=0.4"])
+def test_a_parameter_may_be_given_without_dashes(daemon: Daemon, word: str) -> None:
+    done = daemon.fishctl("set-controller", "swing", word, "longest_half_period=0.8")
+    assert "swing C=0.4 amplitude=default longest_half_period=0.8" in done.stdout
+    done = daemon.fishctl("set-controller", "swing", "D=0.4")
+    assert "No such option '--D'" in done.stderr
 
 
 def test_stop_estop_and_clear_fault_do_what_they_say(daemon: Daemon) -> None:
@@ -148,6 +160,7 @@ def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None
         (("set-parameter", "C", "0.4"), "no controller is running (mode idle)"),
         (("set-parameter", "C"), "every NAME needs a VALUE, such as: C 0.7, or C=0.7"),
         (("set-parameter", "C=0.7", "x"), "every NAME needs a VALUE"),
+        (("set-parameter", "C", "0.7", "C=0.3"), "C is given twice"),
         (("status", "--endpoint", "nonsense"), "'nonsense' is no address"),
         (("stat",), "No such command 'stat'"),
         (("mark",), "Missing argument 'TEXT'"),

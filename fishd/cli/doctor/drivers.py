@@ -11,9 +11,8 @@ from contextlib import ExitStack
 
 from fishd.cli.doctor.base import Context
 from fishd.config.drivers import claims_of
-from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import SystemClock
-from fishd.core.errors import MissingPackage, SensorError, ServoError, StartupError
+from fishd.core.errors import ConfigError, MissingPackage, SensorError, ServoError, StartupError
 from fishd.hardware.checks import START_VIRTUAL_PI, Check, Result, fail, ok, skipped, warning
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
@@ -76,23 +75,23 @@ def force(context: Context) -> Result:
     config = context.config
     try:
         with context.plugged_in(), ExitStack() as stack:
-            sensor = open_sensor(config, ForceCalibration(), SystemClock(), threaded=True)
+            sensor = open_sensor(config, SystemClock(), threaded=True)
             stack.callback(sensor.close)
             trials = list(_windows(sensor, config.tick))
     except MissingPackage:
         raise
-    except StartupError as error:
+    except (ConfigError, StartupError) as error:
         virtual = config.robot == "virtual-pi"
         return fail(str(error), START_VIRTUAL_PI if virtual else "mend what this line says")
     except SensorError as error:
         return fail(str(error), "mend what the lines above say first")
-    samples, suspicions = [n for n, _ in trials], {why for _, why in trials if why}
-    per_tick = sum(samples) / len(samples)
+    suspicions = [why for _, why in trials if why]
+    per_tick = sum(count for count, _ in trials) / len(trials)
     if not per_tick:
         return fail("the sensor answers, but delivers nothing", "switch its power off and on")
     if suspicions:
         return fail(
-            f"not to be believed: {'; '.join(sorted(suspicions))}",
+            f"not to be believed in {len(suspicions)} of {len(trials)} ticks: {suspicions[-1]}",
             "check the wires of the sensor, its amplifier, and its range",
         )
     return _enough(per_tick, context, "not clipped, not frozen")

@@ -42,13 +42,13 @@ def configuration(context: Context) -> Result:
 
 def packages(context: Context) -> Result:
     """Those that this configuration needs, as fishd's own metadata demands them."""
-    robot, wanted, drivers = context.robot, [], ""
+    robot, wanted, drivers = context.robot, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
     if robot != "simulated":
         for _, plugins, settings in context.drivers:
             packages |= {name.lower() for name in plugins.find(settings.driver).packages}
             texts += plugins.requirements(settings.driver)
-            drivers += f" and {settings.driver}"
+            drivers.append(settings.driver)
     for text in texts:
         found = _REQUIREMENT.match(text)
         assert found
@@ -59,7 +59,8 @@ def packages(context: Context) -> Result:
     if problems:
         extra = "fishd" if robot == "simulated" else "fishd[pi]"
         return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
-    return ok(f"all {len(wanted)} that robot {robot}{drivers} needs, under {sys.executable}")
+    who = f"robot {robot} with {' and '.join(drivers)}" if drivers else f"robot {robot}"
+    return ok(f"all {len(wanted)} that {who} needs, under {sys.executable}")
 
 
 def gpio_package(context: Context) -> Result | None:

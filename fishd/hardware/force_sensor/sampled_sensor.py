@@ -6,13 +6,16 @@ In virtual time there is no thread: a read samples until its clock has come to t
 import math
 import threading
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from msgspec.structs import replace
 
+from fishd.core import text
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import Clock
 from fishd.core.errors import SensorError
+from fishd.core.foreign_code import contained
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import ForceSensorDriver, Pair
 from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
@@ -53,9 +56,9 @@ class Sampler:
             self._clock.sleep(wait)
         try:
             if not self._open:
-                self._driver.open()
+                contained(self._driver.open)
                 self._open = True
-            pair = self._driver.sample()
+            pair = contained(self._driver.sample)
         except Exception as error:  # the layers of drivers raise all kinds
             self._recover(error)
         else:
@@ -68,11 +71,12 @@ class Sampler:
     def close(self) -> None:
         """Let go of the hardware; never raises, may be called twice."""
         self._open = False
-        self._driver.close()
+        with suppress(Exception):
+            contained(self._driver.close)
 
     def _recover(self, error: Exception) -> None:
         """Leave the hardware time to settle, and more after several failures."""
-        self.trouble = self._driver.explain(error)
+        self.trouble = self._explained(error)
         self.errors += 1
         self._failures += 1
         pause = max(self._driver.settling, _SHORTEST_PAUSE)
@@ -80,6 +84,12 @@ class Sampler:
             self.close()
             pause = min(LONGEST_PAUSE, pause * 2.0 ** min(self._failures - FEW, 10))
         self.ready_at = self._clock.monotonic() + pause
+
+    def _explained(self, error: Exception) -> str:
+        try:
+            return contained(self._driver.explain, error)
+        except Exception:  # the words are lost, not the reason
+            return text.named(error)
 
 
 HOLD = 2.2e-3
@@ -121,7 +131,7 @@ class SampledSensor:
         self._place = driver.place
         self._transport = driver.transport
         self._sampler = Sampler(driver, clock)
-        self._evaluation = WindowEvaluation(driver.settings, driver.names)
+        self._evaluation = WindowEvaluation(driver.settings, driver.names, driver.raw_unit)
         self._latest: Measurement | None = None
         self._watches: list[VoltageWatch] = []
         self._next_read = math.inf
@@ -162,6 +172,11 @@ class SampledSensor:
         if self._latest is None:
             raise SensorError(f"{self._place} has not delivered yet")
         return self._latest
+
+    @property
+    def unit(self) -> str:
+        """Of the forces: N, or that of the driver until the sensor is calibrated."""
+        return self._evaluation.unit(self.calibration)
 
     def watch(self) -> VoltageWatch:
         """Begin to add up the voltages of every pair that is sampled from now on."""

@@ -12,11 +12,14 @@ from fishd.hardware.settings import ForceSensorSettings
 class WindowEvaluation:
     """Turns pairs of voltages into measurements of the forces."""
 
-    def __init__(self, settings: ForceSensorSettings, names: tuple[str, str]) -> None:
-        """names: what messages call the two channels"""
+    def __init__(
+        self, settings: ForceSensorSettings, names: tuple[str, str], raw_unit: str
+    ) -> None:
+        """names: what messages call the two channels; raw_unit: that of the pairs"""
         self._limit = settings.force_limit
+        self._raw_unit = raw_unit
         patience = math.inf if settings.frozen_after is None else settings.frozen_after
-        self._x, self._y = (_FrozenCode(name, patience) for name in names)
+        self._x, self._y = (_FrozenCode(name, patience, raw_unit) for name in names)
 
     def measure(self, pairs: Sequence[Pair], calibration: ForceCalibration) -> Measurement:
         """Means of at least one pair."""
@@ -28,7 +31,10 @@ class WindowEvaluation:
         frozen_x, frozen_y = self._x.doubt(vxs, newest), self._y.doubt(vys, newest)
         extremes = _extremes(vxs, vys, calibration)
         suspect = (
-            next(filter(None, clipped), "") or frozen_x or frozen_y or self._beyond_limit(extremes)
+            next(filter(None, clipped), "")
+            or frozen_x
+            or frozen_y
+            or self._beyond_limit(extremes, calibration)
         )
         return Measurement(newest, fx, fy, count, suspect, extremes)
 
@@ -37,7 +43,11 @@ class WindowEvaluation:
         self._x.forget()
         self._y.forget()
 
-    def _beyond_limit(self, found: Extremes) -> str:
+    def unit(self, calibration: ForceCalibration) -> str:
+        """Of the forces that this calibration gives."""
+        return self._raw_unit if calibration.untouched else "N"
+
+    def _beyond_limit(self, found: Extremes, calibration: ForceCalibration) -> str:
         limit = self._limit
         for name, low, high in (
             ("F_x", found.fx_min, found.fx_max),
@@ -45,7 +55,10 @@ class WindowEvaluation:
         ):
             if not (low >= -limit and high <= limit):
                 force = high if high > limit else low
-                return f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
+                said = f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
+                if calibration.untouched:
+                    said += f" (not calibrated: 1 {self._raw_unit} counts as 1 N)"
+                return said
         return ""
 
 
@@ -60,8 +73,9 @@ def _extremes(
 class _FrozenCode:
     """Whether one channel says the same for too long."""
 
-    def __init__(self, name: str, patience: float) -> None:
+    def __init__(self, name: str, patience: float, unit: str) -> None:
         self._name = name
+        self._unit = unit
         self._patience = patience
         self.forget()
 
@@ -79,7 +93,7 @@ class _FrozenCode:
         still = newest - self._since
         if still < self._patience:
             return ""
-        return f"{self._name} has been frozen at {last:+.6g} V for {still:.1f} s"
+        return f"{self._name} has been frozen at {last:+.6g} {self._unit} for {still:.1f} s"
 
 
 class VoltageWatch:

@@ -5,6 +5,7 @@ from typing import Any
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock
+from fishd.core.foreign_code import contained
 from fishd.hardware.driver import ServoDriver
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import ServoSettings
@@ -59,12 +60,12 @@ class CalibratedServo:
 
         Raises `ServoError` when the servo cannot be reached, and for an angle that it must not get.
         """
-        self.driver.write(pulses.pulse_width(self._settings, angle))
+        contained(self.driver.write, pulses.pulse_width(self._settings, angle))
 
     def release(self) -> None:
         """Stop the pulses; may be called twice. Raises `ServoError`."""
-        self.driver.off()
+        contained(self.driver.off)
 
     def close(self) -> None:
         """Release the servo and let go of it; may be called twice. Raises `ServoError`."""
-        self.driver.close()
+        contained(self.driver.close)

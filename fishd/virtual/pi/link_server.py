@@ -46,7 +46,7 @@ class LinkServer:
         Raises `StartupError` when another virtual Pi listens there or the place cannot be used.
         """
         path = self._path.resolve()  # a symbolic link leads to the same virtual Pi
-        advice = "stop it, or give this one another virtual_pi.socket"
+        advice = "end it, or give this one another virtual_pi.socket"
         with ExitStack() as stack:
             stack.enter_context(claimed(path, str(path), "another virtual Pi", advice))
             stack.enter_context(self._pi)

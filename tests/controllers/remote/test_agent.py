@@ -217,7 +217,10 @@ def test_a_socket_that_anyone_listens_at_is_not_taken(tmp_path: Path) -> None:
         ("tcp://127.0.0.1", "tcp://HOST:PORT or ipc://PATH is needed"),
         ("ipc://@hidden", "tcp://HOST:PORT or ipc://PATH is needed"),
         ("ipc:///" + 119 * "a", "at most 107 bytes, this one has 120"),
-        ("ipc:///nowhere/agent", "choose an address in a folder that exists"),
+        (
+            "ipc:///nowhere/agent",
+            "choose an address in a folder that exists and that you may write to",
+        ),
         ("tcp://nowhere.invalid:*", "No such device"),
     ],
 )

@@ -198,7 +198,7 @@ def test_each_measurement_is_right_none_is_of_the_future_and_it_recovers(
 def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
     window: list[tuple[int, int]], calibration: ForceCalibration
 ) -> None:
-    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=1e4), ("F_x", "F_y"))
+    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=1e4), ("F_x", "F_y"), "V")
     measured = evaluation.measure(as_pairs(window), calibration)
     forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
     assert measured.fx == pytest.approx(sum(fx for fx, _ in forces) / len(window), abs=1e-9)
@@ -211,7 +211,7 @@ def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
 def test_a_window_is_suspect_exactly_if_a_force_is_beyond_the_limit(
     window: list[tuple[int, int]], calibration: ForceCalibration, limit: float
 ) -> None:
-    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=limit), ("F_x", "F_y"))
+    evaluation = WindowEvaluation(ForceSensorSettings(force_limit=limit), ("F_x", "F_y"), "V")
     measured = evaluation.measure(as_pairs(window), calibration)
     forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
     assert bool(measured.suspect) == any(max(abs(fx), abs(fy)) > limit for fx, fy in forces)

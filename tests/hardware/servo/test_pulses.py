@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
-from fishd.core.errors import ServoError
+from fishd.core.errors import Escaped, ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pulses import LONGEST, SHORTEST, pulse_width, reach
 from fishd.hardware.settings import ServoSettings
@@ -30,6 +30,17 @@ def servo(calibration: ServoCalibration | None = None, centre: float = 1500.0) -
     settings = ServoSettings(centre=centre)
     given = calibration or ServoCalibration()
     return CalibratedServo(Recorder, settings, given, VirtualClock(), threaded=False, tick=0.05)
+
+
+@pytest.mark.parametrize("method", ["write", "off", "close"])
+def test_a_driver_that_wants_to_end_the_process_is_an_error_like_any_other(method: str) -> None:
+    def leave(*_: float) -> None:
+        raise SystemExit(3)
+
+    made = servo()
+    setattr(made.driver, method, leave)
+    with pytest.raises(Escaped, match="SystemExit: 3"):
+        {"write": lambda: made.write(0.1), "off": made.release, "close": made.close}[method]()
 
 
 def test_trim_direction_and_scale_come_from_the_calibration() -> None:

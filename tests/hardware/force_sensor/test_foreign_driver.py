@@ -1,0 +1,95 @@
+"""A force sensor of another package, whose driver may raise anything anywhere."""
+
+import itertools
+from typing import Any
+
+import pytest
+
+from fishd.core.calibration import ForceCalibration
+from fishd.core.clock import VirtualClock
+from fishd.core.errors import SensorError
+from fishd.hardware.driver import ForceSensorDriver, ForceSensorSettings, Pair
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+
+TICK = 0.05
+GRAMS_PER_NEWTON = 102.0
+
+
+class Balance(ForceSensorDriver[ForceSensorSettings]):
+    """Weighs in grams, and raises `error` in the methods that `broken` names."""
+
+    Settings = ForceSensorSettings
+    raw_unit = "g"
+    place = "the balance"
+    broken: tuple[str, ...] = ()
+    error: BaseException = SystemExit(3)
+    grams = 1.0
+
+    def _met(self, method: str) -> None:
+        if method in self.broken:
+            raise self.error
+
+    def open(self) -> None:
+        self._met("open")
+
+    def sample(self) -> Pair:
+        self._met("sample")
+        begun = self.clock.monotonic()
+        self.clock.sleep(0.002)
+        self.grams = -self.grams  # which no frozen code does
+        return Pair(begun, self.clock.monotonic(), self.grams, 0.5 * self.grams)
+
+    def close(self) -> None:
+        self._met("close")
+
+    def explain(self, error: Exception) -> str:
+        self._met("explain")
+        return f"the balance says nothing: {error}"
+
+    @classmethod
+    def pair_rate(cls, settings: ForceSensorSettings) -> float:
+        return 500.0
+
+
+def opened(**settings: Any) -> tuple[Balance, SampledSensor]:
+    clock = VirtualClock()
+    balance = Balance(ForceSensorSettings(driver="balance", **settings), clock)
+    sensor = SampledSensor(balance, ForceCalibration(), clock, threaded=False, tick=TICK)
+    return balance, sensor
+
+
+@pytest.mark.parametrize("error", [SystemExit(3), StopIteration(), OSError(9, "closed")])
+@pytest.mark.parametrize(
+    "broken", [("sample",), ("open", "sample"), ("sample", "close"), ("sample", "explain", "close")]
+)
+def test_whatever_it_raises_is_told_and_samples_come_again(
+    broken: tuple[str, ...], error: BaseException
+) -> None:
+    balance, sensor = opened()
+    times = (TICK * number for number in itertools.count(1))
+    assert sensor.read(next(times)).samples
+    balance.broken, balance.error = broken, error
+    said = set()
+    for _ in range(10):
+        try:
+            sensor.read(next(times))
+        except SensorError as found:
+            said.add(str(found))
+    expected = "the balance says nothing" if "explain" not in broken else type(error).__name__
+    assert any(expected in line for line in said), said
+    balance.broken = ()
+    assert any(sensor.read(next(times)).samples for _ in range(20))
+    balance.broken = ("close",)
+    sensor.close()
+
+
+def test_until_it_is_calibrated_forces_are_in_its_own_unit() -> None:
+    balance, sensor = opened(force_limit=5.0)
+    balance.grams = 60.0
+    assert sensor.unit == "g"
+    suspect = sensor.read(TICK).suspect
+    assert suspect.endswith("force_sensor.force_limit, 5 N (not calibrated: 1 g counts as 1 N)")
+    newtons = 1.0 / GRAMS_PER_NEWTON
+    sensor.recalibrate(ForceCalibration(xx=newtons, yy=newtons, loads=5))
+    assert sensor.unit == "N"
+    assert not sensor.read(2 * TICK).suspect
