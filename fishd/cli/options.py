@@ -121,14 +121,15 @@ class _ControllerCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """A word that begins as a name and `=` is an option whose dashes were left out."""
-        pairs = (word.partition("=") for word in args)
-        return super().parse_args(
-            ctx,
-            [
-                f"--{name.replace('_', '-')}={value}" if equals and name.isidentifier() else word
-                for word, (name, equals, value) in zip(args, pairs, strict=True)
-            ],
-        )
+        options = (param for param in self.params if isinstance(param, click.Option))
+        take_value = {name for option in options if not option.is_flag for name in option.opts}
+        words = []
+        for before, word in zip(["", *args], args, strict=False):
+            name, equals, value = word.partition("=")
+            if equals and name.isidentifier() and before not in take_value:
+                word = f"--{name.replace('_', '-')}={value}"
+            words.append(word)
+        return super().parse_args(ctx, words)
 
 
 class ControllerGroup(click.Group):

@@ -27,6 +27,11 @@ FRESH = 10.0
 LOADING = 10.0
 """How long a controller may take to load, and a file to be written [s]."""
 
+BEGINNINGS = {"set-controller", "clear-fault", "calibrate-servo"}
+"""Operations after which a fish at rest moves, or its servo gets pulses."""
+WAITED = 5.0
+"""One of these that waited longer is refused: whoever asked may have given up [s]."""
+
 RequestId = int | Annotated[str, Meta(max_length=256)] | None
 
 Line = Annotated[str, Meta(max_length=1000, pattern=PRINTABLE)]

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import math
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -55,15 +56,16 @@ class ControlServer:
             task.cancel()
 
     async def _answer(self, number: int, payload: bytes) -> None:
-        for part in link.reply(number, await self._reply(payload)):
+        for part in link.reply(number, await self._reply(1e-9 * number, payload)):
             while not self.send(part):  # a reply that is not whole would never make room for more
                 await asyncio.sleep(_NO_ROOM)
 
-    async def _reply(self, payload: bytes) -> bytes:
+    async def _reply(self, came: float, payload: bytes) -> bytes:
         identity: protocol.RequestId = None
         try:
             request = protocol.decode_request(payload)
             identity = request.id
+            _check_age(request.op, time.monotonic() - came)
             return protocol.success(identity, await self._perform(request.op, request.args))
         except Refused as error:
             return protocol.failure(identity, error)
@@ -71,3 +73,12 @@ class ControlServer:
             log.exception("a request failed")
             internal = Refused("internal", f"fishd failed: {text.named(error)}")
             return protocol.failure(identity, internal)
+
+
+def _check_age(operation: str, seconds: float) -> None:
+    """Raises `Refused` for what would begin to move a fish that was left alone meanwhile."""
+    if operation in protocol.BEGINNINGS and seconds > protocol.WAITED:
+        raise Refused(
+            "stale",
+            f"this {operation} waited for {seconds:.0f} s, as fishd stood still; ask again",
+        )

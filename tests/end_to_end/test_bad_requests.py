@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import threading
 import time
 from typing import Any
@@ -10,6 +11,8 @@ import msgspec
 import pytest
 import zmq
 from rigs.processes import PATIENCE, Daemon, Subscriber
+
+from fishd.core.protocol import WAITED
 
 
 def ask(socket: "zmq.Socket[bytes]", payload: bytes) -> dict[str, Any]:
@@ -107,6 +110,24 @@ def shoot(daemon: Daemon, seconds: float) -> None:
                         break
             socket.send(b"half a message", zmq.SNDMORE | zmq.DONTWAIT)
     context.destroy(linger=0)
+
+
+def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_that_was_asked_for_before(
+    own_daemon: Daemon,
+) -> None:
+    own_daemon.process.send_signal(signal.SIGSTOP)
+    with own_daemon.socket() as socket:
+        swing = {"v": 1, "id": 1, "op": "set-controller", "args": {"name": "swing"}}
+        socket.send(msgspec.json.encode(swing))
+        socket.send(b'{"v":1,"id":2,"op":"stop"}')
+        time.sleep(WAITED + 0.5)
+        own_daemon.process.send_signal(signal.SIGCONT)
+        replies = {reply["id"]: reply for reply in (json.loads(socket.recv()) for _ in range(2))}
+    assert replies[2]["ok"]
+    assert replies[1]["error"]["code"] == "stale"
+    assert replies[1]["error"]["message"].endswith("as fishd stood still; ask again")
+    assert own_daemon.status().mode == "idle"
+    assert own_daemon.fishctl("set-controller", "swing").returncode == 0
 
 
 @pytest.mark.realtime

@@ -35,7 +35,10 @@ def frames(message: bytes) -> list[bytes]:
 
 
 def request(number: int, payload: bytes) -> bytes:
-    """A client's request; replies to it carry the same number."""
+    """A client's request; replies to it carry the same number.
+
+    number: when it came [ns, monotonic], another one for each
+    """
     return REQUEST + number.to_bytes(8, "big") + payload
 
 

@@ -77,7 +77,8 @@ class Router:
         """What the reply to a request needs, by its number."""
         self._open = 0
         self._replies = Replies()
-        self._number = time.monotonic_ns()  # a gateway before this one had other numbers
+        self._number = 0
+        """When the latest request came [ns, monotonic]; no two have the same."""
         self._next_purge = 0.0
         self._ended = False
 
@@ -141,7 +142,7 @@ class Router:
             if client.may_refuse(now):
                 self._answer(envelope, protocol.failure(protocol.request_id(payload), error))
             return
-        self._number += 1
+        self._number = max(self._number + 1, time.monotonic_ns())
         self._envelopes[self._number] = envelope
         message = request(self._number, payload)
         if urgent:

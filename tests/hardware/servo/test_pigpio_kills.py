@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 from rigs.pigpio_rig import GPIO, Bench, connect, script_of
 
+from fishd.core.errors import Escaped
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio_client import TimedSocket
 
@@ -117,7 +118,7 @@ def die_at(
     kill_after(n)
     try:
         deed(bench)
-    except Killed:
+    except (Killed, Escaped):
         return True
     finally:
         kill_after(None)
