@@ -190,7 +190,9 @@ def test_another_active_agent_is_named(env: SwimEnv, fish: Fish, tmp_path: Path)
     with Agent(f"ipc://{tmp_path}/other") as other:
         fish.set_controller("remote", agent=other.address)
         with losing(f"another agent has taken command: {other.address}"):
-            env.reset()
+            for _ in range(100):  # until it has been told
+                env.reset()
+                time.sleep(0.02)
 
 
 @pytest.mark.realtime
