@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd.assembly import build_loop, open_in_virtual_time
 from fishd.config import Config
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
@@ -23,7 +24,6 @@ from fishd.hardware.base import Robot
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.plant.optimum import best_square_wave
 from fishd.virtual.plant.tethered import TrueWindow
-from fishd.wiring import build_loop, open_in_virtual_time
 
 LONGEST = 1e8
 """Runs are shorter than this [s]: three years."""

@@ -1,4 +1,4 @@
-"""The configuration file: YAML in, one frozen `Config` out, or one line that says what is wrong.
+"""The sections of the configuration, and how a file with its overrides becomes a `Config`.
 
 Each section is a struct of the part that it configures; this module only puts them together.
 """

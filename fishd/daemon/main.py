@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 
-from fishd import __version__, wiring
+from fishd import __version__, assembly
 from fishd.config import Config, load
 from fishd.control.loop import SETTLING
 from fishd.controllers import registry
@@ -76,8 +76,8 @@ class Daemon:
             self._mock_ticks = None if config.lockstep else mock_ticks(config)
             controllers = registry.describe_all()  # imports what other packages offer
             preload()  # which would hold up the ticks later
-            robot = wiring.open_robot(config, self._clock, stack, self._file)
-            self._loop = wiring.build_loop(
+            robot = assembly.open_robot(config, self._clock, stack, self._file)
+            self._loop = assembly.build_loop(
                 config, robot, self._clock, self._telemetry, self._notifier.ticked
             )
             stack.callback(self._loop.close)
@@ -85,7 +85,7 @@ class Daemon:
             if robot.panel:
                 robot.panel.on_press = self._on_press
             calibration_requests = CalibrationRequests(
-                self._loop, self._clock, config, wiring.state_folder(config)
+                self._loop, self._clock, config, assembly.state_folder(config)
             )
             fifo = not config.lockstep and realtime.enter(
                 config.realtime.priority, config.realtime.lock_memory

@@ -8,12 +8,12 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
+from fishd.assembly import build_loop
 from fishd.config import Config, Start
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.gateway.link import pair
 from fishd.virtual.fish import SimulatedFish
-from fishd.wiring import build_loop
 
 SHORTEST_TICK = 0.01
 """Faster loops keep their caches warm by themselves [s]."""

@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
+from fishd.assembly import state_folder
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import Refused
 from fishd.core.protocol import (
@@ -20,7 +21,6 @@ from fishd.core.protocol import (
     Tare,
 )
 from fishd.daemon.calibration_requests import MOST_SAMPLES, CalibrationRequests
-from fishd.wiring import state_folder
 
 ANOTHER_BUS = ("force_sensor.bus=2", "virtual_pi.bus=2")
 BRIEFLY = SampleForce(seconds=0.2)

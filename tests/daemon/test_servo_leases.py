@@ -9,12 +9,12 @@ import pytest
 from msgspec.structs import asdict
 from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
+from fishd.assembly import state_folder
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import Refused
 from fishd.core.protocol import LEASE
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.requests import Operations
-from fishd.wiring import state_folder
 
 WIDE = ServoCalibration(trim=30.0, lowest=-3.0, highest=3.0)
 

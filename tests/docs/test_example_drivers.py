@@ -19,7 +19,7 @@ from rigs.example_packages import (
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.pca9685_chip import AUTO_INCREMENT, LED0, MODE1, PRE_SCALE, RESTART, SLEEP, Pca9685Chip
 
-from fishd import wiring
+from fishd import assembly
 from fishd.config import load
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
@@ -213,11 +213,11 @@ def test_a_second_fishd_on_the_same_chip_is_refused(
 ) -> None:
     config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])
     with (
-        ownership.owned(wiring.parts_of(config)[part : part + 1]),
+        ownership.owned(assembly.parts_of(config)[part : part + 1]),
         ExitStack() as stack,
         pytest.raises(StartupError, match=complaint),
     ):
-        wiring.open_robot(config, VirtualClock(), stack)
+        assembly.open_robot(config, VirtualClock(), stack)
     for name in ("gpio2[567]", "i2c-17[78]*"):
         for lock in ownership.FOLDER.glob(f"fishd-{name}.lock"):
             lock.unlink()

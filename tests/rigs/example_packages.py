@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fishd.assembly import assemble
 from fishd.core.clock import VirtualClock
 from fishd.hardware.base import Robot
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS
@@ -20,7 +21,6 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import Tank
 from fishd.virtual.pi.virtual_pi import VirtualPi
-from fishd.wiring import assemble
 from rigs.documents import ROOT
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.lockstep_rig import LockstepRig

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from fishd.assembly import build_loop
 from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
@@ -11,7 +12,6 @@ from fishd.core.clock import Slot, VirtualClock
 from fishd.core.signals import Event, Measurement, Observation, Tick
 from fishd.hardware.base import Robot
 from fishd.virtual.fish import SimulatedFish
-from fishd.wiring import build_loop
 
 
 class Recorder:

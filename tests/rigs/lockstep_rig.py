@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from fishd.assembly import open_in_virtual_time
 from fishd.hardware.base import Robot
-from fishd.wiring import open_in_virtual_time
 from rigs.harness import Rig
 
 GPIO = 18

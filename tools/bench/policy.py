@@ -20,6 +20,7 @@ from common.daemon import Fishd
 from common.machine import machine_in_short
 from common.report import Options, Report, quantile, table
 from fishd import __version__
+from fishd.assembly import build_loop
 from fishd.config import Config, load
 from fishd.control.loop import ControlLoop
 from fishd.controllers import registry
@@ -28,7 +29,6 @@ from fishd.controllers.policy.network import to_onnx
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Percentiles, Tick
 from fishd.virtual.fish import SimulatedFish
-from fishd.wiring import build_loop
 
 DOCUMENT = "policies.md"
 GOAL = 50.0

@@ -20,6 +20,7 @@ from msgspec import Struct
 
 from common.machine import PRIORITY, fifo_permitted, machine_in_short, priorities, scheduling
 from common.report import Options, Report, progress, table
+from fishd.assembly import build_loop
 from fishd.config import Config, load
 from fishd.controllers.remote.controller import Remote, RemoteParameters
 from fishd.core.clock import SystemClock, Ticker
@@ -28,7 +29,6 @@ from fishd.daemon import realtime
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.warm_up import mock_ticks
 from fishd.virtual.fish import SimulatedFish
-from fishd.wiring import build_loop
 
 DOCUMENT = "remote.md"
 GOAL = 2e-3

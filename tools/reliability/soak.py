@@ -25,6 +25,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from common.report import BrokenPromise, Options, Report, progress
+from fishd.assembly import build_loop, open_in_virtual_time
 from fishd.config import Config, load
 from fishd.control.loop import ControlLoop
 from fishd.core.calibration import ForceCalibration
@@ -37,7 +38,6 @@ from fishd.virtual.pi.ads1115 import Ads1115Chip
 from fishd.virtual.pi.faults import FAULTS, INSTANTANEOUS, Faults
 from fishd.virtual.pi.i2c import I2cBus
 from fishd.virtual.pi.linux_i2c import LinuxI2c
-from fishd.wiring import build_loop, open_in_virtual_time
 from reliability.soak_memory import Memory
 from reliability.soak_troubles import Counting, Rest, Saboteur, misuse
 

@@ -1,4 +1,4 @@
-"""What a check of `fishctl doctor` is given, and what it returns."""
+"""What all checks of `fishctl doctor` look at: the configuration, the machine, and a running fishd."""
 
 import os
 import shlex
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from fishd import wiring
+from fishd import assembly
 from fishd.client import Fish
 from fishd.config import Config
 from fishd.core.addresses import find_control, socket_path
@@ -147,7 +147,7 @@ class Context(Machine):
     def owner(self) -> str:
         """Which fishd, at whatever endpoint, drives a part of this robot; empty where none does."""
         try:
-            return ownership.owner(wiring.parts_of(self.config))
+            return ownership.owner(assembly.parts_of(self.config))
         except StartupError:  # where a virtual Pi would be is no good place; the check will say so
             return ""
 
@@ -188,7 +188,7 @@ class Context(Machine):
         """Where the robot is a virtual Pi: with its bus in this process. Raises `StartupError`."""
         with ExitStack() as stack:
             if self.robot == "virtual-pi":
-                wiring.plug_in_virtual_pi(self.config, stack)
+                assembly.plug_in_virtual_pi(self.config, stack)
             yield
 
     @property

@@ -6,12 +6,12 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
+from fishd.assembly import state_folder
 from fishd.cli.doctor.base import Context
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.checks import Check, Result, fail, name_of, ok, skipped, warning
-from fishd.wiring import state_folder
 
 LITTLE_DISK, NO_DISK = 1e9, 50e6
 """Free space that is worth a warning, and that is too little [bytes]."""

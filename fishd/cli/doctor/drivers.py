@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+from fishd.assembly import open_sensor
 from fishd.cli.doctor.base import Context
 from fishd.config.drivers import claims_of
 from fishd.core.clock import SystemClock
@@ -17,7 +18,6 @@ from fishd.hardware.checks import START_VIRTUAL_PI, Check, Result, fail, ok, ski
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
-from fishd.wiring import open_sensor
 
 TRIAL = 1.0
 """How long the sensor is tried [s]."""

@@ -130,6 +130,7 @@ class SampledSensor:
         self._step_time = 0.0
         self._place = driver.place
         self._transport = driver.transport
+        self._own_counters = driver.counters
         self._sampler = Sampler(driver, clock)
         self._evaluation = WindowEvaluation(driver.settings, driver.names, driver.raw_unit)
         self._latest: Measurement | None = None
@@ -190,6 +191,7 @@ class SampledSensor:
         return {
             f"{transport}_errors": sampler.errors,
             f"{transport}_reconnects": sampler.reconnects,
+            **self._own_counters(),
         }
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd.assembly import build_loop
 from fishd.config import Config, Start
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
@@ -15,7 +16,6 @@ from fishd.core.signals import Event, Observation, Tick
 from fishd.learning.env.link import LinkLost, StepResult
 from fishd.learning.settings import Randomisation
 from fishd.virtual.fish import SimulatedFish
-from fishd.wiring import build_loop
 
 _VARIED = ("omega0", "xi", "servo_speed", "coupling")
 """Parameters of the plant that a randomisation has a share for."""

@@ -42,6 +42,9 @@ class Balance(ForceSensorDriver[ForceSensorSettings]):
     def close(self) -> None:
         self._met("close")
 
+    def counters(self) -> dict[str, int]:
+        return {"balance_taps": 3}
+
     def explain(self, error: Exception) -> str:
         self._met("explain")
         return f"the balance says nothing: {error}"
@@ -79,6 +82,7 @@ def test_whatever_it_raises_is_told_and_samples_come_again(
     assert any(expected in line for line in said), said
     balance.broken = ()
     assert any(sensor.read(next(times)).samples for _ in range(20))
+    assert sensor.counters()["balance_taps"] == 3
     balance.broken = ("close",)
     sensor.close()
 
