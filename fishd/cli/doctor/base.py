@@ -1,4 +1,4 @@
-"""What all checks of `fishctl doctor` look at: the configuration, the machine, and a running fishd."""
+"""What all checks of `fishctl doctor` look at: configuration, machine, and a running fishd."""
 
 import os
 import shlex
