@@ -147,16 +147,16 @@ def numbers() -> Outcome:
 
 
 def loading() -> Outcome:
-    """Loads that never end: each is refused, and the next ones find room.
+    """Loads that never end: each is refused, and others load.
 
-    Those that only wait have a fishd of their own beside that of those that compute: so one core is
-    left for who asks.
+    Three fishds at once. Those that compute for ever share one: a core is left for who asks.
     """
-    cases = [(method, way) for method in ("check", "__init__") for way in HANGS]
-    waiting = [case for case in cases if case[1] in ("sleep", "block")]
-    computing = [case for case in cases if case not in waiting]
-    with ThreadPool(2) as pool:
-        found = pool.map(refused_loads, (waiting, computing))
+    cases = [(method, way) for way in HANGS for method in ("check", "__init__")]
+    computing = [case for case in cases if case[1] == "loop"]
+    waiting = [case for case in cases if case[1] != "loop"]
+    groups = computing, waiting[:MOST_AT_ONCE], waiting[MOST_AT_ONCE:]
+    with ThreadPool(len(groups)) as pool:
+        found = pool.map(refused_loads, groups)
     ended, times, statuses = zip(*found, strict=True)
     does, what = f"refusal `too-slow` after {LOADING:g} s; others load", "a load that never ends"
     return Outcome(what, does, len(cases), sum(ended), max(times), sorted(set(statuses)))
@@ -164,15 +164,11 @@ def loading() -> Outcome:
 
 def refused_loads(cases: list[tuple[str, str]]) -> tuple[int, float, int]:
     """How many loads were not refused, the time to the end of fishd [s], its exit status."""
-    ended = 0
-    with running() as (fishd, fish):
-        for begin in range(0, len(cases), MOST_AT_ONCE):
-            some = cases[begin : begin + MOST_AT_ONCE]
-            with ThreadPool(len(some)) as pool:
-                refusals = pool.map(partial(refusal_of_load, fishd.endpoint), some)
-            ended += len(some) - refusals.count("too-slow")
+    with running() as (fishd, fish), ThreadPool(len(cases)) as pool:
+        refusals = pool.map(partial(refusal_of_load, fishd.endpoint), cases)
         fish.set_controller("square")
         await_mode(fish, "running")
+        ended = len(cases) - refusals.count("too-slow")
         return ended, fishd.end(signal.SIGTERM), fishd.process.returncode
 
 
