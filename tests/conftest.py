@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.runner import runtestprotocol
 from hypothesis import settings
 
 # One process per core computes; before numpy or torch is loaded, here and in what tests start.
@@ -19,6 +20,9 @@ for variable in ("COLUMNS", "LINES"):  # which workers have; a terminal says its
 # How long an example takes says something of the machine only.
 settings.register_profile("fishd", deadline=None)
 settings.load_profile("fishd")
+
+STOLEN = 0.03
+"""A test that fails is judged again if so much was stolen meanwhile [s]."""
 
 SLOW = re.compile(
     r"subprocess|multiprocessing|asyncio|time\.sleep|SystemClock|running\("
@@ -57,6 +61,31 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes longest begins first: so no core waits for it at the end."""
     items.sort(key=lambda item: "end_to_end" not in item.nodeid)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """What judges real time is judged again if it fails while the host of a virtual machine takes
+    processor time away: that says nothing of fishd. Elsewhere nothing is ever tried twice.
+    """
+    if not item.get_closest_marker("realtime"):
+        return None
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for _ in range(3):
+        before = stolen()
+        reports = runtestprotocol(item, log=False, nextitem=nextitem)
+        if stolen() - before < STOLEN or not any(report.failed for report in reports):
+            break
+        item.session._setupstate.teardown_exact(None)
+    for report in reports:
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def stolen() -> float:
+    """Processor time that the host has given to others, of all cores since start [s]."""
+    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
 
 
 @pytest.hookimpl(wrapper=True)
