@@ -133,10 +133,9 @@ class Daemon(Process):
 
     def at_rest(self) -> Self:
         """The same one as at its start, whatever a controller or an emergency stop has done."""
-        with Fish(self.endpoint) as fish:
+        with Fish(self.endpoint, timeout=PATIENCE) as fish:
             fish.stop()
-            fish.clear_fault()
-            wait_until(lambda: _rests(fish.status()))
+            wait_until(lambda: _rests(fish))
         return self
 
     def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -160,7 +159,9 @@ class Daemon(Process):
         self.process.wait(PATIENCE)
 
 
-def _rests(status: Status) -> bool:
+def _rests(fish: Fish) -> bool:
+    fish.clear_fault()  # that of the test before, or one that a busy machine brought since
+    status = fish.status()
     return status.mode == "idle" and status.servo_on and status.phi_c == 0.0
 
 
