@@ -25,7 +25,7 @@ from fishd.core.signals import Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.driver import ServoDriver
+from fishd.hardware.driver import ServoDriver, survived
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
@@ -216,7 +216,7 @@ def assemble(
         log.warning("%s", line)
 
     def degraded() -> tuple[str, ...]:
-        lines = servo.driver.degraded
+        lines = tuple(servo.driver.degraded)
         if sensor.calibration.untouched:
             shown = f"the force is not calibrated, and shown in {sensor.unit}"
             lines += (f"{shown}: fishctl calibrate force",)
@@ -231,7 +231,7 @@ def assemble(
         panel=panel,
         calibrated=CalibratedParts(sensor, servo, tell_release),
         degraded=degraded,
-        counters=lambda: {**sensor.counters(), **servo.driver.counters()},
+        counters=lambda: {**sensor.counters(), **survived(servo.driver)},
         countdown=servo.driver.countdown,
     )
 

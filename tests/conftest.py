@@ -58,15 +58,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return whole or bool(SLOW.search(collection_path.read_text(encoding="utf-8"))) or None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes longest begins first: so no core waits for it at the end."""
-    items.sort(key=lambda item: "end_to_end" not in item.nodeid)
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """What judges real time is judged again if it fails while the host of a virtual machine takes
-    processor time away: that says nothing of fishd. Elsewhere nothing is ever tried twice.
+    """What judges real time is judged again, and that is said, if it fails while the host of a
+    virtual machine takes processor time away: that says nothing of fishd. Nothing else is ever
+    tried twice.
     """
     if not item.get_closest_marker("realtime"):
         return None
@@ -76,6 +72,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
         if stolen() - before < STOLEN or not any(report.failed for report in reports):
             break
+        if terminal := item.config.pluginmanager.get_plugin("terminalreporter"):
+            taken = f"failed while the host took {stolen() - before:.2f} s away: judged again"
+            terminal.write_line(f"\n{item.nodeid}: {taken}")
         item.session._setupstate.teardown_exact(None)
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)

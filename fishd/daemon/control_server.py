@@ -80,5 +80,6 @@ def _check_age(operation: str, seconds: float) -> None:
     if operation in protocol.BEGINNINGS and seconds > protocol.WAITED:
         raise Refused(
             "stale",
-            f"this {operation} waited for {seconds:.0f} s, as fishd stood still; ask again",
+            f"this {operation} waited for {seconds:.0f} s, as fishd stood still or was flooded;"
+            " ask again",
         )

@@ -1,5 +1,6 @@
 """What a check of `fishctl doctor` is given, and what it returns."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -19,16 +20,16 @@ class Result(NamedTuple):
     mend: str = ""
 
 
-class Machine:
+class Machine(ABC):
     """The computer that the robot is wired to."""
 
     root: Path = Path("/")
     """Where /sys, /proc, /dev and so on are looked for."""
 
     @property
+    @abstractmethod
     def robot(self) -> str:
         """`pi` or `virtual-pi`."""
-        raise NotImplementedError
 
     @property
     def model(self) -> str:
@@ -46,12 +47,12 @@ class Machine:
         except OSError:
             return ""
 
+    @abstractmethod
     def occupied(self, by_fishd: str) -> Result | None:
         """Why a check leaves the hardware alone; None where no fishd uses it.
 
         by_fishd: what to say of a running fishd, such as `owns the bus`
         """
-        raise NotImplementedError
 
     def plugged_in(self) -> AbstractContextManager[Any]:
         """Within, the I2C buses and pins are those of the robot, a virtual one's too.

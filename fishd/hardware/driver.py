@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from fishd.core.clock import Clock
+from fishd.core.foreign_code import contained
 from fishd.core.schema import Problem, note, unit
 from fishd.hardware.checks import Check, Machine, Result
 from fishd.hardware.settings import ForceSensorSettings, Gpio, ServoSettings
@@ -83,7 +84,15 @@ class Driver(ABC, Generic[S]):
         return ()
 
     def counters(self) -> dict[str, int]:
-        """Errors that were survived, since start."""
+        """Errors that were survived, since start; called from the thread that ticks."""
+        return {}
+
+
+def survived(driver: Driver[Any]) -> dict[str, int]:
+    """The counters of a driver; none where it cannot say them, which must not end fishd."""
+    try:
+        return {str(name): int(count) for name, count in contained(driver.counters).items()}
+    except Exception:
         return {}
 
 

@@ -64,7 +64,7 @@ class Pca9685(ServoDriver[Pca9685Settings]):
 
     def open(self) -> None:
         """Look for the chip and change nothing, or go on without; ImportError without a library."""
-        import adafruit_extended_bus  # noqa: F401
+        import adafruit_extended_bus  # noqa: F401  (is it there?)
 
         self._chip: Chip | None = None
         self._driving = False

@@ -17,7 +17,7 @@ from fishd.core.clock import Clock
 from fishd.core.errors import SensorError
 from fishd.core.foreign_code import contained
 from fishd.core.signals import Measurement
-from fishd.hardware.driver import ForceSensorDriver, Pair
+from fishd.hardware.driver import ForceSensorDriver, Pair, survived
 from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
 
 REMEMBERED = 4096
@@ -130,7 +130,7 @@ class SampledSensor:
         self._step_time = 0.0
         self._place = driver.place
         self._transport = driver.transport
-        self._own_counters = driver.counters
+        self._driver = driver
         self._sampler = Sampler(driver, clock)
         self._evaluation = WindowEvaluation(driver.settings, driver.names, driver.raw_unit)
         self._latest: Measurement | None = None
@@ -191,7 +191,7 @@ class SampledSensor:
         return {
             f"{transport}_errors": sampler.errors,
             f"{transport}_reconnects": sampler.reconnects,
-            **self._own_counters(),
+            **survived(self._driver),
         }
 
     def close(self) -> None:

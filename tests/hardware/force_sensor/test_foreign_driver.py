@@ -43,6 +43,7 @@ class Balance(ForceSensorDriver[ForceSensorSettings]):
         self._met("close")
 
     def counters(self) -> dict[str, int]:
+        self._met("counters")
         return {"balance_taps": 3}
 
     def explain(self, error: Exception) -> str:
@@ -83,7 +84,8 @@ def test_whatever_it_raises_is_told_and_samples_come_again(
     balance.broken = ()
     assert any(sensor.read(next(times)).samples for _ in range(20))
     assert sensor.counters()["balance_taps"] == 3
-    balance.broken = ("close",)
+    balance.broken = ("close", "counters")
+    assert "balance_taps" not in sensor.counters()
     sensor.close()
 
 
