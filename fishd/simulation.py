@@ -1,12 +1,11 @@
 """A whole run in virtual time: the robot's own loop on a simulated fish, and a report."""
 
-import itertools
 import math
 import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import msgspec
 from msgspec import Struct
@@ -173,6 +172,53 @@ class EncodingPublisher:
         self._encode(event)
 
 
+class VirtualRun:
+    """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
+
+    def __init__(self, config: Config, publisher: Publisher) -> None:
+        """publisher: gets the record of every tick, and every event"""
+        self.config = config
+        clock = VirtualClock()
+        with ExitStack() as stack:
+            robot, self._take_window = _swimmer(config, stack)
+            self.loop = build_loop(config, robot, clock, publisher)
+            stack.callback(self.loop.close)
+            self._stack = stack.pop_all()
+        self._slots = virtual_slots(clock, config.tick)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the controller and the robot; may be called twice."""
+        self._stack.close()
+
+    def set_controller(self, name: str, parameters: Mapping[str, Any]) -> None:
+        """Make a controller the active one, from the next tick on.
+
+        Raises `UnknownController`, `ParameterError`, and `Refused` in mode fault.
+        """
+        limits = replace(self.config.limits, virtual=True)
+        self.loop.set_controller(name, registry.create(name, parameters, limits))
+
+    def tick(self) -> TrueWindow:
+        """One tick; what truly happened between its read and the one before."""
+        self.loop.tick(next(self._slots))
+        return self._take_window()
+
+
+def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], TrueWindow]]:
+    """What swims, and how to ask what it truly did since the last time."""
+    if config.robot == "virtual-pi":
+        robot, pi = open_in_virtual_time(config, stack)
+        return robot, pi.tank.take_window
+    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    return fish.robot(), fish.take_window
+
+
 def simulate(
     config: Config,
     name: str,
@@ -214,26 +260,22 @@ def judge(
             f"nothing is left to judge: a run of {seconds:g} s must be longer than the "
             f"{settle:g} s that it may take to settle"
         )
-    clock = VirtualClock()
     beats = Beats()
     begun = 0.0
     took_over: float | None = None
-    with ExitStack() as stack:
-        robot, take_window = _swimmer(config, stack)
-        loop = build_loop(config, robot, clock, publisher)
-        stack.callback(loop.close)
-        loop.set_controller(name, controller)
-        for slot in itertools.islice(virtual_slots(clock, config.tick), ticks):
-            if slot.index == first:  # the first ticks build what later ones reuse
+    with VirtualRun(config, publisher) as run:
+        run.loop.set_controller(name, controller)
+        for index in range(ticks):
+            if index == first:  # the first ticks build what later ones reuse
                 begun = time.perf_counter()
-            angle = loop.applied
-            loop.tick(slot)
-            window = take_window()
-            if loop.active.fallback and took_over is None:
-                took_over = slot.index * config.tick
-            if slot.index >= first:
+            angle = run.loop.applied
+            window = run.tick()
+            if run.loop.active.fallback and took_over is None:
+                took_over = index * config.tick
+            if index >= first:
                 beats.add(angle, window)
         elapsed = time.perf_counter() - begun
+        loop = run.loop
         fallback = loop.active.fallback
         successor = loop.active.name if fallback else None
 
@@ -262,12 +304,3 @@ def judge(
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )
-
-
-def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], TrueWindow]]:
-    """What swims, and how to ask what it truly did since the last time."""
-    if config.robot == "virtual-pi":
-        robot, pi = open_in_virtual_time(config, stack)
-        return robot, pi.tank.take_window
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
-    return fish.robot(), fish.take_window
