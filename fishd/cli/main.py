@@ -28,6 +28,9 @@ VERBS = {
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
+    "Measure": {
+        "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+    },
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
