@@ -12,10 +12,23 @@ from fishd.config import load
 from fishd.virtual.plant.parameters import PlantParameters
 
 if TYPE_CHECKING:
-    from fishd.lab.optimum import OptimalControl, Optima
+    from fishd.lab.optimum import Optima, OptimalControl
 
+_LARGEST = 1.57
+"""As for amplitude_limit [rad]."""
 _LEFT_OUT = ("cable_slack", "backlash", "servo_dead_zone")
 """What the closed forms and the optimal control do not know."""
+
+
+def _checked(
+    ctx: click.Context, param: click.Parameter, values: tuple[float, ...]
+) -> tuple[float, ...]:
+    for value in values:
+        if not 0.0 < value <= _LARGEST:  # NaN is not
+            raise click.BadParameter(
+                f"{value:g} is not valid: a number in (0, {_LARGEST}] is needed"
+            )
+    return values
 
 
 @click.command()
@@ -23,7 +36,8 @@ _LEFT_OUT = ("cable_slack", "backlash", "servo_dead_zone")
     "--amplitude",
     "amplitudes",
     multiple=True,
-    type=click.FloatRange(min=0.0, min_open=True, max=1.57),
+    type=float,
+    callback=_checked,
     help="Φ [rad]; default: amplitude_limit. Repeatable.",
 )
 @click.option("--control", is_flag=True, help="Find the best command of any shape, too.")
@@ -51,6 +65,7 @@ def optimum(
     --control, optimal control finds the best periodic command within ±Φ without being told its
     shape, and draws it with its costate: some seconds.
     """
+    from fishd.lab import drawing
     from fishd.lab import optimum as lab
 
     config = load(file, overrides)
@@ -58,6 +73,8 @@ def optimum(
     chosen = amplitudes or (config.amplitude_limit,)
     if control and len(chosen) > 1:
         raise click.UsageError("--control takes one --amplitude at a time")
+    if control:
+        drawing.check(figure)
     best = lab.best_square_waves(plant, chosen)
     fast, slow = lab.fast_servo(plant, chosen), lab.slow_servo(plant, chosen)
     limit = lab.saturation_amplitude(plant)

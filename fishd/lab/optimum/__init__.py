@@ -10,8 +10,8 @@ from fishd.lab.optimum.square_waves import (
 )
 
 __all__ = [
-    "OptimalControl",
     "Optima",
+    "OptimalControl",
     "best_square_waves",
     "fast_servo",
     "optimal_control",

@@ -30,11 +30,12 @@ def draw(control: OptimalControl, path: str | os.PathLike[str]) -> None:
         angles.set_yticks((-limit, 0.0, limit), ("−Φ", "0", "Φ"))
         angles.set_ylabel(f"angle\n(Φ = {limit:g} rad)")
         costate.axhline(0.0, color="0.8", lw=0.7)
-        costate.stairs(_twice(control.costate), edges, baseline=None, color=GREEN)
+        middles = edges[:-1] + 0.5 * edges[1]
+        costate.plot(middles, _twice(control.costate), color=GREEN)
         costate.set_yticks((-1, 0, 1))
         costate.set_ylabel("costate $p$\nof the wheel (1)")
         force.axhline(0.0, color="0.8", lw=0.7)
-        force.stairs(1e3 * _twice(control.force), edges, baseline=None, color=BLACK)
+        force.plot(middles, 1e3 * _twice(control.force), color=BLACK)
         force.axhline(1e3 * control.thrust, color=ORANGE, ls=(0, (4, 2)))
         force.set_title(
             f"mean {1e3 * control.thrust:.2f} mN, {control.ratio:.2%} of the best square wave",

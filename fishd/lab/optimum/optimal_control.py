@@ -11,6 +11,7 @@ Pontryagin's principle: φ_c enters the Hamiltonian only as p Ω tanh((φ_c − 
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -32,7 +33,7 @@ _FULL = 1e-3
 """|φ_c| is Φ when it differs by less than this share."""
 _LAPS, _SETTLED = 100, 1e-12
 _LINEAR_LAG = 300.0  # in Δ; sinh does not overflow below
-_CLIMB = {"maxiter": 1000, "maxfun": 1000, "ftol": 1e-12, "gtol": 1e-9}
+_EVALUATIONS = 1000
 
 
 @dataclass(frozen=True)
@@ -104,8 +105,7 @@ def optimal_control(
     random = np.random.default_rng(seed)
     slower = min(p.omega0 / (2.0 * math.pi), p.servo_speed / (4.0 * amplitude))
     climbs = [
-        problem.climb(_command(random, intervals), start / slower, 1.0 / slower)
-        for start in STARTS
+        problem.climb(_command(random, intervals), start / slower, 1.0 / slower) for start in STARTS
     ]
     return _described(problem, max(climbs, key=lambda climb: climb.thrust), best_square)
 
@@ -175,9 +175,16 @@ class _Problem:
         lowest, highest = math.log(_SHORTEST * usual), math.log(_LONGEST * usual)
         bounds = [(-1.0, 1.0)] * self.n + [(lowest, highest)]
         start = np.append(share, math.log(period))
-        end = minimize(
-            descend, start, jac=True, method="L-BFGS-B", bounds=bounds, options=_CLIMB
-        ).x
+        options: Any = {
+            "maxiter": _EVALUATIONS,
+            "maxfun": _EVALUATIONS,
+            "ftol": 1e-12,
+            "gtol": 1e-9,
+        }
+        found: Any = minimize(
+            descend, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        )
+        end = found.x
         thrust, _, costate = self.evaluate(end)
         return _Climb(end[:-1], math.exp(end[-1]), thrust, costate)
 
@@ -271,7 +278,7 @@ def _described(problem: _Problem, climb: _Climb, best_square: SteadyState) -> Op
     reversals = np.count_nonzero(np.roll(side, 1) != side)
     return OptimalControl(
         amplitude=problem.amplitude,
-        time=interval * np.arange(problem.n),
+        time=np.arange(problem.n) * np.float64(interval),
         command=command,
         wheel=wheel,
         fin=fin,

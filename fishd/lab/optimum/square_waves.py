@@ -84,7 +84,7 @@ def _with_fast_servo(parameters: PlantParameters) -> PlantParameters:
 def _angles(amplitudes: ArrayLike) -> Array:
     angles = np.atleast_1d(np.asarray(amplitudes, dtype=np.float64))
     if angles.ndim != 1 or not np.all(angles > 0.0):
-        raise ValueError(f"amplitudes must be positive and in one row, not {amplitudes}")
+        raise ValueError(f"amplitudes must be positive and in one row, not {amplitudes!r}")
     return angles
 
 
