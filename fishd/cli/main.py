@@ -37,6 +37,7 @@ VERBS = {
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
+        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
         "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },
