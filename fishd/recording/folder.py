@@ -49,6 +49,15 @@ def runs_folder() -> Path:
     return base / "fishd/runs"
 
 
+def made(folder: Path) -> Path:
+    """The folder, once it is there; raises `RecordingError`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{folder} cannot be made: {error.strerror}") from None
+    return folder
+
+
 def new_path(folder: Path, prefix: str = "") -> Path:
     """A path for a recording that begins now, named after the date and time of this place."""
     name = f"{prefix}{datetime.now():%Y-%m-%d-%H%M%S}"

@@ -10,6 +10,8 @@ from fishd.core.errors import RecordingError
 
 PART = ".part"
 SUFFIX = ".mcap"
+MOST_WAITING = 2**18
+"""What a run in virtual time, which nobody flushes, keeps in memory at most [bytes]."""
 
 
 class PartFile:
@@ -31,7 +33,6 @@ class PartFile:
         if os.path.lexists(path):
             raise RecordingError(f"{path} is there already; choose another name")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._fd = os.open(self.path, flags, 0o666)
         except FileExistsError:
@@ -46,8 +47,10 @@ class PartFile:
         self._written = 0
 
     def write(self, data: bytes) -> int:
-        """Take bytes for the next flush."""
+        """Take whole records for the next flush; raises OSError where that is due at once."""
         self._waiting += data
+        if len(self._waiting) > MOST_WAITING:
+            self.flush()
         return len(data)
 
     def tell(self) -> int:

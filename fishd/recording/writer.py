@@ -194,14 +194,21 @@ class RunWriter:
 
     def _attach(self, name: str, media_type: str, content: bytes) -> None:
         now = time.time_ns()
-        self._writer.add_attachment(now, now, name, media_type, content)
+        try:
+            self._writer.add_attachment(now, now, name, media_type, content)
+        except OSError as error:
+            raise self._failed(error) from None
         self.flush()
 
     def _add(self, topic: str, t: float, seq: int, payload: bytes) -> None:
+        if self._closed:
+            raise RecordingError(f"{self.path}: the recording has ended")
         nanoseconds = max(0, round(t * 1e9))
-        self._writer.add_message(
-            self._channels[topic], nanoseconds, payload, nanoseconds, seq & 0xFFFFFFFF
-        )
+        channel = self._channels[topic]
+        try:
+            self._writer.add_message(channel, nanoseconds, payload, nanoseconds, seq & 0xFFFFFFFF)
+        except OSError as error:
+            raise self._failed(error) from None
 
     def _failed(self, error: OSError) -> RecordingError:
         self._give_up()

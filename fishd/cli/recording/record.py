@@ -17,7 +17,7 @@ from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import FOLDER_VARIABLE, new_path, runs_folder
+from fishd.recording.folder import FOLDER_VARIABLE, made, new_path, runs_folder
 from fishd.recording.recorder import Recorder
 
 folder_option = click.option(
@@ -95,7 +95,7 @@ def record(
     """
     if black_box and run:
         raise click.UsageError("--black-box names its files itself: leave RUN out")
-    place = folder or runs_folder()
+    place = made(folder or runs_folder())
     stopping = _Signals()
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     recorder_of = partial(Recorder, endpoint, tell=_tell)
