@@ -149,7 +149,7 @@ class Recorder:
             self._gone = False
             self._seq = message.seq
             for gap in self.writer.gaps[known:]:
-                self._tell(f"{gap.lost} ticks were lost just before tick {message.seq}")
+                self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
         elif isinstance(message, Status):
             assert self._described
             # Once its ticks come, so that the file says whose they are.
