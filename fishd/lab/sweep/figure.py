@@ -1,7 +1,9 @@
 """The picture of a sweep: thrust with its error bars, and the best point of each curve."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,11 +24,7 @@ def draw(
     error_of: what the bars are, such as `the mean over beats`
     Raises `FishdError` where a file cannot be written.
     """
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "fishd"}):
-        figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    with picture(7.0, 4.2) as figure:
         axes = figure.subplots()
         for index, curve in enumerate(curves):
             _draw(axes, curve, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)])
@@ -39,20 +37,39 @@ def draw(
             fontsize=8,
             color="0.35",
         )
-        axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=8)
-        paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
-        for path in paths:
-            try:
-                figure.savefig(path, dpi=200, metadata={"Date": None} if "svg" in path.name else {})
-            except OSError as error:
-                raise FishdError(
-                    f"{path}: the picture cannot be written: {error.strerror}"
-                ) from None
+        return save(figure, stem)
+
+
+@contextmanager
+def picture(width: float, height: float) -> Iterator[Any]:
+    """A figure of this size [inch], to be drawn and saved while this lasts."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    style: dict[Any, Any] = {
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "svg.fonttype": "none",
+        "svg.hashsalt": "fishd",
+    }
+    with rc_context(style):
+        yield Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: Any, stem: Path) -> list[Path]:
+    """Write it as PNG and as SVG; both paths. Raises `FishdError`."""
+    paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
+    for path in paths:
+        try:
+            figure.savefig(path, dpi=200, metadata={"Date": None} if ".svg" in path.name else {})
+        except OSError as error:
+            raise FishdError(f"{path}: the picture cannot be written: {error.strerror}") from None
     return paths
 
 
-def _draw(axes, curve: Curve, colour: str, marker: str) -> None:  # type: ignore[no-untyped-def]
+def _draw(axes: Any, curve: Curve, colour: str, marker: str) -> None:
     shown = sorted(
         (x, 1e3 * result.thrust, 1e3 * (result.error or 0.0))
         for x, result in zip(curve.x, curve.results, strict=True)
