@@ -15,6 +15,7 @@ from fishd.lab.tables import Table
 from fishd.recording.writer import RunWriter
 
 TRIALS, RECORDING = "trials.csv", "search.mcap"
+_TICKS = [base * 10.0**k for k in range(-4, 4) for base in (1, 2, 3, 5)]
 _COLUMNS = ("thrust", "error", "swum", "passed")
 
 
@@ -90,8 +91,9 @@ def draw(
             axis.axvline(best, color="0.2", linewidth=0.8, label="best, 95 %")
             if each.is_logarithmic:
                 axis.set_xscale("log")
-                axis.xaxis.set_major_formatter("{x:g}")
-                axis.xaxis.set_minor_formatter("{x:g}")
+                ticks = [at for at in _TICKS if each.low <= at <= each.high]
+                axis.set_xticks(ticks, [f"{at:g}" for at in ticks])
+                axis.xaxis.set_minor_formatter("")
             unit = units.get(each.name, "")
             axis.set_xlabel(f"{each.name} ({unit})" if unit not in ("", "1") else each.name)
         axes[0].set_ylabel(f"thrust (m{force_unit})")

@@ -10,7 +10,7 @@ import contextlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from bayes_opt import BayesianOptimization
@@ -173,8 +173,7 @@ class Search:
         """The thrust at these places, and its covariance."""
         self._fit_noise()
         places = [dict(zip(self._names, map(float, place), strict=True)) for place in shares]
-        found: tuple[Any, Any] = self._library.predict(places, return_cov=True)
-        return found
+        return cast(tuple[Array, Array], self._library.predict(places, return_cov=True))
 
     def _candidates(self) -> Array:
         """Numbers from 0 to 1 that fill the space, and what was measured; (n, parameters)."""
