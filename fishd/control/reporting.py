@@ -117,6 +117,7 @@ class Reporter:
                 alpha=truth.alpha if truth else UNSET,
                 alpha_rate=truth.alpha_rate if truth else UNSET,
                 phi=truth.phi if truth else UNSET,
+                quantities=loop.active.quantities or UNSET,
             )
         )
 

@@ -116,6 +116,10 @@ class Tick(Struct, frozen=True, gc=False):
     ] = UNSET
     alpha_rate: Annotated[float | UnsetType, unit("rad/s", "True fin angular velocity.")] = UNSET
     phi: Annotated[float | UnsetType, unit("rad", "True servo wheel angle.")] = UNSET
+    quantities: Annotated[
+        dict[str, float] | UnsetType,
+        note("The controller's own quantities, by name; absent where it has none to show."),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -188,6 +192,15 @@ class Event(Struct, frozen=True):
     data: Annotated[dict[str, Any], note("The same for programs.")] = {}
 
 
+class QuantityInfo(Struct, frozen=True):
+    """A controller's own quantity as a person wants to know it."""
+
+    name: str
+    unit: str
+    """In SI notation, `1` where there is none."""
+    description: str
+
+
 class ControllerInfo(Struct, frozen=True):
     """A controller as a person or an option parser wants to know it."""
 
@@ -195,6 +208,7 @@ class ControllerInfo(Struct, frozen=True):
     summary: str
     """One line that says what it does."""
     parameters: tuple[Field, ...]
+    quantities: tuple[QuantityInfo, ...] = ()
 
 
 class Reason(Struct, frozen=True):
@@ -284,3 +298,9 @@ class Status(Struct, frozen=True):
             "Unit of forces and thrust: `N`; `V`, or the driver's, until the sensor is calibrated."
         ),
     ] = "N"
+    quantities: Annotated[
+        dict[str, float], note("The active controller's own quantities, as in `tick`.")
+    ] = {}
+    quantity_units: Annotated[
+        dict[str, str], note("Unit of each quantity that this controller has; `1` for none.")
+    ] = {}

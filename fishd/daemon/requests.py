@@ -125,6 +125,8 @@ class Operations:
             name=self._name,
             phi_c=loop.applied,
             force_unit=loop.robot.force_unit,
+            quantities=loop.active.quantities,
+            quantity_units=loop.active.quantity_units,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
