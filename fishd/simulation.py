@@ -248,13 +248,15 @@ def simulate(
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
     settle: float = 10.0,
+    publisher: Publisher | None = None,
 ) -> Report:
     """Let a controller swim a simulated fish for `seconds`, and judge it after `settle` seconds.
 
+    publisher: gets the record of every tick, and every event
     Raises `UnknownController` and `ParameterError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
-    return judge(config, name, controller, seconds, settle, EncodingPublisher())
+    return judge(config, name, controller, seconds, settle, publisher or EncodingPublisher())
 
 
 def judge(

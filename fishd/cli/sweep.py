@@ -18,6 +18,7 @@ from fishd.cli.output import counted, echo, print_json
 from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError, NoDaemon
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ def _on_robot(
     path: Path, found: "list[Point]", seconds: float, endpoint: str | None
 ) -> "tuple[bool, SweepFolder]":
     from fishd.lab.measurement import plan
-    from fishd.lab.rig import LiveRig
+    from fishd.lab.rig import Disturbed, LiveRig
     from fishd.lab.sweep import running
     from fishd.lab.sweep.folder import Begun
 
@@ -201,8 +202,12 @@ def _on_robot(
         unit = fish.status().force_unit
         begun = Begun("robot", fish.config(), {"seconds": seconds}, unit)
         with _opened(path, begun, found) as folder, _showing(folder, found, "s", seconds) as count:
-            rig = LiveRig(fish)
-            whole = running.on_robot(folder, found, rig, seconds, count.done, count.at)
+            try:
+                whole = running.on_robot(
+                    folder, found, LiveRig(fish), seconds, count.done, count.at
+                )
+            except (Disturbed, NoDaemon) as error:
+                raise FishdError(f"{error}; to go on: {_again(path)}") from None
     return whole, folder
 
 
@@ -268,29 +273,20 @@ def _conclude(
     as_json: bool,
 ) -> int:
     """Draw what there is, and say what is best; the exit status."""
-    from fishd.lab.sweep import curves, figure, grid
+    from fishd.lab.sweep import curves, figure
 
-    over = grid.axis(found)
     drawn = curves.curves(folder, found)
     unit = folder.begun.force_unit
-    bests = [best for curve in drawn if (best := curves.best(curve, over))]
-    name = over.removeprefix(grid.PARAMETER)
+    bests = [(curve, best) for curve in drawn if (best := curves.best(curve))]
     pictures = []
     if bests:
-        pictures = figure.draw(
-            folder.path / "thrust",
-            drawn,
-            name,
-            units.get(name, ""),
-            error_of=error_of,
-            force_unit=unit,
-        )
+        stem = folder.path / "thrust"
+        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
     if as_json:
-        print_json(bests)
+        print_json([best for _, best in bests])
     else:
-        for curve, best in ((one, curves.best(one, over)) for one in drawn):
-            if best:
-                echo(f"{curve.label}: {_proposal(best, units.get(name, ''), unit)}")
+        for curve, best in bests:
+            echo(f"{curve.label}: {_proposal(best, units.get(best.over, ''), unit)}")
         echo(f"table: {folder.path / 'points.csv'}")
         if pictures:
             echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")

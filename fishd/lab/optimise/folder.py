@@ -10,7 +10,7 @@ from fishd.config import Config
 from fishd.core.errors import ConfigError
 from fishd.lab.optimise.search import Proposal, Search
 from fishd.lab.optimise.trials import Trial
-from fishd.lab.sweep.figure import picture, save
+from fishd.lab.drawing import BLUE, ORANGE, drawn, save
 from fishd.lab.tables import Table
 from fishd.recording.writer import RunWriter
 
@@ -71,19 +71,20 @@ def draw(
     Raises `FishdError` where a file cannot be written.
     """
     names = [each.name for each in search.ranges]
-    with picture(3.6 * len(names) + 2.4, 3.8) as figure:
+    paths = [folder / "thrust.png", folder / "thrust.svg"]
+    with drawn(paths[0], (3.6 * len(names) + 2.4, 3.8)) as figure:
         axes = figure.subplots(1, len(names), squeeze=False)[0]
         for axis, each in zip(axes, search.ranges, strict=True):
             x, y, error = search.measured(each.name)
             if len(names) == 1:
                 values, mean, half = search.curve()
                 axis.fill_between(
-                    values, 1e3 * (mean - half), 1e3 * (mean + half), color="#0072b2", alpha=0.15,
+                    values, 1e3 * (mean - half), 1e3 * (mean + half), color=BLUE, alpha=0.15,
                     linewidth=0.0, label="expected, 95 %",
                 )  # fmt: skip
-                axis.plot(values, 1e3 * mean, color="#0072b2", linewidth=1.0)
+                axis.plot(values, 1e3 * mean, color=BLUE, linewidth=1.0)
             axis.errorbar(
-                x, 1e3 * np.array(y), yerr=1e3 * np.array(error), fmt="o", color="#d55e00",
+                x, 1e3 * np.array(y), yerr=1e3 * np.array(error), fmt="o", color=ORANGE,
                 markersize=4, elinewidth=0.8, capsize=2, label="candidates, 95 %",
             )  # fmt: skip
             best = found.parameters[each.name]
@@ -97,5 +98,6 @@ def draw(
             unit = units.get(each.name, "")
             axis.set_xlabel(f"{each.name} ({unit})" if unit not in ("", "1") else each.name)
         axes[0].set_ylabel(f"thrust (m{force_unit})")
-        axes[-1].legend(frameon=False, fontsize=8)
-        return save(figure, folder / "thrust")
+        axes[-1].legend()
+        save(figure, paths[1])
+    return paths

@@ -16,6 +16,8 @@ class Curve(NamedTuple):
     """Thrust over one quantity, all else being the same."""
 
     label: str
+    over: str
+    """That quantity, such as `frequency` or `plant.xi`; empty for a single point."""
     points: list[Point]
     x: list[float]
     results: list[Result]
@@ -46,17 +48,24 @@ class Best(Struct, frozen=True):
 
 
 def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
-    """The curves of the points that were measured, along the quantity with the most values."""
-    over = axis(found)
-    groups: dict[str, list[Point]] = {}
+    """The curves of the points that were measured.
+
+    Each runs along the quantity that has the most values among the points of its controller.
+    """
+    groups: dict[tuple[str, str], list[Point]] = {}
+    axes = {
+        name: axis([point for point in found if point.controller == name])
+        for name in {point.controller for point in found}
+    }
     for point in found:
-        if folder.key(point) in folder.results and (not over or over in point.columns()):
+        if folder.key(point) in folder.results:
+            over = axes[point.controller]
             rest = {name: value for name, value in point.columns().items() if name != over}
-            groups.setdefault(json.dumps(rest), []).append(point)
-    return [_curve(folder, group, over, found) for group in groups.values()]
+            groups.setdefault((over, json.dumps(rest)), []).append(point)
+    return [_curve(folder, group, over, found) for (over, _), group in groups.items()]
 
 
-def best(curve: Curve, over: str) -> Best | None:
+def best(curve: Curve) -> Best | None:
     """The best of a curve; None where there is none."""
     if curve.peak is None:
         return None
@@ -70,7 +79,7 @@ def best(curve: Curve, over: str) -> Best | None:
         controller=point.controller,
         parameters=point.parameters,
         keys=point.keys,
-        over=over.removeprefix(PARAMETER),
+        over=curve.over,
         x=found.x,
         x_low=found.x_low,
         x_high=found.x_high,
@@ -92,21 +101,10 @@ def _curve(folder: SweepFolder, group: list[Point], over: str, all_of: Sequence[
             [thrusts[index] for index in swum],
             [results[index].error for index in swum],
         )
-    return Curve(_label(group[0], over, all_of), group, x, results, top)
-
-
-def _label(point: Point, over: str, all_of: Sequence[Point]) -> str:
-    """Its controller, and what else differs in the sweep."""
-    same = {
-        name
-        for name, value in point.columns().items()
-        if all(other.columns().get(name, value) == value for other in all_of)
-    }
-    words = [
-        f"{name.removeprefix(PARAMETER)}={value:g}"
-        if isinstance(value, float)
-        else f"{name}={value}"
-        for name, value in list(point.columns().items())[1:]
-        if name not in same and name != over
-    ]
-    return " ".join((point.controller, *words))
+        same = {
+            name
+            for name, value in group[0].columns().items()
+            if all(other.columns().get(name, value) == value for other in all_of)
+        }
+    label = group[0].label(without={*same, over})
+    return Curve(label, over.removeprefix(PARAMETER), group, x, results, top)

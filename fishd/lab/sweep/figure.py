@@ -1,71 +1,52 @@
 """The picture of a sweep: thrust with its error bars, and the best point of each curve."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fishd.core.errors import FishdError
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, save
 from fishd.lab.sweep.curves import Curve
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#1a1a1a")
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE, BLACK)
 MARKERS = "os^Dv<>"
 
 
 def draw(
-    stem: Path, curves: Sequence[Curve], over: str, unit: str, *, error_of: str, force_unit: str
+    stem: Path,
+    found: Sequence[Curve],
+    units: Mapping[str, str],
+    *,
+    error_of: str,
+    force_unit: str,
 ) -> list[Path]:
     """Write the picture as PNG and as SVG; returns both paths.
 
     stem: path without a suffix
-    over: what the curves are drawn over, unit: of that
+    found: curves; those over one quantity share a panel, the others are left out
+    units: of what they are drawn over
     error_of: what the bars are, such as `the mean over beats`
-    Raises `FishdError` where a file cannot be written.
+    Raises `FishdError` where a file cannot be written, and `MissingPackage`.
     """
-    with picture(7.0, 4.2) as figure:
-        axes = figure.subplots()
-        for index, curve in enumerate(curves):
-            _draw(axes, curve, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)])
-        axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
-        axes.set_xlabel(f"{over} ({unit})" if unit not in ("", "1") else over)
-        axes.set_ylabel(f"thrust (m{force_unit})")
-        axes.set_title(
-            f"bars: 95 % interval of {error_of}; cross: best, of the parabola drawn",
-            loc="left",
-            fontsize=8,
-            color="0.35",
-        )
-        axes.legend(frameon=False, fontsize=8)
-        return save(figure, stem)
-
-
-@contextmanager
-def picture(width: float, height: float) -> Iterator[Any]:
-    """A figure of this size [inch], to be drawn and saved while this lasts."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    style: dict[Any, Any] = {
-        "font.size": 9,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "svg.fonttype": "none",
-        "svg.hashsalt": "fishd",
-    }
-    with rc_context(style):
-        yield Figure(figsize=(width, height), layout="constrained")
-
-
-def save(figure: Any, stem: Path) -> list[Path]:
-    """Write it as PNG and as SVG; both paths. Raises `FishdError`."""
+    panels: dict[str, list[Curve]] = {}
+    for curve in found:
+        if curve.over:
+            panels.setdefault(curve.over, []).append(curve)
     paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
-    for path in paths:
-        try:
-            figure.savefig(path, dpi=200, metadata={"Date": None} if ".svg" in path.name else {})
-        except OSError as error:
-            raise FishdError(f"{path}: the picture cannot be written: {error.strerror}") from None
+    with drawn(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:
+        shown = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+        for axes, (over, curves) in zip(shown, panels.items(), strict=True):
+            for index, curve in enumerate(curves):
+                _draw(axes, curve, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)])
+            axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
+            unit = units.get(over, "")
+            axes.set_xlabel(f"{over} ({unit})" if unit not in ("", "1") else over)
+            axes.legend()
+        shown[0].set_ylabel(f"thrust (m{force_unit})")
+        note = f"bars: 95 % interval of {error_of}; cross: best, of the parabola drawn"
+        shown[0].set_title(note, fontsize=8, fontweight="normal", color=GREY)
+        save(figure, paths[1])
     return paths
 
 

@@ -21,6 +21,8 @@ from fishd.lab.sweep.measuring import Result
 BEGUN, POINTS, RECORDINGS = "sweep.json", "points.csv", "ticks"
 RECORDING = "recording"
 """The column that names the recording of a point."""
+OTHERS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
+"""Sections and keys of a configuration that have no part in the thrust."""
 MEASURED = tuple(field.name for field in fields(Result))
 
 On = Literal["simulation", "robot"]
@@ -172,7 +174,9 @@ def _check_same(file: Path, begun: Begun) -> None:
         raise ConfigError(f"{file}: no sweep began so: {error}") from None
     before, now = (_leaves(msgspec.to_builtins(each)) for each in (data, begun))
     for key in dict.fromkeys([*before, *now]):
-        if key != "version" and before.get(key) != now.get(key):
+        if key == "version" or key.removeprefix("config.").partition(".")[0] in OTHERS:
+            continue
+        if before.get(key) != now.get(key):
             raise ConfigError(
                 f"{file}: this sweep was begun with {key} = {before.get(key)}, now it is "
                 f"{now.get(key)}; give the same, or another --folder"
