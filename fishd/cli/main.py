@@ -44,6 +44,10 @@ VERBS = {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
     },
+    "Experiment": {
+        "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
+        "optimise": Verb("optimise", "optimise", "Search the best parameters of a controller."),
+    },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
         "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
