@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 from fishd.client import Fish
 from fishd.config import Config
 from fishd.core.errors import FishdError, FishError
-from fishd.core.signals import Event, Reason, Tick
-from fishd.simulation import VirtualRun
+from fishd.core.signals import Reason, Tick
+from fishd.simulation import KeepingPublisher, VirtualRun
 
 
 class Disturbed(FishdError):
@@ -52,8 +51,8 @@ class VirtualRig:
         self.name = "simulation"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
-        self._collected = _Collected([])
-        self._run = VirtualRun(config, self._collected)
+        self._kept = KeepingPublisher()
+        self._run = VirtualRun(config, self._kept)
 
     def __enter__(self) -> Self:
         return self
@@ -73,7 +72,7 @@ class VirtualRig:
 
     def _pass(self, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
-        self._collected.ticks = ticks
+        self._kept.ticks = ticks
         for _ in range(max(1, round(seconds / self.tick))):
             self._run.tick()
             _check(ticks[-1], controller, self._run.loop.supervisor.reason)
@@ -129,19 +128,6 @@ class LiveRig:
             if tick.seq >= first + count - 1:
                 break
         return ticks
-
-
-@dataclass
-class _Collected:
-    """What the loop publishes: its latest ticks."""
-
-    ticks: list[Tick]
-
-    def tick(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def event(self, event: Event) -> None:
-        pass  # what matters of them is in the ticks
 
 
 def _as_told(tick: Tick, controller: str | None) -> bool:
