@@ -222,5 +222,5 @@ def test_a_run_takes_a_path_or_a_configuration_and_keys_that_override_either() -
     assert len(of_file) == 50
     assert not of_file.equals(simulation.run(path, "swing", {}, 1.0, overrides={"tick": 0.02}))
     for config in (path, load(path)):
-        with pytest.raises(ConfigError, match=r"plant\.x1: unknown key; did you mean 'xi'"):
-            simulation.run(config, overrides={"plant.x1": 0.6})
+        with pytest.raises(ConfigError, match=r"plant\.omega: unknown key; did you mean 'omega0'"):
+            simulation.run(config, overrides={"plant.omega": 9})

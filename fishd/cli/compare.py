@@ -1,120 +1,255 @@
-"""The verb that compares policies and controllers on the same simulated fish."""
+"""The verb that compares policies and controllers on the same fish, simulated or live."""
 
+import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from fishd.cli.completion import complete_contestant
+from fishd.cli.config import fish_options
+from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.simulate import run_options
-from fishd.config import load
+from fishd.client import Fish
+from fishd.config import adopt, load
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError, ParameterError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from fishd.learning.compare.comparison import Standing
+    from fishd.lab.compare.comparison import Standing, Trace
+    from fishd.lab.compare.contestants import Contestant
 
 WIDE = 1000
-_HEADS = ("mN", "Hz", "|φ_c|/Φ", "square")
+"""Columns of a table in a file or a pipe, where nothing is wrapped."""
+SECONDS, SETTLE = 60.0, 10.0
+
+
+class _Outcome(NamedTuple):
+    standings: "list[Standing]"
+    traces: "list[Trace]"
+    left_out: "list[tuple[Contestant, FishdError]]"
+    amplitude: float  # rad
+    unit: str = "N"
+    ended: str = ""  # why before everyone had swum, if so
+    status: int = 0
 
 
 @click.command()
 @click.argument(
     "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
-@run_options
 @click.option(
-    "--seeds",
+    "--on",
+    type=click.Choice(["simulation", "robot"]),
+    default="simulation",
+    show_default=True,
+    help="A fish simulated here in virtual time, or that of the fishd that runs, real or not.",
+)
+@click.option(
+    "--runs",
     type=click.IntRange(1, 1000),
     default=1,
     show_default=True,
-    help="Runs of each contestant, with different noise.",
+    help="Runs of each contestant; in simulation, with different noise.",
 )
+@click.option(
+    "--for",
+    "live_seconds",
+    type=float,
+    help=f"On a robot: length of each run, swimming and resting in turn [s]. [default: {SECONDS}]",
+)
+@click.option(
+    "--seconds", type=float, help=f"In simulation: length of each run [s]. [default: {SECONDS}]"
+)
+@click.option(
+    "--settle",
+    type=float,
+    help=f"In simulation: time before figures are taken [s]. [default: {SETTLE}]",
+)
+@fish_options
+@endpoint_option
+@json_option
 @click.option(
     "--png",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw command, fin, force and efficiency into this file.",
+    help="Draw command, fin, force and result of each into this file.",
 )
-def evaluate(
+def compare(
     contestants: tuple[str, ...],
+    on: str,
+    runs: int,
+    live_seconds: float | None,
+    seconds: float | None,
+    settle: float | None,
     file: Path | None,
     overrides: tuple[str, ...],
-    seconds: float,
-    settle: float,
-    seeds: int,
-    png: Path | None,
+    endpoint: str | None,
     as_json: bool,
+    png: Path | None,
 ) -> int:
-    """Compare policies and controllers on the same simulated fish.
+    """Compare policies and controllers on the same fish.
 
     A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
     with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. Without any: the
     best square wave, swing, and the named policies that are made for this fish.
 
-    Efficiency is the thrust over that of the best square wave. |φ_c|/Φ is the mean size of the
-    command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866. Exit
-    status 1 when one is refused on this fish, such as a policy for another amplitude, or ends in
-    mode fault; the others swim all the same.
+    In simulation thrust is the true one, and efficiency that over the thrust of the best square
+    wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
+    rest, and shows what was measured. ± is the 95 % interval: of a measurement, or of the mean of
+    several runs. |φ_c|/Φ is the mean size of the command, square its mean size over its rms:
+    square wave 1, sine 0.900, triangle 0.866. Exit status 1 when one is refused on this fish, such
+    as a policy for another amplitude, or ends in mode fault; the others swim all the same.
     """
-    from fishd.learning.compare import comparison
+    other: dict[str, Any] = {"--for": live_seconds}
+    if on == "robot":
+        other = {"--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides}
+    if given := [name for name, value in other.items() if value not in (None, ())]:
+        place = "a fish that runs" if on == "robot" else "simulated fish"
+        raise click.UsageError(f"{given[0]} means nothing for {place}: this is --on {on}")
+    if on == "robot":
+        length = SECONDS if live_seconds is None else live_seconds
+        outcome = _on_robot(contestants, length, runs, endpoint)
+    else:
+        lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
+        outcome = _in_simulation(contestants, file, overrides, *lengths, runs)
+    if png and outcome.standings:
+        from fishd.lab.compare.figures import picture
+
+        picture(png, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
+    return _report(outcome, as_json)
+
+
+def _in_simulation(
+    texts: tuple[str, ...],
+    file: Path | None,
+    overrides: tuple[str, ...],
+    seconds: float,
+    settle: float,
+    runs: int,
+) -> _Outcome:
+    from fishd.lab.compare import comparison
+    from fishd.lab.compare.contestants import default_contestants, parse, refusal
 
     config = load(file, overrides)
-    chosen = [comparison.parse(text) for text in contestants]
-    chosen = chosen or comparison.default_contestants(config)
-    refused = [(one, why) for one in chosen if (why := comparison.refusal(config, one))]
-    able = [one for one in chosen if one not in (out for out, _ in refused)]
-    standings, traces = comparison.compare(config, able or chosen, seconds, settle, seeds)
-    if png:
-        from fishd.learning.compare.figures import picture
+    chosen = [parse(text) for text in texts] or default_contestants(config)
+    left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
+    able = [one for one in chosen if one not in (out for out, _ in left_out)]
+    swum = able or chosen
+    with _progress(len(swum) * runs * seconds) as progress:
+        found = comparison.compare(config, swum, seconds, settle, runs, progress)
+    return _Outcome(*found, left_out, config.amplitude_limit)
 
-        picture(png, standings, traces, config.amplitude_limit)
+
+def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str | None) -> _Outcome:
+    from fishd.lab.compare.contestants import absolute, default_contestants, parse
+    from fishd.lab.compare.live import LiveComparison
+    from fishd.lab.rig import LiveRig
+
+    ended, status = "", 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too lets the fish rest
+    chosen = [absolute(parse(text)) for text in texts]
+    with Fish(endpoint) as fish:
+        chosen = chosen or default_contestants(adopt(fish.config()))
+        unit = fish.status().force_unit
+        with LiveRig(fish) as rig, _progress(len(chosen) * runs * seconds) as progress:
+            live = LiveComparison(rig, chosen)
+            try:
+                live.swim(seconds, runs, progress)
+            except KeyboardInterrupt:
+                ended, status = "interrupted; the fish rests", INTERRUPTED
+            except ParameterError:
+                raise
+            except FishdError as error:
+                ended, status = str(error), 1
+    return _Outcome(
+        live.standings(), live.traces(), live.left_out, rig.amplitude, unit, ended, status
+    )
+
+
+def _report(outcome: _Outcome, as_json: bool) -> int:
+    """Print it; gives the exit status."""
+    standings = outcome.standings
     if as_json:
         print_json(standings)
-    else:
+    elif standings:
         from rich.console import Console
 
-        # In a file or a pipe nothing is wrapped.
-        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings))
-    for one, why in refused:
-        echo(f"fishctl: {one.label}: refused: {why}", err=True)
+        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings, outcome.unit))
+    for one, why in outcome.left_out:
+        echo(f"fishctl: {one.label}: left out: {why}", err=True)
     for standing in standings:
         for took_over in standing.fallbacks:
             echo(f"fishctl: {standing.contestant}: another took over: {took_over}", err=True)
     faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
     for contestant, fault in faults:
         echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
-    return 1 if faults or refused else 0
+    if outcome.ended:
+        echo(f"fishctl: {outcome.ended}", err=True)
+    return outcome.status or (1 if faults or outcome.left_out else 0)
 
 
-def _table(standings: "list[Standing]") -> "Table":
+def _table(standings: "list[Standing]", unit: str) -> "Table":
     from rich.table import Table
 
-    runs = standings[0].runs
-    best = {
-        (run.best_square_thrust, run.best_square_frequency)
-        for standing in standings
-        for run in standing.runs
-    }
-    caption = None
-    if len(best) == 1:
-        ((thrust, frequency),) = best
-        caption = f"The best square wave: {thrust * 1e3:.2f} mN at {frequency:.3f} Hz."
-    several = len(runs) > 1
+    simulated = all(standing.runs for standing in standings)
+    several = simulated and len(standings[0].runs) > 1
+    caption = _of_simulated(standings) if simulated else None
     table = Table(caption=caption, caption_justify="left", box=None, pad_edge=False)
     table.add_column("contestant", overflow="fold")
-    for head in ("efficiency", *(["lowest – highest"] if several else []), *_HEADS):
+    heads = ["efficiency"] if simulated else []
+    heads += ["lowest – highest"] if several else []
+    for head in (*heads, f"m{unit}", "Hz", "|φ_c|/Φ", "square"):
         table.add_column(head, justify="right", no_wrap=True)
     for standing in standings:
-        spread = f"{standing.lowest_efficiency:.1%} – {standing.highest_efficiency:.1%}"
+        cells = [f"{standing.efficiency:.1%}"] if simulated else []
+        if several:
+            shares = [run.efficiency for run in standing.runs]
+            cells.append(f"{min(shares):.1%} – {max(shares):.1%}")
+        error = "" if standing.error is None else f" ± {standing.error * 1e3:.2f}"
         table.add_row(
             standing.contestant,
-            f"{standing.efficiency:.1%}",
-            *([spread] if several else []),
-            f"{standing.thrust * 1e3:.2f}",
+            *cells,
+            f"{standing.thrust * 1e3:.2f}{error}",
             f"{standing.frequency:.3f}",
             f"{standing.fullness:.3f}",
             f"{standing.squareness:.3f}",
         )
     return table
+
+
+def _of_simulated(standings: "list[Standing]") -> str | None:
+    """What efficiency is of, where it is the same for all."""
+    best = {
+        (run.best_square_thrust, run.best_square_frequency)
+        for standing in standings
+        for run in standing.runs
+    }
+    if len(best) != 1:
+        return None
+    ((thrust, frequency),) = best
+    return f"The best square wave: {thrust * 1e3:.2f} mN at {frequency:.3f} Hz."
+
+
+@contextmanager
+def _progress(total: float) -> Iterator[Callable[[float], None]]:
+    """A bar of seconds swum, with the time left, where standard error is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda seconds: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns: tuple[Any, ...] = (
+        TextColumn("{task.completed:.0f} of {task.total:.0f} s swum"),
+        BarColumn(bar_width=30),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda seconds: progress.update(task, completed=seconds)

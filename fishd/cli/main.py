@@ -34,7 +34,8 @@ VERBS = {
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
-        "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
+        "compare": Verb("compare", "compare", "Compare controllers and policies on one fish."),
+        "learn": Verb("learn", "learn", "Train policies, and write them to files."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },
     "Check and configure": {

@@ -15,6 +15,10 @@ class Disturbed(FishdError):
     """The fish did not do what the experiment told it to; the message says what it did."""
 
 
+class Replaced(Disturbed):
+    """The controller gave up and another one took over, which the experiment did not ask for."""
+
+
 class Rig(Protocol):
     """One fish, of which an experiment is in charge; a context manager that leaves it at rest."""
 
@@ -75,7 +79,8 @@ class VirtualRig:
         self._kept.ticks = ticks
         for _ in range(max(1, round(seconds / self.tick))):
             self._run.tick()
-            _check(ticks[-1], controller, self._run.loop.supervisor.reason)
+            loop = self._run.loop
+            _check(ticks[-1], controller, loop.supervisor.reason, loop.active.fallback)
         return ticks
 
 
@@ -101,7 +106,8 @@ class LiveRig:
             return
         with suppress(FishError):
             status = self._fish.status()
-            if (status.mode, status.controller) == ("running", self._controller):
+            ours = status.controller == self._controller or status.fallback
+            if status.mode == "running" and ours:
                 self._fish.stop()
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
@@ -123,7 +129,8 @@ class LiveRig:
             if not first <= tick.seq < first + 2 * count:  # of before, or of another fishd
                 continue
             if not _as_told(tick, controller):
-                _check(tick, controller, self._fish.status().reason)
+                status = self._fish.status()
+                _check(tick, controller, status.reason, status.fallback)
             ticks.append(tick)
             if tick.seq >= first + count - 1:
                 break
@@ -136,11 +143,19 @@ def _as_told(tick: Tick, controller: str | None) -> bool:
     return (tick.mode, tick.controller) == ("running", controller)
 
 
-def _check(tick: Tick, controller: str | None, reason: Reason | None) -> None:
-    """Raises `Disturbed` where the fish does another thing than it was told to."""
+def _check(
+    tick: Tick, controller: str | None, reason: Reason | None, fallback: Reason | None
+) -> None:
+    """Raises `Disturbed` where the fish does another thing than it was told to.
+
+    reason: why it is in mode fault or estop; fallback: why another controller took over
+    """
     if _as_told(tick, controller):
         return
     told = f"told to let {controller} swim" if controller else "told to rest"
-    why = f" ({reason.message})" if reason else ""
+    cause = reason or fallback
+    why = f" ({cause.message})" if cause else ""
     does = f"{tick.controller} swims" if tick.mode == "running" else f"it is in mode {tick.mode}"
-    raise Disturbed(f"the fish was {told}, but {does}{why}: this measurement is lost")
+    replaced = controller and fallback and tick.mode == "running"
+    kind = Replaced if replaced else Disturbed
+    raise kind(f"the fish was {told}, but {does}{why}: this measurement is lost")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fishd.learning.compare import figures
+from fishd.lab.compare import figures
 
 _CURVES = (
     ("#0072b2", "-", 2.6),
