@@ -2,17 +2,17 @@
 
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
+from fishd.cli.lab_progress import showing
 from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import echo, print_json
+from fishd.cli.sweep import ON, refuse_other
 from fishd.client import Fish
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
@@ -43,13 +43,7 @@ class _Outcome(NamedTuple):
 @click.argument(
     "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
-@click.option(
-    "--on",
-    type=click.Choice(["simulation", "robot"]),
-    default="simulation",
-    show_default=True,
-    help="A fish simulated here in virtual time, or that of the fishd that runs, real or not.",
-)
+@ON
 @click.option(
     "--runs",
     type=click.IntRange(1, 1000),
@@ -75,9 +69,10 @@ class _Outcome(NamedTuple):
 @endpoint_option
 @json_option
 @click.option(
-    "--png",
+    "--plot",
+    "picture",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw command, fin, force and result of each into this file.",
+    help="Draw command, fin, force and result of each into this file (.png, .svg).",
 )
 def compare(
     contestants: tuple[str, ...],
@@ -90,7 +85,7 @@ def compare(
     overrides: tuple[str, ...],
     endpoint: str | None,
     as_json: bool,
-    png: Path | None,
+    picture: Path | None,
 ) -> int:
     """Compare policies and controllers on the same fish.
 
@@ -105,22 +100,24 @@ def compare(
     square wave 1, sine 0.900, triangle 0.866. Exit status 1 when one is refused on this fish, such
     as a policy for another amplitude, or ends in mode fault; the others swim all the same.
     """
-    other: dict[str, Any] = {"--for": live_seconds}
-    if on == "robot":
-        other = {"--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides}
-    if given := [name for name, value in other.items() if value not in (None, ())]:
-        place = "a fish that runs" if on == "robot" else "simulated fish"
-        raise click.UsageError(f"{given[0]} means nothing for {place}: this is --on {on}")
+    of_simulation = {
+        "--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides,
+    }  # fmt: skip
+    refuse_other(on, of_simulation, {"--for": live_seconds})
+    if picture:
+        from fishd.lab import drawing
+
+        drawing.check(picture)
     if on == "robot":
         length = SECONDS if live_seconds is None else live_seconds
         outcome = _on_robot(contestants, length, runs, endpoint)
     else:
         lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
         outcome = _in_simulation(contestants, file, overrides, *lengths, runs)
-    if png and outcome.standings:
-        from fishd.lab.compare.figures import picture
+    if picture and outcome.standings:
+        from fishd.lab.compare.figures import draw
 
-        picture(png, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
+        draw(picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
     return _report(outcome, as_json)
 
 
@@ -140,8 +137,8 @@ def _in_simulation(
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
     able = [one for one in chosen if one not in (out for out, _ in left_out)]
     swum = able or chosen
-    with _progress(len(swum) * runs * seconds) as progress:
-        found = comparison.compare(config, swum, seconds, settle, runs, progress)
+    with showing(len(swum) * runs * seconds, "s swum") as bar:
+        found = comparison.compare(config, swum, seconds, settle, runs, bar.at)
     return _Outcome(*found, left_out, config.amplitude_limit)
 
 
@@ -156,10 +153,10 @@ def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str |
     with Fish(endpoint) as fish:
         chosen = chosen or default_contestants(adopt(fish.config()))
         unit = fish.status().force_unit
-        with LiveRig(fish) as rig, _progress(len(chosen) * runs * seconds) as progress:
+        with LiveRig(fish) as rig, showing(len(chosen) * runs * seconds, "s") as bar:
             live = LiveComparison(rig, chosen)
             try:
-                live.swim(seconds, runs, progress)
+                live.swim(seconds, runs, bar.at)
             except KeyboardInterrupt:
                 ended, status = "interrupted; the fish rests", INTERRUPTED
             except ParameterError:
@@ -233,23 +230,3 @@ def _of_simulated(standings: "list[Standing]") -> str | None:
         return None
     ((thrust, frequency),) = best
     return f"The best square wave: {thrust * 1e3:.2f} mN at {frequency:.3f} Hz."
-
-
-@contextmanager
-def _progress(total: float) -> Iterator[Callable[[float], None]]:
-    """A bar of seconds swum, with the time left, where standard error is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda seconds: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns: tuple[Any, ...] = (
-        TextColumn("{task.completed:.0f} of {task.total:.0f} s swum"),
-        BarColumn(bar_width=30),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=total)
-        yield lambda seconds: progress.update(task, completed=seconds)

@@ -105,13 +105,13 @@ def test_the_picture_begins_with_an_upward_reversal() -> None:
 
 def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path: Path) -> None:
     matplotlib = pytest.importorskip("matplotlib")
-    from fishd.lab.compare.figures import picture
+    from fishd.lab.compare.figures import draw
 
     contestants = [parse("swing"), parse("sine:frequency=1.8")]
     with matplotlib.rc_context({"svg.fonttype": "none"}):
         for runs in (1, 3):
             standings, traces = compare(CONFIG, contestants, 20.0, 5.0, runs)
-            picture(tmp_path / f"{runs}.svg", standings, traces, 0.42)
+            draw(tmp_path / f"{runs}.svg", standings, traces, 0.42)
     one, three = letters_of(tmp_path / "1.svg"), letters_of(tmp_path / "3.svg")
     for name in ("command", "finangle", "asmeasured", "truemean", "efficiency", "Φ=0.42rad"):
         assert name in one
@@ -135,8 +135,8 @@ def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
 
 def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from fishd.lab.compare.figures import picture
+    from fishd.lab.compare.figures import draw
 
     standings, traces = compare(CONFIG, [parse("hold")], 6.0, 1.0)
-    with pytest.raises(FishdError, match=r"no/such\.png: the picture cannot be written"):
-        picture(tmp_path / "no" / "such.png", standings, traces, 0.42)
+    with pytest.raises(FishdError, match=r"no/such\.png: the figure cannot be written"):
+        draw(tmp_path / "no" / "such.png", standings, traces, 0.42)

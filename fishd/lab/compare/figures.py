@@ -1,35 +1,22 @@
 """Pictures of a comparison: command, fin, force and result of each contestant."""
 
-import importlib
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fishd.core.errors import FishdError
 from fishd.lab.compare.comparison import TRACE, Standing, Trace
+from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn
 
-_COMMAND, _FORCE, _FIN = "#1a1a1a", "#0072b2", "#d55e00"
 _SPREAD = "0.2"
 _FORCES = ("$F_x$, drift subtracted", "$F_x$ as measured")
 _THRUSTS = ("thrust, measured", "true mean $F_x$")
 """What is drawn of a live fish, and of a simulated one."""
-DASHED = (0, (4, 3))
-STYLE = {
-    "font.size": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.frameon": False,
-}
 
 
-def picture(
+def draw(
     path: str | os.PathLike[str],
     standings: Sequence[Standing],
     traces: Sequence[Trace],
@@ -40,41 +27,36 @@ def picture(
 
     That is its efficiency, or, of a fish that could only be measured, its thrust.
     amplitude: Φ [rad]; unit: of the forces
-    Raises `FishdError` where matplotlib is missing or the file cannot be made.
+    Raises `FishdError` where the file cannot be made, and `MissingPackage`.
     """
-    plt = pyplot()
     rows = len(standings)
     simulated = all(standing.runs for standing in standings)
     most = max(standing.thrust + (standing.error or 0.0) for standing in standings)
-    with plt.rc_context(STYLE):
-        shape: dict[str, Any] = {"figsize": (7.2, 0.55 + 1.15 * rows), "width_ratios": (3, 3, 1.6)}
-        figure, axes = plt.subplots(rows, 3, squeeze=False, layout="constrained", **shape)
+    with drawn(path, (7.6, 0.7 + 1.25 * rows)) as figure:
+        axes = figure.subplots(rows, 3, squeeze=False, width_ratios=(3, 3, 1.8))
         forces = [1e3 * force for trace in traces for force in trace.thrust]
         limits = min(0.0, *forces) - 4.0, 1.15 * max(0.0, *forces) + 1.0
-        for axis, title in zip(
-            axes[0], ("", "force", "efficiency" if simulated else "thrust"), strict=True
-        ):
-            axis.set_title(title, loc="left", fontsize=8)
-        for drawn, standing, trace in zip(axes, standings, traces, strict=True):
+        axes[0][1].set_title("force", fontweight="normal")
+        axes[0][2].set_title("efficiency" if simulated else "thrust", fontweight="normal")
+        for (left, middle, right), standing, trace in zip(axes, standings, traces, strict=True):
             shown = _from_upward_reversal(trace)
-            _draw_angles(drawn[0], shown, amplitude)
-            _draw_force(drawn[1], standing, shown, limits, unit)
+            left.set_title(standing.contestant)
+            _draw_angles(left, shown, amplitude)
+            _draw_force(middle, standing, shown, limits, unit)
             if simulated:
-                _draw_efficiency(drawn[2], standing)
+                _draw_efficiency(right, standing)
             else:
-                _draw_thrust(drawn[2], standing, most)
-            _describe(drawn[2], standing, unit)
-            drawn[0].set_title(standing.contestant, loc="left", fontsize=8, fontweight="bold")
+                _draw_thrust(right, standing, most)
+            _describe(right, standing, unit)
         for axis in axes[:-1].flat:
             axis.tick_params(labelbottom=False)
         for axis in axes[-1][:2]:
             axis.set_xlabel("time (s)")
-        what = "% of the best square wave" if simulated else f"m{unit}"
-        axes[-1][2].set_xlabel(what, fontsize=7)
+        what = "% of the best\nsquare wave" if simulated else f"m{unit}"
+        axes[-1][2].set_xlabel(what)
         named = [axis.get_legend_handles_labels() for axis in axes[0]]
         handles, labels = ([one for pair in named for one in pair[k]] for k in (0, 1))
-        figure.legend(handles, labels, loc="outside lower left", ncols=3, fontsize=7)
-        save(plt, figure, Path(path))
+        figure.legend(handles, labels, loc="outside lower left", ncols=3)
 
 
 def _from_upward_reversal(trace: Trace) -> Trace:
@@ -92,10 +74,10 @@ def _from_upward_reversal(trace: Trace) -> Trace:
 
 def _draw_angles(axis: Any, trace: Trace, amplitude: float) -> None:
     # Not as a step plot: it would turn to the command after the last time shown.
-    line = {"color": _COMMAND, "linewidth": 0.9, "label": "command $φ_c$"}
+    line = {"color": BLACK, "linewidth": 0.9, "label": "command $φ_c$"}
     axis.stairs(trace.command[:-1], trace.time, baseline=None, **line)
     if not any(map(math.isnan, trace.fin)):
-        axis.plot(trace.time, trace.fin, color=_FIN, linewidth=1.0, label="fin angle α")
+        axis.plot(trace.time, trace.fin, color=ORANGE, linewidth=1.0, label="fin angle α")
     axis.set_ylim(-1.15 * amplitude, 1.15 * amplitude)
     axis.set_yticks((-amplitude, 0.0, amplitude), ("−Φ", "0", "Φ"))
     axis.set_xlim(0.0, trace.time[-1])
@@ -107,10 +89,10 @@ def _draw_force(
 ) -> None:
     thrust = 1e3 * np.array(trace.thrust)
     axis.axhline(0.0, color="0.8", linewidth=0.6)
-    axis.plot(trace.time, thrust, color=_FORCE, linewidth=0.9, label=_FORCES[bool(standing.runs)])
+    axis.plot(trace.time, thrust, color=BLUE, linewidth=0.9, label=_FORCES[bool(standing.runs)])
     label = _THRUSTS[bool(standing.runs)] + _of_runs(", mean", standing)
     mean = 1e3 * standing.thrust
-    axis.axhline(mean, color=_FORCE, linewidth=0.7, linestyle=DASHED, label=label)
+    axis.axhline(mean, color=BLUE, linewidth=0.7, linestyle="--", label=label)
     axis.set_ylim(limits)
     axis.set_xlim(0.0, trace.time[-1])
     axis.set_ylabel(f"$F_x$ (m{unit})")
@@ -165,26 +147,3 @@ def _of_runs(what: str, standing: Standing) -> str:
     """`what` and of how many runs; nothing where there is only one."""
     runs = len(standing.thrusts)
     return f"{what} of {runs} runs" if runs > 1 else ""
-
-
-def pyplot() -> Any:
-    """matplotlib's, without a display; raises `FishdError` where it is missing."""
-    try:
-        import matplotlib
-    except ModuleNotFoundError:
-        raise FishdError(
-            "a picture needs matplotlib, which is not installed: pip install 'fishd[lab]'"
-        ) from None
-    matplotlib.use("agg")
-    return importlib.import_module("matplotlib.pyplot")
-
-
-def save(plt: Any, figure: Any, path: Path) -> None:
-    """Write a figure and close it; raises `FishdError`."""
-    try:
-        figure.savefig(path, dpi=200)
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise FishdError(f"{path}: the picture cannot be written: {why}") from None
-    finally:
-        plt.close(figure)
