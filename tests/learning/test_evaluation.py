@@ -10,7 +10,7 @@ import pytest
 from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
-from fishd.learning.compare.comparison import best_on_grid
+from fishd.lab.compare.contestants import best_on_grid
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import in_simulation, judge, on_link, worst_of_others
 from fishd.learning.env.simulated_link import SimulatedLink, at_edge, drawn
