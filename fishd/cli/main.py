@@ -37,12 +37,16 @@ VERBS = {
         "rerun": Verb("recording.rerun", "rerun", "Let a controller choose again, offline."),
         "recover": Verb("recording.recover", "recover", "Finish a recording that was cut off."),
     },
+    "Measure": {
+        "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+    },
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
+        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
         "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },

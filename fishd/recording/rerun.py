@@ -23,8 +23,8 @@ from fishd.core.foreign_code import contained
 from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
 
-ESTIMATES = ("fy_rate", "fin_velocity", "thrust", "frequency")
-"""What the estimator adds to a measurement."""
+ESTIMATES = ("fy_rate", "fin_velocity", "frequency")
+"""What the estimator adds to a measurement, and ticks tell; their thrust is that of the filter."""
 
 
 class Stretch(Struct):
