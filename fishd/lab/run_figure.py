@@ -33,7 +33,7 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
         axes[0].set_xlim(traces.time[0], max(traces.time[-1], traces.time[0] + 0.1))
         for axis in axes:
             _events(axis, traces, named=axis is axes[0])
-        _portrait(right.add_subplot(right.add_gridspec(5, 1)[:3]), traces)
+        _portrait(right.add_subplot(right.add_gridspec(panels, 1)[:2]), traces)
 
 
 def _forces(axis: "Axes", traces: Traces) -> None:

@@ -38,8 +38,9 @@ class Summary(Struct, frozen=True):
     restarts: int = 0
     """How often another fishd took the place of the one before."""
     thrust: float | None = None
-    """Mean `thrust` of the ticks in which the tail beat and the sensor's zero was known; where it
-    never was, mean F_x while a controller swam, as measured; None where none swam [N]."""
+    """Mean `thrust` of the ticks in which the tail beat and the sensor's zero was known, weighted
+    by its interval; where it never was, mean F_x while a controller swam, as measured; None where
+    none swam [N]."""
     thrust_error: float | None = None
     """Half of the 95 % interval of that thrust, mean; None where the zero was never known [N]."""
     swimming: dict[str, int] = {}
@@ -75,7 +76,7 @@ class Tally:
         self._ticks = self._events = self._marks = self._missed = self._restarts = 0
         self._pid = self._known = 0
         self._impulse = 0.0
-        self._known_ticks, self._thrust, self._error = 0, 0.0, 0.0
+        self._weight = self._thrust = self._error = 0.0
         self._swimming: dict[str, int] = {}
 
     def add(self, message: TickHead | Tick | Event | Status) -> None:
@@ -94,9 +95,11 @@ class Tally:
         if tick.mode == "running":
             self._impulse += tick.fx
             if tick.thrust_error is not UNSET and tick.frequency:
-                self._known_ticks += 1
-                self._thrust += tick.thrust
-                self._error += tick.thrust_error
+                # Errors of one recording are alike: they weigh the ticks, and do not average out.
+                weight = 1.0 / max(tick.thrust_error, 1e-9) ** 2
+                self._weight += weight
+                self._thrust += weight * tick.thrust
+                self._error += weight * tick.thrust_error
             self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
         if last is None:
             self._first_t = tick.t
@@ -135,11 +138,11 @@ class Tally:
     @property
     def summary(self) -> Summary:
         """All that was added."""
-        swam, known = sum(self._swimming.values()), self._known_ticks
+        swam = sum(self._swimming.values())
         thrust = self._impulse / swam if swam else None
         error = None
-        if known:
-            thrust, error = self._thrust / known, self._error / known
+        if self._weight:
+            thrust, error = self._thrust / self._weight, self._error / self._weight
         return Summary(
             begins=self._first_t,
             ends=self._last.t if self._last else 0.0,
