@@ -9,6 +9,7 @@ import click
 from fishd.core.console import complain
 
 _EXTRAS = {
+    "bayes_opt": "lab",
     "distributed": "cluster",
     "gymnasium": "learn",
     "joblib": "lab",
@@ -20,6 +21,7 @@ _EXTRAS = {
     "plotly": "lab",
     "pyarrow": "lab",
     "scipy": "lab",
+    "sklearn": "lab",
     "stable_baselines3": "learn",
     "tensorboard": "learn",
     "torch": "learn",

@@ -122,15 +122,20 @@ def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, floa
 
 
 def evaluate(
-    ticks: Sequence[Tick], controller: str, parameters: Mapping[str, Any], tick: float
+    ticks: Sequence[Tick],
+    controller: str,
+    parameters: Mapping[str, Any],
+    tick: float,
+    settles: float = SWIM_SETTLES,
 ) -> Measured:
     """The thrust in ticks of a fish that swam and rested in turn, with one controller.
 
     tick: period of the loop [s]
+    settles: when a swim is steady [s]
     Raises `ParameterError` where there is too little to tell it from a drift.
     """
     first = ticks[0].seq
-    found = [block for phase in _phases(ticks) for block in _blocks(phase, tick, first)]
+    found = [block for phase in _phases(ticks) for block in _blocks(phase, tick, first, settles)]
     swimming = [block for block in found if block.swims]
     if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
         raise ParameterError(
@@ -178,13 +183,13 @@ def _phases(ticks: Sequence[Tick]) -> Iterator[list[Tick]]:
     yield phase
 
 
-def _blocks(phase: list[Tick], tick: float, first: int) -> Iterator[_Block]:
+def _blocks(phase: list[Tick], tick: float, first: int, settles: float) -> Iterator[_Block]:
     """Whole beats of a swim, or pieces of a rest, once it has settled.
 
     first: `seq` that time is counted from
     """
     swims = phase[0].mode == "running"
-    begin = round((SWIM_SETTLES if swims else REST_SETTLES) / tick)
+    begin = round((settles if swims else REST_SETTLES) / tick)
     ups = _reversals(phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1
