@@ -16,7 +16,7 @@ BLACK, BLUE, ORANGE, GREEN, PURPLE = "#1a1a1a", "#0072b2", "#d55e00", "#009e73",
 """Colours that stay apart in grey and for the colour-blind (Okabe and Ito), darkest first."""
 GREY = "0.55"
 """Of what a curve is compared with."""
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -8,9 +8,9 @@ import numpy as np
 
 from fishd.config import Config
 from fishd.core.errors import ConfigError
+from fishd.lab.drawing import BLUE, ORANGE, drawn, save
 from fishd.lab.optimise.search import Proposal, Search
 from fishd.lab.optimise.trials import Trial
-from fishd.lab.drawing import BLUE, ORANGE, drawn, save
 from fishd.lab.tables import Table
 from fishd.recording.writer import RunWriter
 
