@@ -13,6 +13,7 @@ from fishd.cli.output import echo, echo_rows, made_printable, measured, print_js
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core.addresses import ENDPOINT_VARIABLE
+from fishd.core.console import thrust_words
 from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
 from fishd.core.schema import Field, nearest
@@ -20,6 +21,7 @@ from fishd.core.signals import Percentiles, Reason, Status
 
 T = TypeVar("T")
 _HELP = "docs/troubleshooting.md"
+_ZERO = "(its zero is not known: stop for 3 s, then swim on; or fishctl measure)"
 
 
 @click.command()
@@ -194,7 +196,6 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
             ("mode", f"{status.mode} ({_why(reason)})"),
             ("to do", f"{remedy}; then: fishctl clear-fault"),
         ]
-    thrust = "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
     uptime = datetime.timedelta(seconds=int(status.uptime))
     survived = {name: count for name, count in status.counters.items() if count}
     missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
@@ -204,7 +205,8 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
-        ("thrust", f"{thrust} m{status.force_unit} at {status.frequency:.2f} Hz"),
+        ("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz"),
+        *([("", _ZERO)] if status.thrust_error is None and not status.sensor_lost else []),
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),

@@ -28,6 +28,9 @@ VERBS = {
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
+    "Measure": {
+        "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+    },
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
         "runs": Verb("recording.runs", "runs", "List the recordings."),
@@ -47,6 +50,7 @@ VERBS = {
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
+        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
         "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },

@@ -51,7 +51,7 @@ def measured(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[
     """Names of quantities, and their values with units: `("top_speed", "2.31")`."""
     spelled = []
     for name, value in quantities.items():
-        unit = units.get(name, "1")
+        unit = text.quoted(units.get(name, "1"))
         spelled.append((text.quoted(name), f"{value:.3g}" + (f" {unit}" if unit != "1" else "")))
     return spelled
 

@@ -6,12 +6,15 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import UNSET
+from msgspec.structs import replace
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
 from fishd.cli.output import measured, spelled, time_of_day
 from fishd.core import text
+from fishd.core.console import thrust_words
 from fishd.core.signals import Event, Status, Tick
 
 SPAN = 5.0
@@ -113,9 +116,13 @@ class View:
 
     def _figures(self) -> Table:
         tick = self._ticks[-1]
-        thrust = "–" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f}"
+        known = replace(
+            self.status,
+            thrust=tick.thrust,
+            thrust_error=None if tick.thrust_error is UNSET else tick.thrust_error,
+        )
         figures = {
-            "thrust": f"{thrust} m{text.quoted(self.status.force_unit)}",
+            "thrust": thrust_words(known),
             "tail beat": f"{tick.frequency:.2f} Hz",
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
             "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",

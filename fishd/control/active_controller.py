@@ -41,10 +41,14 @@ class ActiveController:
         former, self.parameters = self.controller, _plain(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
         self.quantities, self.quantity_units = {}, units
+        self.dispose(former, f"the controller before {name}")
+
+    def dispose(self, controller: Controller[Any], what: str) -> None:
+        """Close a controller that will not be active any more."""
         try:
-            contained(former.close)
+            contained(controller.close)
         except Exception as error:
-            self._reporter.problem(f"the controller before {name} could not be closed", error)
+            self._reporter.problem(f"{what} could not be closed", error)
 
     def rest(self) -> None:
         """Make `hold` the active one, at neutral."""

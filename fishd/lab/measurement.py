@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
@@ -20,8 +21,6 @@ REST_SETTLES = 1.0
 """The water and the fin are still after so long, fading included [s]."""
 BLOCK = 0.5
 """Rest is cut in pieces of this length [s]."""
-
-
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
 
@@ -68,6 +67,38 @@ def measure(
         ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
         progress(len(ticks) * rig.tick)
     return evaluate(ticks, controller, parameters, rig.tick)
+
+
+class Summary(Struct, frozen=True):
+    """A measurement without what it was found from."""
+
+    controller: str
+    parameters: dict[str, Any]
+    thrust: float
+    """[N]"""
+    error: float
+    """Half of its 95 % interval [N]."""
+    frequency: float
+    """[Hz]"""
+    factor: float
+    """Thrust over the mean square of `fin_velocity`."""
+    swims: int
+    seconds: float
+    """How long it took, rests included [s]."""
+
+
+def summary(found: Measured, tick: float) -> Summary:
+    """What fits in a line, or in JSON; tick: period of the loop [s]."""
+    return Summary(
+        found.controller,
+        dict(found.parameters),
+        found.thrust,
+        found.error,
+        found.frequency,
+        found.thrust / found.power if found.power else 0.0,
+        found.swims,
+        len(found.ticks) * tick,
+    )
 
 
 def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, float]]:
