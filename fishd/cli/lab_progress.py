@@ -46,7 +46,7 @@ class Bar(Lines):
 
 
 @contextmanager
-def showing(total: float, unit: str, *, err: bool) -> Iterator[Lines]:
+def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
     """A bar where it can be seen, else lines.
 
     total: in `unit`; err: on standard error, since the output is for a program
