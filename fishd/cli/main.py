@@ -30,6 +30,8 @@ VERBS = {
     },
     "Measure": {
         "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+        "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
+        "optimise": Verb("optimise", "optimise", "Search the best parameters of a controller."),
     },
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
@@ -43,10 +45,6 @@ VERBS = {
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
-    },
-    "Experiment": {
-        "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
-        "optimise": Verb("optimise", "optimise", "Search the best parameters of a controller."),
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
