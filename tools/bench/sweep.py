@@ -88,6 +88,7 @@ OPTIONS: Options = {
 
 def measure(options: Namespace) -> Report:
     """Both; a minute."""
+    load_before = os.getloadavg()[0]
     sweeps = []
     for _ in range(options.runs):
         sweeps.append(sweep_seconds())
@@ -111,7 +112,8 @@ def measure(options: Namespace) -> Report:
             "bench sweep": f"60 points on {joblib.cpu_count()} cores: "
             f"{statistics.median(times):.1f} s (median of {len(times)}; "
             f"{min(times):.1f} – {max(times):.1f} s), start and picture included, for "
-            f"{statistics.median(used):.1f} s of computing.",
+            f"{statistics.median(used):.1f} s of computing, begun at a load average of "
+            f"{load_before:.1f}.",
             "bench search": f"{text}\n\nThe best frequency was within the interval of "
             f"{sum(covers)} of {len(covers)}.",
         },
