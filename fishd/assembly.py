@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from fishd.config import Config
 from fishd.config.drivers import claims_of
 from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
 from fishd.control.reporting import Publisher
@@ -229,6 +230,7 @@ def assemble(
         servo=servo,
         truth=truth,
         panel=panel,
+        tared=sensor,
         calibrated=CalibratedParts(sensor, servo, tell_release),
         degraded=degraded,
         counters=lambda: {**sensor.counters(), **survived(servo.driver)},
@@ -304,6 +306,7 @@ def build_loop(
     loop = ControlLoop(
         robot=robot,
         estimator=LateralForceEstimator(config.estimator),
+        thrust=LiveThrust(config.estimator.zero_drift),
         guard=guard,
         limits=config.limits,
         clock=clock,
@@ -313,5 +316,8 @@ def build_loop(
     start = config.start
     if start.controller is not None:
         controller = registry.create(start.controller, start.parameters, config.limits)
-        loop.set_controller(start.controller, controller)
+        if start.rest:
+            loop.set_controller_after(start.rest, start.controller, controller)
+        else:
+            loop.set_controller(start.controller, controller)
     return loop

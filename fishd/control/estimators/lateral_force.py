@@ -16,7 +16,7 @@ from fishd.core.signals import Measurement, Observation
 
 
 class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the fin velocity is found."""
+    """How fin velocity and thrust are found."""
 
     leak: Annotated[
         float,
@@ -33,6 +33,16 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1000,
         ),
     ] = 2.0
+    zero_drift: Annotated[
+        float,
+        unit(
+            "N/√s",
+            "How fast the zero of F_x wanders, standard deviation after a second: by this the "
+            "interval of the thrust grows.",
+            ge=0,
+            le=1,
+        ),
+    ] = 6e-4
 
 
 class LateralForceEstimator:
