@@ -65,6 +65,10 @@ class ServoError(FishdError, OSError):
     """The servo cannot be driven."""
 
 
+class RecordingError(FishdError, OSError):
+    """A recording cannot be written, or a file holds none."""
+
+
 class FishError(FishdError):
     """A request to a daemon failed."""
 

@@ -11,9 +11,6 @@ from msgspec import Struct
 
 from fishd.core.schema import note, unit
 
-DRIFT_PERIOD = 60.0
-"""Period of the slow drift [s]: a few thousandths of the tail beat, as warming electronics do."""
-
 
 class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How imperfect the simulated rig is."""
@@ -27,10 +24,22 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         float,
         unit(
             "N",
-            "Amplitude of a slow drift of both offsets, a sine of 60 s whose phase depends on the "
-            "seed.",
+            "Amplitude of a slow drift of both offsets, a sine whose phase depends on the seed.",
             ge=0,
             le=10,
+        ),
+    ] = 0.0
+    drift_period: Annotated[float, unit("s", "Period of that sine.", gt=0, le=1e6)] = 60.0
+    drift_rate: Annotated[
+        float, unit("N/s", "A steady drift of both offsets beside it.", ge=-1, le=1)
+    ] = 0.0
+    drift_walk: Annotated[
+        float,
+        unit(
+            "N/√s",
+            "A random walk of each offset beside these: its standard deviation after a second.",
+            ge=0,
+            le=1,
         ),
     ] = 0.0
     rotation: Annotated[
@@ -67,6 +76,7 @@ class Imperfections:
         self._phase_y = self._random.uniform(0, math.tau)
         self._cos = math.cos(settings.rotation)
         self._sin = math.sin(settings.rotation)
+        self._walk_x = self._walk_y = 0.0
 
     def apply(self, fx: float, fy: float, time: float, duration: float) -> tuple[float, float]:
         """The forces as the rig shows them [N], for a window of `duration` that ends at `time` [s].
@@ -77,10 +87,15 @@ class Imperfections:
         settings = self._settings
         gauss = self._random.gauss
         noise = settings.noise * math.sqrt(self._tick / duration)
-        angle = math.tau * time / DRIFT_PERIOD
-        offset_x = settings.offset_x + settings.drift * math.sin(angle + self._phase_x)
-        offset_y = settings.offset_y + settings.drift * math.sin(angle + self._phase_y)
+        if settings.drift_walk:
+            step = settings.drift_walk * math.sqrt(duration)
+            self._walk_x += gauss(0.0, step)
+            self._walk_y += gauss(0.0, step)
+        angle = math.tau * time / settings.drift_period
+        steady = settings.drift_rate * time
+        drift_x = settings.drift * math.sin(angle + self._phase_x) + steady + self._walk_x
+        drift_y = settings.drift * math.sin(angle + self._phase_y) + steady + self._walk_y
         return (
-            self._cos * fx - self._sin * fy + offset_x + gauss(0.0, noise),
-            self._sin * fx + self._cos * fy + offset_y + gauss(0.0, noise),
+            self._cos * fx - self._sin * fy + settings.offset_x + drift_x + gauss(0.0, noise),
+            self._sin * fx + self._cos * fy + settings.offset_y + drift_y + gauss(0.0, noise),
         )

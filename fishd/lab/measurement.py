@@ -1,0 +1,202 @@
+"""The thrust of a controller with its interval: the fish swims and rests in turn."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Tick
+from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
+from fishd.lab.rig import Rig
+
+SWIM, REST = 6.0, 2.75
+"""How long the fish swims and rests in turn [s]."""
+SWIM_SETTLES = 1.5
+"""A swim is steady after so long [s]; what the force was before is left out."""
+REST_SETTLES = 1.0
+"""The water and the fin are still after so long, fading included [s]."""
+BLOCK = 0.5
+"""Rest is cut in pieces of this length [s]."""
+
+
+SHORT_BEAT = 0.4
+"""Beats are taken together until they last so long [s]."""
+
+
+class Measured(NamedTuple):
+    """What a controller does on a rig, and what it was found from."""
+
+    controller: str
+    parameters: Mapping[str, Any]
+    thrust: float
+    """[N]"""
+    error: float
+    """Half of its 95 % interval [N]."""
+    frequency: float
+    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    power: float
+    """Mean square of `fin_velocity` while it swims, in the square of that quantity's unit."""
+    swims: int
+    """How often it swam."""
+    blocks: Blocks
+    """The force in blocks; of time since the first tick."""
+    drift: Array
+    """The force without swimming, block by block [N]."""
+    ticks: Sequence[Tick]
+    """Every tick, in order."""
+
+
+def measure(
+    rig: Rig,
+    controller: str,
+    parameters: Mapping[str, Any],
+    seconds: float = 60.0,
+    progress: Callable[[float], None] = lambda seconds: None,
+) -> Measured:
+    """Let a controller swim and rest in turn for so long, and find its thrust.
+
+    The drift of the sensor is told apart by the rests: see `fishd.lab.drift`.
+    progress: called with the time that has passed [s]
+
+    Raises `ParameterError` for a time that is too short, `Disturbed`, and what `Rig.swim` raises.
+    """
+    ticks: list[Tick] = []
+    for swims, length in plan(seconds, parameters):
+        ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
+        progress(len(ticks) * rig.tick)
+    return evaluate(ticks, controller, parameters, rig.tick)
+
+
+def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, float]]:
+    """When to swim (True) and to rest, and for how long each [s]; `seconds` in all.
+
+    A slow beat makes a swim longer. Raises `ParameterError` where two swims do not fit.
+    """
+    frequency = parameters.get("frequency")
+    swim = SWIM
+    if isinstance(frequency, int | float) and frequency > 0.0:
+        swim = max(SWIM, SWIM_SETTLES + 3.0 / frequency)
+    count = math.floor((seconds - REST) / (swim + REST)) if math.isfinite(seconds) else 0
+    if count < 2:
+        raise ParameterError(
+            f"a measurement of {seconds:g} s is too short: two swims of {swim:.3g} s between three "
+            f"rests of {REST:g} s need {2 * swim + 3 * REST:.3g} s"
+        )
+    stretched = seconds / (REST + count * (swim + REST))
+    cycle = [(True, swim * stretched), (False, REST * stretched)]
+    return [(False, REST * stretched), *cycle * count]
+
+
+def evaluate(
+    ticks: Sequence[Tick], controller: str, parameters: Mapping[str, Any], tick: float
+) -> Measured:
+    """The thrust in ticks of a fish that swam and rested in turn, with one controller.
+
+    tick: period of the loop [s]
+    Raises `ParameterError` where there is too little to tell it from a drift.
+    """
+    first = ticks[0].seq
+    found = [block for phase in _phases(ticks) for block in _blocks(phase, tick, first)]
+    swimming = [block for block in found if block.swims]
+    if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
+        raise ParameterError(
+            f"too little is left of {len(ticks) * tick:.3g} s to measure a thrust: whole beats of "
+            f"{controller} between rests are needed"
+        )
+    time, force = np.array([(block.time, block.force) for block in found]).T
+    swims = np.array([block.swims for block in found])
+    lasts = np.array([block.lasts for block in found])
+    spread = np.where(swims, _spread(found, True), _spread(found, False))
+    blocks = Blocks(time, force, spread / lasts, swims)
+    result = fit(blocks)
+    lasting = sum(block.lasts for block in swimming)
+    return Measured(
+        controller=controller,
+        parameters=dict(parameters),
+        thrust=result.force,
+        error=result.error,
+        frequency=sum(block.beats for block in swimming) / lasting,
+        power=sum(block.power * block.lasts for block in swimming) / lasting,
+        swims=sum(1 for phase in _phases(ticks) if phase[0].mode == "running"),
+        blocks=blocks,
+        drift=result.drift,
+        ticks=ticks,
+    )
+
+
+class _Block(NamedTuple):
+    time: float  # of its middle, s
+    lasts: float  # s
+    force: float  # N
+    power: float
+    beats: float
+    swims: bool
+
+
+def _phases(ticks: Sequence[Tick]) -> Iterator[list[Tick]]:
+    """The ticks of each swim and each rest."""
+    phase = [ticks[0]]
+    for tick in ticks[1:]:
+        if tick.mode != phase[-1].mode:
+            yield phase
+            phase = []
+        phase.append(tick)
+    yield phase
+
+
+def _blocks(phase: list[Tick], tick: float, first: int) -> Iterator[_Block]:
+    """Whole beats of a swim, or pieces of a rest, once it has settled.
+
+    first: `seq` that time is counted from
+    """
+    swims = phase[0].mode == "running"
+    begin = round((SWIM_SETTLES if swims else REST_SETTLES) / tick)
+    ups = _reversals(phase) if swims else []
+    cuts = [up for up in ups if up >= begin]
+    beating = len(cuts) > 1
+    if not beating:
+        cuts = list(range(begin, len(phase), max(1, round(BLOCK / tick))))
+    begun, beats = 0, 0
+    for index in range(1, len(cuts)):
+        beats += 1
+        start, end = cuts[begun], cuts[index]
+        if (end - start) * tick < SHORT_BEAT - 1e-9 * tick:
+            continue
+        # A force is that of the window before its tick, an angle that of the one after it.
+        window = phase[start + 1 : end + 1]
+        yield _Block(
+            time=(0.5 * (phase[start].seq + phase[end].seq) - first) * tick,
+            lasts=len(window) * tick,
+            force=sum(each.fx for each in window) / len(window),
+            power=sum(each.fin_velocity**2 for each in window) / len(window),
+            beats=beats if beating else 0,
+            swims=swims,
+        )
+        begun, beats = index, 0
+
+
+def _reversals(phase: list[Tick]) -> list[int]:
+    """Where the instruction angle becomes positive."""
+    side, found = 0.0, []
+    for index, tick in enumerate(phase):
+        if tick.phi_c and math.copysign(1.0, tick.phi_c) != side:
+            if side < 0.0:
+                found.append(index)
+            side = math.copysign(1.0, tick.phi_c)
+    return found
+
+
+def _spread(found: Sequence[_Block], swims: bool) -> float:
+    """Variance of the force of a second of swimming or rest, from block to block [N² s].
+
+    By neighbours, so that hardly any drift is in it.
+    """
+    steps = [
+        (other.force - one.force) ** 2 / (1.0 / one.lasts + 1.0 / other.lasts)
+        for one, other in pairwise(found)
+        if one.swims == other.swims == swims and other.time - one.time < 2.0 * one.lasts
+    ]
+    return max(sum(steps) / max(1, len(steps)), 1e-12)

@@ -1,0 +1,107 @@
+"""The file while it is written: `<run>.mcap.part`, whole chunks only, renamed when it is whole."""
+
+import errno
+import fcntl
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+from fishd.core.errors import RecordingError
+
+PART = ".part"
+SUFFIX = ".mcap"
+
+
+class PartFile:
+    """Writes whole flushes or nothing: a full disk leaves what was flushed before, whole.
+
+    It has as much of a Python file as the MCAP writer needs. It is locked while it is open, so that
+    nobody mistakes it for one that was left behind.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """path: of the finished file. Raises `RecordingError` where there is one, or no room."""
+        self.final = path
+        self.path = path.with_name(path.name + PART)
+        if os.path.lexists(path):
+            raise RecordingError(f"{path} is there already; choose another name")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+            self._fd = os.open(self.path, flags, 0o666)
+        except FileExistsError:
+            raise RecordingError(
+                f"{self.path} is there already, of a recording that runs or was not finished; "
+                f"choose another name, or see 'fishctl recover {self.path}'"
+            ) from None
+        except OSError as error:
+            raise RecordingError(f"{self.path} cannot be written: {error.strerror}") from None
+        fcntl.flock(self._fd, fcntl.LOCK_EX)
+        self._waiting = bytearray()
+        self._written = 0
+
+    def write(self, data: bytes) -> int:
+        """Take bytes for the next flush."""
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        """How long the file is, with what waits [bytes]."""
+        return self._written + len(self._waiting)
+
+    def flush(self) -> None:
+        """Hand all that waits to the kernel, or none of it; raises OSError."""
+        view, done = memoryview(bytes(self._waiting)), 0
+        try:
+            while done < len(view):
+                done += os.write(self._fd, view[done:])
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(self._fd, self._written)
+                os.lseek(self._fd, self._written, os.SEEK_SET)
+            raise
+        self._written += done
+        self._waiting.clear()
+
+    def sync(self) -> None:
+        """Wait until what was flushed survives a power cut, too; raises OSError."""
+        os.fdatasync(self._fd)
+
+    def free(self) -> int:
+        """Room left on the disk, for this user [bytes]."""
+        found = os.fstatvfs(self._fd)
+        return found.f_bavail * found.f_frsize
+
+    def finish(self) -> None:
+        """Give the file its final name; raises OSError, and leaves the part where it is then."""
+        self.sync()
+        try:
+            self.final.hardlink_to(self.path)  # unlike a rename, never onto another file
+        except OSError as error:
+            if error.errno == errno.EEXIST or self.final.exists():
+                raise
+            self.path.rename(self.final)  # a file system without links, such as that of USB sticks
+        else:
+            self.path.unlink()
+        folder = os.open(self.final.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def close(self) -> None:
+        """Close it; may be called twice."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+def is_being_written(file: IO[bytes]) -> bool:
+    """Does some process still write this part?"""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    fcntl.flock(file, fcntl.LOCK_UN)
+    return False

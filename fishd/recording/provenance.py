@@ -1,0 +1,58 @@
+"""Where a recording comes from: versions, machine and people, as its first record says."""
+
+import getpass
+import platform
+import socket
+import subprocess
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+
+from fishd import __version__
+
+FORMAT = "1"
+"""Version of the layout of a recording."""
+
+
+def provenance(
+    run: str, source: str, operator: str, subject: str, note: str, extra: Mapping[str, str]
+) -> dict[str, str]:
+    """The metadata `fishd.run` of a recording that begins now.
+
+    source: `fishd`, `simulation`, or what else made the ticks
+    """
+    return {
+        **extra,
+        "run": run,
+        "format": FORMAT,
+        "source": source,
+        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
+        "operator": operator or _user(),
+        "subject": subject,
+        "note": note,
+        "version": __version__,
+        "git_commit": git_commit(),
+        "host": socket.gethostname(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
+
+
+def git_commit() -> str:
+    """The commit of fishd's sources, with `-dirty` where they are changed; empty outside of git."""
+    folder = Path(__file__).resolve().parents[2]
+    if not (folder / ".git").exists():
+        return ""
+    command = ("git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--dirty")
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip()
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a user without a name
+        return ""

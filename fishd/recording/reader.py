@@ -1,0 +1,189 @@
+"""Reads recordings, also one that was never finished: a kill leaves whole chunks."""
+
+import os
+import struct
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import msgspec
+import yaml
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
+
+from fishd.config import Config, adopt
+from fishd.core.errors import RecordingError
+from fishd.core.frames import frame
+from fishd.core.protocol import Calibrations
+from fishd.core.signals import Event, Status, Tick
+from fishd.recording.part_file import PART, SUFFIX
+from fishd.recording.schemas import CHANNELS
+from fishd.recording.summary import Gap, Summary, Tally
+from fishd.recording.writer import CALIBRATIONS, CONFIG
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+T = TypeVar("T")
+
+LONGEST_RECORD = 2**28
+"""No record of a recording is longer; what says so is damaged [bytes]."""
+
+
+class Entry(NamedTuple):
+    """One message of a recording."""
+
+    topic: str
+    """`tick`, `event` or `status`."""
+    payload: bytes
+    """JSON, to the byte what fishd sent."""
+
+
+class Run:
+    """A recording, as `open_run` reads it; its messages are decoded when they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises `RecordingError` where the file cannot be read, or is no recording."""
+        self.path = path
+        self.about: dict[str, str] = {}
+        """Run, version, git commit, host, Python, operator, subject, note, and more."""
+        self.daemons: list[dict[str, str]] = []
+        """Each fishd that was recorded: version, process, robot."""
+        self.configs: list[dict[str, Any]] = []
+        """The configuration of each, as `fishctl config show` prints it."""
+        self.calibrations: list[Calibrations] = []
+        """The calibrations that were in use, of each fishd that was asked."""
+        self.finished = False
+        """False where the recording was not ended, or is still being written."""
+        self.reason = ""
+        """Why it ended; empty unless it is finished."""
+        self.entries: list[Entry] = []
+        """All messages in the order in which they came."""
+        self._scan()
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.path.name.removesuffix(PART).removesuffix(SUFFIX)
+
+    @cached_property
+    def config(self) -> Config:
+        """The configuration of the first fishd; raises `RecordingError` without any."""
+        if not self.configs:
+            raise RecordingError(f"{self.path}: no configuration was recorded")
+        return adopt(self.configs[0])
+
+    @cached_property
+    def ticks(self) -> list[Tick]:
+        """All ticks, in the order in which they came; raises `RecordingError`."""
+        return self._decoded("tick", Tick)
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """All events, marks and changes of parameters among them; raises `RecordingError`."""
+        return self._decoded("event", Event)
+
+    @cached_property
+    def statuses(self) -> list[Status]:
+        """All statuses, one a second; none of a run in virtual time. Raises `RecordingError`."""
+        return self._decoded("status", Status)
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """Where ticks are missing."""
+        return self._tally.gaps
+
+    @property
+    def summary(self) -> Summary:
+        """The recording in numbers."""
+        return self._tally.summary
+
+    @cached_property
+    def _tally(self) -> Tally:
+        tally = Tally()
+        for tick in self.ticks:
+            tally.tick(tick)
+        for event in self.events:
+            tally.event(event)
+        return tally
+
+    def frame(self) -> "DataFrame":
+        """The ticks as a table: `fishd.core.frames.frame`."""
+        return frame(self.ticks)
+
+    def _scan(self) -> None:
+        topics: dict[int, str] = {}
+        for record in records(self.path):
+            self.finished = isinstance(record, Footer)
+            if isinstance(record, Message):
+                if (topic := topics.get(record.channel_id)) in CHANNELS:
+                    self.entries.append(Entry(topic, record.data))
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Metadata):
+                self._take_metadata(record.name, record.metadata)
+            elif isinstance(record, Attachment):
+                self._take_attachment(record.name, record.data)
+        if not self.about:
+            raise RecordingError(f"{self.path} is an MCAP file, but no recording of fishd")
+
+    def _take_metadata(self, name: str, data: dict[str, str]) -> None:
+        if name == "fishd.run":
+            self.about = data
+        elif name == "fishd.daemon":
+            self.daemons.append(data)
+        elif name == "fishd.end":
+            self.reason = data.get("reason", "")
+
+    def _take_attachment(self, name: str, data: bytes) -> None:
+        if name == CONFIG:
+            self.configs.append(yaml.safe_load(data))
+        elif name == CALIBRATIONS:
+            self.calibrations.append(msgspec.json.decode(data, type=Calibrations))
+
+    def _decoded(self, topic: str, kind: type[T]) -> list[T]:
+        decode = msgspec.json.Decoder(kind).decode
+        try:
+            return [decode(payload) for found, payload in self.entries if found == topic]
+        except msgspec.DecodeError as error:
+            made = self.about.get("version", "unknown")
+            raise RecordingError(
+                f"{self.path}: a {topic} of fishd {made} cannot be read by this one: {error}"
+            ) from None
+
+
+def read(path: str | os.PathLike[str]) -> "DataFrame":
+    """The ticks of a recording as a table: one row a tick, one column a field of `Tick`, SI units.
+
+    Raises `RecordingError`, and `MissingPackage` without pandas (extra: lab).
+    """
+    return open_run(path).frame()
+
+
+def open_run(path: str | os.PathLike[str]) -> Run:
+    """A recording, finished or not; raises `RecordingError`."""
+    return Run(Path(path))
+
+
+def records(path: Path) -> Iterator[McapRecord]:
+    """All records of an MCAP file; one that was cut off ends with its last whole chunk.
+
+    Raises `RecordingError`.
+    """
+    begun = False
+    try:
+        with path.open("rb") as file:
+            try:
+                reader = StreamReader(file, validate_crcs=True, record_size_limit=LONGEST_RECORD)
+                for record in reader.records:
+                    begun = True
+                    yield record
+            except (McapError, ZstdError, struct.error, ValueError):
+                pass  # it was not finished, or is damaged from here on
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
+    if not begun:
+        raise RecordingError(f"{path} is no MCAP file")

@@ -1,0 +1,138 @@
+"""What a recording amounts to: how long, who swam, how much thrust, and what is missing."""
+
+from typing import NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from fishd.core.signals import Event, Tick
+
+
+class Gap(NamedTuple):
+    """Ticks that fishd made and that are not in the recording."""
+
+    after: float
+    """Time of the last tick before it; of the first one after it where there is none [s, unix]."""
+    seq: int
+    """Number of the first tick that is missing."""
+    lost: int
+    """How many are missing."""
+
+
+class Summary(Struct, frozen=True):
+    """A recording in numbers; stands in its last record `fishd.end`."""
+
+    begins: float = 0.0
+    """Time of the first tick [s, unix]."""
+    ends: float = 0.0
+    """Time of the last tick [s, unix]."""
+    ticks: int = 0
+    events: int = 0
+    marks: int = 0
+    gaps: int = 0
+    """How often ticks are missing."""
+    lost: int = 0
+    """How many ticks are missing in those gaps."""
+    missed: int = 0
+    """Slots that fishd itself skipped meanwhile: it made no tick there."""
+    restarts: int = 0
+    """How often another fishd took the place of the one before."""
+    thrust: float | None = None
+    """Mean F_x of all ticks in which a controller swam, as measured: drift and offset are in it,
+    and so are starts; None where none swam [N]."""
+    swimming: dict[str, int] = {}
+    """Ticks in mode running, by controller."""
+
+    @property
+    def duration(self) -> float:
+        """From the first tick to the last [s]."""
+        return self.ends - self.begins
+
+
+class TickHead(Struct, frozen=True, gc=False):
+    """As much of a `Tick` as a summary needs."""
+
+    t: float
+    seq: int
+    mode: str
+    controller: str
+    fx: float
+    missed: int
+
+
+class Tally:
+    """Adds up a recording, tick by tick, while it is written or read."""
+
+    def __init__(self) -> None:
+        self.gaps: list[Gap] = []
+        self._last: TickHead | Tick | None = None
+        self._first_t = 0.0
+        self._ticks = self._events = self._marks = self._missed = self._restarts = 0
+        self._impulse = 0.0
+        self._swimming: dict[str, int] = {}
+
+    def tick(self, tick: TickHead | Tick) -> bool:
+        """Add a tick; returns False where it is the first of another fishd."""
+        last, self._last = self._last, tick
+        self._ticks += 1
+        if tick.mode == "running":
+            self._impulse += tick.fx
+            self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
+        if last is None:
+            self._first_t = tick.t
+            return True
+        same = tick.seq > last.seq
+        before = last.seq if same else 0  # another fishd counts from 1
+        if tick.seq > before + 1:
+            self.gaps.append(Gap(last.t, before + 1, tick.seq - before - 1))
+        if same:
+            self._missed += max(0, tick.missed - last.missed)
+        else:
+            self._restarts += 1
+        return same
+
+    def event(self, event: Event) -> None:
+        """Add an event."""
+        self._events += 1
+        self._marks += event.kind == "mark"
+
+    @property
+    def seconds(self) -> float:
+        """From the first tick to the last [s]."""
+        return self._last.t - self._first_t if self._last else 0.0
+
+    @property
+    def summary(self) -> Summary:
+        """All that was added."""
+        swam = sum(self._swimming.values())
+        return Summary(
+            begins=self._first_t,
+            ends=self._last.t if self._last else 0.0,
+            ticks=self._ticks,
+            events=self._events,
+            marks=self._marks,
+            gaps=len(self.gaps),
+            lost=sum(gap.lost for gap in self.gaps),
+            missed=self._missed,
+            restarts=self._restarts,
+            thrust=self._impulse / swam if swam else None,
+            swimming=dict(self._swimming),
+        )
+
+
+def to_metadata(summary: Summary) -> dict[str, str]:
+    """Its fields as texts, each JSON, as MCAP's metadata wants them."""
+    return {
+        name: msgspec.json.encode(value).decode()
+        for name, value in msgspec.structs.asdict(summary).items()
+    }
+
+
+def from_metadata(data: dict[str, str]) -> Summary | None:
+    """The summary in the metadata of a recording; None where there is none."""
+    known = {name: data[name] for name in Summary.__struct_fields__ if name in data}
+    try:
+        raw = {name: msgspec.json.decode(value) for name, value in known.items()}
+        return msgspec.convert(raw, Summary) if raw else None
+    except msgspec.MsgspecError:
+        return None

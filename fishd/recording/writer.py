@@ -1,0 +1,217 @@
+"""Writes one recording: an MCAP file that Foxglove, Lichtblick and PlotJuggler open.
+
+docs/recording.md shows its layout.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+from mcap.writer import CompressionType, Writer
+
+from fishd.config import Config, to_yaml
+from fishd.core.errors import RecordingError
+from fishd.core.protocol import Calibrations
+from fishd.core.signals import Event, Status, Tick
+from fishd.recording.part_file import SUFFIX, PartFile
+from fishd.recording.provenance import provenance
+from fishd.recording.schemas import CHANNELS, json_schema, schema_name
+from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
+
+CHUNK = 32 * 2**10
+"""A chunk is closed when it is longer; to close one stalls the writer for 0.5 ms [bytes]."""
+CONFIG, CALIBRATIONS = "config.yaml", "calibrations.json"
+"""Names of attachments."""
+
+
+class RunWriter:
+    """A recording that is being written: a publisher of ticks and events, and a context manager.
+
+    Until it is closed the file is called `<run>.mcap.part`. Whatever ends the process, all that was
+    flushed stays readable. A file is never overwritten.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        source: str = "fishd",
+        operator: str = "",
+        subject: str = "",
+        note: str = "",
+        extra: Mapping[str, str] | None = None,
+    ) -> None:
+        """
+        path: of the finished file; `.mcap` is added where it is missing
+        source: what made the ticks, such as `simulation`
+        operator: who recorded; by default the name of this user
+        subject: which fish, note: what for
+        extra: what else is to be kept with it, such as the point of a sweep
+
+        Raises `RecordingError` where the file exists or cannot be made.
+        """
+        path = Path(path)
+        self.path = path if path.name.endswith(SUFFIX) else path.with_name(path.name + SUFFIX)
+        self.tally = Tally()
+        self._file = PartFile(self.path)
+        self._closed = False
+        self._encode = msgspec.json.Encoder().encode
+        self._writer = Writer(self._file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer.start(profile="", library="fishd")
+        run = self.path.name.removesuffix(SUFFIX)
+        self._writer.add_metadata(
+            "fishd.run", provenance(run, source, operator, subject, note, extra or {})
+        )
+        self._channels = {
+            topic: self._writer.register_channel(
+                topic,
+                "json",
+                self._writer.register_schema(
+                    schema_name(message), "jsonschema", json_schema(message)
+                ),
+            )
+            for topic, message in CHANNELS.items()
+        }
+        self.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        if isinstance(error, RecordingError):  # nothing more can be written
+            self.abandon()
+        else:
+            self.close("ended" if error is None else f"ended by {type(error).__name__}")
+
+    @property
+    def part(self) -> Path:
+        """Where the recording is until it is closed."""
+        return self._file.path
+
+    @property
+    def size(self) -> int:
+        """How long the file is by now [bytes]."""
+        return self._file.tell()
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """Where ticks are missing, so far."""
+        return self.tally.gaps
+
+    @property
+    def summary(self) -> Summary:
+        """What was recorded so far."""
+        return self.tally.summary
+
+    def free(self) -> int:
+        """Room left on its disk [bytes]."""
+        return self._file.free()
+
+    def describe(
+        self,
+        config: Config | Mapping[str, Any],
+        calibrations: Calibrations | None = None,
+        daemon: Mapping[str, str] | None = None,
+    ) -> None:
+        """Keep what the ticks from now on are made with; again where another fishd takes over.
+
+        daemon: what is to be known of it, such as its version
+        Raises `RecordingError` when it cannot be written.
+        """
+        now = time.time_ns()
+        if daemon is not None:
+            self._writer.add_metadata("fishd.daemon", dict(daemon))
+        yaml = to_yaml(config if isinstance(config, Config) else dict(config))
+        self._writer.add_attachment(now, now, CONFIG, "application/yaml", yaml.encode())
+        if calibrations is not None:
+            content = self._encode(calibrations)
+            self._writer.add_attachment(now, now, CALIBRATIONS, "application/json", content)
+        self.flush()
+
+    def tick(self, tick: Tick) -> None:
+        """Record a tick."""
+        self.tally.tick(tick)
+        self._add("tick", tick.t, tick.seq, self._encode(tick))
+
+    def event(self, event: Event) -> None:
+        """Record an event."""
+        self.tally.event(event)
+        self._add("event", event.t, 0, self._encode(event))
+
+    def status(self, status: Status) -> None:
+        """Record a status."""
+        self._add("status", status.t, status.seq, self._encode(status))
+
+    def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
+        """Record a message of telemetry to the byte, and return what it says.
+
+        Raises `msgspec.DecodeError` for what is none.
+        """
+        head: TickHead | Event | Status
+        if topic == "tick":
+            head = _decode_tick(payload)
+            self.tally.tick(head)
+        elif topic == "event":
+            head = _decode_event(payload)
+            self.tally.event(head)
+        else:
+            head = _decode_status(payload)
+        self._add(topic, head.t, 0 if isinstance(head, Event) else head.seq, payload)
+        return head
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Hand all to the kernel, so that the end of this process loses none of it.
+
+        sync: wait until the disk has it, so that a power cut loses none of it either
+        Raises `RecordingError`.
+        """
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            if sync:
+                self._file.sync()
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def close(self, reason: str = "ended") -> None:
+        """Finish the file and give it its name; may be called twice.
+
+        reason: why it ends, kept in the file
+        Raises `RecordingError`; the `.part` is readable all the same.
+        """
+        if self._closed:
+            return
+        try:
+            self._writer.add_metadata(
+                "fishd.end", to_metadata(self.tally.summary) | {"reason": reason}
+            )
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            self._file.finish()
+        except OSError as error:
+            raise self._failed(error) from None
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Leave the `.part` as it was flushed last."""
+        self._closed = True
+        self._file.close()
+
+    def _add(self, topic: str, t: float, seq: int, payload: bytes) -> None:
+        nanoseconds = max(0, round(t * 1e9))
+        self._writer.add_message(
+            self._channels[topic], nanoseconds, payload, nanoseconds, seq & 0xFFFFFFFF
+        )
+
+    def _failed(self, error: OSError) -> RecordingError:
+        what = f"{self.part}: the recording ends after {self.tally.seconds:.0f} s"
+        kept = f"what was written is readable; with more room: fishctl recover {self.part}"
+        return RecordingError(f"{what}: {error.strerror or error}; {kept}")
+
+
+_decode_tick = msgspec.json.Decoder(TickHead).decode
+_decode_event = msgspec.json.Decoder(Event).decode
+_decode_status = msgspec.json.Decoder(Status).decode
