@@ -32,6 +32,9 @@ VERBS = {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
     },
+    "Experiment": {
+        "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
+    },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
         "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),

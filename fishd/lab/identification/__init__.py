@@ -4,7 +4,7 @@
 """
 
 from fishd.lab.identification.experiment import experiment
-from fishd.lab.identification.identify import DEFAULT, identify
+from fishd.lab.identification.identify import DEFAULT, check, identify
 from fishd.lab.identification.passages import Unidentifiable
 from fishd.lab.identification.result import Channel, Estimate, Fit, Identification
 
@@ -15,6 +15,7 @@ __all__ = [
     "Fit",
     "Identification",
     "Unidentifiable",
+    "check",
     "experiment",
     "identify",
 ]

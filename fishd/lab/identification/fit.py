@@ -1,9 +1,9 @@
 """Least squares on the simulated response: the parameters that explain measured forces best.
 
 The offset of the sensor drifts: it is a level whose slope wanders, by likeliest strengths. The
-residual of each channel is filtered such that this drift plus white noise becomes white (innovations
-of a local linear trend, Harvey, "Forecasting, structural time series models and the Kalman filter",
-in the steady state). Level and slope at the start of each passage are projected out.
+residual of each channel is filtered such that this drift plus white noise becomes white, which are
+the innovations of a local linear trend in the steady state (Harvey, "Forecasting, structural time
+series models and the Kalman filter"). Level and slope at the start of a passage are projected out.
 """
 
 from collections.abc import Sequence

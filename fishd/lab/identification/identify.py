@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2
 
+from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
 from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Problem, solve
 from fishd.lab.identification.passages import Passage, Unidentifiable, passages
@@ -55,10 +56,10 @@ def identify(
     start: where to begin, and the value of what is not fitted; by default the fish of Fu et al.
     fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`
 
-    Raises `Unidentifiable` for runs that hold nothing to fit, ValueError for a name in `fit` that
-    is not possible, and what `fishd.recording.read` raises.
+    Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
+    that is not possible, and what `fishd.recording.read` raises.
     """
-    names = _checked(fit)
+    names = check(fit)
     parts = passages([_table(run) for run in _several(runs)])
     if not any(one.commands.any() for one in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
@@ -86,12 +87,13 @@ def _table(run: object) -> "DataFrame":
     return run  # type: ignore[return-value]
 
 
-def _checked(fit: Sequence[str]) -> tuple[str, ...]:
+def check(fit: Sequence[str]) -> tuple[str, ...]:
+    """Names of what to fit, in order; raises ParameterError for one that is not possible."""
     for name in fit:
         if name not in POSSIBLE:
-            raise ValueError(f"'{name}' cannot be fitted; {nearest(name, list(POSSIBLE))}")
+            raise ParameterError(f"'{name}' cannot be fitted; {nearest(name, list(POSSIBLE))}")
     if not fit:
-        raise ValueError(f"nothing to fit; possible: {', '.join(POSSIBLE)}")
+        raise ParameterError(f"nothing to fit; possible: {', '.join(POSSIBLE)}")
     return tuple(name for name in POSSIBLE if name in fit)
 
 
@@ -134,7 +136,7 @@ def _summary(
     jacobian = problem.jacobian(values)
     covariance, untold = _covariance(jacobian, innovations)
     deviations = np.sqrt(np.diag(covariance))
-    spread = dict(zip(problem.names, _Z * deviations, strict=True))
+    spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
     estimates = [_estimate(name, values[name], spread) for name in UNITS if name in values]
     means = np.concatenate(residuals, axis=1).mean(axis=1)
     slopes = problem.slopes_of_means(values)
@@ -267,8 +269,8 @@ def _remarks(
     coloured = [symbols[channel.name] for channel in channels if not channel.white]
     if coloured:
         remarks.append(
-            f"what is left of {' and '.join(coloured)} is more than noise: the model lacks something "
-            "of this fish, and intervals may be too narrow"
+            f"what is left of {' and '.join(coloured)} is more than noise: the model lacks "
+            "something of this fish, and intervals may be too narrow"
         )
     return tuple(remarks)
 

@@ -1,8 +1,8 @@
 """What a fish of given parameters answers to recorded commands, fast enough for a fit.
 
-The same equations as fishd.virtual.plant, for a whole run at once: the servo in closed form, tick by
-tick; the fin, which is linear, by its exact discrete filter on a grid that is shifted by the delay,
-so that every jump of the command falls on it.
+The same equations as fishd.virtual.plant, for a whole run at once: the servo in closed form, tick
+by tick; the fin, which is linear, by its exact discrete filter on a grid that is shifted by the
+delay, so that every jump of the command falls on it.
 """
 
 import math
@@ -51,7 +51,7 @@ def response(
 ) -> Array:
     """Window means of [−α α̈, −α̈, −α̇] for λ = 1, of shape (3, len(ends) − 1).
 
-    With coupling λ the forces are F_x = K λ² · the first, F_y = K λ · the second + K_d λ · the third.
+    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third.
 
     commands: φ_c in each slot of one period [rad], from the start on
     ends: slots at whose starts windows end; the first one begins where the first window does
@@ -84,7 +84,8 @@ def response(
     pulled = sum(w * u for w, u in zip(_parabola(part), pulls, strict=True))
     minus = drive.xi * drive.omega0 * v + drive.omega0**2 * (a - pulled)
     sums = np.stack((a * minus, minus, -v)).reshape(3, slots, samples).sum(axis=2)
-    return np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
+    means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
+    return means
 
 
 def _pull(drive: Drive, held: Array, steps: int, tick: float) -> Array:
