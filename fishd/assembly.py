@@ -12,7 +12,9 @@ from msgspec.structs import replace
 
 from fishd.config import Config
 from fishd.config.drivers import claims_of
+from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
 from fishd.control.reporting import Publisher
@@ -286,6 +288,13 @@ def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
             return
 
 
+def build_estimator(config: Config) -> Estimator:
+    """What `estimator.kind` names."""
+    if config.estimator.kind == "observer":
+        return Observer(config.estimator, config.plant, config.tick)
+    return LateralForceEstimator(config.estimator)
+
+
 def build_loop(
     config: Config,
     robot: Robot,
@@ -303,7 +312,7 @@ def build_loop(
         guard.restrict(*robot.calibrated.servo.reach)
     loop = ControlLoop(
         robot=robot,
-        estimator=LateralForceEstimator(config.estimator),
+        estimator=build_estimator(config),
         guard=guard,
         limits=config.limits,
         clock=clock,

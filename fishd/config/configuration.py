@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 from fishd.config import consistency as config_checks
 from fishd.config import drivers
 from fishd.config.overrides import apply_overrides
-from fishd.control.estimators.lateral_force import EstimatorSettings
+from fishd.control.estimators.base import EstimatorSettings
 from fishd.controllers.base import ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
-from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.estimators.base import Estimator
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
 from fishd.control.servo_output import ServoOutput
@@ -49,7 +49,7 @@ class ControlLoop:
     def __init__(
         self,
         robot: Robot,
-        estimator: LateralForceEstimator,
+        estimator: Estimator,
         guard: Guard,
         limits: Limits,
         clock: Clock,

@@ -8,4 +8,18 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 from common.report import run  # noqa: E402
 
 if __name__ == "__main__":
-    sys.exit(run("bench", ("tick", "sampler", "policy", "remote", "learning", "chatter", "swing")))
+    sys.exit(
+        run(
+            "bench",
+            (
+                "tick",
+                "sampler",
+                "policy",
+                "remote",
+                "learning",
+                "chatter",
+                "swing",
+                "identification",
+            ),
+        )
+    )
