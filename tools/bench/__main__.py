@@ -20,6 +20,7 @@ if __name__ == "__main__":
                 "chatter",
                 "swing",
                 "identification",
+                "estimators",
             ),
         )
     )
