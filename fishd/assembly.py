@@ -222,6 +222,10 @@ def assemble(
         if sensor.calibration.untouched:
             shown = f"the force is not calibrated, and shown in {sensor.unit}"
             lines += (f"{shown}: fishctl calibrate force",)
+            if config.estimator.kind == "observer":
+                lines += (
+                    "estimator.kind: observer needs forces in N, so the fin velocity is wrong",
+                )
         cut = _cut_by_calibration(config, servo)
         return (*lines, cut) if cut else lines
 

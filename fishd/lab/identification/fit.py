@@ -97,6 +97,11 @@ class Problem:
         return self.to_z(lowest), self.to_z(highest)
 
     @property
+    def unexplained(self) -> float:
+        """How much of both forces `noise` has to stand for, as a logarithm; smaller is likelier."""
+        return float(sum(np.log(noise.innovation) for noise in self.noise))
+
+    @property
     def measured(self) -> list[Array]:
         """The forces that are judged [N], by passage, each (2, windows)."""
         return [one.forces[:, skip:] for one, skip in self._passages]
@@ -171,11 +176,14 @@ class Problem:
         return moved
 
 
-def solve(problem: Problem, start: dict[str, float], rounds: int = 3) -> dict[str, float]:
+def solve(
+    problem: Problem, start: dict[str, float], rounds: int = 3, steps: int = 40
+) -> dict[str, float]:
     """The likeliest values; `problem.noise` is what is likeliest with them.
 
     start: a value for each parameter; those that are not fitted keep it
-    rounds: how often the noise is estimated anew
+    rounds: how often the noise is estimated anew, at most
+    steps: of the least squares in each round, at most
     """
     values = start
     low, high = problem.bounds()
@@ -197,7 +205,7 @@ def solve(problem: Problem, start: dict[str, float], rounds: int = 3) -> dict[st
             x_scale="jac",
             xtol=1e-6,
             ftol=1e-8,
-            max_nfev=40,
+            max_nfev=steps,
         )
         values = problem.to_values(found.x, fixed)
         before = problem.noise

@@ -31,10 +31,12 @@ _SETTLE = 2.0
 _LONGEST_SETTLE = 20.0
 _FORGOTTEN = 7.0
 """Time constants of the fin after which its start is forgotten."""
-_GOOD = 0.95
-"""Share of F_y that a fit has explained which began at the right place."""
+_ROUGH = 12
+"""Steps of a fit that shows whether it is worth going on."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
 """Natural frequency, as a multiple of that of the first fish, and delay [s]."""
+_UNKNOWN = 50.0
+"""Error of a logarithm that says nothing any more."""
 _SMOOTH = 5.0
 """For the drift that is shown [s]."""
 _SINGULAR = 1e-10
@@ -100,25 +102,37 @@ def check(fit: Sequence[str]) -> tuple[str, ...]:
 def _solved(
     parts: Sequence[Passage], names: tuple[str, ...], first: dict[str, float]
 ) -> tuple[Problem, dict[str, float]]:
-    """The best fit of several starts; more than one only where the first one misses."""
-    best: tuple[float, Problem, dict[str, float]] | None = None
-    for frequency, delay in _STARTS:
-        begin = dict(first)
-        if "omega0" in names:
-            begin["omega0"] *= frequency
-        if "servo_delay" in names:
-            begin["servo_delay"] = max(first["servo_delay"], delay)
-        if "backlash" in names:
-            begin["backlash"] = max(first["backlash"], 0.01)
-        problem = Problem(parts, names, _SETTLE)
-        values = solve(problem, begin)
-        left = sum(noise.innovation for noise in problem.noise)
-        if best is None or left < best[0]:
-            best = left, problem, values
-        if _explained(best[1], best[1].residuals(best[2]))[1] > _GOOD:
-            break
-    assert best is not None
-    return best[1:]
+    """The best fit of several starts; of one, where it leaves no more than noise.
+
+    The others are fitted roughly, and the best of them to its end.
+    """
+    starts = [_begun(first, names, *start) for start in _STARTS]
+    problem = Problem(parts, names, _SETTLE)
+    values = solve(problem, starts[0])
+    if all(map(_is_white, problem.whitened(problem.residuals(values)))):
+        return problem, values
+    rough = []
+    for start in starts[1:]:
+        other = Problem(parts, names, _SETTLE)
+        rough.append((solve(other, start, rounds=1, steps=_ROUGH), other))
+    best, other = min(rough, key=lambda each: each[1].unexplained)
+    best = solve(other, best)
+    return (other, best) if other.unexplained < problem.unexplained else (problem, values)
+
+
+def _begun(
+    first: dict[str, float], names: tuple[str, ...], frequency: float, delay: float
+) -> dict[str, float]:
+    """Where a fit begins; away from zero, where backlash has no slope."""
+    begun = dict(first)
+    for name, value in (
+        ("omega0", first["omega0"] * frequency),
+        ("servo_delay", max(first["servo_delay"], delay)),
+        ("backlash", max(first["backlash"], 0.01)),
+    ):
+        if name in names:
+            begun[name] = value
+    return begun
 
 
 def _settling(values: dict[str, float]) -> float:
@@ -199,6 +213,7 @@ def _estimate(name: str, value: float, spread: dict[str, float]) -> Estimate:
     if error is None:
         return Estimate(name, value, value, value, fitted=False)
     if name in LOGARITHMIC:  # a share, and so the interval is not symmetric
+        error = min(error, _UNKNOWN)
         return Estimate(name, value, value * float(np.exp(-error)), value * float(np.exp(error)))
     low = value - error if name == "rotation" else max(0.0, value - error)
     return Estimate(name, value, low, value + error)
