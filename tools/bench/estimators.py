@@ -81,8 +81,8 @@ def efficiency(run: tuple[Rig, str, float, int]) -> float:
         plant=believed(rig.plant, estimator, seed),
         estimator=EstimatorSettings(
             kind="lateral_force" if estimator == ESTIMATORS[0] else "observer",
-            noise=rig.simulation.noise,
-            rotation=rig.simulation.rotation,
+            force_noise=rig.simulation.noise,
+            sensor_rotation=rig.simulation.rotation,
         ),
     )
     rig_of_seed = msgspec.structs.replace(rig.simulation, seed=seed)

@@ -38,10 +38,10 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1000,
         ),
     ] = 2.0
-    noise: Annotated[
+    force_noise: Annotated[
         float, unit("N", "Of observer: noise of F_y, rms of the mean over one tick.", gt=0, le=1)
     ] = 1e-3
-    drift: Annotated[
+    offset_drift: Annotated[
         float,
         unit("N/√s", "Of observer: by how much the offset of F_y wanders in a second.", ge=0, le=1),
     ] = 1e-3
@@ -54,7 +54,7 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1000,
         ),
     ] = 1.0
-    rotation: Annotated[
+    sensor_rotation: Annotated[
         float,
         unit(
             "rad",

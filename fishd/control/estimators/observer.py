@@ -50,7 +50,7 @@ class Observer(Estimator):
     """
 
     def __init__(self, settings: EstimatorSettings, plant: PlantParameters, tick: float) -> None:
-        """tick: the period that `settings.noise` refers to [s]"""
+        """tick: the period that `settings.force_noise` refers to [s]"""
         super().__init__()
         self._settings = settings
         self._plant = plant
@@ -69,7 +69,7 @@ class Observer(Estimator):
         In rad/s.
         """
         settings, fish, ahead = self._settings, self._fish, self._ahead
-        rotation = settings.rotation
+        rotation = settings.sensor_rotation
         force = math.cos(rotation) * measurement.fy - math.sin(rotation) * measurement.fx
         if self._offset is None:
             self._offset = force
@@ -102,7 +102,7 @@ class Observer(Estimator):
         plant, settings = self._plant, self._settings
         motion, spread = _motion(plant, dt)
         spread = settings.disturbance**2 * spread
-        wander = settings.drift**2 * dt
+        wander = settings.offset_drift**2 * dt
         # F_y = −K α̈ − K_d α̇, so its mean is a difference between the ends of the window.
         ends = np.array([-plant.lateral_drag, -plant.thrust_coefficient]) / dt
         grow, noise = np.eye(3), np.zeros((3, 3))
@@ -110,7 +110,7 @@ class Observer(Estimator):
         noise[:2, :2], noise[2, 2] = spread, wander
         felt = np.append(ends @ (motion - np.eye(2)), 1.0)
         shared = np.append(spread @ ends, 0.5 * wander)
-        white = settings.noise**2 * self._tick / dt
+        white = settings.force_noise**2 * self._tick / dt
         return Step(grow, noise, felt, shared, float(ends @ spread @ ends) + wander / 3.0 + white)
 
 
