@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Who judges real time goes ahead of other programs, where that is permitted.
 AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -20)
 
-.PHONY: help run test test-fast lint docs bench clean
+.PHONY: help run test test-fast lint docs figures bench clean
 
 help:  ## List what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
@@ -37,6 +37,9 @@ lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 docs: $(VENV)/installed-dev  ## Write the generated parts of docs/ again
 	$(BIN)/python tools/config_reference.py --write
 	$(BIN)/python tools/protocol_reference.py --write
+
+figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
+	$(BIN)/python tools/paper
 
 bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine
 	$(BIN)/python tools/bench tick

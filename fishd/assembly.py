@@ -14,6 +14,7 @@ from fishd.config import Config
 from fishd.config.drivers import claims_of
 from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
@@ -235,6 +236,7 @@ def assemble(
         servo=servo,
         truth=truth,
         panel=panel,
+        tared=sensor,
         calibrated=CalibratedParts(sensor, servo, tell_release),
         degraded=degraded,
         counters=lambda: {**sensor.counters(), **survived(servo.driver)},
@@ -293,7 +295,7 @@ def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
 
 
 def build_estimator(config: Config) -> Estimator:
-    """What `estimator.kind` names."""
+    """The one that `estimator.kind` names."""
     if config.estimator.kind == "observer":
         return Observer(config.estimator, config.plant, config.tick)
     return LateralForceEstimator(config.estimator)
@@ -317,6 +319,7 @@ def build_loop(
     loop = ControlLoop(
         robot=robot,
         estimator=build_estimator(config),
+        thrust=LiveThrust(config.estimator.zero_drift),
         guard=guard,
         limits=config.limits,
         clock=clock,
@@ -326,5 +329,8 @@ def build_loop(
     start = config.start
     if start.controller is not None:
         controller = registry.create(start.controller, start.parameters, config.limits)
-        loop.set_controller(start.controller, controller)
+        if start.rest:
+            loop.set_controller_after(start.rest, start.controller, controller)
+        else:
+            loop.set_controller(start.controller, controller)
     return loop

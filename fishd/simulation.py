@@ -3,7 +3,7 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple, Self
 
@@ -81,6 +81,12 @@ class Beats:
         self._open = _Sums()
         self._began = False
         self._side = 0.0
+        self._each: list[tuple[float, float]] = []  # impulse N s, duration s
+
+    @property
+    def count(self) -> int:
+        """How many whole beats there were."""
+        return len(self._each)
 
     def add(self, angle: float, window: TrueWindow) -> None:
         """Add a window; angle: the instruction angle during it [rad]."""
@@ -90,6 +96,7 @@ class Beats:
             if side > 0.0:
                 if self._began:
                     self._whole += self._open
+                    self._each.append((self._open.impulse, self._open.duration))
                 self._began = True
                 self._open = _Sums()
         self._side = side
@@ -106,6 +113,7 @@ class Beats:
         rms = math.sqrt(sums.angle_squared / sums.duration)
         return BeatMeans(
             thrust=sums.impulse / sums.duration,
+            thrust_deviation=_deviation(self._each),
             frequency=frequency,
             fin_amplitude=sums.peaks / sums.halves,
             mean_angle=mean,
@@ -118,11 +126,26 @@ class BeatMeans(NamedTuple):
     """Means over beats."""
 
     thrust: float  # N
+    thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
     frequency: float  # Hz
     fin_amplitude: float  # rad
     mean_angle: float  # of |φ_c|, rad
     squareness: float  # mean |φ_c| over rms φ_c
     half_beats: tuple[int, int]  # shortest and longest, ticks
+
+
+def _deviation(beats: Sequence[tuple[float, float]]) -> float:
+    """Standard error of impulse over duration, a ratio of two means; NaN for fewer than two beats.
+
+    Cochran, Sampling Techniques, 3rd edition, equation 6.9.
+    """
+    n = len(beats)
+    if n < 2:
+        return math.nan
+    duration = sum(lasts for _, lasts in beats)
+    mean = sum(impulse for impulse, _ in beats) / duration
+    squares = sum((impulse - mean * lasts) ** 2 for impulse, lasts in beats)
+    return math.sqrt(squares * n / (n - 1)) / duration
 
 
 class _Sums:
@@ -225,13 +248,15 @@ def simulate(
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
     settle: float = 10.0,
+    publisher: Publisher | None = None,
 ) -> Report:
     """Let a controller swim a simulated fish for `seconds`, and judge it after `settle` seconds.
 
+    publisher: gets the record of every tick, and every event
     Raises `UnknownController` and `ParameterError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
-    return judge(config, name, controller, seconds, settle, EncodingPublisher())
+    return judge(config, name, controller, seconds, settle, publisher or EncodingPublisher())
 
 
 def judge(

@@ -64,12 +64,12 @@ make_venv() {
   step "$HOME_FOLDER: made with Python $version"
 }
 
-# What the controller `ppo` needs has wheels for 64 bits only. The kernel does not tell: 32-bit
-# Raspberry Pi OS boots a 64-bit one on a Pi 4 and 5, and `uname -m` says aarch64 there.
+# What the controller `ppo` and recordings need has wheels for 64 bits only. The kernel does not
+# tell: 32-bit Raspberry Pi OS boots a 64-bit one on a Pi 4 and 5, and `uname -m` says aarch64 there.
 core_extras() {
   local bits=$1 platform=$2
   case $bits-$platform in
-    64-linux-aarch64 | 64-linux-x86_64) echo pi,policy ;;
+    64-linux-aarch64 | 64-linux-x86_64) echo pi,record,policy ;;
     *) echo pi ;;
   esac
 }
@@ -227,6 +227,9 @@ take_effect() {
   fi
   systemctl --quiet enable fishd.service
   step "fishd.service: enabled, starts with the next boot"
+  if ! systemctl --quiet is-enabled fishd-recorder.service 2>/dev/null; then
+    step "to record always: sudo systemctl enable --now fishd-recorder"
+  fi
 }
 
 say_what_next() {

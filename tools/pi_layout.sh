@@ -7,12 +7,14 @@ HOME_FOLDER=/opt/fishd
 CONFIG=/etc/fishd/fishd.yaml
 CONFIG_AS_INSTALLED=$HOME_FOLDER/fishd.yaml.installed
 STATE_FOLDER=/var/lib/fishd
+RECORDINGS=/var/lib/fishd-recorder
 COMMANDS=/usr/local/bin
 
 # Files of systemd/, and where they go. Under /etc, so that they do not collide with packages.
 SYSTEM_FILES=(
   "fishd.service /etc/systemd/system/fishd.service"
   "fishd-failure.service /etc/systemd/system/fishd-failure.service"
+  "fishd-recorder.service /etc/systemd/system/fishd-recorder.service"
   "pigpiod.service.d/fishd.conf /etc/systemd/system/pigpiod.service.d/fishd.conf"
   "sysusers.d/fishd.conf /etc/sysusers.d/fishd.conf"
   "tmpfiles.d/fishd.conf /etc/tmpfiles.d/fishd.conf"

@@ -20,6 +20,8 @@ remove_if_empty() { rmdir "$DESTDIR$1" 2>/dev/null || true; }
 
 stop_service() {
   local status=0
+  systemctl stop fishd-recorder.service 2>/dev/null || true
+  systemctl --quiet disable fishd-recorder.service 2>/dev/null || true
   # Whether it is active or not: one that waits for its restart is not, and would come back.
   systemctl stop fishd.service 2>/dev/null || status=$?
   case $status in
@@ -57,9 +59,14 @@ remove_state() {
   remove_if_empty "$STATE_FOLDER"
   if [[ $PURGE == 1 ]]; then
     remove "$STATE_FOLDER"
+    remove "$RECORDINGS"
     remove /etc/systemd/system/fishd.service.d
+    remove /etc/systemd/system/fishd-recorder.service.d
   elif [[ -e $DESTDIR$STATE_FOLDER ]]; then
     step "$STATE_FOLDER: calibrations, kept; PURGE=1 removes them"
+  fi
+  if [[ -e $DESTDIR$RECORDINGS ]]; then
+    step "$RECORDINGS: recordings, kept; PURGE=1 removes them"
   fi
 }
 

@@ -11,6 +11,7 @@ from fishd.controllers import (
     Observation,
     ParameterError,
     amplitude_of,
+    quantity,
     unit,
 )
 
@@ -31,6 +32,7 @@ class Chirp(Controller[ChirpParameters]):
     """Sweep a square wave's frequency up and down: thrust against frequency in one run."""
 
     Parameters = ChirpParameters
+    frequency: float = quantity("Hz", "Present frequency of the sweep.")
 
     def __init__(self, parameters: ChirpParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
@@ -55,7 +57,7 @@ class Chirp(Controller[ChirpParameters]):
         p = self.parameters
         self._progress = (self._progress + observation.dt / p.sweep_time) % 2.0
         height = 1.0 - abs(1.0 - self._progress)
-        frequency = p.lowest + (p.highest - p.lowest) * height
-        self._phase = (self._phase + frequency * observation.dt) % 1.0
+        self.frequency = p.lowest + (p.highest - p.lowest) * height
+        self._phase = (self._phase + self.frequency * observation.dt) % 1.0
         side = 1.0 if self._phase < 0.5 else -1.0
         return side * amplitude_of(p, self.limits)

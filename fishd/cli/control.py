@@ -9,17 +9,19 @@ import click
 
 from fishd.cli.completion import active_parameters, complete_pair
 from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
-from fishd.cli.output import echo, echo_rows, made_printable, print_json, spelled
+from fishd.cli.output import echo, echo_rows, made_printable, measured, print_json, spelled
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core.addresses import ENDPOINT_VARIABLE
-from fishd.core.errors import NoDaemon
+from fishd.core.console import thrust_words
+from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
-from fishd.core.schema import Field
+from fishd.core.schema import Field, nearest
 from fishd.core.signals import Percentiles, Reason, Status
 
 T = TypeVar("T")
 _HELP = "docs/troubleshooting.md"
+_ZERO = "(its zero is not known: stop for 3 s, then swim on; or fishctl measure)"
 
 
 @click.command()
@@ -53,10 +55,20 @@ def asked(
 
 
 @click.command()
+@click.argument("name", required=False, metavar="[NAME]")
 @daemon_options
-def controllers(endpoint: str | None, as_json: bool) -> None:
-    """List the controllers that the daemon knows, and their parameters."""
+def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
+    """List the controllers that the daemon knows, or show the one of that NAME.
+
+    Each with its parameters, as options, and the quantities of its own that telemetry shows.
+    """
     known = asked(endpoint, Fish.controllers, registry.describe_all, "controllers")
+    if name is not None:
+        names = [info.name for info in known]
+        if name not in names:
+            hint = nearest(name, names)
+            raise UnknownController(f"no controller is named '{name}'; {hint}")
+        known = [info for info in known if info.name == name]
     if as_json:
         print_json(known)
         return
@@ -64,6 +76,9 @@ def controllers(endpoint: str | None, as_json: bool) -> None:
         click.echo(f"{click.style(info.name, bold=True)}  {info.summary}")
         for field in info.parameters:
             echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
+        for quantity in info.quantities:
+            unit = "" if quantity.unit == "1" else f" [{quantity.unit}]"
+            echo(f"    shows {quantity.name:<18} {quantity.description.rstrip('.')}{unit}")
 
 
 @click.group(cls=ControllerGroup, options=daemon_options, remote=True)
@@ -181,7 +196,6 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
             ("mode", f"{status.mode} ({_why(reason)})"),
             ("to do", f"{remedy}; then: fishctl clear-fault"),
         ]
-    thrust = "–" if status.sensor_lost else f"{status.thrust * 1e3:.2f}"
     uptime = datetime.timedelta(seconds=int(status.uptime))
     survived = {name: count for name, count in status.counters.items() if count}
     missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
@@ -191,7 +205,9 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
-        ("thrust", f"{thrust} m{status.force_unit} at {status.frequency:.2f} Hz"),
+        ("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz"),
+        *([("", _ZERO)] if status.thrust_error is None and not status.sensor_lost else []),
+        *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
         *([("survived", spelled(survived))] if survived else []),
@@ -211,6 +227,11 @@ def _timing_rows(status: Status) -> list[tuple[str, str]]:
         ("busy", _percentiles(timing.busy)),
         *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
     ]
+
+
+def _quantities(status: Status) -> str:
+    each = measured(status.quantities, status.quantity_units)
+    return ", ".join(f"{name} {value}" for name, value in each)
 
 
 def _angle(status: Status) -> str:

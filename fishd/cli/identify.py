@@ -16,6 +16,8 @@ from fishd.client import Fish
 from fishd.config import Config, adopt, load
 from fishd.core import files
 from fishd.core.errors import FishdError
+from fishd.core.interruption import interrupted_once
+from fishd.core.signals import Tick
 
 if TYPE_CHECKING:
     from fishd.lab.identification import Estimate, Identification
@@ -47,7 +49,8 @@ _SYMBOLS = {
     "real or not. [default: simulation]",
 )
 @click.option(
-    "--seconds",
+    "--for",
+    "seconds",
     type=click.FloatRange(min=30.0, max=3600.0),
     help="With --experiment: how long it takes. [default: 180]",
 )
@@ -81,9 +84,9 @@ _SYMBOLS = {
 )
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option(
-    "--png",
+    "--plot",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw forces, fit and residual into this file.",
+    help="Draw forces, fit and residual into this file (.png, .svg, .pdf).",
 )
 @endpoint_option
 @json_option
@@ -98,7 +101,7 @@ def identify(
     fit: str | None,
     target: Path | None,
     force: bool,
-    png: Path | None,
+    plot: Path | None,
     endpoint: str | None,
     as_json: bool,
 ) -> None:
@@ -110,11 +113,19 @@ def identify(
     """
     if experiment == bool(runs):
         raise click.UsageError("name recordings to identify, or use --experiment: one of the two")
-    for option, value in (("--on", on), ("--seconds", seconds), ("--record", record)):
+    for option, value in (("--on", on), ("--for", seconds), ("--record", record)):
         if value is not None and not experiment:
             raise click.UsageError(f"{option} goes with --experiment")
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
+    if record:
+        record = record.with_name(f"{record.name.removesuffix('.mcap')}.mcap")
+        if record.exists():
+            raise FishdError(f"{record}: exists already; --record names another")
+    if plot:
+        from fishd.lab.drawing import check
+
+        check(plot)
 
     from fishd.lab import identification as lab
 
@@ -128,10 +139,10 @@ def identify(
         config, tables = load(file, overrides), list(runs)
         origin = ", ".join(run.name for run in runs)
     found = lab.identify(tables, start=config.plant, fit=names)
-    if png:
-        from fishd.lab.identification.figure import picture
+    if plot:
+        from fishd.lab.identification.figure import draw
 
-        picture(found, png)
+        draw(found, plot)
     if as_json:
         print_json(found.to_builtins())
     else:
@@ -165,18 +176,23 @@ def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None
     from fishd.lab.identification import experiment
     from fishd.lab.rig import LiveRig, Rig, VirtualRig
 
-    with ExitStack() as stack:
-        writer = None
-        if record:
-            from fishd.recording import RunWriter
+    def keep(ticks: list[Tick]) -> None:
+        from fishd.recording import RunWriter
 
-            writer = stack.enter_context(RunWriter(record, note="fishctl identify --experiment"))
-            writer.describe(config)
+        if record:
+            note = "fishctl identify --experiment"
+            with RunWriter(record, source=config.robot, note=note) as writer:
+                writer.describe(config)
+                for tick in ticks:
+                    writer.tick(tick)
+
+    with ExitStack() as stack:
+        stack.enter_context(interrupted_once())
         rig: Rig = LiveRig(stack.enter_context(fish)) if fish else VirtualRig(config)
         stack.enter_context(rig)
         if fish:
             echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
-        return experiment(rig, seconds, writer)
+        return experiment(rig, seconds, keep=keep)
 
 
 def _write(target: Path, text: str) -> None:

@@ -28,15 +28,30 @@ VERBS = {
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
+    "Measure": {
+        "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+    },
+    "Record": {
+        "record": Verb("recording.record", "record", "Record a running fish into a file."),
+        "runs": Verb("recording.runs", "runs", "List the recordings."),
+        "plot": Verb("recording.plot", "plot", "Draw a recording, as a picture and a page."),
+        "export": Verb("recording.export", "export", "Write a recording as CSV or Parquet."),
+        "replay": Verb("recording.replay", "replay", "Publish a recording, as if it were live."),
+        "rerun": Verb("recording.rerun", "rerun", "Let a controller choose again, offline."),
+        "recover": Verb("recording.recover", "recover", "Finish a recording that was cut off."),
+    },
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
     },
     "Experiment": {
+        "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
+        "optimise": Verb("optimise", "optimise", "Search the best parameters of a controller."),
         "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
+        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
         "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },

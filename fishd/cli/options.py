@@ -1,7 +1,7 @@
 """Options that verbs share, and options that are generated from the parameters of controllers."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -12,7 +12,7 @@ from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
 from fishd.client import Fish
 from fishd.controllers import registry
-from fishd.core.errors import FishError, UnknownController
+from fishd.core.errors import FishError, ParameterError, UnknownController
 from fishd.core.schema import Field, names_file, spelled, wanted
 from fishd.core.signals import ControllerInfo
 
@@ -85,17 +85,35 @@ _PARSERS: dict[str, Callable[[str], Any]] = {"number": _finite, "integer": int, 
 _PREFIX = "parameter_"
 
 
-def parameter_options(info: ControllerInfo) -> list[click.Parameter]:
+class ValuesType(ParameterType):
+    """Several values for one parameter: a list, or a range of numbers."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """`0.4:4:0.2` or `0.3,0.6` from the command line to a list of values."""
+        if not isinstance(value, str):
+            return value
+        from fishd.lab.sweep.grid import spread
+
+        try:
+            return [super(ValuesType, self).convert(each, param, ctx) for each in spread(value)]
+        except ParameterError as error:
+            self.fail(str(error), param, ctx)
+
+
+def parameter_options(
+    fields: Iterable[Field], kind: type[ParameterType] = ParameterType
+) -> list[click.Parameter]:
     """One option for each parameter of a controller, its case kept (`--C`)."""
+    several = "|LOW:HIGH:STEP|VALUE,..." if kind is ValuesType else ""
     return [
         click.Option(
             [_PREFIX + field.name, "--" + field.name.replace("_", "-")],
-            type=ParameterType(field),
-            metavar="NAME|FILE" if field.file else field.kind.upper(),
+            type=kind(field),
+            metavar=("NAME|FILE" if field.file else field.kind.upper()) + several,
             help=describe(field),
             default=None,
         )
-        for field in info.parameters
+        for field in fields
     ]
 
 
@@ -140,16 +158,28 @@ class ControllerGroup(click.Group):
     """
 
     def __init__(
-        self, *args: Any, options: Callable[[F], F], remote: bool = False, **kwargs: Any
+        self,
+        *args: Any,
+        options: Callable[[F], F],
+        remote: bool = False,
+        several: bool = False,
+        **kwargs: Any,
     ) -> None:
-        """options: decorator that adds the verb's own options to each sub-command."""
+        """
+        options: decorator that adds the verb's own options to each sub-command
+        several: `square,sine` is a sub-command, too; each parameter takes several values
+        """
         super().__init__(*args, **kwargs)
         self._options = options
         self._remote = remote
+        self._several = several
         self._action: Callable[..., Any] = lambda: None
 
     def action(self, function: F) -> F:
-        """Decorator: call `function(name, parameters, **options)` for each sub-command."""
+        """Decorator: call `function(name, parameters, **options)` for each sub-command.
+
+        With several, it gets their `ControllerInfo`s for the name, and lists of values.
+        """
         self._action = function
         return function
 
@@ -158,24 +188,32 @@ class ControllerGroup(click.Group):
         return [info.name for info in registry.describe_all()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The sub-command of one controller."""
-        try:
-            info = registry.describe(cmd_name)
-        except UnknownController as error:
-            if not self._remote:
-                raise
-            info = self._ask_daemon(ctx, cmd_name, error)
+        """The sub-command of one controller, or of several."""
+        names = list(filter(None, cmd_name.split(","))) if self._several else [cmd_name]
+        infos = [self._info(ctx, name) for name in names]
+        fields = {field.name: field for info in infos for field in info.parameters}
 
         @click.pass_context
         def callback(ctx: click.Context, /, **values: Any) -> Any:
-            return self._action(info.name, given_parameters(ctx, values), **values)
+            parameters = given_parameters(ctx, values)
+            return self._action(infos if self._several else cmd_name, parameters, **values)
 
         decorated = self._options(cast(Any, callback))
-        command = click.command(
-            cmd_name, _ControllerCommand, help=info.summary, short_help=info.summary
-        )(decorated)
-        command.params = parameter_options(info) + command.params
+        about = infos[0].summary if len(infos) == 1 else f"{', '.join(names)}, side by side."
+        command = click.command(cmd_name, _ControllerCommand, help=about, short_help=about)(
+            decorated
+        )
+        kind = ValuesType if self._several else ParameterType
+        command.params = parameter_options(fields.values(), kind) + command.params
         return command
+
+    def _info(self, ctx: click.Context, name: str) -> ControllerInfo:
+        try:
+            return registry.describe(name)
+        except UnknownController as error:
+            if not self._remote:
+                raise
+            return self._ask_daemon(ctx, name, error)
 
     def _ask_daemon(
         self, ctx: click.Context, name: str, unknown: UnknownController

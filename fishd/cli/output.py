@@ -47,6 +47,15 @@ def spelled(parameters: dict[str, Any]) -> str:
     return text.line(" ".join(words))
 
 
+def measured(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[str, str]]:
+    """Names of quantities, and their values with units: `("top_speed", "2.31")`."""
+    spelled = []
+    for name, value in quantities.items():
+        unit = text.quoted(units.get(name, "1"))
+        spelled.append((text.quoted(name), f"{value:.3g}" + (f" {unit}" if unit != "1" else "")))
+    return spelled
+
+
 def counted(number: int, noun: str) -> str:
     """A number of things: `1 warning`, `2 warnings`."""
     return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -9,8 +9,10 @@ from fishd.cli.config import fish_options
 from fishd.cli.options import ControllerGroup, json_option
 from fishd.cli.output import echo, echo_rows, print_json, spelled
 from fishd.config import Config, load
+from fishd.core.errors import MissingPackage
 
 if TYPE_CHECKING:
+    from fishd.recording import RunWriter
     from fishd.simulation import Report
 
 _ROUNDED = "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
@@ -36,7 +38,18 @@ def run_options(function: Any) -> Any:
     return function
 
 
-@click.group(cls=ControllerGroup, options=run_options)
+def _options(function: Any) -> Any:
+    record = click.option(
+        "--record",
+        "recording",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="Record the run into this .mcap file, which must not exist.",
+    )
+    return run_options(record(function))
+
+
+@click.group(cls=ControllerGroup, options=_options)
 def simulate() -> None:
     """Swim a simulated fish in virtual time, with the very loop that runs on the robot."""
 
@@ -49,12 +62,18 @@ def _simulate(
     settle: float,
     file: Path | None,
     overrides: tuple[str, ...],
+    recording: Path | None,
     as_json: bool,
 ) -> int:
     from fishd.simulation import simulate as run
 
     config = load(file, overrides)
-    report = run(config, name, parameters, seconds, settle)
+    if recording:
+        with _recorder(recording) as writer:
+            writer.describe(config)
+            report = run(config, name, parameters, seconds, settle, writer)
+    else:
+        report = run(config, name, parameters, seconds, settle)
     if as_json:
         print_json(report)
     else:
@@ -65,6 +84,16 @@ def _simulate(
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
     return 0
+
+
+def _recorder(path: Path) -> "RunWriter":
+    try:
+        from fishd.recording import RunWriter
+    except ModuleNotFoundError as error:
+        raise MissingPackage(
+            f"--record needs the package {error.name}; with pip: pip install 'fishd[record]'"
+        ) from None
+    return RunWriter(path, source="simulation")
 
 
 def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, str]]:

@@ -6,6 +6,28 @@ from typing import Any, NamedTuple
 
 import click
 
+from fishd.core.console import complain
+
+_EXTRAS = {
+    "bayes_opt": "lab",
+    "distributed": "cluster",
+    "gymnasium": "learn",
+    "joblib": "lab",
+    "matplotlib": "lab",
+    "mcap": "record",
+    "onnx": "policy",
+    "onnxruntime": "policy",
+    "pandas": "lab",
+    "plotly": "lab",
+    "pyarrow": "lab",
+    "scipy": "lab",
+    "sklearn": "lab",
+    "stable_baselines3": "learn",
+    "tensorboard": "learn",
+    "torch": "learn",
+}
+"""The extra that brings a package."""
+
 
 class Verb(NamedTuple):
     """Where a verb is, and what it is for."""
@@ -29,6 +51,21 @@ class Verbs(click.Group):
         stubs = {name: click.Command(name) for name in self._verbs}
         super().__init__(*args, **kwargs)
         self.commands.update(stubs)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a verb; a package of an extra that is missing is one line."""
+        try:
+            return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package not in _EXTRAS:
+                raise
+            complain(
+                "fishctl",
+                f"{package} is not installed; where the sources of fishd are: pip install "
+                f"--constraint tools/constraints.txt --editable '.[{_EXTRAS[package]}]'",
+                1,
+            )
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """All verbs, in the order of help."""

@@ -12,7 +12,7 @@ from contextlib import suppress
 import click
 
 from fishd.cli.options import daemon_options
-from fishd.cli.output import echo, print_json_line, time_of_day
+from fishd.cli.output import echo, measured, print_json_line, time_of_day
 from fishd.client import AsyncFish
 from fishd.core import text
 from fishd.core.console import status_line
@@ -57,7 +57,9 @@ async def _print_ticks(fish: AsyncFish) -> None:
 async def _print_lines(fish: AsyncFish) -> None:
     while True:
         status = await fish.status()
-        echo(f"{time_of_day(status.t)}  {text.quoted(status.name)}  {status_line(status)}")
+        own = measured(status.quantities, status.quantity_units)
+        more = "".join(f"  {name} {value}" for name, value in own)
+        echo(f"{time_of_day(status.t)}  {text.quoted(status.name)}  {status_line(status)}{more}")
         await asyncio.sleep(1.0)
 
 

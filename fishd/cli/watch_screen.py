@@ -6,12 +6,15 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import UNSET
+from msgspec.structs import replace
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from fishd.cli.output import spelled, time_of_day
+from fishd.cli.output import measured, spelled, time_of_day
 from fishd.core import text
+from fishd.core.console import thrust_words
 from fishd.core.signals import Event, Status, Tick
 
 SPAN = 5.0
@@ -82,9 +85,12 @@ class View:
             message = text.line(f"{'' if reason else 'took over: '}{why.code}: {why.message}")
             header += Text(message, "red" if reason else "yellow").wrap(console, width)
         yield from header
+        own = self._quantities()
         yield self._figures()
+        yield from own
         events = max(0, min(3, (height - 14) // 3))
-        room = height - len(header) - 2 - events - 1  # 2 rows of figures, 1 for the time axis
+        # 2 rows of figures, 1 for the time axis.
+        room = height - len(header) - 2 - len(own) - events - 1
         traces = TRACES[: max(0, room // 2)] if width >= 2 * LABEL else ()
         for trace in traces:
             yield self._plot(trace, width, room // len(traces))
@@ -110,9 +116,13 @@ class View:
 
     def _figures(self) -> Table:
         tick = self._ticks[-1]
-        thrust = "–" if self.status.sensor_lost else f"{tick.thrust * 1e3:.2f}"
+        known = replace(
+            self.status,
+            thrust=tick.thrust,
+            thrust_error=None if tick.thrust_error is UNSET else tick.thrust_error,
+        )
         figures = {
-            "thrust": f"{thrust} m{text.quoted(self.status.force_unit)}",
+            "thrust": thrust_words(known),
             "tail beat": f"{tick.frequency:.2f} Hz",
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
             "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
@@ -125,6 +135,16 @@ class View:
         table.add_row(*figures, style="dim")
         table.add_row(*figures.values(), style="bold")
         return table
+
+    def _quantities(self) -> list[Text]:
+        """The controller's own, in one line; no line where it has none."""
+        now = self._ticks[-1].quantities
+        if not isinstance(now, dict):
+            return []
+        parts: list[str | tuple[str, str]] = []
+        for name, value in measured(now, self.status.quantity_units):
+            parts += [(f"{name} ", "dim"), (f"{value}   ", "bold")]
+        return [_one_line(*parts)]
 
     def _plot(self, trace: Trace, width: int, rows: int) -> Text:
         """A trace with its name and scale to the left; lost ticks leave a gap."""

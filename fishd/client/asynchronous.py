@@ -97,6 +97,10 @@ class AsyncFish(Connection):
         """Apply another calibration of the force sensor, and save it."""
         return await self._call(Calibrations, "calibrate-force", calibration=calibration)
 
+    async def calibrate_thrust(self, factor: float, error: float) -> State:
+        """As `Fish.calibrate_thrust`."""
+        return await self._call(State, "calibrate-thrust", factor=factor, error=error)
+
     async def calibrate_servo(
         self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
     ) -> Calibrations:

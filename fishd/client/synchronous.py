@@ -133,6 +133,13 @@ class Fish(Connection):
         """
         return self._call(Calibrations, "end-lease", lease=lease)
 
+    def calibrate_thrust(self, factor: float, error: float) -> State:
+        """Let the thrust be shown as this factor times the mean square of `fin_velocity`.
+
+        error: half of its 95 % interval, in its unit
+        """
+        return self._call(State, "calibrate-thrust", factor=factor, error=error)
+
     def ticks(self) -> Iterator[Tick]:
         """Every tick from now on; raises `NoDaemon` when none comes in time."""
         return self._subscribe(b"tick", Tick)

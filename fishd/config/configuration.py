@@ -46,6 +46,15 @@ class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     parameters: Annotated[
         dict[str, Any], note("Its parameters; those left out keep their defaults.")
     ] = {}
+    rest: Annotated[
+        float,
+        unit(
+            "s",
+            "How long the fish rests before: 3 s are enough to find the zero of the force sensor.",
+            ge=0,
+            le=3600,
+        ),
+    ] = 0.0
 
 
 class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -129,7 +138,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             "its agent, and the next one follows at once."
         ),
     ] = False
-    estimator: Annotated[EstimatorSettings, note("Fin velocity from the lateral force.")] = (
+    estimator: Annotated[EstimatorSettings, note("Fin velocity and thrust from the forces.")] = (
         EstimatorSettings()
     )
     plant: Annotated[

@@ -8,6 +8,7 @@ from msgspec import Struct
 from fishd.control.reporting import Reporter
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.hold import Hold, HoldParameters
+from fishd.controllers.quantities import quantities_of, values_of
 from fishd.core import text
 from fishd.core.errors import ControllerFault
 from fishd.core.foreign_code import contained
@@ -26,18 +27,28 @@ class ActiveController:
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
         self.parameters = _plain(self.controller)
         """Its parameters, as JSON has them."""
+        self.quantities: dict[str, float] = {}
+        """Its own, as of its latest update; empty where it has none to show."""
+        self.quantity_units: dict[str, str] = {}
+        """The units of all that it has."""
         self.fallback: Reason | None = None
         """Why it took over from the controller that was set, if it did."""
         self._fresh = False
 
     def replace(self, name: str, controller: Controller[Any]) -> None:
         """Make a ready-made controller the active one; raises what its parameters raise."""
+        units = {each.name: each.unit for each in quantities_of(type(controller))}
         former, self.parameters = self.controller, _plain(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
+        self.quantities, self.quantity_units = {}, units
+        self.dispose(former, f"the controller before {name}")
+
+    def dispose(self, controller: Controller[Any], what: str) -> None:
+        """Close a controller that will not be active any more."""
         try:
-            contained(former.close)
+            contained(controller.close)
         except Exception as error:
-            self._reporter.problem(f"the controller before {name} could not be closed", error)
+            self._reporter.problem(f"{what} could not be closed", error)
 
     def rest(self) -> None:
         """Make `hold` the active one, at neutral."""
@@ -55,7 +66,10 @@ class ActiveController:
         if self._fresh:
             contained(self.controller.activate, observation)
             self._fresh = False
-        return contained(self.controller.update, observation)
+        command = contained(self.controller.update, observation)
+        if self.quantity_units:
+            self.quantities = contained(values_of, self.controller, self.quantity_units)
+        return command
 
     def retune(self, parameters: Struct) -> None:
         """Give it new, already checked parameters; raises what it raises."""

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from fishd.core import text
+from fishd.core.foreign_code import real_number
 
 
 class Guard:
@@ -41,7 +41,7 @@ class Guard:
         previous: the angle that is applied now [rad]
         Raises ValueError when the command is no number, or not finite.
         """
-        angle = command if type(command) is float else _number(command)
+        angle = command if type(command) is float else real_number(command, "the command")
         if not math.isfinite(angle):
             raise ValueError(f"the command is {angle}, not an angle")
         wanted = max(self.lowest, min(self.highest, angle))
@@ -50,19 +50,6 @@ class Guard:
     def fade(self, previous: float) -> float:
         """The next instruction angle on the way to neutral [rad]."""
         return _towards(0.0, previous, self.fade_step)
-
-
-def _number(command: Any) -> float:
-    """A real number as a float; raises ValueError for what is none, such as a text or True."""
-    try:
-        # An array of one number, whatever its shape, or one of numpy's own kinds of number.
-        value = command.item() if hasattr(command, "item") else command
-        if not isinstance(value, bool | str | bytes | bytearray):
-            return float(value)
-    except (TypeError, ValueError, OverflowError):
-        pass
-    kind = text.quoted(type(command).__name__)
-    raise ValueError(f"the command is of type {kind}, not one real number")
 
 
 def _towards(wanted: float, previous: float, step: float) -> float:

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
 from fishd.control.estimators.base import Estimator
+from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
 from fishd.control.servo_output import ServoOutput
@@ -50,6 +51,7 @@ class ControlLoop:
         self,
         robot: Robot,
         estimator: Estimator,
+        thrust: LiveThrust,
         guard: Guard,
         limits: Limits,
         clock: Clock,
@@ -71,6 +73,7 @@ class ControlLoop:
         """The instruction angle that was sent last, after the guard [rad]."""
         self.neutral_for = 0.0
         """How long the instruction angle has been zero [s]."""
+        self.thrust = thrust
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self._estimator = estimator
@@ -78,6 +81,14 @@ class ControlLoop:
         self._notify = notify
         self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
         self._index = -1
+        self._awaited: tuple[int, str, Controller[Any]] | None = None
+
+    @property
+    def known_thrust(self) -> tuple[float, float | None]:
+        """Thrust and half of its 95 % interval [N]; while its zero is not known, as measured."""
+        if self.thrust.thrust is not None:
+            return self.thrust.thrust, self.thrust.error
+        return (self.observation.thrust if self.observation else 0.0), None
 
     def tick(self, slot: Slot) -> None:
         """One turn of the loop."""
@@ -93,6 +104,12 @@ class ControlLoop:
         self.statistics.missed += slot.missed
         dt = (slot.index - self._index) * self.limits.tick
         self._index = slot.index
+        if self._awaited and self.seq > self._awaited[0]:
+            (_, name, controller), self._awaited = self._awaited, None
+            try:
+                self.set_controller(name, controller)
+            except Exception as error:
+                self._fail("controller-error", f"controller {name} cannot begin", error)
         self._attend_panel(slot)
         measurement = self._read(slot)
         read = self._now()
@@ -124,12 +141,18 @@ class ControlLoop:
         Raises `Refused` while a fault or an emergency stop is latched.
         """
         self.supervisor.check_startable()
+        self._await_nobody()
         self.active.replace(name, controller)
         self.reporter.controller("controller", name, self.active.parameters)
         self.supervisor.start()
 
+    def set_controller_after(self, seconds: float, name: str, controller: Controller[Any]) -> None:
+        """Make it the active one after so long at rest; whatever else is asked for comes first."""
+        self._awaited = (math.ceil(seconds / self.limits.tick - 1e-9), name, controller)
+
     def stop(self) -> None:
         """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
+        self._await_nobody()
         self.supervisor.stop()
 
     def clear_fault(self) -> None:
@@ -142,11 +165,19 @@ class ControlLoop:
 
     def close(self) -> None:
         """Let go of the active controller; nothing ticks after this."""
+        self._await_nobody()
         self.active.rest()
+
+    def _await_nobody(self) -> None:
+        if self._awaited:
+            _, name, controller = self._awaited
+            self._awaited = None
+            self.active.dispose(controller, f"{name}, which was to begin,")
 
     def _mode_changed(self, before: Mode) -> None:
         """All that a change of mode leads to, whatever caused it."""
         mode = self.supervisor.mode
+        self._await_nobody()
         if mode is Mode.ESTOP:
             self._write(neutral=False)  # first of all
         if mode is not Mode.RUNNING:
@@ -190,7 +221,10 @@ class ControlLoop:
 
     def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
         try:
-            return self._estimator.update(measurement, self.applied, slot.deadline, dt)
+            seen = self._estimator.update(measurement, self.applied, slot.deadline, dt)
+            if not self.supervisor.sensor_lost:
+                self.thrust.update(seen, self.supervisor.mode is Mode.RUNNING)
+            return seen
         except Exception as error:
             self._fail("estimate-error", "the estimator failed", error)
             fx, fy, angle = measurement.fx, measurement.fy, self.applied

@@ -89,6 +89,7 @@ class Reporter:
         now: the time after the servo was driven [s, monotonic]
         """
         slot, measurement, observation, marks = turn
+        thrust, error = loop.known_thrust
         extremes = measurement.extremes
         truth = loop.robot.truth() if loop.robot.truth else None
         self._publisher.tick(
@@ -103,7 +104,8 @@ class Reporter:
                 fin_velocity=observation.fin_velocity,
                 phi_c=loop.applied,
                 servo_on=loop.servo.on,
-                thrust=observation.thrust,
+                thrust=thrust,
+                thrust_error=UNSET if error is None else error,
                 frequency=observation.frequency,
                 samples=measurement.samples,
                 fx_min=extremes.fx_min if extremes else UNSET,
@@ -117,6 +119,7 @@ class Reporter:
                 alpha=truth.alpha if truth else UNSET,
                 alpha_rate=truth.alpha_rate if truth else UNSET,
                 phi=truth.phi if truth else UNSET,
+                quantities=loop.active.quantities or UNSET,
             )
         )
 

@@ -5,6 +5,7 @@ waits for the answer of its agent. `policy/` reads its file before it takes over
 """
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.controllers.quantities import quantity
 from fishd.core.errors import ParameterError
 from fishd.core.schema import note, unit
 from fishd.core.signals import Observation
@@ -17,5 +18,6 @@ __all__ = [
     "ParameterError",
     "amplitude_of",
     "note",
+    "quantity",
     "unit",
 ]

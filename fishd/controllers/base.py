@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 from msgspec import Meta, Struct
 
+from fishd.controllers.quantities import quantities_of
 from fishd.core.errors import ParameterError
 from fishd.core.schema import note, unit
 from fishd.core.signals import Observation
@@ -62,10 +63,16 @@ class Controller(ABC, Generic[P]):
 
     A subclass names its `Parameters`, a frozen msgspec struct whose fields carry bounds, unit and
     description: help texts, command-line options and documentation are made from it. Everything
-    slow (loading a file, warming up) belongs into `__init__`, which runs outside the tick.
+    slow (loading a file, warming up) belongs into `__init__`, which runs outside the tick. What
+    it wants to show of its inside is a `quantity`.
     """
 
     Parameters: ClassVar[type[Struct]]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Raises TypeError where its quantities cannot be shown."""
+        super().__init_subclass__(**kwargs)
+        quantities_of(cls)
 
     def __init__(self, parameters: P, limits: Limits) -> None:
         """Raises `ParameterError` when the parameters do not fit the limits."""

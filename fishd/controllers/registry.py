@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from fishd.controllers.base import Controller, Limits
+from fishd.controllers.quantities import quantities_of
 from fishd.core import text
 from fishd.core.errors import ParameterError, UnknownController
 from fishd.core.foreign_code import Attempt, contained
@@ -42,10 +43,15 @@ names, find = _found.names, _found.find
 
 
 def describe(name: str) -> ControllerInfo:
-    """Name, summary and parameters of one controller; raises `UnknownController`."""
+    """Name, summary, parameters and quantities of a controller; raises `UnknownController`."""
     found = find(name)
     summary = text.line(str(found.__doc__ or "").strip().partition("\n")[0])
-    return ControllerInfo(name=name, summary=summary, parameters=fields_of(found.Parameters))
+    return ControllerInfo(
+        name=name,
+        summary=summary,
+        parameters=fields_of(found.Parameters),
+        quantities=quantities_of(found),
+    )
 
 
 def describe_all() -> list[ControllerInfo]:

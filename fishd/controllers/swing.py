@@ -5,6 +5,7 @@ from typing import Annotated
 from msgspec import Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.controllers.quantities import quantity
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
@@ -42,12 +43,16 @@ class Swing(Controller[SwingParameters]):
     """
 
     Parameters = SwingParameters
+    top_speed: float = quantity("1", "The fin's highest speed since the last reversal.")
+    reversal_speed: float = quantity("1", "C times `top_speed`: the fin reverses when so slow.")
+    since_reversal: float = quantity("s", "Time since the last reversal.")
 
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._direction = 1.0
-        self._top_speed = 0.0
-        self._elapsed = 0.0
+        self.top_speed = 0.0
+        self.reversal_speed = 0.0
+        self.since_reversal = 0.0
 
     def activate(self, observation: Observation) -> None:
         """Push on towards the side of the present angle; from rest, towards plus."""
@@ -55,16 +60,17 @@ class Swing(Controller[SwingParameters]):
 
     def update(self, observation: Observation) -> float:
         """Plus or minus the amplitude [rad]."""
-        self._elapsed += observation.dt
+        self.since_reversal += observation.dt
         speed = self._direction * observation.fin_velocity
         parameters = self.parameters
-        slowed = self._top_speed > 0.0 and speed <= parameters.C * self._top_speed
-        self._top_speed = max(self._top_speed, speed)
-        settled = self._elapsed > REFRACTORY * parameters.longest_half_period
+        slowed = self.top_speed > 0.0 and speed <= parameters.C * self.top_speed
+        self.top_speed = max(self.top_speed, speed)
+        settled = self.since_reversal > REFRACTORY * parameters.longest_half_period
         # Half a tick early is nearer to the longest half period than half a tick late.
-        overdue = self._elapsed + 0.5 * self.limits.tick > parameters.longest_half_period
+        overdue = self.since_reversal + 0.5 * self.limits.tick > parameters.longest_half_period
         if (slowed and settled) or overdue:
             self._direction = -self._direction
-            self._top_speed = 0.0
-            self._elapsed = 0.0
+            self.top_speed = 0.0
+            self.since_reversal = 0.0
+        self.reversal_speed = parameters.C * self.top_speed
         return self._direction * amplitude_of(parameters, self.limits)

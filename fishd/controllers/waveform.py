@@ -10,6 +10,7 @@ from typing import Annotated
 from msgspec import Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.controllers.quantities import quantity
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
@@ -31,10 +32,11 @@ class Waveform(Controller[WaveformParameters]):
     """
 
     Parameters = WaveformParameters
+    phase: float = quantity("1", "Phase of the waveform: 0 to 1 over one period.")
 
     def __init__(self, parameters: WaveformParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
-        self._phase = 0.0
+        self.phase = 0.0
         self._first = True
 
     def update(self, observation: Observation) -> float:
@@ -42,8 +44,8 @@ class Waveform(Controller[WaveformParameters]):
         if self._first:
             self._first = False
         else:
-            self._phase = (self._phase + self.parameters.frequency * observation.dt) % 1.0
-        return self.amplitude * self.shape(self._phase)
+            self.phase = (self.phase + self.parameters.frequency * observation.dt) % 1.0
+        return self.amplitude * self.shape(self.phase)
 
     @property
     def amplitude(self) -> float:
@@ -60,7 +62,7 @@ class Square(Waveform):
 
     def activate(self, observation: Observation) -> None:
         """Start on the side of the present angle."""
-        self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
+        self.phase = 0.0 if observation.instruction_angle >= 0 else 0.5
 
     def shape(self, phase: float) -> float:
         """+1 in the first half of the period, −1 in the second."""
@@ -84,14 +86,14 @@ class Smooth(Waveform):
     def activate(self, observation: Observation) -> None:
         """Choose phase and excess such that the first angle is the present one."""
         angle = observation.instruction_angle
-        self._phase = self.phase_of(max(-1.0, min(1.0, angle / self.amplitude)))
-        self._excess = angle - self.amplitude * self.shape(self._phase)
+        self.phase = self.phase_of(max(-1.0, min(1.0, angle / self.amplitude)))
+        self._excess = angle - self.amplitude * self.shape(self.phase)
 
     def retune(self, parameters: WaveformParameters) -> None:
         """Keep the phase; take a jump that a new amplitude would make into the excess."""
-        before = self.amplitude * self.shape(self._phase)
+        before = self.amplitude * self.shape(self.phase)
         super().retune(parameters)
-        self._excess += before - self.amplitude * self.shape(self._phase)
+        self._excess += before - self.amplitude * self.shape(self.phase)
 
     def update(self, observation: Observation) -> float:
         """The waveform's angle at this tick, plus what is left of the excess [rad]."""

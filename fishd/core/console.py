@@ -22,14 +22,21 @@ def status_line(status: Status) -> str:
     if status.reason:
         what = f"{status.mode} {status.reason.code}"
     what = text.quoted(what)
-    thrust = "     –" if status.sensor_lost else f"{status.thrust * 1e3:6.2f}"
-    thrust += f" m{text.quoted(status.force_unit)}"
     servo = "  servo not reached" if status.servo_lost else ""
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust}  "
+        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust_words(status):>16}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
     )
+
+
+def thrust_words(status: Status) -> str:
+    """Thrust and half of its 95 % interval: `25.7 ± 1.8 mN`; `?` while the zero is not known."""
+    unit = f"m{text.quoted(status.force_unit)}"
+    if status.sensor_lost:
+        return f"– {unit}"
+    thrust, error = status.thrust * 1e3, status.thrust_error
+    return f"{thrust:.2f} ± {'?' if error is None else f'{error * 1e3:.2f}'} {unit}"
 
 
 def run(command: click.Command, name: str) -> int:

@@ -40,6 +40,22 @@ def _ctrl_c_is_raised() -> bool:
     return in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def real_number(value: Any, what: str) -> float:
+    """A real number as a float; raises ValueError for what is none, such as a text or True.
+
+    what: what it is called in the error
+    """
+    try:
+        # An array of one number, whatever its shape, or one of numpy's own kinds of number.
+        number = value.item() if hasattr(value, "item") else value
+        if not isinstance(number, bool | str | bytes | bytearray):
+            return float(number)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    kind = text.quoted(type(value).__name__)
+    raise ValueError(f"{what} is of type {kind}, not one real number")
+
+
 class GivenUp(BaseException):
     """Raised in the thread of an `Attempt` that was given up."""
 

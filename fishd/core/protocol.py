@@ -146,6 +146,14 @@ class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
     lease: str | None = None
 
 
+class CalibrateThrust(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of calibrate-thrust: thrust [N] over the mean square of `fin_velocity`."""
+
+    factor: Annotated[float, Meta(gt=0)]
+    error: Annotated[float, Meta(gt=0)]
+    """Half of its 95 % interval."""
+
+
 class ServoLease(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of renew-lease and end-lease."""
 
@@ -234,6 +242,11 @@ OPERATIONS = {
     ),
     "end-lease": Operation(
         ServoLease, _CALIBRATIONS, "begins to end it: neutral, then the calibration of before"
+    ),
+    "calibrate-thrust": Operation(
+        CalibrateThrust,
+        _STATE,
+        "takes the factor from a measurement, and shows the thrust by it until fishd ends",
     ),
 }
 """All operations, by name."""

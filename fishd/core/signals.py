@@ -102,7 +102,14 @@ class Tick(Struct, frozen=True, gc=False):
         float, unit("rad", "Instruction angle that was sent to the servo in this tick.")
     ]
     servo_on: Annotated[bool, note("False once the servo is known to get no pulses.")]
-    thrust: Annotated[float, unit("N", "Mean `fx` over the latest whole tail beats.")]
+    thrust: Annotated[
+        float,
+        unit(
+            "N",
+            "Thrust over the latest whole tail beats, the sensor's zero taken off; mean `fx` where "
+            "that is not known.",
+        ),
+    ]
     frequency: Annotated[
         float, unit("Hz", "Tail-beat frequency, from reversals of `phi_c`; 0.0 when not beating.")
     ]
@@ -111,6 +118,10 @@ class Tick(Struct, frozen=True, gc=False):
     lateness_us: Annotated[float, unit("µs", "How late after its deadline the tick began.")]
     busy_us: Annotated[float, unit("µs", "From the start of the tick until the servo was driven.")]
     missed: Annotated[int, note("Slots skipped since start.")]
+    thrust_error: Annotated[
+        float | UnsetType,
+        unit("N", "Half of the 95 % interval of `thrust`; absent while the zero is not known."),
+    ] = UNSET
     fx_min: Annotated[
         float | UnsetType, unit("N", "Lowest of these samples of F_x; not of a simulated fish.")
     ] = UNSET
@@ -122,6 +133,10 @@ class Tick(Struct, frozen=True, gc=False):
     ] = UNSET
     alpha_rate: Annotated[float | UnsetType, unit("rad/s", "True fin angular velocity.")] = UNSET
     phi: Annotated[float | UnsetType, unit("rad", "True servo wheel angle.")] = UNSET
+    quantities: Annotated[
+        dict[str, float] | UnsetType,
+        note("The controller's own quantities, by name; absent where it has none to show."),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -194,6 +209,15 @@ class Event(Struct, frozen=True):
     data: Annotated[dict[str, Any], note("The same for programs.")] = {}
 
 
+class QuantityInfo(Struct, frozen=True):
+    """A controller's own quantity as a person wants to know it."""
+
+    name: str
+    unit: str
+    """In SI notation, `1` where there is none."""
+    description: str
+
+
 class ControllerInfo(Struct, frozen=True):
     """A controller as a person or an option parser wants to know it."""
 
@@ -201,6 +225,7 @@ class ControllerInfo(Struct, frozen=True):
     summary: str
     """One line that says what it does."""
     parameters: tuple[Field, ...]
+    quantities: tuple[QuantityInfo, ...] = ()
 
 
 class Reason(Struct, frozen=True):
@@ -290,3 +315,13 @@ class Status(Struct, frozen=True):
             "Unit of forces and thrust: `N`; `V`, or the driver's, until the sensor is calibrated."
         ),
     ] = "N"
+    thrust_error: Annotated[
+        float | None,
+        unit("N", "Half of the 95 % interval of `thrust`; null while the zero is not known."),
+    ] = None
+    quantities: Annotated[
+        dict[str, float], note("The active controller's own quantities, as in `tick`.")
+    ] = {}
+    quantity_units: Annotated[
+        dict[str, str], note("Unit of each quantity that this controller has; `1` for none.")
+    ] = {}

@@ -30,8 +30,8 @@ from fishd.core.schema import Problem
 from fishd.daemon.background_calls import BackgroundCalls
 from fishd.daemon.trial_calibration import (
     TrialCalibration,
-    calibrated_parts,
     calibrated_parts_at_rest,
+    tared_sensor_at_rest,
 )
 from fishd.hardware.calibration_files import CalibrationFolder, check
 
@@ -47,7 +47,7 @@ Handlers = dict[str, Callable[[Any], Awaitable[Any]]]
 
 
 class CalibrationRequests:
-    """Answers the requests about calibrations of a robot; refuses them for a simulated fish."""
+    """Answers the requests about calibrations; a simulated fish can only be tared."""
 
     def __init__(self, loop: ControlLoop, clock: Clock, config: Config, folder: Path) -> None:
         """folder: where calibrations are kept"""
@@ -83,18 +83,18 @@ class CalibrationRequests:
         return self._servo.lease is not None
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
-        parts = calibrated_parts(self._loop)
+        robot = self._loop.robot
         return Calibrations(
-            force=parts.sensor.calibration,
+            force=robot.tared.calibration if robot.tared else ForceCalibration(),
             force_file=self._force_file,
-            servo=parts.servo.calibration,
+            servo=robot.calibrated.servo.calibration if robot.calibrated else ServoCalibration(),
             servo_file=self._servo_file,
             lease=self._servo.lease,
             force_limit=self._sensor.force_limit,
         )
 
     async def _sample_force(self, wanted: SampleForce) -> ForceSample:
-        sensor = calibrated_parts_at_rest(self._loop).sensor
+        sensor = tared_sensor_at_rest(self._loop)
         if self._sampling >= MOST_SAMPLES:
             raise Refused("busy", f"{self._sampling} samples are being taken; try again")
         watch = sensor.watch()
@@ -118,7 +118,7 @@ class CalibrationRequests:
         until = now() + seconds
         while (left := until - now()) > 0.0:
             await asyncio.sleep(min(left, _LOOK))
-            calibrated_parts_at_rest(self._loop)
+            tared_sensor_at_rest(self._loop)
 
     def _forget_old_samples(self) -> None:
         oldest = self._clock.monotonic() - FRESH
@@ -137,7 +137,7 @@ class CalibrationRequests:
         if sample.suspect:
             raise Refused("suspect", f"the forces are not to be believed: {sample.suspect}")
         async with self._changing:
-            before = calibrated_parts_at_rest(self._loop).sensor.calibration
+            before = tared_sensor_at_rest(self._loop).calibration
             restless = max(
                 math.hypot(before.xx * sample.vx_std, before.xy * sample.vy_std),
                 math.hypot(before.yx * sample.vx_std, before.yy * sample.vy_std),
@@ -187,12 +187,18 @@ class CalibrationRequests:
             )
 
     async def _adopt_force(self, calibration: ForceCalibration) -> Calibrations:
-        calibrated_parts_at_rest(self._loop)
-        saved, path = await self._save(calibration)
+        sensor = tared_sensor_at_rest(self._loop)
+        before = sensor.calibration
+        if self._loop.robot.calibrated:
+            calibration, path = await self._save(calibration)
+            self._force_file = str(path)
+            self._announce("force sensor", path)
         # The newest file is used from the next start on, so it is now, whatever else began.
-        calibrated_parts(self._loop).sensor.recalibrate(saved)
-        self._force_file = str(path)
-        self._announce("force sensor", path)
+        sensor.recalibrate(calibration)
+        if _matrix(before) == _matrix(calibration):
+            self._loop.thrust.forget_zero()
+        else:
+            self._loop.thrust.forget()
         return await self._calibrations(NoArguments())
 
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
@@ -241,6 +247,10 @@ class CalibrationRequests:
 
     def _announce(self, what: str, path: Path) -> None:
         self._loop.reporter.event("calibration", f"{what}: {path}", file=str(path))
+
+
+def _matrix(calibration: ForceCalibration) -> tuple[float, ...]:
+    return calibration.xx, calibration.xy, calibration.yx, calibration.yy
 
 
 def _sensible(calibration: C) -> C:

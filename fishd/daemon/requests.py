@@ -75,6 +75,7 @@ class Operations:
             "clear-fault": self._clear_fault,
             "mark": self._mark,
             **calibration_requests.handlers,
+            "calibrate-thrust": self._calibrate_thrust,
         }
 
     async def perform(self, op: str, args: dict[str, Any]) -> Any:
@@ -93,6 +94,7 @@ class Operations:
         """The daemon in one snapshot."""
         loop = self._loop
         observation = loop.observation
+        thrust, error = loop.known_thrust
         return Status(
             t=self._clock.wall(),
             version=__version__,
@@ -103,7 +105,8 @@ class Operations:
             controller=loop.active.name,
             parameters=loop.active.parameters,
             servo_on=loop.servo.on,
-            thrust=observation.thrust if observation else 0.0,
+            thrust=thrust,
+            thrust_error=error,
             frequency=observation.frequency if observation else 0.0,
             tick=loop.limits.tick,
             amplitude_limit=loop.limits.amplitude,
@@ -125,6 +128,8 @@ class Operations:
             name=self._name,
             phi_c=loop.applied,
             force_unit=loop.robot.force_unit,
+            quantities=loop.active.quantities,
+            quantity_units=loop.active.quantity_units,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:
@@ -218,6 +223,10 @@ class Operations:
 
     async def _mark(self, wanted: protocol.Mark) -> State:
         self._loop.reporter.event("mark", wanted.text)
+        return self._state()
+
+    async def _calibrate_thrust(self, wanted: protocol.CalibrateThrust) -> State:
+        self._loop.thrust.calibrate(wanted.factor, wanted.error)
         return self._state()
 
     def _dispose(self, controller: Controller[Any]) -> None:

@@ -14,7 +14,7 @@ from fishd.core.clock import Clock
 from fishd.core.errors import Refused
 from fishd.core.protocol import LEASE
 from fishd.core.schema import Problem
-from fishd.hardware.base import CalibratedParts
+from fishd.hardware.base import CalibratedParts, TaredSensor
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import ServoSettings
 
@@ -35,11 +35,23 @@ def calibrated_parts(loop: ControlLoop) -> CalibratedParts:
 def calibrated_parts_at_rest(loop: ControlLoop) -> CalibratedParts:
     """The same while nothing swims; `hold` may be active. Raises `Refused`."""
     parts = calibrated_parts(loop)
+    _check_rest(loop)
+    return parts
+
+
+def tared_sensor_at_rest(loop: ControlLoop) -> TaredSensor:
+    """The force sensor, a simulated one too, while nothing swims; raises `Refused`."""
+    if loop.robot.tared is None:
+        raise Refused("simulated", "this fish's force sensor has no zero to set")
+    _check_rest(loop)
+    return loop.robot.tared
+
+
+def _check_rest(loop: ControlLoop) -> None:
     if loop.supervisor.mode is Mode.RUNNING and loop.active.name != "hold":
         raise Refused(
             "running", f"{loop.active.name} is the active controller; stop it with 'fishctl stop'"
         )
-    return parts
 
 
 class _Lease:

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from fishd.core.calibration import ServoCalibration
+from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.signals import Measurement, Truth
 
 if TYPE_CHECKING:
-    from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+    from fishd.hardware.force_sensor.window import VoltageWatch
     from fishd.hardware.panel import RpiGpioPanel
     from fishd.hardware.servo.calibrated_servo import CalibratedServo
 
@@ -26,6 +26,23 @@ class ForceSensor(Protocol):
 
     def close(self) -> None:
         """Let go of the sensor; may be called twice."""
+
+
+class TaredSensor(Protocol):
+    """A force sensor whose zero can be set."""
+
+    calibration: ForceCalibration
+    """What turns what it senses into forces."""
+
+    @property
+    def unit(self) -> str:
+        """Of the forces: `N`, or that of the driver until the sensor is calibrated."""
+
+    def recalibrate(self, calibration: ForceCalibration) -> None:
+        """Use another calibration from the next read on."""
+
+    def watch(self) -> "VoltageWatch":
+        """Begin to add up what it senses from now on."""
 
 
 class Servo(Protocol):
@@ -57,8 +74,10 @@ class Robot:
     truth: Callable[[], Truth] | None = None
     """The true state at the latest read, where the fish is simulated."""
     panel: "RpiGpioPanel | None" = None
+    tared: TaredSensor | None = None
+    """The force sensor, where it can be tared."""
     calibrated: "CalibratedParts | None" = None
-    """What can be calibrated; None for a simulated fish, which has nothing to calibrate."""
+    """What can be calibrated; None for a simulated fish, whose forces can only be tared."""
     degraded: Callable[[], tuple[str, ...]] = tuple
     """What keeps this robot from being as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
@@ -69,14 +88,14 @@ class Robot:
     @property
     def force_unit(self) -> str:
         """`N`; that of the sensor's driver where it was never calibrated."""
-        return self.calibrated.sensor.unit if self.calibrated else "N"
+        return self.tared.unit if self.tared else "N"
 
 
 @dataclass(frozen=True)
 class CalibratedParts:
     """A robot's sensor and servo as what can be calibrated."""
 
-    sensor: "SampledSensor"
+    sensor: TaredSensor
     servo: "CalibratedServo"
     recalibrated: Callable[[ServoCalibration], None] = lambda calibration: None
     """Called when another calibration of the servo applies."""

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
@@ -20,8 +21,6 @@ REST_SETTLES = 1.0
 """The water and the fin are still after so long, fading included [s]."""
 BLOCK = 0.5
 """Rest is cut in pieces of this length [s]."""
-
-
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
 
@@ -70,6 +69,38 @@ def measure(
     return evaluate(ticks, controller, parameters, rig.tick)
 
 
+class Summary(Struct, frozen=True):
+    """A measurement without what it was found from."""
+
+    controller: str
+    parameters: dict[str, Any]
+    thrust: float
+    """[N]"""
+    error: float
+    """Half of its 95 % interval [N]."""
+    frequency: float
+    """[Hz]"""
+    factor: float
+    """Thrust over the mean square of `fin_velocity`."""
+    swims: int
+    seconds: float
+    """How long it took, rests included [s]."""
+
+
+def summary(found: Measured, tick: float) -> Summary:
+    """What fits in a line, or in JSON; tick: period of the loop [s]."""
+    return Summary(
+        found.controller,
+        dict(found.parameters),
+        found.thrust,
+        found.error,
+        found.frequency,
+        found.thrust / found.power if found.power else 0.0,
+        found.swims,
+        len(found.ticks) * tick,
+    )
+
+
 def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, float]]:
     """When to swim (True) and to rest, and for how long each [s]; `seconds` in all.
 
@@ -91,15 +122,20 @@ def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, floa
 
 
 def evaluate(
-    ticks: Sequence[Tick], controller: str, parameters: Mapping[str, Any], tick: float
+    ticks: Sequence[Tick],
+    controller: str,
+    parameters: Mapping[str, Any],
+    tick: float,
+    settles: float = SWIM_SETTLES,
 ) -> Measured:
     """The thrust in ticks of a fish that swam and rested in turn, with one controller.
 
     tick: period of the loop [s]
+    settles: when a swim is steady [s]
     Raises `ParameterError` where there is too little to tell it from a drift.
     """
     first = ticks[0].seq
-    found = [block for phase in _phases(ticks) for block in _blocks(phase, tick, first)]
+    found = [block for phase in _phases(ticks) for block in _blocks(phase, tick, first, settles)]
     swimming = [block for block in found if block.swims]
     if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
         raise ParameterError(
@@ -147,13 +183,13 @@ def _phases(ticks: Sequence[Tick]) -> Iterator[list[Tick]]:
     yield phase
 
 
-def _blocks(phase: list[Tick], tick: float, first: int) -> Iterator[_Block]:
+def _blocks(phase: list[Tick], tick: float, first: int, settles: float) -> Iterator[_Block]:
     """Whole beats of a swim, or pieces of a rest, once it has settled.
 
     first: `seq` that time is counted from
     """
     swims = phase[0].mode == "running"
-    begin = round((SWIM_SETTLES if swims else REST_SETTLES) / tick)
+    begin = round((settles if swims else REST_SETTLES) / tick)
     ups = _reversals(phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1

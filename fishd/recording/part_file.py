@@ -5,12 +5,13 @@ import fcntl
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
 
 from fishd.core.errors import RecordingError
 
 PART = ".part"
 SUFFIX = ".mcap"
+MOST_WAITING = 2**18
+"""What a run in virtual time, which nobody flushes, keeps in memory at most [bytes]."""
 
 
 class PartFile:
@@ -20,14 +21,18 @@ class PartFile:
     nobody mistakes it for one that was left behind.
     """
 
-    def __init__(self, path: Path) -> None:
-        """path: of the finished file. Raises `RecordingError` where there is one, or no room."""
+    def __init__(self, path: Path, part: Path | None = None) -> None:
+        """
+        path: of the finished file
+        part: its name until then; by default `.part` is added
+
+        Raises `RecordingError` where either exists or cannot be made.
+        """
         self.final = path
-        self.path = path.with_name(path.name + PART)
+        self.path = part or path.with_name(path.name + PART)
         if os.path.lexists(path):
             raise RecordingError(f"{path} is there already; choose another name")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._fd = os.open(self.path, flags, 0o666)
         except FileExistsError:
@@ -42,8 +47,10 @@ class PartFile:
         self._written = 0
 
     def write(self, data: bytes) -> int:
-        """Take bytes for the next flush."""
+        """Take whole records for the next flush; raises OSError where that is due at once."""
         self._waiting += data
+        if len(self._waiting) > MOST_WAITING:
+            self.flush()
         return len(data)
 
     def tell(self) -> int:
@@ -90,6 +97,10 @@ class PartFile:
         finally:
             os.close(folder)
 
+    def remove(self) -> None:
+        """Take the part away."""
+        self.path.unlink(missing_ok=True)
+
     def close(self) -> None:
         """Close it; may be called twice."""
         if self._fd >= 0:
@@ -97,11 +108,13 @@ class PartFile:
             self._fd = -1
 
 
-def is_being_written(file: IO[bytes]) -> bool:
+def is_being_written(path: Path) -> bool:
     """Does some process still write this part?"""
     try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    fcntl.flock(file, fcntl.LOCK_UN)
+    except OSError:
+        return False
     return False

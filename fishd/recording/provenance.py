@@ -6,6 +6,7 @@ import socket
 import subprocess
 from collections.abc import Mapping
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 
 from fishd import __version__
@@ -38,6 +39,7 @@ def provenance(
     }
 
 
+@cache
 def git_commit() -> str:
     """The commit of fishd's sources, with `-dirty` where they are changed; empty outside of git."""
     folder = Path(__file__).resolve().parents[2]

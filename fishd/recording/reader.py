@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from fishd.config import Config, adopt
-from fishd.core.errors import RecordingError
+from fishd.core.errors import ConfigError, RecordingError
 from fishd.core.frames import frame
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
@@ -52,10 +52,11 @@ class Run:
         """Run, version, git commit, host, Python, operator, subject, note, and more."""
         self.daemons: list[dict[str, str]] = []
         """Each fishd that was recorded: version, process, robot."""
-        self.configs: list[dict[str, Any]] = []
-        """The configuration of each, as `fishctl config show` prints it."""
+        self.configs: dict[int, dict[str, Any]] = {}
+        """The configuration of each, by its number in the recording, from 0; of one that ended
+        before it could be asked there is none."""
         self.calibrations: list[Calibrations] = []
-        """The calibrations that were in use, of each fishd that was asked."""
+        """The calibrations that were in use, one after the other."""
         self.finished = False
         """False where the recording was not ended, or is still being written."""
         self.reason = ""
@@ -69,12 +70,23 @@ class Run:
         """Name of the run."""
         return self.path.name.removesuffix(PART).removesuffix(SUFFIX)
 
-    @cached_property
+    @property
     def config(self) -> Config:
         """The configuration of the first fishd; raises `RecordingError` without any."""
-        if not self.configs:
-            raise RecordingError(f"{self.path}: no configuration was recorded")
-        return adopt(self.configs[0])
+        return self.config_of(0)
+
+    def config_of(self, number: int) -> Config:
+        """The configuration of the fishd of this number; raises `RecordingError`."""
+        if number not in self.configs:
+            raise RecordingError(f"{self.path}: the configuration of its fishd was not recorded")
+        try:
+            return adopt(self.configs[number])
+        except ConfigError as error:
+            made = self.about.get("version", "unknown")
+            raise RecordingError(
+                f"{self.path}: the configuration of fishd {made} cannot be read by this one: "
+                f"{error}"
+            ) from None
 
     @cached_property
     def ticks(self) -> list[Tick]:
@@ -91,6 +103,16 @@ class Run:
         """All statuses, one a second; none of a run in virtual time. Raises `RecordingError`."""
         return self._decoded("status", Status)
 
+    def messages(self) -> Iterator[Tick | Event | Status]:
+        """All messages in the order in which they came; raises `RecordingError`."""
+        of: dict[str, Iterator[Tick | Event | Status]] = {
+            "tick": iter(self.ticks),
+            "event": iter(self.events),
+            "status": iter(self.statuses),
+        }
+        for entry in self.entries:
+            yield next(of[entry.topic])
+
     @property
     def gaps(self) -> list[Gap]:
         """Where ticks are missing."""
@@ -104,10 +126,8 @@ class Run:
     @cached_property
     def _tally(self) -> Tally:
         tally = Tally()
-        for tick in self.ticks:
-            tally.tick(tick)
-        for event in self.events:
-            tally.event(event)
+        for message in self.messages():
+            tally.add(message)
         return tally
 
     def frame(self) -> "DataFrame":
@@ -140,7 +160,7 @@ class Run:
 
     def _take_attachment(self, name: str, data: bytes) -> None:
         if name == CONFIG:
-            self.configs.append(yaml.safe_load(data))
+            self.configs[int(self.daemons[-1]["number"])] = yaml.safe_load(data)
         elif name == CALIBRATIONS:
             self.calibrations.append(msgspec.json.decode(data, type=Calibrations))
 

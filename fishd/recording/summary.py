@@ -5,7 +5,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec import Struct
 
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Event, Status, Tick
 
 
 class Gap(NamedTuple):
@@ -68,8 +68,18 @@ class Tally:
         self._last: TickHead | Tick | None = None
         self._first_t = 0.0
         self._ticks = self._events = self._marks = self._missed = self._restarts = 0
+        self._pid = self._known = 0
         self._impulse = 0.0
         self._swimming: dict[str, int] = {}
+
+    def add(self, message: TickHead | Tick | Event | Status) -> None:
+        """Add any message."""
+        if isinstance(message, Event):
+            self.event(message)
+        elif isinstance(message, Status):
+            self.status(message)
+        else:
+            self.tick(message)
 
     def tick(self, tick: TickHead | Tick) -> bool:
         """Add a tick; returns False where it is the first of another fishd."""
@@ -91,10 +101,21 @@ class Tally:
             self._restarts += 1
         return same
 
+    def status(self, status: Status) -> None:
+        """Add a status, which also shows another fishd whose ticks have higher numbers."""
+        if self._pid not in (0, status.pid) and self._known == self._restarts:
+            self._restarts += 1
+        self._pid, self._known = status.pid, self._restarts
+
     def event(self, event: Event) -> None:
         """Add an event."""
         self._events += 1
         self._marks += event.kind == "mark"
+
+    @property
+    def restarts(self) -> int:
+        """How often another fishd took the place of the one before."""
+        return self._restarts
 
     @property
     def seconds(self) -> float:

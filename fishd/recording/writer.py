@@ -4,7 +4,7 @@ docs/recording.md shows its layout.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -80,10 +80,11 @@ class RunWriter:
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        if isinstance(error, RecordingError):  # nothing more can be written
-            self.abandon()
-        else:
-            self.close("ended" if error is None else f"ended by {type(error).__name__}")
+        """Finish the file; where an error came before there was anything to keep, remove it."""
+        if error is not None and not self.tally.summary.ticks:
+            self._file.remove()
+            self._give_up()
+        self.close("ended" if error is None else f"ended by {type(error).__name__}")
 
     @property
     def part(self) -> Path:
@@ -110,25 +111,23 @@ class RunWriter:
         return self._file.free()
 
     def describe(
-        self,
-        config: Config | Mapping[str, Any],
-        calibrations: Calibrations | None = None,
-        daemon: Mapping[str, str] | None = None,
+        self, config: Config | Mapping[str, Any], daemon: Mapping[str, str] | None = None
     ) -> None:
-        """Keep what the ticks from now on are made with; again where another fishd takes over.
+        """Keep the configuration that the ticks from now on are made with.
 
-        daemon: what is to be known of it, such as its version
+        To be called at the start, and again where another fishd takes over.
+
+        daemon: what is to be known of that fishd, such as its process
         Raises `RecordingError` when it cannot be written.
         """
-        now = time.time_ns()
-        if daemon is not None:
-            self._writer.add_metadata("fishd.daemon", dict(daemon))
+        number = str(self.tally.restarts)
+        self._writer.add_metadata("fishd.daemon", {"number": number, **(daemon or {})})
         yaml = to_yaml(config if isinstance(config, Config) else dict(config))
-        self._writer.add_attachment(now, now, CONFIG, "application/yaml", yaml.encode())
-        if calibrations is not None:
-            content = self._encode(calibrations)
-            self._writer.add_attachment(now, now, CALIBRATIONS, "application/json", content)
-        self.flush()
+        self._attach(CONFIG, "application/yaml", yaml.encode())
+
+    def calibrated(self, calibrations: Calibrations) -> None:
+        """Keep the calibrations that are used from now on; raises `RecordingError`."""
+        self._attach(CALIBRATIONS, "application/json", self._encode(calibrations))
 
     def tick(self, tick: Tick) -> None:
         """Record a tick."""
@@ -142,6 +141,7 @@ class RunWriter:
 
     def status(self, status: Status) -> None:
         """Record a status."""
+        self.tally.status(status)
         self._add("status", status.t, status.seq, self._encode(status))
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
@@ -149,15 +149,8 @@ class RunWriter:
 
         Raises `msgspec.DecodeError` for what is none.
         """
-        head: TickHead | Event | Status
-        if topic == "tick":
-            head = _decode_tick(payload)
-            self.tally.tick(head)
-        elif topic == "event":
-            head = _decode_event(payload)
-            self.tally.event(head)
-        else:
-            head = _decode_status(payload)
+        head = _DECODERS[topic](payload)
+        self.tally.add(head)
         self._add(topic, head.t, 0 if isinstance(head, Event) else head.seq, payload)
         return head
 
@@ -192,26 +185,40 @@ class RunWriter:
             self._file.finish()
         except OSError as error:
             raise self._failed(error) from None
-        finally:
-            self.abandon()
+        self._give_up()
 
-    def abandon(self) -> None:
-        """Leave the `.part` as it was flushed last."""
+    def _give_up(self) -> None:
+        """Nothing more is written."""
         self._closed = True
         self._file.close()
 
+    def _attach(self, name: str, media_type: str, content: bytes) -> None:
+        now = time.time_ns()
+        try:
+            self._writer.add_attachment(now, now, name, media_type, content)
+        except OSError as error:
+            raise self._failed(error) from None
+        self.flush()
+
     def _add(self, topic: str, t: float, seq: int, payload: bytes) -> None:
+        if self._closed:
+            raise RecordingError(f"{self.path}: the recording has ended")
         nanoseconds = max(0, round(t * 1e9))
-        self._writer.add_message(
-            self._channels[topic], nanoseconds, payload, nanoseconds, seq & 0xFFFFFFFF
-        )
+        channel = self._channels[topic]
+        try:
+            self._writer.add_message(channel, nanoseconds, payload, nanoseconds, seq & 0xFFFFFFFF)
+        except OSError as error:
+            raise self._failed(error) from None
 
     def _failed(self, error: OSError) -> RecordingError:
+        self._give_up()
         what = f"{self.part}: the recording ends after {self.tally.seconds:.0f} s"
         kept = f"what was written is readable; with more room: fishctl recover {self.part}"
         return RecordingError(f"{what}: {error.strerror or error}; {kept}")
 
 
-_decode_tick = msgspec.json.Decoder(TickHead).decode
-_decode_event = msgspec.json.Decoder(Event).decode
-_decode_status = msgspec.json.Decoder(Status).decode
+_DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {
+    "tick": msgspec.json.Decoder(TickHead).decode,
+    "event": msgspec.json.Decoder(Event).decode,
+    "status": msgspec.json.Decoder(Status).decode,
+}

@@ -4,8 +4,11 @@ It advances when it is read, by the time since the previous read, under the inst
 was last written. So it knows no clock and runs as well in real time as in virtual time.
 """
 
+from fishd.core.calibration import ForceCalibration
 from fishd.core.signals import Measurement, Truth
 from fishd.hardware.base import Robot
+from fishd.hardware.driver import Pair
+from fishd.hardware.force_sensor.window import VoltageWatch
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish, TrueWindow, Window
@@ -26,6 +29,10 @@ class SimulatedFish:
         self._start = 0.0
         self._angle: float | None = None
         self._fin_speed = 0.0
+        self.calibration = ForceCalibration()
+        """What turns forces as the rig shows them into those that are told: a tare's doing."""
+        self.unit = "N"
+        self._watches: list[VoltageWatch] = []
 
     def read(self, now: float) -> Measurement:
         """Swim until `now` [s] and measure the forces on the way."""
@@ -38,7 +45,22 @@ class SimulatedFish:
         fx, fy = self._imperfections.apply(
             window.sampled_thrust, window.sampled_lateral_force, now - self._start, duration
         )
+        if self._watches:
+            self._watches = [watch for watch in self._watches if not watch.closed]
+            for watch in self._watches:
+                watch.add([Pair(now - duration, now, fx, fy)], "")
+        fx, fy = self.calibration.forces(fx, fy)
         return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
+
+    def recalibrate(self, calibration: ForceCalibration) -> None:
+        """Use another zero from the next read on; it is forgotten with this fish."""
+        self.calibration = calibration
+
+    def watch(self) -> VoltageWatch:
+        """Begin to add up the forces of every window that begins from now on."""
+        watch = VoltageWatch(self._time or 0.0, self.calibration)
+        self._watches.append(watch)
+        return watch
 
     def take_window(self) -> TrueWindow:
         """What truly happened between the latest two reads."""
@@ -68,4 +90,4 @@ class SimulatedFish:
 
     def robot(self) -> Robot:
         """This fish as the loop sees it."""
-        return Robot(name="simulated", sensor=self, servo=self, truth=self.truth)
+        return Robot(name="simulated", sensor=self, servo=self, truth=self.truth, tared=self)

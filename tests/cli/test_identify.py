@@ -18,7 +18,7 @@ def invoke(*arguments: str) -> Result:
 @pytest.mark.slow
 def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_path: Path) -> None:
     fish, record, picture = (tmp_path / name for name in ("fish.yaml", "run.mcap", "fit.png"))
-    swim = ("--experiment", "--seconds", "40", "--record", str(record), "--png", str(picture))
+    swim = ("--experiment", "--for", "40", "--record", str(record), "--plot", str(picture))
     done = invoke(*swim, "--set", "plant.omega0=11", "--to", str(fish))
     assert done.exit_code == 0, done.output
     assert "omega0 ω₀" in done.stdout
@@ -42,8 +42,8 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     [
         ((), "name recordings to identify, or use --experiment: one of the two"),
         (("run.mcap", "--experiment"), "one of the two"),
-        (("run.mcap", "--seconds", "60"), "--seconds goes with --experiment"),
-        (("--experiment", "--seconds", "5"), "5.0 is not in the range"),
+        (("run.mcap", "--for", "60"), "--for goes with --experiment"),
+        (("--experiment", "--for", "5"), "5.0 is not in the range"),
     ],
 )
 def test_a_command_line_that_makes_no_sense_is_refused(

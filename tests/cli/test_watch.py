@@ -131,7 +131,9 @@ def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) 
     assert (ended.returncode, ended.stderr) == (0, "")
     lines = ended.stdout.splitlines()
     assert 1 <= len(lines) <= 3
-    assert all(re.fullmatch(r"\d\d:\d\d:\d\d  \S+  running swing .* ticks", line) for line in lines)
+    line = r"\d\d:\d\d:\d\d  \S+  running swing .* ticks"
+    assert all(re.match(line, each) for each in lines)
+    assert re.search(r" ticks  top_speed \S+  reversal_speed \S+  since_reversal \S+ s$", lines[-1])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -258,6 +260,12 @@ def test_a_lost_sensor_or_servo_and_a_controller_that_took_over_are_shown() -> N
     assert "– mN" in screen[3]
 
 
+def test_what_the_controller_shows_is_on_the_screen_with_its_unit() -> None:
+    own = {"top_speed": 2.3144, "since_reversal": 0.15}
+    screen = shown(view_of([tick(1, quantities=own)], quantity_units={"since_reversal": "s"}))
+    assert screen[3].split() == ["top_speed", "2.31", "since_reversal", "0.15", "s"]
+
+
 def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_change() -> None:
     assert not view_of([tick(1, t=100.5)], t=100.0).outdated
     assert view_of([tick(1, t=101.0)], t=100.0).outdated
@@ -268,7 +276,7 @@ def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_
 def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
     view = view_of(map(tick, range(1, 101)), reason=Reason("servo-link", "the cable is off"))
     for width in (1, 10, 27, 28, 60, 250):
-        for height in (1, 2, 5, 9, 15, 60):
+        for height in (1, 2, 3, 5, 9, 15, 60):
             screen = shown(view, width, height)
             assert len(screen) == height
             assert max(map(len, screen)) <= width

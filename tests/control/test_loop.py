@@ -269,6 +269,7 @@ def test_no_field_of_a_tick_keeps_what_it_was_while_a_controller_ran(
 ) -> None:
     rig, restless = fragile_rig(kind=Restless)
     restless.clock = rig.clock
+    rig.run(60)  # the zero of the force is found
     rig.start("square", frequency=4.9)
     running = rig.run(40, missed=1, lateness=5e-3)[-1]
     leave = {

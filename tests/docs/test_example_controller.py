@@ -49,6 +49,7 @@ def test_it_is_listed_beside_the_controllers_that_come_with_fishd(laptop: Path) 
     assert parameters["highest"]["unit"] == "Hz"
     assert parameters["highest"]["interval"] == "(0, 10]"
     assert parameters["amplitude"]["optional"]
+    assert [quantity["name"] for quantity in known["chirp"]["quantities"]] == ["frequency"]
 
 
 def test_it_can_be_named_in_the_configuration(laptop: Path, tmp_path: Path) -> None:

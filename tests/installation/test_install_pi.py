@@ -296,14 +296,16 @@ def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_pa
 @pytest.mark.parametrize(
     ("bits", "platform", "extras"),
     [
-        ("64", "linux-aarch64", "pi,policy"),
-        ("64", "linux-x86_64", "pi,policy"),
+        ("64", "linux-aarch64", "pi,record,policy"),
+        ("64", "linux-x86_64", "pi,record,policy"),
         ("32", "linux-aarch64", "pi"),  # 32-bit Raspberry Pi OS on a Pi 4: the kernel has 64
         ("32", "linux-armv7l", "pi"),
         ("64", "linux-riscv64", "pi"),
     ],
 )
-def test_policies_are_for_a_python_of_64_bits(bits: str, platform: str, extras: str) -> None:
+def test_policies_and_recordings_are_for_a_python_of_64_bits(
+    bits: str, platform: str, extras: str
+) -> None:
     assert said_by("core_extras", bits, platform) == extras
 
 

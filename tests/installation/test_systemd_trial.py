@@ -29,5 +29,5 @@ def test_the_trial_collects_what_the_installation_inside_will_ask_for(
     root._wheels(tmp_path)
     script = f'source {CHECKOUT}/tools/install_pi.sh; core_extras $(about_python "$0")'
     asked = subprocess.check_output(["bash", "-c", script, sys.executable], text=True).strip()
-    assert asked == "pi,policy"
+    assert asked == "pi,record,policy"
     assert f"{CHECKOUT}[{asked}]" in collected

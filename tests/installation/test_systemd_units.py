@@ -14,7 +14,8 @@ from rigs.processes import call
 from fishd.config import Config, load
 
 SYSTEMD = ROOT / "systemd"
-UNITS = ("fishd.service", "fishd-failure.service")
+ON_THE_ROBOT = ("fishd.service", "fishd-failure.service")
+UNITS = (*ON_THE_ROBOT, "fishd-recorder.service")
 MOST_EXPOSED = 2.0
 """`systemd-analyze security`: 0 is shut, 10 is open."""
 SHIPPED_UNITS = Path("/usr/lib/systemd/system")
@@ -45,7 +46,15 @@ def root(tmp_path: Path) -> Path:
     shutil.copytree(SHIPPED_UNITS, tmp_path / "usr/lib/systemd/system", symlinks=True)
     (tmp_path / "usr/lib/systemd/system/pigpiod.service").write_text(PIGPIOD)
     fishd = "opt/fishd/bin/fishd"
-    for program in (fishd, f"{fishd}-release", "usr/bin/pigpiod", "bin/sh", "bin/systemctl"):
+    fishctl = "opt/fishd/bin/fishctl"
+    for program in (
+        fishd,
+        f"{fishd}-release",
+        fishctl,
+        "usr/bin/pigpiod",
+        "bin/sh",
+        "bin/systemctl",
+    ):
         (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / program).touch(0o755)
     return tmp_path
@@ -106,7 +115,7 @@ def test_what_the_hardware_needs_stays_open() -> None:
     } <= open_
 
 
-@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("unit", ON_THE_ROBOT)
 def test_the_devices_of_the_robot_are_allowed_and_no_others(unit: str) -> None:
     assert setting(unit, "DevicePolicy") == ["closed"]
     devices = {line.split()[0] for line in setting(unit, "DeviceAllow")}
@@ -149,6 +158,16 @@ def test_clients_and_controllers_cannot_take_what_the_pi_needs() -> None:
 def test_only_fishd_itself_is_asked_to_stop() -> None:
     """Its processes carry telemetry and requests, which it still needs while it fades."""
     assert setting("fishd.service", "KillMode") == ["mixed"]
+
+
+def test_the_black_box_gives_way_to_fishd_and_reaches_no_device() -> None:
+    unit = "fishd-recorder.service"
+    assert setting(unit, "PrivateDevices") == ["yes"]
+    assert int(setting(unit, "Nice")[0]) > 0
+    assert setting(unit, "IOSchedulingClass") == ["idle"]
+    (fishd,) = setting("fishd.service", "RuntimeDirectory")
+    assert setting(unit, "Environment") == [f"FISHD_ENDPOINT=ipc:///run/{fishd}/control"]
+    assert setting(unit, "User") == setting("fishd.service", "User")
 
 
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:

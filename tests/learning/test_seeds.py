@@ -19,8 +19,8 @@ from joblib.externals.loky import get_reusable_executor
 from rigs.processes import FISHCTL, fishctl
 from rigs.swimming import LONG_ENOUGH, Done, wait_for, while_it_trains
 
+from fishd.lab import parallel
 from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluations, write_summary
-from fishd.learning.train import seeds
 
 SETTINGS = """\
 steps: {steps}
@@ -241,7 +241,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    monkeypatch.setattr(seeds, "CONNECT", 0.2)
+    monkeypatch.setattr(parallel, "CONNECT", 0.2)
     done = fishctl(*command(tmp_path, "--seeds", "2", "--cluster", "tcp://127.0.0.1:1"))
     assert "no Dask scheduler answers at tcp://127.0.0.1:1" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)

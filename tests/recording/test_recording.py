@@ -1,32 +1,19 @@
 """What is written is what is read, whatever happened to the writer."""
 
+import errno
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from rigs.harness import Rig
+from rigs.recordings import recorded, swum, write
 
 from fishd.core.errors import RecordingError
-from fishd.recording import RunWriter, open_run, read
-
-
-def swum(seconds: float = 3.0) -> Rig:
-    """A virtual fish that has swum, and was retuned in the middle of it."""
-    rig = Rig()
-    rig.start("swing")
-    rig.run_for(seconds / 2)
-    rig.retune(C=0.3)
-    rig.run_for(seconds / 2)
-    return rig
-
-
-def recorded(rig: Rig, path: Path, **about: str) -> Path:
-    with RunWriter(path, **about) as writer:
-        writer.describe(rig.config)
-        for event in rig.recorder.events:
-            writer.event(event)
-        for tick in rig.recorder.ticks:
-            writer.tick(tick)
-    return writer.path
+from fishd.recording import Gap, RunWriter, open_run, read
+from fishd.recording.folder import find, glance, glances
+from fishd.recording.recover import recover
+from fishd.simulation import simulate
 
 
 def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
@@ -37,11 +24,8 @@ def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
     assert run.ticks == rig.recorder.ticks
     assert run.events == rig.recorder.events
     assert run.config == rig.config
-    assert {run.about[key] for key in ("operator", "subject", "note")} == {
-        "Ada",
-        "fish 3",
-        "stiff fin",
-    }
+    about = ("operator", "subject", "note", "source")
+    assert [run.about[key] for key in about] == ["Ada", "fish 3", "stiff fin", "fishd"]
     assert run.finished
     assert (run.gaps, run.summary.swimming) == ([], {"swing": 60})
     table = read(path)
@@ -53,4 +37,121 @@ def test_an_older_recording_is_never_overwritten(tmp_path: Path) -> None:
     before = path.read_bytes()
     with pytest.raises(RecordingError, match="is there already; choose another name"):
         RunWriter(path)
+    with RunWriter(tmp_path / "other"), pytest.raises(RecordingError, match="that runs or was not"):
+        RunWriter(tmp_path / "other")
     assert path.read_bytes() == before
+
+
+def test_ticks_that_are_missing_are_counted(tmp_path: Path) -> None:
+    ticks = swum().recorder.ticks
+    again = swum(1.0).recorder.ticks
+    path = write(tmp_path / "run", [*ticks[:10], *ticks[13:], *again[2:]])
+    for summary in (open_run(path).summary, glance(path).summary):
+        assert (summary.gaps, summary.lost, summary.restarts) == (2, 5, 1)
+    assert open_run(path).gaps == [Gap(ticks[9].t, 11, 3), Gap(ticks[-1].t, 1, 2)]
+
+
+def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> None:
+    whole = recorded(swum(), tmp_path / "whole", flush_every=10)
+    content, ticks = whole.read_bytes(), open_run(whole).ticks
+    kept = []
+    for share in (0.3, 0.5, 0.7, 0.9, 0.999):
+        part = tmp_path / f"cut{share}.mcap.part"
+        part.write_bytes(content[: int(share * len(content))])
+        (cut,) = (each for each in glances(tmp_path) if each.path == part)
+        assert not cut.finished
+        run = recover(part)
+        assert run.path == tmp_path / f"cut{share}.mcap"
+        assert not part.exists()
+        assert run.finished
+        assert run.reason.startswith("recovered")
+        assert run.ticks == ticks[: len(run.ticks)]
+        assert glance(run.path).summary == run.summary
+        kept.append(len(run.ticks))
+    assert kept == sorted(kept)
+    assert kept[0] < kept[-1] == len(ticks)
+
+
+def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
+    with RunWriter(tmp_path / "run") as writer:
+        assert glance(writer.part).writing
+        with pytest.raises(RecordingError, match="is being recorded now; end that first"):
+            recover(writer.part)
+
+
+def test_a_damaged_byte_costs_nothing_before_its_chunk(tmp_path: Path) -> None:
+    path = recorded(swum(), tmp_path / "run", flush_every=10)
+    content = bytearray(path.read_bytes())
+    content[int(0.6 * len(content))] ^= 0xFF
+    path.write_bytes(content)
+    run = open_run(path)
+    assert not run.finished
+    assert 0 < len(run.ticks) < 60
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    writer, ticks, room = RunWriter(tmp_path / "run"), swum().recorder.ticks, 20000
+    written = os.write
+
+    def full(fd: int, data: bytes) -> int:
+        nonlocal room
+        if room <= 0:
+            raise OSError(number, os.strerror(number))
+        room -= len(data := bytes(data)[:room])  # the last write is cut short
+        return written(fd, data)
+
+    monkeypatch.setattr(os, "write", full)
+
+    def record() -> None:
+        for tick in ticks * 10:
+            writer.tick(tick)
+            writer.flush()
+
+    with pytest.raises(RecordingError, match=f"{os.strerror(number)}; what was written is reada"):
+        record()
+    with pytest.raises(RecordingError, match="has ended"):
+        writer.tick(ticks[0])
+    writer.close()
+    monkeypatch.undo()
+    run = recover(writer.part)
+    assert 0 < len(run.ticks) < 600
+    assert run.ticks == (ticks * 10)[: len(run.ticks)]
+
+
+def test_a_run_that_never_began_leaves_no_file(tmp_path: Path) -> None:
+    config = Rig().config
+    with (
+        pytest.raises(ValueError, match="nothing is left to judge"),
+        RunWriter(tmp_path / "run") as writer,
+    ):
+        simulate(config, "swing", {}, 1.0, publisher=writer)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda path: path.touch(), "is no MCAP file"),
+        (lambda path: path.write_text("t,fx\n0,1\n" * 100), "is no MCAP file"),
+        (lambda path: path.mkdir(), "cannot be read: Is a directory"),
+        (lambda path: None, "cannot be read: No such file"),
+    ],
+)
+def test_what_is_no_recording_is_said_in_one_line(
+    tmp_path: Path, make: Callable[[Path], None], complaint: str
+) -> None:
+    make(tmp_path / "run.mcap")
+    with pytest.raises(RecordingError, match=complaint):
+        open_run(tmp_path / "run.mcap")
+
+
+def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:
+    path = recorded(swum(0.2), tmp_path / "morning")
+    assert find("morning", tmp_path) == find(str(path)) == find("latest", tmp_path) == path
+    with pytest.raises(RecordingError, match="did you mean 'morning'"):
+        find("mornin", tmp_path)
+    with pytest.raises(RecordingError, match="there is no recording in"):
+        find("latest", tmp_path / "nowhere")

@@ -20,12 +20,15 @@ class Recorder:
     def __init__(self) -> None:
         self.ticks: list[Tick] = []
         self.events: list[Event] = []
+        self.messages: list[Tick | Event] = []
 
     def tick(self, tick: Tick) -> None:
         self.ticks.append(tick)
+        self.messages.append(tick)
 
     def event(self, event: Event) -> None:
         self.events.append(event)
+        self.messages.append(event)
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.events]

@@ -18,7 +18,6 @@ if __name__ == "__main__":
                 "remote",
                 "learning",
                 "chatter",
-                "swing",
                 "identification",
                 "estimators",
             ),

@@ -34,7 +34,8 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     """Call the present force zero; the fish must hang still.
 
     Refused while it swims, while the force varies, and for a force that is too large to be an
-    offset. It is saved as a new calibration file. Ctrl-C while it measures: nothing changes.
+    offset. It is saved as a new calibration file, but for a simulated fish. Ctrl-C while it
+    measures: nothing changes.
     """
     with Fish(endpoint) as fish:
         before = fish.calibrations().force
@@ -44,4 +45,5 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
         return
     for when, force in (("before", before), ("after", after.force)):
         echo(f"{when:<7} x0 {force.x0 * 1e3:+9.2f} mN   y0 {force.y0 * 1e3:+9.2f} mN")
-    echo(text.line(f"in use, and saved in {after.force_file}"))
+    kept = f"and saved in {after.force_file}" if after.force_file else "until this fish ends"
+    echo(text.line(f"in use, {kept}"))

@@ -13,6 +13,7 @@ from fishd.cli.options import endpoint_option
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
+from fishd.core.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.learning.train.jobs import Job, Outcome
@@ -175,7 +176,7 @@ def _job(
 
 def _train(job: "Job") -> int:
     from fishd.learning.train.progress import on_terminal
-    from fishd.learning.train.training import on_signal, train
+    from fishd.learning.train.training import train
 
     asked = threading.Event()
     with on_signal(asked.set), on_terminal() as display:

@@ -11,7 +11,7 @@ from fishd.core.signals import Measurement, Observation
 
 
 class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the fin velocity is found."""
+    """How fin velocity and thrust are found."""
 
     kind: Annotated[
         Literal["lateral_force", "observer"],
@@ -38,6 +38,16 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1000,
         ),
     ] = 2.0
+    zero_drift: Annotated[
+        float,
+        unit(
+            "N/√s",
+            "How fast the zero of F_x wanders, standard deviation after a second: by this the "
+            "interval of the thrust grows.",
+            ge=0,
+            le=1,
+        ),
+    ] = 6e-4
     force_noise: Annotated[
         float, unit("N", "Of observer: noise of F_y, rms of the mean over one tick.", gt=0, le=1)
     ] = 1e-3

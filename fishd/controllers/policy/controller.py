@@ -8,6 +8,7 @@ from msgspec import Struct
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.controllers.policy import library
+from fishd.controllers.quantities import quantity
 from fishd.core.errors import ParameterError, PolicyError
 from fishd.core.schema import PRINTABLE, unit
 from fishd.core.signals import Observation
@@ -44,6 +45,7 @@ class Ppo(Controller[PpoParameters]):
     """
 
     Parameters = PpoParameters
+    action: float = quantity("1", "What the network put out, before it is cut to -1 to 1.")
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Reads, checks and warms up the policy."""
@@ -85,16 +87,16 @@ class Ppo(Controller[PpoParameters]):
         Raises `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
-        return self._limit.apply(self._choose(observation), observation.dt)
-
-    def _choose(self, observation: Observation) -> float:
-        """What the network wants [rad]."""
-        network = self._network
-        self._write(observation, network.row)
-        action = network.run()
+        self.action = action = self._choose(observation)
         if math.isfinite(action):
             action = max(-1.0, min(1.0, action))
-        return self._amplitude * action
+        return self._limit.apply(self._amplitude * action, observation.dt)
+
+    def _choose(self, observation: Observation) -> float:
+        """What the network puts out."""
+        network = self._network
+        self._write(observation, network.row)
+        return network.run()
 
 
 def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":

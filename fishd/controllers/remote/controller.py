@@ -9,6 +9,7 @@ from msgspec.structs import astuple
 
 from fishd.controllers.base import LONGEST_DWELL, Controller, Limits
 from fishd.controllers.dwell import DwellLimit
+from fishd.controllers.quantities import quantity
 from fishd.controllers.remote.messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.controllers.remote.wire import Wire
 from fishd.core.addresses import why_not_connected
@@ -78,6 +79,8 @@ class Remote(Controller[RemoteParameters]):
     """
 
     Parameters = RemoteParameters
+    action: float | None = quantity("rad", "The agent's action; absent where none came in time.")
+    silent: int = quantity("ticks", "Ticks in a row without an action.")
 
     def __init__(self, parameters: RemoteParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
@@ -91,7 +94,7 @@ class Remote(Controller[RemoteParameters]):
         self._seq = 0
         self._open = 0
         """The observation whose action is waited for; 0 for none."""
-        self._command: float | None = None
+        self.action = None
         self._resting = False
         """Is this tick part of a pause?"""
         self._pause = 0.0
@@ -102,8 +105,7 @@ class Remote(Controller[RemoteParameters]):
         """Answers for a tick that was over, since the latest one in time."""
         self._foreign = 0
         """Messages that named another session, since then."""
-        self._silent = 0
-        """Ticks in a row without an action."""
+        self.silent = 0
         self._waited = 0.0
         """For the first action [s]."""
         self._problem: ControllerFault | None = None
@@ -187,11 +189,11 @@ class Remote(Controller[RemoteParameters]):
     @property
     def _settled(self) -> bool:
         """Is the command of this tick known?"""
-        return self._resting or self._command is not None
+        return self._resting or self.action is not None
 
     def _begin(self, o: Observation) -> None:
         """Begin a tick; actions that came since the last one are too late, a pause is not."""
-        self._observation, self._command, self._unsent, self._open = o, None, False, 0
+        self._observation, self.action, self._unsent, self._open = o, None, False, 0
         self._exchange()
         if not self.limits.virtual:
             self._pause = max(0.0, self._pause - o.dt)
@@ -219,7 +221,7 @@ class Remote(Controller[RemoteParameters]):
                 self._unsent = True  # the agent is gone: its successor has to be asked again
             if self._unsent and writable:
                 self._send()
-            elif readable and self._command is None:
+            elif readable and self.action is None:
                 self._take(self._wire.receive())
             else:
                 return
@@ -248,18 +250,18 @@ class Remote(Controller[RemoteParameters]):
                 f"{message.seq}, which was never sent; the latest is {self._seq}",
             )
         elif message.seq == self._open:
-            self._command = message.phi_c
+            self.action = message.phi_c
         else:
             self._late += 1
 
     def _decide(self, observation: Observation) -> float:
         """The command of this tick; raises `ControllerFault` after too many without an action."""
-        if self._command is not None:
+        if self.action is not None:
             self._answered = self._open
-            self._silent = self._late = self._foreign = 0
-            return self._command
+            self.silent = self._late = self._foreign = 0
+            return self.action
         if self._settled:
-            self._silent = 0
+            self.silent = 0
             return 0.0
         self._lost += 1
         agent, patience = self.parameters.agent, self._patience
@@ -273,11 +275,11 @@ class Remote(Controller[RemoteParameters]):
             if self._late or self._foreign:
                 raise _silence(f"no action has come in time {what} ({self._wrong})")
             raise _silence(f"no action has come {what}: does it run, and is that its address?")
-        self._silent += 1
-        if self._silent >= self.parameters.misses:
+        self.silent += 1
+        if self.silent >= self.parameters.misses:
             raise _silence(
                 f"the agent at {agent} has not answered within {patience * 1e3:g} ms, "
-                f"{self._silent} ticks in a row ({self._wrong})"
+                f"{self.silent} ticks in a row ({self._wrong})"
             )
         return 0.0
 

@@ -1,10 +1,11 @@
 """Lets a fish swim what tells most about it."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from fishd.core.frames import frame
+from fishd.core.signals import Tick
 from fishd.lab.rig import Rig
-from fishd.recording import RunWriter
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -15,19 +16,20 @@ SHORTEST = 30.0
 """Less swimming tells too little [s]."""
 
 
-def experiment(rig: Rig, seconds: float = 180.0, recorder: RunWriter | None = None) -> "DataFrame":
+def experiment(
+    rig: Rig, seconds: float = 180.0, keep: Callable[[list[Tick]], None] | None = None
+) -> "DataFrame":
     """Rest, then swim `excitation` at the rig's whole amplitude; a row a tick.
 
     seconds: how long all of it takes [s]
-    recorder: gets all ticks, once it has swum
+    keep: is given all ticks, once it has swum
     Raises ValueError for less than `SHORTEST`, `Disturbed` where somebody else takes the fish, and
-    what the rig and the recorder raise.
+    what the rig and `keep` raise.
     """
     if not seconds >= SHORTEST:
         raise ValueError(f"an experiment of {seconds:g} s is too short; {SHORTEST:g} s are needed")
     ticks = rig.rest(REST)
     ticks += rig.swim("excitation", {}, seconds - REST)
-    if recorder:
-        for tick in ticks:
-            recorder.tick(tick)
+    if keep:
+        keep(ticks)
     return frame(ticks)

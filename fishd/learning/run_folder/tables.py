@@ -1,19 +1,17 @@
 """The CSV files of a run, which go on after a resume, and the summary of several seeds."""
 
-import csv
-import io
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from stable_baselines3.common.logger import KVWriter
 
-from fishd.core import files
 from fishd.core.errors import ConfigError
-from fishd.core.files import FileProblem, write_atomically
+from fishd.core.files import FileProblem, NoFile, write_atomically
+from fishd.lab import tables
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder.checkpoints import CheckpointError
 
@@ -52,20 +50,8 @@ SUMMARY = (
 """Columns of seeds.csv: efficiencies of the current policies, and of each seed's best so far."""
 
 
-class Table:
-    """A CSV file with a header; every row is passed to the operating system at once."""
-
-    def __init__(self, path: Path, columns: Iterable[str]) -> None:
-        self._path = path
-        self._columns = tuple(columns)
-        if not path.exists():
-            write_atomically(path, _lines([self._columns]))
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """One row; numbers in full precision."""
-        values = [_plain(row.get(column)) for column in self._columns]
-        with self._path.open("a", newline="", encoding="utf-8") as file:
-            file.write(_lines([values]))
+class Table(tables.Table):
+    """A table whose rows say after how many steps they were made."""
 
     def keep_until(self, steps: int) -> None:
         """Drop the rows of later steps, which a resumed run is going to do again.
@@ -73,15 +59,15 @@ class Table:
         Raises `CheckpointError` where the file is not such a table.
         """
         try:
-            head, *rows = _read(self._path)
+            head, *rows = tables.read(self.path)
             at = head.index("steps")
             complete = [row for row in rows if len(row) == len(head)]  # the last may be cut off
             kept = [row for row in complete if int(row[at]) <= steps]
         except (ValueError, FileProblem):
             raise CheckpointError(
-                f"{self._path}: not a table of a training; move it away, and a new one is begun"
+                f"{self.path}: not a table of a training; move it away, and a new one is begun"
             ) from None
-        write_atomically(self._path, _lines([head, *kept]))
+        write_atomically(self.path, tables.lines([head, *kept]))
 
 
 class ProgressWriter(KVWriter):
@@ -107,10 +93,10 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     """
     path = folder / EVALUATIONS
     try:
-        head, *rows = _read(path)
+        head, *rows = tables.read(path)
         given = [{key: text for key, text in zip(head, row, strict=True) if text} for row in rows]
         return msgspec.convert(given, list[Evaluation], strict=False)
-    except files.NoFile:
+    except NoFile:
         return []
     except FileProblem as problem:
         raise ConfigError(f"{path}: {problem}") from None
@@ -136,25 +122,4 @@ def write_summary(path: Path, folders: Sequence[Path]) -> None:
         columns = list(zip(*pairs, strict=True))
         spread = [f(values) for values in columns for f in (statistics.median, min, max)]
         lines.append([steps, len(pairs), *spread])
-    write_atomically(path, _lines(lines))
-
-
-def _read(path: Path) -> list[list[str]]:
-    """All rows, the header first; raises `FileProblem`."""
-    text = files.read_text(path, files.TABLE, "a table of a training")
-    try:
-        return list(csv.reader(io.StringIO(text)))
-    except csv.Error as error:
-        raise FileProblem(f"not a CSV file: {error}") from None
-
-
-def _lines(rows: Iterable[Sequence[Any]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
-
-
-def _plain(value: Any) -> Any:
-    """Numbers of numpy as those of Python, booleans as 0 and 1."""
-    value = value.item() if hasattr(value, "item") else value
-    return int(value) if isinstance(value, bool) else value
+    write_atomically(path, tables.lines(lines))

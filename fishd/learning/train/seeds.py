@@ -6,22 +6,17 @@ and does not affect the others; one whose process was killed is resumed in anoth
 
 import io
 import shutil
-import signal
 import tempfile
-import threading
-import time
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
-from uuid import uuid4
+from typing import NamedTuple
 
-import joblib
-from joblib.externals.loky.process_executor import TerminatedWorkerError
 from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
+from fishd.core.interruption import on_signal
+from fishd.lab.parallel import Killed, Stop, workers
 from fishd.learning.train.jobs import Job, Outcome
 
 # What brings torch is imported where it is used: a process that is told to stop before it has
@@ -29,21 +24,13 @@ from fishd.learning.train.jobs import Job, Outcome
 
 STOP = "stop"
 """A file of this name in the run folder ends the trainings in it."""
-CONNECT = 10.0
-"""How long to wait for a scheduler that does not answer [s]."""
-_POLL = 1.0
-"""How often a worker asks the scheduler whether to stop [s]."""
-_ATTEMPTS = 3
-"""How often what is left is begun, where a process was killed."""
 
 
 class _Task(NamedTuple):
     """What is sent to a worker."""
 
-    number: int
     job: Job
-    stop: str
-    """Path of the file, or name of the Dask event, that tells it to stop."""
+    stop: Stop
 
 
 def train_seeds(
@@ -74,23 +61,17 @@ def train_seeds(
         outcomes[index] = outcome
         ended(waiting[index].settings.seed, outcome)
 
-    with scheduler(cluster) as event, _stop_on_signal(folder / STOP, event):
+    with workers(folder / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
         make_folder(folder)
-        name = event.name if event else str(folder / STOP)
-        for attempt in range(_ATTEMPTS):
-            tasks = [_Task(n, job, name) for n, job in enumerate(waiting) if n not in outcomes]
-            try:
-                for index, outcome, files in _run(tasks, jobs, cluster):
-                    if files:
-                        unpack(files, waiting[index].folder)
-                    keep(index, outcome)
-            except TerminatedWorkerError:
-                if attempt + 1 < _ATTEMPTS:
-                    continue  # which process was killed is not known: all that are left are resumed
-                for task in tasks:
-                    if task.number not in outcomes:
-                        keep(task.number, _failed(task.job, "its process was killed"))
-            break
+        tasks = [_Task(each, crew.stop) for each in waiting]
+        try:
+            for index, found in crew.run(_train_remotely if cluster else _train_here, tasks):
+                if found[1]:
+                    unpack(found[1], waiting[index].folder)
+                keep(index, found[0])
+        except Killed as killed:
+            for index in killed.left:
+                keep(index, _failed(waiting[index], "its process was killed"))
     write_summary(folder / "seeds.csv", [job.folder for job in waiting])
     return [outcomes[index] for index in range(seeds)]
 
@@ -106,42 +87,16 @@ def _job_of(job: Job, folder: Path, index: int) -> Job:
     )
 
 
-def _run(
-    tasks: list[_Task], jobs: int | None, cluster: str | None
-) -> Iterator[tuple[int, Outcome, bytes]]:
-    """Index, outcome and packed folder of each task: as they end, on a cluster all at the end."""
-    if cluster:
-        with joblib.parallel_config(backend="dask", scheduler_host=cluster):
-            try:
-                found = joblib.Parallel()(joblib.delayed(_train_remotely)(task) for task in tasks)
-            except Exception as error:  # joblib, Dask and their connections have many of their own
-                raise FishdError(
-                    f"the Dask cluster at {cluster} was lost, and with it the trainings that it "
-                    f"had not sent back: {type(error).__name__}: {error}"
-                ) from error
-        yield from found
-        return
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        workers = min(jobs or joblib.cpu_count(), len(tasks))
-        parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-        from fishd.learning.train.training import handled
-
-        # Its processes ignore Ctrl-C and hang-up, which a child inherits: they are told to stop.
-        with handled((signal.SIGINT, signal.SIGHUP), signal.SIG_IGN):
-            outcomes = parallel(joblib.delayed(_train_here)(task) for task in tasks)
-        yield from outcomes
-
-
-def _train_here(task: _Task) -> tuple[int, Outcome, bytes]:
+def _train_here(task: _Task) -> tuple[Outcome, bytes]:
     """In a process of its own on this machine."""
-    return task.number, _train(task.job, Path(task.stop).exists), b""
+    return _train(task.job, task.stop.asked()), b""
 
 
-def _train_remotely(task: _Task) -> tuple[int, Outcome, bytes]:
+def _train_remotely(task: _Task) -> tuple[Outcome, bytes]:
     """On a Dask worker, in a temporary folder whose files are sent back."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / task.job.folder.name
-        outcome = _train(replace(task.job, folder=folder), stop_requested(task.stop))
+        outcome = _train(replace(task.job, folder=folder), task.stop.asked())
         home = task.job.folder
         outcome = replace(
             outcome,
@@ -149,7 +104,7 @@ def _train_remotely(task: _Task) -> tuple[int, Outcome, bytes]:
             checkpoint=outcome.checkpoint and home / outcome.checkpoint.name,
             best=outcome.best and home / outcome.best.name,
         )
-        return task.number, outcome, pack(folder)
+        return outcome, pack(folder)
 
 
 def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
@@ -172,59 +127,6 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
 
 def _failed(job: Job, message: str) -> Outcome:
     return Outcome(folder=job.folder, ended="failed", message=message)
-
-
-@contextmanager
-def _stop_on_signal(file: Path, event: Any) -> Iterator[None]:
-    """While this lasts, signals tell all of them to stop."""
-    from fishd.learning.train.training import on_signal
-
-    def ask() -> None:
-        if event:
-            threading.Thread(target=event.set).start()  # it waits for the scheduler
-        else:
-            file.touch()
-
-    try:
-        with on_signal(ask):
-            yield
-    finally:
-        file.unlink(missing_ok=True)
-
-
-@contextmanager
-def scheduler(address: str | None) -> Iterator[Any]:
-    """A connection to the scheduler, and an event there that means stop; None without address."""
-    if address is None:
-        yield None
-        return
-    from distributed import Client, Event
-
-    try:
-        client = Client(address, timeout=CONNECT, name="fishctl learn")
-    except (OSError, ValueError, TypeError, TimeoutError) as error:
-        raise FishdError(f"no Dask scheduler answers at {address}: {error}") from None
-    with client:
-        if not client.scheduler_info()["workers"]:
-            raise FishdError(f"the Dask scheduler at {address} has no workers")
-        yield Event(f"fishd-stop-{uuid4().hex}", client=client)
-
-
-def stop_requested(name: str) -> Callable[[], bool]:
-    """A function, for use on a Dask worker, that tells whether an event of this name was set."""
-    from distributed import Event, get_client
-
-    event = Event(name, client=get_client())
-    was_set, next_look = False, 0.0
-
-    def stop() -> bool:
-        nonlocal was_set, next_look
-        if not was_set and time.monotonic() >= next_look:
-            was_set = event.is_set()
-            next_look = time.monotonic() + _POLL
-        return was_set
-
-    return stop
 
 
 def pack(folder: Path) -> bytes:

@@ -7,11 +7,9 @@ record     a row in the tables, a checkpoint where one is due, another where it 
 """
 
 import shlex
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
-from typing import Any, cast
+from collections.abc import Callable
+from contextlib import closing
+from typing import cast
 
 import numpy as np
 import torch
@@ -65,34 +63,6 @@ def train(
         ) from error
     finally:
         link.close()
-
-
-@contextmanager
-def on_signal(ask: Callable[[], object]) -> Iterator[None]:
-    """While this lasts, SIGINT, SIGTERM and SIGHUP call `ask`; the second of a kind acts as before.
-
-    Only the main thread receives signals; in any other nothing happens.
-    """
-
-    def heard(number: int, _: object) -> None:
-        signal.signal(number, former[number])
-        ask()
-
-    with handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), heard) as former:
-        yield
-
-
-@contextmanager
-def handled(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
-    """While this lasts, these go to `handler`, in the main thread; yields who had them before."""
-    former: dict[int, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        former = {number: signal.signal(number, handler) for number in signals}
-    try:
-        yield former
-    finally:
-        for number, before in former.items():
-            signal.signal(number, before)
 
 
 class Training:

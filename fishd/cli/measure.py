@@ -1,0 +1,110 @@
+"""The verb that finds a controller's thrust with its interval, on a live or a simulated fish."""
+
+import signal
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fishd.cli.config import fish_options
+from fishd.cli.lab_progress import showing
+from fishd.cli.options import ControllerGroup, endpoint_option, json_option
+from fishd.cli.output import echo, print_json, spelled
+from fishd.client import Fish
+from fishd.config import load
+
+if TYPE_CHECKING:
+    from fishd.lab.measurement import Measured
+
+
+def measure_options(function: Any) -> Any:
+    """The options of this verb."""
+    for option in (
+        json_option,
+        endpoint_option,
+        fish_options,
+        click.option(
+            "--plot",
+            "picture",
+            type=click.Path(path_type=Path, dir_okay=False),
+            help="Draw raw force, fitted drift and corrected thrust into this file (.png, .svg).",
+        ),
+        click.option(
+            "--on",
+            "where",
+            type=click.Choice(["robot", "simulation"]),
+            default="robot",
+            show_default=True,
+            help="The fish of a running fishd, or one in virtual time.",
+        ),
+        click.option(
+            "--for",
+            "seconds",
+            type=float,
+            default=60.0,
+            show_default=True,
+            help="Length of the whole measurement, rests included [s].",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+@click.group(cls=ControllerGroup, options=measure_options, remote=True)
+def measure() -> None:
+    """Find a controller's thrust, with its 95 % interval.
+
+    The fish swims and rests in turn, about 6 s and 3 s, so that a drift of the force sensor can be
+    told apart; only whole beats count. The fish must be at rest before, and is at rest afterwards.
+    A running fishd shows its thrust by this measurement from then on.
+    """
+
+
+@measure.action
+def _measure(
+    name: str,
+    parameters: dict[str, Any],
+    seconds: float,
+    where: str,
+    picture: Path | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    endpoint: str | None,
+    as_json: bool,
+) -> None:
+    from fishd.lab.measurement import measure as run
+    from fishd.lab.measurement import summary
+    from fishd.lab.rig import LiveRig, Rig, VirtualRig
+
+    if where == "robot" and (file or overrides):
+        raise click.UsageError(
+            "--config and --set describe a fish in virtual time: --on simulation"
+        )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too leaves the fish at rest
+    with ExitStack() as stack:
+        rig: Rig
+        if where == "simulation":
+            rig = stack.enter_context(VirtualRig(load(file, overrides)))
+            found = run(rig, name, parameters, seconds)
+        else:
+            fish = stack.enter_context(Fish(endpoint))
+            rig = stack.enter_context(LiveRig(fish))
+            with showing(seconds, "s") as bar:
+                found = run(rig, name, parameters, seconds, bar.at)
+            if found.thrust > found.error:
+                fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
+        if picture:
+            from fishd.lab.measurement_figure import draw
+
+            draw(found, rig.tick, picture)
+    if as_json:
+        print_json(summary(found, rig.tick))
+    else:
+        echo(_line(found))
+
+
+def _line(found: "Measured") -> str:
+    what = f"{found.controller} {spelled(dict(found.parameters))}".rstrip()
+    thrust = f"{found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} mN"
+    return f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"

@@ -1,0 +1,36 @@
+"""The verb that writes a recording as tables for other programs."""
+
+from pathlib import Path
+
+import click
+
+from fishd.cli.output import echo
+from fishd.cli.recording.record import folder_option
+from fishd.recording import open_run
+from fishd.recording.export import Format
+from fishd.recording.export import export as write
+from fishd.recording.folder import find
+
+
+@click.command()
+@click.argument("run")
+@click.option("--csv", "form", flag_value="csv", help="Text, which every program reads.")
+@click.option("--parquet", "form", flag_value="parquet", help="Smaller, and faster to read.")
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path(),
+    help="The folder to write to; default: this one.",
+)
+@click.option("--force", is_flag=True, help="Replace files that are there already.")
+@folder_option
+def export(run: str, form: Format | None, target: Path, force: bool, folder: Path | None) -> None:
+    """Write a recording as tables: one row a tick, and a second file with its events.
+
+    RUN is a path, a name in the folder of recordings, or 'latest'. No digit of a number is lost.
+    """
+    if form is None:
+        raise click.UsageError("--csv or --parquet is needed")
+    for path in write(open_run(find(run, folder)), target, form, replace=force):
+        echo(path)

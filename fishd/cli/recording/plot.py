@@ -1,0 +1,51 @@
+"""The verb that draws a recording."""
+
+import math
+from pathlib import Path
+
+import click
+
+from fishd.cli.output import echo
+from fishd.cli.recording.record import folder_option
+from fishd.lab.run_figure import picture
+from fishd.lab.run_traces import traces
+from fishd.recording import open_run
+from fishd.recording.folder import find
+
+
+@click.command()
+@click.argument("run")
+@click.option("--from", "begin", type=click.FloatRange(min=0), default=0.0, help="Begin here [s].")
+@click.option(
+    "--until", "end", type=click.FloatRange(min=0), default=math.inf, help="End here [s]."
+)
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    default=Path(),
+    help="The folder to write to; default: this one.",
+)
+@click.option("--png", "only", flag_value="png", help="The picture alone.")
+@click.option("--html", "only", flag_value="html", help="The interactive page alone.")
+@folder_option
+def plot(
+    run: str, begin: float, end: float, target: Path, only: str | None, folder: Path | None
+) -> None:
+    """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
+
+    RUN is a path, a name in the folder of recordings, or 'latest'. NAME.png is a picture; NAME.html
+    is a page to zoom into, which needs no network. Either replaces an older one.
+    """
+    recorded = open_run(find(run, folder))
+    drawn = traces(recorded, begin, end)
+    if only != "html":
+        path = target / f"{recorded.name}.png"
+        picture(drawn, path)
+        echo(path)
+    if only != "png":
+        from fishd.lab.run_page import page
+
+        path = target / f"{recorded.name}.html"
+        page(drawn, path)
+        echo(path)

@@ -1,0 +1,198 @@
+"""The verb that records a running fish, and the always-on black box."""
+
+import re
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import click
+
+from fishd.cli.options import endpoint_option
+from fishd.cli.output import counted, echo
+from fishd.client import Fish
+from fishd.core import text
+from fishd.core.errors import FishError, NoDaemon, RecordingError
+from fishd.recording import RunWriter
+from fishd.recording.black_box import BlackBox
+from fishd.recording.folder import FOLDER_VARIABLE, made, new_path, runs_folder
+from fishd.recording.recorder import Recorder
+
+folder_option = click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    help=f"Where recordings are; default: ${FOLDER_VARIABLE}, else fishd/runs in "
+    "$XDG_DATA_HOME or ~/.local/share.",
+)
+
+
+UNITS = {"MB": 10**6, "GB": 10**9}
+LEAST = 10**7
+"""A black box is no smaller than this [bytes]."""
+
+
+class Size(click.ParamType[int]):
+    """A size such as `500MB` or `2GB`, in bytes."""
+
+    name = "size"
+
+    def convert(
+        self, value: str | int, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int:
+        """Text to bytes."""
+        if isinstance(value, int):
+            return value
+        found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(MB|GB)", value.strip(), re.IGNORECASE)
+        size = round(float(found[1]) * UNITS[found[2].upper()]) if found else 0
+        if size < LEAST:
+            self.fail(f"'{value}' is not valid: 10MB or more is needed, such as 2GB", param, ctx)
+        return size
+
+
+@click.command()
+@click.argument("run", required=False)
+@endpoint_option
+@folder_option
+@click.option("--operator", default="", help="Who records; default: this user.")
+@click.option("--subject", default="", help="Which fish, such as its number.")
+@click.option("--note", default="", help="What for.")
+@click.option(
+    "--for",
+    "seconds",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End by itself after this time; by default Ctrl-C ends it.",
+)
+@click.option(
+    "--black-box",
+    is_flag=True,
+    help="Record for ever, a file an hour, and remove the oldest; waits for a fishd.",
+)
+@click.option(
+    "--keep",
+    type=Size(),
+    default="2GB",
+    show_default=True,
+    help="Size of all files of the black box together.",
+)
+def record(
+    run: str | None,
+    endpoint: str | None,
+    folder: Path | None,
+    operator: str,
+    subject: str,
+    note: str,
+    seconds: float | None,
+    black_box: bool,
+    keep: int,
+) -> None:
+    """Record a running fish: every tick, event and status, until Ctrl-C or SIGTERM.
+
+    RUN is a name in the folder of recordings or a path; by default the date and time. The
+    recording survives a restart of fishd. No older recording is ever overwritten.
+    """
+    if black_box and run:
+        raise click.UsageError("--black-box names its files itself: leave RUN out")
+    place = made(folder or runs_folder())
+    stopping = _Signals()
+    begin = partial(RunWriter, operator=operator, subject=subject, note=note)
+    recorder_of = partial(Recorder, endpoint, tell=_tell)
+    if black_box:
+        box = BlackBox(place, keep, begin)
+        _record_for_ever(partial(recorder_of, box.open, due=box.due), stopping, seconds)
+        return
+    progress = _draw if sys.stdout.isatty() else lambda writer: None
+    path = _path(run, place)
+    recorder = recorder_of(partial(begin, path), progress=progress)
+    try:
+        with recorder:
+            echo(f"recording to {recorder.writer.path}; Ctrl-C ends it")
+            recorder.run(stopping, seconds)
+    except RecordingError as error:
+        if recorder.began:
+            _tell_fishd(endpoint, f"recording {path.name} ended: {error}")
+        raise
+    finally:
+        if recorder.began:
+            _end_line()
+            echo(f"{recorder.writer.path.name}: {_amount(recorder.writer)}")
+
+
+def _record_for_ever(
+    open_recorder: Callable[[], Recorder], stopping: "_Signals", seconds: float | None
+) -> None:
+    """Wait for a fishd, record it, and go on after any restart of it."""
+    waiting = False
+    while not stopping():
+        try:
+            with open_recorder() as recorder:
+                echo(f"recording to {recorder.writer.path}")
+                recorder.run(stopping, seconds)
+                return
+        except NoDaemon as error:
+            if not waiting:
+                _tell(f"waiting: {error}")
+            waiting = True
+            stopping.wait(1.0)
+
+
+def _path(run: str | None, folder: Path) -> Path:
+    if run is None:
+        return new_path(folder)
+    return Path(run).expanduser() if "/" in run else folder / run
+
+
+class _Signals:
+    """True once somebody asked for the end: Ctrl-C, SIGTERM, or a terminal that closes."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as below nohup
+                signal.signal(number, self._ask)
+
+    def __call__(self) -> bool:
+        return self._asked
+
+    def wait(self, seconds: float) -> None:
+        """Wait for a signal, but no longer than this."""
+        if not self._asked:
+            signal.sigtimedwait((), seconds)
+
+    def _ask(self, *_: object) -> None:
+        self._asked = True
+
+
+def _tell(line: str) -> None:
+    _end_line()
+    echo(f"fishctl: {line}", err=True)
+
+
+def _draw(writer: RunWriter) -> None:
+    click.echo(f"\r{_amount(writer)}", nl=False)
+
+
+def _end_line() -> None:
+    if sys.stdout.isatty():
+        click.echo("\r\x1b[K", nl=False)
+
+
+def _amount(writer: RunWriter) -> str:
+    summary = writer.summary
+    return ", ".join(
+        (
+            f"{summary.duration:.1f} s",
+            counted(summary.ticks, "tick"),
+            f"{summary.lost} lost",
+            counted(summary.events, "event"),
+            f"{writer.size / 1e3:.0f} kB",
+        )
+    )
+
+
+def _tell_fishd(endpoint: str | None, what: str) -> None:
+    """Put it into the event stream, where an operator looks."""
+    with suppress(FishError), Fish(endpoint) as fish:
+        fish.mark(text.line(what))

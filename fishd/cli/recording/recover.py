@@ -1,0 +1,27 @@
+"""The verb that finishes a recording that was cut off."""
+
+from pathlib import Path
+
+import click
+
+from fishd.cli.output import counted, echo
+from fishd.cli.recording.record import folder_option
+from fishd.recording.folder import find
+from fishd.recording.recover import recover as finish
+
+
+@click.command()
+@click.argument("file")
+@folder_option
+def recover(file: str, folder: Path | None) -> None:
+    """Finish a recording that was cut off, by a kill, a full disk or a power cut.
+
+    FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
+    NAME.mcap; a file of another name stays as it is, and NAME-recovered.mcap is written beside it.
+    """
+    run = finish(find(file, folder))
+    summary = run.summary
+    echo(
+        f"{run.path}: {summary.duration:.1f} s, {counted(summary.ticks, 'tick')}, "
+        f"{summary.lost} lost, {counted(summary.events, 'event')}"
+    )

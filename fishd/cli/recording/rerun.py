@@ -1,0 +1,97 @@
+"""The verb that lets a controller choose again on what was recorded."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fishd.cli.config import set_option
+from fishd.cli.options import ParameterType, json_option
+from fishd.cli.output import counted, echo, print_json, spelled
+from fishd.cli.recording.record import folder_option
+from fishd.controllers import registry
+from fishd.recording import open_run
+from fishd.recording.folder import find
+from fishd.recording.rerun import Estimates, Stretch
+from fishd.recording.rerun import rerun as choose_again
+
+
+@click.command()
+@click.argument("run")
+@click.argument("parameters", nargs=-1, metavar="[NAME=VALUE]...")
+@click.option("--controller", metavar="NAME", help="Who chooses; default: whoever swam.")
+@set_option
+@folder_option
+@json_option
+def rerun(
+    run: str,
+    parameters: tuple[str, ...],
+    controller: str | None,
+    overrides: tuple[str, ...],
+    folder: Path | None,
+    as_json: bool,
+) -> int:
+    """Let a controller choose again in each recorded tick, and compare its commands.
+
+    RUN is a path, a name in the folder of recordings, or 'latest'. The controller sees the recorded
+    forces and angles. The one that swam gives the same commands to the last bit, from each of its
+    starts that is in the recording; exit status 1 where it does not. One that swam already when the
+    recording began is compared, too, but not judged.
+
+    fishctl rerun latest --controller swing C=0.4
+    """
+    given = _parameters(controller, parameters)
+    result = choose_again(open_run(find(run, folder)), controller, given, overrides)
+    if as_json:
+        print_json(result)
+    else:
+        for stretch in result.stretches:
+            _print(stretch)
+        if not result.stretches:
+            echo("no controller swam")
+        _print_estimates(result.estimates)
+    same = controller is None and not given and not overrides
+    wrong = [s for s in result.stretches if s.from_start and s.equal < s.ticks]
+    return 1 if same and wrong else 0
+
+
+def _parameters(controller: str | None, words: tuple[str, ...]) -> dict[str, Any]:
+    if not words:
+        return {}
+    if controller is None:
+        raise click.UsageError(
+            f"'{words[0]}': --controller is needed, to say whose parameter it is"
+        )
+    fields = {field.name: field for field in registry.describe(controller).parameters}
+    given: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise click.UsageError(f"'{word}': NAME=VALUE is needed")
+        field = fields.get(name)
+        given[name] = ParameterType(field).convert(value, None, None) if field else value
+    return given
+
+
+def _print(stretch: Stretch) -> None:
+    who = f"{stretch.recorded} {spelled(stretch.parameters)}".rstrip()
+    again = "" if stretch.controller == stretch.recorded else f", {stretch.controller} again"
+    echo(f"from tick {stretch.seq}: {who}{again}")
+    share = f"{stretch.equal} of {counted(stretch.ticks, 'command')} equal to the last bit"
+    if stretch.equal == stretch.ticks:
+        echo(f"  all {share}")
+    else:
+        echo(
+            f"  {share}; the others by up to {stretch.largest:.3g} rad, the last one in tick "
+            f"{stretch.differs_last}"
+        )
+    if not stretch.from_start:
+        echo("  it swam already when these ticks begin, so its past is not known")
+
+
+def _print_estimates(estimates: Estimates) -> None:
+    echo(
+        f"estimates: {estimates.equal} of {counted(estimates.ticks, 'tick')} equal to the last bit"
+    )
+    if not estimates.from_start:
+        echo("  fishd estimated already when these ticks begin, so its past is not known")

@@ -1,0 +1,116 @@
+"""The verb that lists recordings."""
+
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import click
+import msgspec
+
+from fishd.cli.options import json_option
+from fishd.cli.output import counted, echo, print_json
+from fishd.cli.recording.record import folder_option
+from fishd.core import text
+from fishd.core.errors import RecordingError
+from fishd.recording.folder import Glance, glances, runs_folder
+
+WIDE = 1000
+
+
+@click.command()
+@folder_option
+@json_option
+def runs(folder: Path | None, as_json: bool) -> int:
+    """List the recordings, the oldest first.
+
+    'thrust' is the mean longitudinal force while it swam, as measured: the drift and the offset of
+    the sensor are in it. 'lost' are ticks that fishd made and that are not in the file.
+    """
+    place = folder or runs_folder()
+    found = list(glances(place))
+    good = [each for each in found if isinstance(each, Glance)]
+    if as_json:
+        print_json([_as_json(each) for each in good])
+    elif good:
+        _print(good)
+    else:
+        echo(f"there is no recording in {place} yet; see 'fishctl record --help'")
+    wrong = [each for each in found if isinstance(each, RecordingError)]
+    for error in wrong:
+        echo(f"fishctl: {error}", err=True)
+    return 1 if wrong else 0
+
+
+def _as_json(glance: Glance) -> dict[str, Any]:
+    return {
+        "name": glance.name,
+        "path": str(glance.path),
+        "state": _state(glance),
+        "duration": glance.summary.duration,
+        **msgspec.structs.asdict(glance.summary),
+        "about": glance.about,
+    }
+
+
+def _print(found: list[Glance]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column("run", overflow="fold")
+    for head in ("began", "length", "thrust", "ticks", "lost", "marks"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for head in ("swam", "about"):
+        table.add_column(head, overflow="fold")
+    for glance in found:
+        summary = glance.summary
+        thrust = "–" if summary.thrust is None else f"{summary.thrust * 1e3:.2f} m{_unit(glance)}"
+        table.add_row(
+            text.line(glance.name),
+            _began(glance.about.get("started", "")),
+            _length(summary.duration),
+            thrust,
+            str(summary.ticks),
+            str(summary.lost),
+            str(summary.marks),
+            text.line(", ".join(summary.swimming) or "–"),
+            text.line("; ".join(_remarks(glance))),
+        )
+    # In a file or a pipe nothing is wrapped.
+    Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(table)
+
+
+def _unit(glance: Glance) -> str:
+    return glance.about.get("force_unit", "N")
+
+
+def _remarks(glance: Glance) -> list[str]:
+    state = _state(glance)
+    restarts = glance.summary.restarts
+    return [
+        *([state] if state != "finished" else []),
+        *([counted(restarts, "restart")] if restarts else []),
+        *(glance.about[key] for key in ("subject", "note") if glance.about.get(key)),
+    ]
+
+
+def _state(glance: Glance) -> str:
+    if glance.writing:
+        return "recording"
+    return "finished" if glance.finished else "unfinished"
+
+
+def _began(iso: str) -> str:
+    try:
+        return f"{datetime.fromisoformat(iso):%Y-%m-%d %H:%M}"
+    except ValueError:
+        return "–"
+
+
+def _length(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60.0)
+    hours, minutes = divmod(int(minutes), 60)
+    if hours:
+        return f"{hours}:{minutes:02}:{rest:02.0f}"
+    return f"{minutes}:{rest:04.1f}" if minutes else f"{rest:.1f} s"

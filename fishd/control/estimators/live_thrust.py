@@ -1,0 +1,211 @@
+"""The thrust of the fish as it swims, and how well it is known while the force sensor drifts.
+
+Over whole beats, thrust is proportional to the mean square of the fin velocity, and that is free of
+drift: F_x = −Kαα̈ averages to K times the mean of α̇². The factor is not known beforehand. Two
+numbers are tracked by a Kalman filter, from the mean force of each beat and of each piece of a
+rest: the force that the sensor shows without any thrust, its zero, which wanders; and the factor,
+which hardly does. So each rest makes the thrust known, and each change between rest and swimming
+makes it better known.
+"""
+
+import math
+from collections import deque
+
+from fishd.core.signals import Observation
+
+SWIM_SETTLES = 1.5
+"""The fin swims steadily after so long [s]."""
+REST_SETTLES = 1.0
+"""The fin hangs still after so long, fading included [s]."""
+STILL = 2.5
+"""A tail that has not been moved for so long rests, whoever has command [s]."""
+PIECE = 0.5
+"""A rest is cut in pieces of this length, and beats are taken together until they last so [s]."""
+SPAN = 4.0
+"""The thrust is that of the latest beats, of no more than this in all [s]."""
+LONGEST_BEAT = 10.0
+"""A tail that has not reversed for so long does not beat [s]."""
+FACTOR_WALKS = 0.002
+"""How fast the factor becomes uncertain: share of it, standard deviation after a second."""
+SHAPE = 0.01
+"""The factor is not the same for every wave: it differs by this share."""
+INTERVAL = 1.96
+"""Half of a 95 % interval, over the standard deviation."""
+BROKEN = 8.0
+"""A force at rest so many standard deviations off is no drift: the zero is found anew."""
+UNKNOWN = 1.0
+"""Standard deviation of a zero that nothing is known of, and of a thrust [N]."""
+MOST_KNOWN = 0.1
+"""A thrust that is known no better than this is not known [N]."""
+_NOISE = 2e-3
+"""What blocks are thought to vary by until there are two to compare [N]."""
+_FORGETS = 0.1
+"""Share of the newest comparison in the variance of blocks."""
+
+
+class LiveThrust:
+    """Thrust over the latest whole beats, and half of its 95 % interval."""
+
+    def __init__(self, zero_drift: float) -> None:
+        """zero_drift: how fast the zero wanders, standard deviation after a second [N/√s]"""
+        self.thrust: float | None = None
+        """Of the latest beats; at rest, of the latest piece of it [N]. None while not known."""
+        self.error = 0.0
+        """Half of its 95 % interval [N]."""
+        self._wander = zero_drift**2
+        self._zero = self._factor = 0.0
+        self._zero_variance, self._covariance = UNKNOWN**2, 0.0
+        self._factor_variance: float | None = None
+        self._time = -math.inf
+        self._at_rest = 0.0
+        self._noises = {True: _Noise(), False: _Noise()}
+        self._swims = False
+        self._angle = self._still = 0.0
+        self._phase = 0.0
+        self._side = 0.0
+        self._block: _Block | None = None
+        self._beats: deque[_Block] = deque()
+
+    def forget_zero(self) -> None:
+        """The sensor's zero was set: find it anew, in the next rest."""
+        self._zero_variance, self._covariance = UNKNOWN**2, 0.0
+        self._block = self.thrust = None
+
+    def forget(self) -> None:
+        """The sensor's calibration was changed: nothing found so far holds."""
+        self._factor, self._factor_variance = 0.0, None
+        self.forget_zero()
+
+    def calibrate(self, factor: float, error: float) -> None:
+        """Take the factor from a measurement.
+
+        factor: thrust over the mean square of `fin_velocity`
+        error: half of its 95 % interval
+        """
+        self._factor, self._factor_variance = factor, (error / INTERVAL) ** 2
+        self.forget_zero()
+
+    def update(self, seen: Observation, running: bool) -> None:
+        """Take in a tick; running: is a controller active?"""
+        moved = seen.instruction_angle != self._angle
+        self._still = 0.0 if moved else self._still + seen.dt
+        self._angle = seen.instruction_angle
+        swims = running and self._still < STILL
+        if swims != self._swims:
+            self._swims, self._phase, self._side = swims, 0.0, 0.0
+            self._block = None
+            self._beats.clear()
+            self._at_rest = 0.0
+        self._phase += seen.dt
+        # Of the instruction angle during this window: a beat ends with the window before it.
+        ends = self._reversed(seen.instruction_angle) if swims else True
+        if ends and self._block and self._block.lasts >= PIECE - 1e-9:
+            self._close(self._block, seen.time - seen.dt)
+            self._block = None
+        if ends and not self._block and self._phase > (SWIM_SETTLES if swims else REST_SETTLES):
+            self._block = _Block()
+        if self._block:
+            self._block.add(seen)
+            if self._block.lasts > LONGEST_BEAT:
+                self._block = None
+                self._beats.clear()
+        self._know(seen)
+
+    def _reversed(self, angle: float) -> bool:
+        """Has the instruction angle become positive?"""
+        before = self._side
+        if angle:
+            self._side = math.copysign(1.0, angle)
+        return before < 0.0 < self._side
+
+    def _close(self, block: "_Block", time: float) -> None:
+        """Learn from a block that ended at `time` [s]."""
+        power = 0.0
+        if self._swims:
+            power = block.power
+            self._beats.append(block)
+            while len(self._beats) > 1 and sum(beat.lasts for beat in self._beats) > SPAN:
+                self._beats.popleft()
+            if self._factor_variance is None and power > 0.0:
+                self._factor_variance = (UNKNOWN / power) ** 2
+        self._wait(time)
+        self._learn(block.force, power, self._noises[self._swims].add(block))
+        self._at_rest = block.force - self._zero
+
+    def _wait(self, time: float) -> None:
+        """What is known becomes less certain with time."""
+        passed = max(0.0, time - self._time) if self._time > -math.inf else 0.0
+        self._time = time
+        self._zero_variance = min(UNKNOWN**2, self._zero_variance + self._wander * passed)
+        if self._factor_variance is not None:
+            self._factor_variance += (FACTOR_WALKS * self._factor) ** 2 * passed
+
+    def _learn(self, force: float, power: float, variance: float) -> None:
+        """A step of the filter: force = zero + factor * power + noise of that variance."""
+        a, b, c = self._zero_variance, self._covariance, self._factor_variance or 0.0
+        surprise = force - self._zero - self._factor * power
+        along, across = a + b * power, b + c * power
+        total = along + across * power + variance
+        if power == 0.0 and surprise**2 > BROKEN**2 * total:
+            self._zero, self._zero_variance, self._covariance = force, variance, 0.0
+            return
+        self._zero += along / total * surprise
+        self._factor += across / total * surprise
+        self._zero_variance = max(0.0, a - along * along / total)
+        self._covariance = b - along * across / total
+        if self._factor_variance is not None:
+            self._factor_variance = max(0.0, c - across * across / total)
+
+    def _know(self, seen: Observation) -> None:
+        """Thrust and error now."""
+        passed = seen.time - self._time
+        if self._swims and self._beats and self._factor_variance is not None:
+            lasts = sum(beat.lasts for beat in self._beats)
+            power = sum(beat.power * beat.lasts for beat in self._beats) / lasts
+            thrust = self._factor * power
+            spread = self._factor_variance + (FACTOR_WALKS * self._factor) ** 2 * passed
+            error = math.hypot(INTERVAL * power * math.sqrt(spread), SHAPE * thrust)
+        elif not self._swims:
+            thrust = self._at_rest
+            error = INTERVAL * math.sqrt(self._zero_variance + self._wander * passed)
+        else:
+            thrust, error = 0.0, math.inf
+        self.thrust, self.error = (thrust, error) if error < MOST_KNOWN else (None, 0.0)
+
+
+class _Block:
+    """Sums of a whole beat, or of a piece of a rest."""
+
+    def __init__(self) -> None:
+        self.lasts = 0.0
+        self._impulse = self._energy = 0.0
+
+    def add(self, seen: Observation) -> None:
+        self.lasts += seen.dt
+        self._impulse += seen.fx * seen.dt
+        self._energy += seen.fin_velocity**2 * seen.dt
+
+    @property
+    def force(self) -> float:
+        """Mean F_x [N]."""
+        return self._impulse / self.lasts
+
+    @property
+    def power(self) -> float:
+        """Mean square of the fin velocity."""
+        return self._energy / self.lasts
+
+
+class _Noise:
+    """Variance of the force of blocks, from one to the next, so that hardly any drift is in it."""
+
+    def __init__(self) -> None:
+        self._variance = _NOISE**2
+        self._before: float | None = None
+
+    def add(self, block: _Block) -> float:
+        if self._before is not None:
+            found = 0.5 * (block.force - self._before) ** 2
+            self._variance += _FORGETS * (found - self._variance)
+        self._before = block.force
+        return self._variance

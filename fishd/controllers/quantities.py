@@ -1,0 +1,76 @@
+"""A controller's own quantities: internal values that it shows, such as its present frequency."""
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from fishd.core import text
+from fishd.core.foreign_code import contained, real_number
+from fishd.core.signals import QuantityInfo
+
+MOST = 16
+"""Quantities of a controller."""
+LONGEST_NAME = 40
+"""[characters]"""
+
+
+class _Declared(NamedTuple):
+    unit: str
+    description: str
+
+
+def quantity(unit: str, description: str) -> Any:
+    """An attribute that everybody sees: in telemetry, recordings and plots.
+
+    `frequency: float = quantity("Hz", "Present frequency of the sweep.")` in the class of a
+    controller, and `self.frequency = 1.5` wherever it changes. What it is after `update` goes into
+    the tick. It is left out before it is assigned, and while it is None or no finite real number.
+
+    unit: in SI notation, `1` where there is none
+    description: one sentence
+    """
+    return _Declared(unit, description)
+
+
+def quantities_of(controller: type[Any]) -> tuple[QuantityInfo, ...]:
+    """What the quantities of a class of controllers are called and mean, its bases' first.
+
+    Raises TypeError where they cannot be shown: too many of them, or too long a name.
+    """
+    found = dict(_declarations(controller))
+    if len(found) > MOST:
+        raise TypeError(f"it has {len(found)} quantities; at most {MOST} are possible")
+    for name, (unit, description) in found.items():
+        if not name.isidentifier() or len(name) > LONGEST_NAME:
+            raise TypeError(
+                f"'{text.quoted(name)}' cannot name a quantity: a Python name of at most "
+                f"{LONGEST_NAME} characters is needed"
+            )
+        if not (isinstance(unit, str) and isinstance(description, str)):
+            raise TypeError(f"unit and description of quantity '{name}' must be texts")
+    return tuple(
+        QuantityInfo(name, text.quoted(unit), text.line(description))
+        for name, (unit, description) in found.items()
+    )
+
+
+def values_of(controller: object, names: Iterable[str]) -> dict[str, float]:
+    """What these quantities of a controller are now; without those that are no finite number."""
+    held, found = vars(controller), {}
+    for name in names:
+        value = held.get(name)
+        if type(value) is not float:
+            try:
+                value = contained(real_number, value, name)
+            except Exception:  # which costs no more than the quantity
+                continue
+        if math.isfinite(value):
+            found[name] = value
+    return found
+
+
+def _declarations(controller: type[Any]) -> Iterable[tuple[str, _Declared]]:
+    for base in reversed(controller.__mro__):
+        for name, value in vars(base).items():
+            if isinstance(value, _Declared):
+                yield name, value

@@ -1,0 +1,53 @@
+"""Ctrl-C, SIGTERM and SIGHUP: what a program that moves a fish or computes for long does then."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def on_signal(ask: Callable[[], object]) -> Iterator[None]:
+    """While this lasts, SIGINT, SIGTERM and SIGHUP call `ask`; the second of a kind acts as before.
+
+    Only the main thread receives signals; in any other nothing happens.
+    """
+
+    def heard(number: int, _: object) -> None:
+        signal.signal(number, former[number])
+        ask()
+
+    with handled(SIGNALS, heard) as former:
+        yield
+
+
+@contextmanager
+def interrupted_once() -> Iterator[None]:
+    """While this lasts, the first of the three raises KeyboardInterrupt, and the others nothing.
+
+    So what is done then, such as stopping a fish, is done to its end. Main thread only.
+    """
+
+    def heard(number: int, _: object) -> None:
+        for each in SIGNALS:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    with handled(SIGNALS, heard):
+        yield
+
+
+@contextmanager
+def handled(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
+    """While this lasts, these go to `handler`, in the main thread; yields who had them before."""
+    former: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        former = {number: signal.signal(number, handler) for number in signals}
+    try:
+        yield former
+    finally:
+        for number, before in former.items():
+            signal.signal(number, before)

@@ -1,0 +1,81 @@
+"""How the laboratory draws: one style, without a display, and the same file for the same data."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fishd.core.errors import FishdError, MissingPackage
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DOTS_PER_INCH = 200
+FORMATS = (".pdf", ".png", ".svg")
+_MISSING = "a figure needs matplotlib, which is not installed: pip install 'fishd[lab]'"
+BLACK, BLUE, ORANGE, GREEN, PURPLE = "#1a1a1a", "#0072b2", "#d55e00", "#009e73", "#aa4499"
+"""Colours that stay apart in grey and for the colour-blind (Okabe and Ito), darkest first."""
+GREY = "0.55"
+"""Of what a curve is compared with."""
+_STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "svg.hashsalt": "fishd",  # else the names within an .svg differ from run to run
+}
+
+
+def check(path: str | os.PathLike[str]) -> None:
+    """Raise `FishdError` where no figure can be written there, before anything is computed.
+
+    Raises `MissingPackage` without matplotlib (extra: lab).
+    """
+    if find_spec("matplotlib") is None:
+        raise MissingPackage(_MISSING)
+    file = Path(path)
+    if file.suffix.lower() not in FORMATS:
+        kind = file.suffix or "without a suffix"
+        raise FishdError(
+            f"{file}: a figure has no format {kind}: {', '.join(FORMATS[:-1])} or {FORMATS[-1]} "
+            "is needed"
+        )
+    if not file.parent.is_dir():
+        raise FishdError(f"{file}: the figure cannot be written: there is no folder {file.parent}")
+
+
+@contextmanager
+def drawn(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator["Figure"]:
+    """A figure to draw on, of `size` (width and height, inch); it is written on leaving.
+
+    path: the suffix chooses the format, one of `FORMATS`; no file holds a date
+    Raises as `check` does, and `FishdError` where writing fails.
+    """
+    check(path)
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        yield figure
+        _save(figure, Path(path))
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    dates: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    try:
+        figure.savefig(path, dpi=DOTS_PER_INCH, metadata=dates.get(path.suffix.lower()))
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise FishdError(f"{path}: the figure cannot be written: {why}") from None

@@ -1,0 +1,1 @@
+"""The best parameters of a controller on a rig, searched by Bayesian optimisation."""

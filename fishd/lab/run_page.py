@@ -1,0 +1,106 @@
+"""A recording as an interactive page: one .html file that needs no network."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from plotly.graph_objects import Figure, Scattergl
+from plotly.subplots import make_subplots
+
+from fishd.core import text
+from fishd.core.errors import RecordingError
+from fishd.core.files import write_atomically
+from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
+from fishd.lab.run_traces import PORTRAIT, Traces
+
+_PORTRAIT_HEIGHT = 2
+"""Of the phase portrait, in rows of the others."""
+
+
+def page(traces: Traces, path: str | os.PathLike[str]) -> None:
+    """Write the page; raises `RecordingError` where it cannot be."""
+    titles = ["forces", "command", "thrust", *map(text.quoted, traces.quantities)]
+    rows = len(titles) + 1
+    figure = make_subplots(
+        rows=rows,
+        cols=1,
+        row_heights=[1] * (rows - 1) + [_PORTRAIT_HEIGHT],
+        vertical_spacing=0.3 / rows,
+        subplot_titles=[*titles, f"phase portrait, last {PORTRAIT:g} s of swimming"],
+    )
+    _lines(figure, traces)
+    _portrait(figure, traces, rows)
+    for row in range(1, rows):
+        figure.update_xaxes(matches="x", row=row, col=1)
+    figure.update_xaxes(title_text="time (s)", row=rows - 1, col=1)
+    for time, event in traces.events:
+        said = text.line(event.message, 60) if event.kind == "mark" else event.kind
+        colour = PURPLE if event.kind == "mark" else "grey"
+        figure.add_vline(time, line={"color": colour, "width": 1, "dash": "dot"}, row="all")
+        figure.add_annotation(
+            x=time, y=1, yref="y domain", text=_escaped(said), showarrow=False, xanchor="left"
+        )
+    figure.update_layout(
+        title=_escaped(text.line(traces.title)),
+        height=190 * (rows + _PORTRAIT_HEIGHT),
+        template="plotly_white",
+        hovermode="x unified",
+    )
+    try:
+        write_atomically(Path(path), figure.to_html(include_plotlyjs=True))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _lines(figure: Figure, traces: Traces) -> None:
+    def add(row: int, name: str, values: Any, colour: str, **line: Any) -> None:
+        figure.add_trace(
+            Scattergl(
+                x=traces.time,
+                y=values,
+                name=name,
+                mode="lines",
+                line={"color": colour, "width": 1.2, **line},
+            ),
+            row=row,
+            col=1,
+        )
+
+    add(1, f"F_x ({traces.unit})", traces.fx, BLUE)
+    add(1, f"F_y ({traces.unit})", traces.fy, ORANGE)
+    add(2, "command φ_c (rad)", traces.phi_c, BLACK, shape="hv")
+    if traces.alpha is not None:
+        add(2, "true fin angle α (rad)", traces.alpha, GREEN)
+    add(3, f"thrust over whole beats ({traces.unit})", traces.thrust, BLUE)
+    for row, (name, values) in enumerate(traces.quantities.items(), start=4):
+        add(row, _escaped(text.quoted(name)), values, GREEN)
+    figure.update_yaxes(title_text=traces.unit, row=1, col=1)
+    figure.update_yaxes(title_text="rad", row=2, col=1)
+    figure.update_yaxes(title_text=traces.unit, row=3, col=1)
+
+
+def _portrait(figure: Figure, traces: Traces, row: int) -> None:
+    if traces.alpha is not None and traces.alpha_rate is not None:
+        across, up = traces.alpha, traces.alpha_rate
+        names = "true fin angle α (rad)", "its rate (rad/s)"
+    else:
+        across, up = traces.fin_velocity, traces.fy
+        names = "fin velocity, as estimated", f"F_y ({traces.unit})"
+    chosen = traces.portrait
+    line = Scattergl(
+        x=across[chosen],
+        y=up[chosen],
+        text=[f"{time:.2f} s" for time in traces.time[chosen]],
+        mode="lines+markers",
+        marker={"size": 3},
+        line={"color": GREEN, "width": 1},
+        name="phase portrait",
+    )
+    figure.add_trace(line, row=row, col=1)
+    figure.update_xaxes(title_text=names[0], row=row, col=1)
+    figure.update_yaxes(title_text=names[1], row=row, col=1)
+
+
+def _escaped(words: str) -> str:
+    """Text that a page shows as it is."""
+    return words.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -1,0 +1,110 @@
+"""What a sweep shows: a curve of thrust for each controller and setting, and its best point."""
+
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+
+from fishd.lab.sweep.folder import SweepFolder
+from fishd.lab.sweep.grid import PARAMETER, Point, axis
+from fishd.lab.sweep.measuring import Result
+from fishd.lab.sweep.peak import Peak, peak
+
+
+class Curve(NamedTuple):
+    """Thrust over one quantity, all else being the same."""
+
+    label: str
+    over: str
+    """That quantity, such as `frequency` or `plant.xi`; empty for a single point."""
+    points: list[Point]
+    x: list[float]
+    results: list[Result]
+    peak: Peak | None
+    """None over nothing, or where no point has a thrust."""
+
+
+class Best(Struct, frozen=True):
+    """The best of a curve, as a program reads it."""
+
+    controller: str
+    parameters: dict[str, Any]
+    """Those of the highest point that was measured."""
+    keys: dict[str, Any]
+    over: str
+    """What was varied along the curve, such as `frequency` or `plant.xi`."""
+    x: float
+    """The best value of that."""
+    x_low: float | None
+    """Its 95 % interval; None where there is none to tell."""
+    x_high: float | None
+    thrust: float
+    """[N]"""
+    error: float | None
+    """Half of its 95 % interval [N]."""
+    at_edge: bool
+    """The highest point is at the edge of the grid: the best may lie beyond."""
+
+
+def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
+    """The curves of the points that were measured.
+
+    Each runs along the quantity that has the most values among the points of its controller.
+    """
+    groups: dict[tuple[str, str], list[Point]] = {}
+    axes = {
+        name: axis([point for point in found if point.controller == name])
+        for name in {point.controller for point in found}
+    }
+    for point in found:
+        if folder.key(point) in folder.results:
+            over = axes[point.controller]
+            rest = {name: value for name, value in point.columns().items() if name != over}
+            groups.setdefault((over, json.dumps(rest)), []).append(point)
+    return [_curve(folder, group, over, found) for (over, _), group in groups.items()]
+
+
+def best(curve: Curve) -> Best | None:
+    """The best of a curve; None where there is none."""
+    if curve.peak is None:
+        return None
+    found = curve.peak
+    index = max(
+        (index for index, result in enumerate(curve.results) if result.thrust is not None),
+        key=lambda index: curve.results[index].thrust or 0.0,
+    )
+    point = curve.points[index]
+    return Best(
+        controller=point.controller,
+        parameters=point.parameters,
+        keys=point.keys,
+        over=curve.over,
+        x=found.x,
+        x_low=found.x_low,
+        x_high=found.x_high,
+        thrust=found.y,
+        error=found.y_error,
+        at_edge=found.at_edge,
+    )
+
+
+def _curve(folder: SweepFolder, group: list[Point], over: str, all_of: Sequence[Point]) -> Curve:
+    results = [folder.results[folder.key(point)] for point in group]
+    x = [float(point.columns()[over]) for point in group] if over else []
+    swum = [index for index, result in enumerate(results) if result.thrust is not None]
+    top = None
+    if over and swum:
+        thrusts = [result.thrust or 0.0 for result in results]
+        top = peak(
+            [x[index] for index in swum],
+            [thrusts[index] for index in swum],
+            [results[index].error for index in swum],
+        )
+        same = {
+            name
+            for name, value in group[0].columns().items()
+            if all(other.columns().get(name, value) == value for other in all_of)
+        }
+    label = group[0].label(without={*same, over})
+    return Curve(label, over.removeprefix(PARAMETER), group, x, results, top)

@@ -1,0 +1,193 @@
+"""The folder of a sweep: what it was begun with, a table of its points, and their recordings."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import fields
+
+from fishd import __version__
+from fishd.core import files
+from fishd.core.errors import ConfigError
+from fishd.core.files import FileProblem, write_atomically
+from fishd.core.lockfile import NotALock, Taken, locked
+from fishd.lab import tables
+from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.measuring import Result
+
+BEGUN, POINTS, RECORDINGS = "sweep.json", "points.csv", "ticks"
+RECORDING = "recording"
+"""The column that names the recording of a point."""
+OTHERS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
+"""Sections and keys of a configuration that have no part in the thrust."""
+MEASURED = tuple(field.name for field in fields(Result))
+
+On = Literal["simulation", "robot"]
+
+
+class Begun(Struct, frozen=True):
+    """What all points of a sweep have in common; a folder is gone on with only by the same."""
+
+    on: On
+    config: dict[str, Any]
+    """The fish, as plain data."""
+    lengths: dict[str, float]
+    """How long it swims at each point."""
+    force_unit: str = "N"
+    version: str = __version__
+
+
+class SweepFolder:
+    """A folder in which points are kept as they are measured; `results` has them by their key."""
+
+    def __init__(self, path: Path, begun: Begun, columns: Sequence[str]) -> None:
+        """Makes the folder, or goes on with one.
+
+        columns: names of what differs from point to point, as in `Point.columns`
+        Raises `ConfigError` where it is of another sweep.
+        """
+        self.path = path
+        self.begun = begun
+        self._columns = tuple(columns)
+        self.results: dict[tuple[str, ...], Result] = {}
+        try:
+            _make(path, begun)
+            (path / RECORDINGS).mkdir(exist_ok=True)
+            head = (*self._columns, *MEASURED, RECORDING)
+            self._read(head)
+            self._table = tables.Table(path / POINTS, head)
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def key(self, point: Point) -> tuple[str, ...]:
+        """What tells a point from the others: its columns as text."""
+        values = point.columns()
+        return tuple(str(values.get(name, "")) for name in self._columns)
+
+    def keep(self, point: Point, result: Result, recording: bytes | Path) -> None:
+        """Keep what was measured, its recording first; raises `ConfigError` when it cannot be.
+
+        recording: its content, or a file in `RECORDINGS`
+        """
+        try:
+            if isinstance(recording, bytes):
+                path = self.recording_of(point)
+                write_atomically(path, recording)
+                recording = path
+            key = self.key(point)
+            values = msgspec.structs.asdict(result)
+            row = dict(zip(self._columns, key, strict=True)) | values
+            self._table.add(row | {RECORDING: f"{RECORDINGS}/{recording.name}"})
+        except OSError as error:
+            raise self._unwritable(error) from None
+        self.results[key] = result
+
+    def recording_of(self, point: Point) -> Path:
+        """A free name for the recording of the next point."""
+        number = len(self.results) + 1
+        while any((self.path / RECORDINGS).glob(f"{number:04d}-*")):
+            number += 1
+        return self.path / RECORDINGS / f"{number:04d}-{point.controller}.mcap"
+
+    def sort(self, found: Sequence[Point]) -> None:
+        """Put the rows in the order of these points; others stay at the end."""
+        try:
+            head, *rows = tables.read(self.path / POINTS)
+        except FileProblem as problem:
+            raise ConfigError(f"{self.path / POINTS}: {problem}") from None
+        order = {self.key(point): index for index, point in enumerate(found)}
+        width = len(self._columns)
+        rows.sort(key=lambda row: order.get(tuple(row[:width]), len(order)))
+        try:
+            write_atomically(self.path / POINTS, tables.lines([head, *rows]))
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _read(self, head: tuple[str, ...]) -> None:
+        """The points that are there; a last row that a kill has cut off is dropped."""
+        path = self.path / POINTS
+        if not path.exists():
+            return
+        try:
+            before, *rows = tables.read(path)
+            if tuple(before) != head:
+                raise ConfigError(
+                    f"{path}: this sweep has other parameters or keys: it was of "
+                    f"{', '.join(before[: -len(MEASURED) - 1])}; give another --folder"
+                )
+            complete = [row for row in rows if len(row) == len(head)]
+            for row in complete:
+                measured = dict(zip(head, row, strict=True))
+                given = {name: measured[name] for name in MEASURED if measured[name]}
+                self.results[tuple(row[: len(self._columns)])] = msgspec.convert(
+                    given, Result, strict=False
+                )
+        except ConfigError:
+            raise
+        except (ValueError, FileProblem):
+            raise ConfigError(
+                f"{path}: not the table of a sweep; move it away, and its points are measured again"
+            ) from None
+        text = tables.lines([head, *complete])
+        if text != path.read_text(encoding="utf-8"):
+            write_atomically(path, text)
+
+    def _unwritable(self, error: OSError) -> ConfigError:
+        where = error.filename or self.path
+        return ConfigError(f"{where}: cannot be written: {error.strerror}; nothing is lost")
+
+
+@contextmanager
+def owned(path: Path) -> Iterator[None]:
+    """While this lasts, no other sweep uses the folder; raises `ConfigError`."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with locked(path / "sweep", remove=True):
+            yield
+    except Taken as taken:
+        raise ConfigError(f"{path}: a sweep runs in it, process {taken.pid}") from None
+    except NotALock as error:
+        raise ConfigError(f"{error.filename}: {error.strerror}") from None
+
+
+def _make(path: Path, begun: Begun) -> None:
+    file = path / BEGUN
+    if file.exists():
+        _check_same(file, begun)
+        return
+    others = [each for each in path.iterdir() if not each.name.endswith(".lock")]
+    if others:
+        raise ConfigError(f"{path}: not empty, and no sweep began in it; give another --folder")
+    write_atomically(file, msgspec.json.format(msgspec.json.encode(begun), indent=2))
+
+
+def _check_same(file: Path, begun: Begun) -> None:
+    """Refuse to go on with another fish, or for another length."""
+    try:
+        data = msgspec.json.decode(files.read(file, files.SETTINGS, "a sweep"), type=Begun)
+    except FileProblem as problem:
+        raise ConfigError(f"{file}: {problem}") from None
+    except msgspec.MsgspecError as error:
+        raise ConfigError(f"{file}: no sweep began so: {error}") from None
+    before, now = (_leaves(msgspec.to_builtins(each)) for each in (data, begun))
+    for key in dict.fromkeys([*before, *now]):
+        if key == "version" or key.removeprefix("config.").partition(".")[0] in OTHERS:
+            continue
+        if before.get(key) != now.get(key):
+            raise ConfigError(
+                f"{file}: this sweep was begun with {key} = {before.get(key)}, now it is "
+                f"{now.get(key)}; give the same, or another --folder"
+            )
+
+
+def _leaves(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping) and value:
+            found |= _leaves(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = value
+    return found

@@ -1,0 +1,139 @@
+"""The points of a sweep: every combination of controllers, parameter values and configured keys."""
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from decimal import Decimal, InvalidOperation
+from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from fishd.config import Config
+from fishd.controllers import registry
+from fishd.core.errors import ParameterError
+
+MOST = 100_000
+"""A grid has no more points."""
+PARAMETER = "parameters."
+"""What the column of a controller's parameter begins with; that of a configured key is its name."""
+
+
+class Point(Struct, frozen=True):
+    """One thing to measure."""
+
+    controller: str
+    parameters: dict[str, Any]
+    """Those that were given; the others have their defaults."""
+    keys: dict[str, Any] = {}
+    """Keys of the configuration that differ from that of the sweep, in dotted form."""
+
+    def columns(self) -> dict[str, Any]:
+        """Its columns in a table, by name."""
+        parameters = {PARAMETER + name: value for name, value in self.parameters.items()}
+        return {"controller": self.controller, **parameters, **self.keys}
+
+    def label(self, *, without: Collection[str] = ()) -> str:
+        """`square frequency=1.4 amplitude=0.3`: its columns in a line, but for some."""
+        pairs = list(self.columns().items())[1:]
+        words = (
+            f"{name.removeprefix(PARAMETER)}={_short(value)}"
+            for name, value in pairs
+            if name not in without
+        )
+        return " ".join((self.controller, *words))
+
+
+def spread(text: str) -> list[str]:
+    """The values of `0.4:4:0.2` (low:high:step, both ends included) or of a list `0.3,0.6,1`.
+
+    Each is a text, exact in decimals. Raises `ParameterError`.
+    """
+    found: list[str] = []
+    for piece in text.split(","):
+        piece = piece.strip()
+        found += _range(piece) if ":" in piece else [piece]
+        if len(found) > MOST:
+            raise ParameterError(f"'{text}' has more than {MOST} values")
+    if "" in found:
+        raise ParameterError(f"'{text}' is not valid: a value is missing in it")
+    return list(dict.fromkeys(found))
+
+
+def _range(piece: str) -> list[str]:
+    try:
+        low, high, step = (Decimal(part) for part in piece.split(":"))
+        if step <= 0 or high < low or not (high - low).is_finite():
+            raise ValueError(piece)
+        count = int((high - low) / step + Decimal("1e-9")) + 1
+    except (ValueError, InvalidOperation, OverflowError):
+        raise ParameterError(
+            f"'{piece}' is not valid: LOW:HIGH:STEP is needed, such as 0.4:4:0.2"
+        ) from None
+    if count > MOST:
+        raise ParameterError(f"'{piece}' has more than {MOST} values")
+    return [str((low + k * step).normalize()) for k in range(count)]
+
+
+def points(
+    controllers: Sequence[str],
+    parameters: Mapping[str, Sequence[Any]],
+    takes: Mapping[str, Sequence[str]],
+    keys: Mapping[str, Sequence[Any]] | None = None,
+) -> list[Point]:
+    """Every combination, in order: the last parameter changes first.
+
+    parameters: the values of each
+    takes: the names of the parameters of each controller; one that it does not know is left out
+    keys: the values of each key of the configuration
+
+    Raises `ParameterError` for a parameter that no controller has, and for too many points.
+    """
+    keys = keys or {}
+    for name in parameters:
+        if not any(name in takes[each] for each in controllers):
+            raise ParameterError(f"no parameter '{name}' has {', '.join(controllers)}")
+    found = []
+    for changed in _combinations(keys):
+        for controller in dict.fromkeys(controllers):
+            own = {name: parameters[name] for name in parameters if name in takes[controller]}
+            found += [Point(controller, given, changed) for given in _combinations(own)]
+            if len(found) > MOST:
+                raise ParameterError(f"this grid has more than {MOST} points")
+    return found
+
+
+def _combinations(values: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    count = 1
+    for each in values.values():
+        count *= len(each)
+    if count > MOST:
+        raise ParameterError(f"this grid has more than {MOST} points")
+    return [
+        dict(zip(values, combination, strict=True))
+        for combination in itertools.product(*values.values())
+    ]
+
+
+def check(point: Point, config: Config) -> None:
+    """Raises `ParameterError` and `UnknownController` where it cannot swim a fish of `config`."""
+    limits = replace(config.limits, virtual=True)
+    try:
+        registry.check(point.controller, point.parameters, limits)
+    except ParameterError as error:
+        where = " ".join(f"{key}={_short(value)}" for key, value in point.keys.items())
+        raise ParameterError(f"{error}{f' (with {where})' if where else ''}", error.path) from None
+
+
+def axis(found: Sequence[Point]) -> str:
+    """The column to draw results over: the number with the most values; empty where all agree."""
+    values: dict[str, set[Any]] = {}
+    for point in found:
+        for name, value in point.columns().items():
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                values.setdefault(name, set()).add(value)
+    counts = {name: len(each) for name, each in values.items() if len(each) > 1}
+    return max(counts, key=lambda name: counts[name]) if counts else ""
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,143 @@
+"""The thrust at one point of a sweep: the true one of a simulated fish, or that of a rig."""
+
+import math
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from fishd.config import Config, Start
+from fishd.control.reporting import Publisher
+from fishd.controllers import registry
+from fishd.controllers.base import amplitude_of
+from fishd.core.signals import Tick
+from fishd.lab.measurement import measure
+from fishd.lab.parallel import Stop
+from fishd.lab.rig import Rig
+from fishd.lab.sweep.grid import Point
+from fishd.recording.writer import RunWriter
+from fishd.simulation import Beats, VirtualRun
+from fishd.virtual.plant.optimum import best_square_wave
+
+SLOWEST = 0.4
+"""A controller without a frequency is given the time of so slow a tail beat [Hz]."""
+
+
+class Result(Struct, frozen=True):
+    """What was found at a point; the measured columns of a sweep's table."""
+
+    thrust: float | None = None
+    """Mean over whole tail beats [N]; None where there is `trouble`."""
+    error: float | None = None
+    """Half of its 95 % interval [N]; None where it is not known."""
+    beat_frequency: float = 0.0
+    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    efficiency: float | None = None
+    """Thrust over that of the best square wave; of a simulated fish."""
+    fin_amplitude: float | None = None
+    """Largest fin angle of a half beat, mean [rad]; of a simulated fish."""
+    seconds: float = 0.0
+    """How long it swam and rested [s]."""
+    trouble: str = ""
+    """Why there is no thrust."""
+
+
+class Lengths(Struct, frozen=True):
+    """How long a simulated fish swims at each point."""
+
+    settle: float = 10.0
+    """Not judged [s]."""
+    periods: int = 20
+    """Tail beats that are judged."""
+
+
+class Task(NamedTuple):
+    """A point, and all that a worker needs to measure it."""
+
+    point: Point
+    config: Config
+    lengths: Lengths
+    stop: Stop
+
+
+def simulated(task: Task) -> tuple[Result, bytes] | None:
+    """What `swim` finds at a point, and its recording; None where told to stop."""
+    if task.stop.asked()():
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        extra = {name: str(value) for name, value in task.point.columns().items()}
+        path = Path(folder) / "point.mcap"
+        with RunWriter(path, source="simulation", note=task.point.label(), extra=extra) as writer:
+            writer.describe(task.config)
+            result = swim(task.point, task.config, task.lengths, writer)
+        return result, path.read_bytes()
+
+
+def swim(point: Point, config: Config, lengths: Lengths, publisher: Publisher) -> Result:
+    """The true thrust of a simulated fish at a point.
+
+    The error is that of the mean over the beats, as they differ from one another: by noise that
+    the controller answers, and by half beats that are no whole number of ticks.
+
+    publisher: gets every tick
+    Raises `ParameterError` and `UnknownController`.
+    """
+    config = replace(config, start=Start())
+    limits = replace(config.limits, virtual=True)
+    controller = registry.create(point.controller, point.parameters, limits)
+    asked = getattr(controller.parameters, "frequency", None)
+    slowest = min(asked, SLOWEST) if isinstance(asked, float) and asked > 0.0 else SLOWEST
+    settle = math.ceil(lengths.settle / config.tick)
+    most = settle + math.ceil((lengths.periods + 2) / slowest / config.tick)
+    beats = Beats()
+    with VirtualRun(config, publisher) as run:
+        run.loop.set_controller(point.controller, controller)
+        for index in range(most):
+            angle = run.loop.applied
+            window = run.tick()
+            if index > settle:
+                beats.add(angle, window)
+            if beats.count >= lengths.periods or run.loop.supervisor.reason:
+                break
+        reason, fallback = run.loop.supervisor.reason, run.loop.active.fallback
+    seconds = (index + 1) * config.tick
+    if trouble := reason or fallback:
+        return Result(seconds=seconds, trouble=trouble.message)
+    means = beats.means()
+    best = best_square_wave(config.plant, amplitude_of(controller.parameters, config.limits))
+    return Result(
+        thrust=means.thrust,
+        error=_half_width(means.thrust_deviation, beats.count),
+        beat_frequency=means.frequency,
+        efficiency=means.thrust / best.thrust if best.thrust > 0.0 else None,
+        fin_amplitude=means.fin_amplitude,
+        seconds=seconds,
+    )
+
+
+def on_rig(
+    point: Point, rig: Rig, seconds: float, progress: Callable[[float], None]
+) -> tuple[Result, list[Tick]]:
+    """The thrust that a rig measures at a point, freed of its drift, and the ticks.
+
+    progress: called with the time that has passed [s]
+    Raises as `fishd.lab.measurement.measure`.
+    """
+    found = measure(rig, point.controller, point.parameters, seconds, progress)
+    result = Result(
+        thrust=found.thrust,
+        error=found.error,
+        beat_frequency=found.frequency,
+        seconds=len(found.ticks) * rig.tick,
+    )
+    return result, list(found.ticks)
+
+
+def _half_width(deviation: float, count: int) -> float | None:
+    """Half of the 95 % interval of a mean of so many beats; None for fewer than two."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(count - 1, 0.975) * deviation) if count > 1 else None

@@ -1,0 +1,147 @@
+"""The folder of recordings: where it is, what is in it, and which recording a name means."""
+
+import os
+import struct
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from fishd.core.errors import RecordingError
+from fishd.core.schema import nearest
+from fishd.recording.part_file import PART, SUFFIX, is_being_written
+from fishd.recording.reader import open_run
+from fishd.recording.summary import Summary, from_metadata
+
+FOLDER_VARIABLE = "FISHD_RUNS"
+LATEST = "latest"
+"""Stands for the newest recording."""
+
+
+class Glance(NamedTuple):
+    """A recording in short."""
+
+    name: str
+    path: Path
+    about: dict[str, str]
+    """As `Run.about`."""
+    summary: Summary
+    finished: bool
+    writing: bool
+    """True while some process still writes it."""
+
+
+def runs_folder() -> Path:
+    """$FISHD_RUNS, else the service's state folder, else `fishd/runs` in that of the user's data.
+
+    It need not exist.
+    """
+    if given := os.environ.get(FOLDER_VARIABLE):
+        return Path(given)
+    if state := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
+        return Path(state)
+    data = os.environ.get("XDG_DATA_HOME", "")
+    # Relative ones are to be ignored, says the XDG Base Directory Specification.
+    base = Path(data) if data.startswith("/") else Path.home() / ".local/share"
+    return base / "fishd/runs"
+
+
+def made(folder: Path) -> Path:
+    """The folder, once it is there; raises `RecordingError`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{folder} cannot be made: {error.strerror}") from None
+    return folder
+
+
+def new_path(folder: Path, prefix: str = "") -> Path:
+    """A path for a recording that begins now, named after the date and time of this place."""
+    name = f"{prefix}{datetime.now():%Y-%m-%d-%H%M%S}"
+    path, number = folder / (name + SUFFIX), 1
+    while os.path.lexists(path) or os.path.lexists(f"{path}{PART}"):
+        number += 1
+        path = folder / f"{name}-{number}{SUFFIX}"
+    return path
+
+
+def paths(folder: Path) -> list[Path]:
+    """All recordings of a folder, finished or not, the oldest first."""
+    try:
+        found = [path for path in folder.iterdir() if path.name.endswith((SUFFIX, SUFFIX + PART))]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordingError(f"{folder} cannot be read: {error.strerror}") from None
+    return [path for _, path in sorted((_modified(path), path) for path in found)]
+
+
+def find(run: str, folder: Path | None = None) -> Path:
+    """The file that a name means: a path, a name in the folder of recordings, or `latest`.
+
+    Raises `RecordingError`.
+    """
+    path = Path(run).expanduser()
+    if path.is_file():
+        return path
+    folder = folder or runs_folder()
+    known = paths(folder)
+    if run == LATEST:
+        if not known:
+            raise RecordingError(f"there is no recording in {folder} yet; see 'fishctl record'")
+        return known[-1]
+    for suffix in ("", SUFFIX, SUFFIX + PART):
+        if "/" not in run and (found := folder / (run + suffix)).is_file():
+            return found
+    names = [name_of(path) for path in known]
+    hint = nearest(run, names[-10:], listed="there are") if names else "there is none yet"
+    raise RecordingError(f"no recording '{run}', neither a file nor a name in {folder}; {hint}")
+
+
+def name_of(path: Path) -> str:
+    """The name of a recording, without suffix."""
+    return path.name.removesuffix(PART).removesuffix(SUFFIX)
+
+
+def glances(folder: Path) -> Iterator[Glance | RecordingError]:
+    """All recordings of a folder in short, the oldest first; or what is wrong with one."""
+    for path in paths(folder):
+        try:
+            yield glance(path)
+        except RecordingError as error:
+            yield error
+
+
+def glance(path: Path) -> Glance:
+    """A recording in short; at once where it is finished. Raises `RecordingError`."""
+    found = _from_index(path)
+    if found is not None:
+        return found
+    run = open_run(path)
+    writing = is_being_written(path)
+    return Glance(run.name, path, run.about, run.summary, run.finished, writing)
+
+
+def _from_index(path: Path) -> Glance | None:
+    """What the index at the end of a finished recording leads to; None without one."""
+    try:
+        with path.open("rb") as file:
+            metadata = {each.name: each.metadata for each in make_reader(file).iter_metadata()}
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
+    except (McapError, ValueError, struct.error):  # no end, or a damaged one
+        return None
+    summary = from_metadata(metadata.get("fishd.end", {}))
+    if summary is None or "fishd.run" not in metadata:
+        return None
+    return Glance(name_of(path), path, metadata["fishd.run"], summary, True, False)
+
+
+def _modified(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

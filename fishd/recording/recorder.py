@@ -1,0 +1,247 @@
+"""Records a running fishd: a process of its own that subscribes to telemetry."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any, NamedTuple, Self
+
+import msgspec
+import zmq
+
+from fishd.client import Fish
+from fishd.core import text
+from fishd.core.errors import FishError, RecordingError, Refused
+from fishd.core.protocol import Calibrations
+from fishd.core.signals import Status
+from fishd.recording.schemas import CHANNELS
+from fishd.recording.summary import TickHead
+from fishd.recording.writer import RunWriter
+
+DRAIN = 0.2
+"""Messages are taken from their queue this often, so as to wake up seldom [s]."""
+FLUSH = 0.5
+"""All is handed to the kernel this often: a kill loses at most so much, and `DRAIN` [s]."""
+SYNC = 10.0
+"""A power cut loses at most so much [s]."""
+SILENCE = 1.0
+"""Without a message for so long, fishd is looked for again [s]."""
+RESERVE = 16 * 2**20
+"""Recordings end before the disk has less room than this [bytes]."""
+ABOUT = (
+    "version",
+    "pid",
+    "name",
+    "robot",
+    "tick",
+    "amplitude_limit",
+    "lowest",
+    "highest",
+    "force_unit",
+    "realtime",
+)
+"""What is kept of the status of each fishd."""
+WAITING = 20000
+"""Messages that may wait for a recorder that is held up: a quarter of an hour."""
+
+
+class Recorder:
+    """Writes all that a fishd says until it is told to stop, through any restart of fishd."""
+
+    def __init__(
+        self,
+        endpoint: str | None,
+        open_writer: Callable[[], RunWriter],
+        *,
+        tell: Callable[[str], None],
+        progress: Callable[[RunWriter], None] = lambda writer: None,
+        due: Callable[[RunWriter], bool] = lambda writer: False,
+    ) -> None:
+        """
+        endpoint: control socket of fishd; None looks for that of this machine
+        open_writer: begins a recording
+        tell: gets a line where something happens that its reader should know
+        progress: called once a second
+        due: is it time to close this recording and begin the next one?
+        """
+        self._endpoint = endpoint
+        self._open_writer = open_writer
+        self._tell, self._progress, self._due = tell, progress, due
+        self._telemetry = Telemetry()
+        self._writer: RunWriter | None = None
+        self._described: Description | None = None
+        self._seq = 0
+        self._gone = False
+        self.reason = "stopped"
+        """Why the recording ended, as the file says."""
+
+    def __enter__(self) -> Self:
+        """Begin, where there is a fishd: raises `NoDaemon`, `Refused`, `RecordingError`."""
+        try:
+            self._described = self._ask()
+            self._telemetry.connect(self._described.status.telemetry)
+            self._open()
+        except BaseException:
+            self._telemetry.close()
+            raise
+        return self
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        """Finish the file, also after an error; raises `RecordingError`."""
+        self._telemetry.close()
+        self.writer.close(self.reason if error is None else text.named(error))
+
+    @property
+    def began(self) -> bool:
+        """Was a file opened?"""
+        return self._writer is not None
+
+    @property
+    def writer(self) -> RunWriter:
+        """The recording that is being written."""
+        assert self._writer is not None
+        return self._writer
+
+    def run(self, stopping: Callable[[], bool], seconds: float | None = None) -> None:
+        """Record until `stopping`, or for so long [s]; raises `RecordingError`."""
+        heard = flushed = synced = told = began = time.monotonic()
+        while not stopping():
+            now = time.monotonic()
+            if seconds is not None and now - began >= seconds:
+                self.reason = f"after {seconds:g} s, as asked"
+                break
+            time.sleep(DRAIN)
+            for topic, payload in self._telemetry.messages():
+                self._take(topic, payload)
+                heard = now
+            if now - flushed >= FLUSH - DRAIN / 2:
+                flushed = now
+                sync = now - synced >= SYNC
+                synced = now if sync else synced
+                self.writer.flush(sync=sync)
+                self._check_room()
+            if now - told >= 1.0:
+                told = now
+                self._progress(self.writer)
+                if self._due(self.writer):
+                    self.writer.close("continued in the next file")
+                    self._open()
+            if now - heard >= SILENCE:
+                heard = now
+                self._look_for_fishd()
+
+    def _open(self) -> None:
+        assert self._described
+        self._writer = self._open_writer()
+        self._describe(self._described)
+
+    def _take(self, topic: str, payload: bytes) -> None:
+        known = len(self.writer.gaps)
+        try:
+            message = self.writer.message(topic, payload)
+        except msgspec.DecodeError:
+            self._tell(f"a message of topic {topic} is none of fishd's: left out")
+            return
+        if isinstance(message, TickHead):
+            if message.seq <= self._seq:
+                self._tell("another fishd has taken over: the recording goes on with it")
+            elif self._gone:
+                self._tell("fishd is heard again: the recording goes on")
+            self._gone = False
+            self._seq = message.seq
+            for gap in self.writer.gaps[known:]:
+                self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
+        elif isinstance(message, Status):
+            assert self._described
+            # Once its ticks come, so that the file says whose they are.
+            if message.pid != self._described.status.pid and self._seq <= message.seq:
+                self._ask_again()
+        elif message.kind == "calibration":
+            self._ask_again()
+
+    def _ask(self) -> "Description":
+        """What fishd says of itself; raises `FishError`."""
+        with Fish(self._endpoint) as fish:
+            status, config = fish.status(), fish.config()
+            try:
+                return Description(status, config, fish.calibrations())
+            except Refused:  # a simulated fish may have none
+                return Description(status, config, None)
+
+    def _ask_again(self) -> None:
+        """A fishd that does not answer is asked again at its next status."""
+        with suppress(FishError):
+            self._described = self._ask()
+            self._describe(self._described)
+
+    def _describe(self, found: "Description") -> None:
+        """Put what fishd says of itself into the file; raises `RecordingError`."""
+        about = {name: str(getattr(found.status, name)) for name in ABOUT}
+        self.writer.describe(found.config, about)
+        if found.calibrations is not None:
+            self.writer.calibrated(found.calibrations)
+
+    def _look_for_fishd(self) -> None:
+        """Telemetry comes back by itself, unless fishd has another address now."""
+        try:
+            with Fish(self._endpoint, timeout=0.5) as fish:
+                self._telemetry.connect(fish.status().telemetry)
+        except FishError:
+            if not self._gone:
+                self._tell("fishd is gone: the recording waits for it")
+            self._gone = True
+
+    def _check_room(self) -> None:
+        free = self.writer.free()
+        if free < RESERVE:
+            raise OutOfRoom(
+                f"{self.writer.path}: the recording ends after {self.writer.tally.seconds:.0f} s: "
+                f"only {free / 2**20:.0f} MB are left on this disk"
+            )
+
+
+class Description(NamedTuple):
+    """What a fishd says of itself when it is asked."""
+
+    status: Status
+    config: dict[str, Any]
+    calibrations: Calibrations | None
+
+
+class OutOfRoom(RecordingError):
+    """A recording ended since the disk is almost full; the file is finished."""
+
+
+class Telemetry:
+    """All topics of telemetry, with room for many messages to wait."""
+
+    def __init__(self) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.set(zmq.RCVHWM, WAITING)
+        self._socket.set(zmq.RECONNECT_IVL, 10)
+        for topic in CHANNELS:
+            self._socket.subscribe(topic.encode())
+        self._address = ""
+
+    def connect(self, address: str) -> None:
+        """Listen to this address alone."""
+        if address != self._address:
+            if self._address:
+                self._socket.disconnect(self._address)
+            self._socket.connect(address)
+            self._address = address
+
+    def messages(self) -> Iterator[tuple[str, bytes]]:
+        """Topics and payloads that wait."""
+        for _ in range(WAITING):
+            try:
+                frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            topic = frames[0].decode("ascii", "replace")
+            if len(frames) == 2 and topic in CHANNELS:
+                yield topic, frames[1]
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._context.destroy(linger=0)

@@ -1,0 +1,73 @@
+"""Finishes a recording that was cut off, by a kill or a power cut say."""
+
+from pathlib import Path
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
+
+from fishd.core.errors import RecordingError
+from fishd.recording.part_file import PART, SUFFIX, PartFile, is_being_written
+from fishd.recording.reader import Run, open_run, records
+from fishd.recording.summary import to_metadata
+from fishd.recording.writer import CHUNK
+
+RECOVERED = "recovered: the recording was not finished"
+
+
+def recover(path: Path) -> Run:
+    """Write what can be read of a recording into a finished one, and open that.
+
+    `RUN.mcap.part` becomes `RUN.mcap`; what has another name stays, beside `NAME-recovered.mcap`.
+    Raises `RecordingError` where there is nothing to recover, or no room to do so.
+    """
+    is_part = path.name.endswith(SUFFIX + PART)
+    if is_part and is_being_written(path):
+        raise RecordingError(f"{path} is being recorded now; end that first")
+    run = open_run(path)
+    if run.finished:
+        raise RecordingError(f"{path} is finished and whole: there is nothing to recover")
+    final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
+    file = PartFile(final, final.with_name(final.name + ".recovering"))
+    try:
+        _copy(run, file)
+        file.finish()
+    except OSError as error:
+        file.remove()
+        raise RecordingError(f"{final} cannot be written: {error.strerror or error}") from None
+    finally:
+        file.close()
+    if is_part:
+        path.unlink(missing_ok=True)
+    return open_run(final)
+
+
+def _copy(run: Run, file: PartFile) -> None:
+    writer = Writer(file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
+    writer.start(profile="", library="fishd")
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    for record in records(run.path):
+        if isinstance(record, Message):
+            writer.add_message(
+                channels[record.channel_id],
+                record.log_time,
+                record.data,
+                record.publish_time,
+                record.sequence,
+            )
+        elif isinstance(record, Schema):
+            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel):
+            channels[record.id] = writer.register_channel(
+                record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+            )
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+    writer.add_metadata("fishd.end", to_metadata(run.summary) | {"reason": RECOVERED})
+    writer.flush()  # type: ignore[no-untyped-call]
+    writer.finish()  # type: ignore[no-untyped-call]
+    file.flush()

@@ -1,0 +1,70 @@
+"""`fishctl optimum`: what it says of the configured fish, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fishd.cli.main import fishctl
+from fishd.core.errors import FishdError
+
+QUICK = ("--set", "plant.servo_speed=1000", "--set", "plant.servo_lag=0.001")
+"""A servo for which the best command is found soon."""
+
+
+def invoke(*arguments: str) -> Result:
+    return CliRunner().invoke(fishctl, ["optimum", *arguments])
+
+
+def test_it_shows_the_best_square_wave_and_the_limits_of_the_configured_fish() -> None:
+    done = invoke("--amplitude", "0.31", "--amplitude", "0.42")
+    assert done.exit_code == 0
+    assert "best square 15.366 mN at 1.753 Hz" in done.output
+    assert "best square 25.784 mN at 1.709 Hz" in done.output
+    assert "slow servo  91.825 mN" in done.output
+    other = json.loads(invoke("--set", "plant.servo_speed=11.6", "--json").output)
+    assert other["saturation_amplitude"] == pytest.approx(11.6 / 12.5)
+    assert other["best_square"]["amplitude"] == [0.42]
+
+
+def test_optimal_control_is_told_and_drawn(tmp_path: Path) -> None:
+    picture = tmp_path / "best.svg"
+    done = invoke("--control", "--figure", str(picture), *QUICK)
+    assert done.exit_code == 0
+    assert "|φ_c| = Φ in 100.0% of the time" in done.output
+    assert picture.read_text(encoding="utf-8").startswith("<?xml")
+
+
+@pytest.mark.parametrize(
+    ("file", "complaint"),
+    [
+        ("missing/best.png", "there is no folder"),
+        ("best.xyz", "a figure has no format .xyz: .pdf, .png or .svg is needed"),
+    ],
+)
+def test_a_figure_that_cannot_be_written_is_refused_before_anything_is_computed(
+    file: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fishd.lab.optimum.optimal_control", lambda *_: pytest.fail("computed"))
+    done = invoke("--control", "--figure", str(tmp_path / file))
+    assert isinstance(done.exception, FishdError)
+    assert complaint in str(done.exception)
+
+
+def test_what_the_limits_leave_out_is_said() -> None:
+    done = invoke("--set", "plant.backlash=0.02")
+    assert "the limits leave out plant.backlash" in done.stderr
+
+
+def test_optimal_control_is_for_one_amplitude_at_a_time() -> None:
+    done = invoke("--control", "--amplitude", "0.2", "--amplitude", "0.3")
+    assert done.exit_code == 2
+    assert "one --amplitude at a time" in done.output
+
+
+@pytest.mark.parametrize("value", ["0", "-0.1", "1.6", "nan", "inf"])
+def test_an_amplitude_that_no_fish_has_is_refused(value: str) -> None:
+    done = invoke("--amplitude", value)
+    assert done.exit_code == 2
+    assert "a number in (0, 1.57] is needed" in done.output

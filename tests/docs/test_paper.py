@@ -1,0 +1,61 @@
+"""What the pages say of the paper's figures and numbers, against the tables, equations and loop."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from common.report import DOCS, between
+from fishd.simulation import Report
+from paper import claims, figure_3, figure_4, figure_5, swing_map
+from paper.runs import Run, read, swim
+
+SECTIONS = (*claims.sections(), *swing_map.sections())
+
+
+@pytest.mark.parametrize(
+    ("document", "name", "text"), SECTIONS, ids=[name for _, name, _ in SECTIONS]
+)
+def test_the_page_says_what_tables_and_equations_give(document: str, name: str, text: str) -> None:
+    assert between(DOCS / document, name) == text
+
+
+def row(name: str, **having: str | float) -> dict[str, Any]:
+    (found,) = read(name, **having)
+    return found
+
+
+def assert_same(report: Report, row: Mapping[str, Any]) -> None:
+    """As in a table, but for what other libraries round otherwise."""
+    if "thrust_mN" in row:
+        assert 1e3 * report.mean_thrust == pytest.approx(row["thrust_mN"], rel=5e-3)
+    else:
+        assert report.efficiency == pytest.approx(row["efficiency"], abs=5e-3)
+
+
+@pytest.mark.parametrize("wave", figure_4.WAVES)
+@pytest.mark.parametrize("tick", figure_4.TICKS)
+def test_waveforms_still_thrust_as_in_figure_4(wave: str, tick: float) -> None:
+    swum = swim(figure_4.run(wave, tick, 1.8))
+    assert_same(swum, row(figure_4.NAME, waveform=wave, tick_s=tick, frequency_Hz=1.8))
+
+
+def test_swing_and_a_learned_policy_still_thrust_as_in_figure_3() -> None:
+    for source, controller, parameters in (
+        (figure_3.SWING, "swing", {"C": 0.6}),
+        (figure_3.LEARNT, "ppo", {"policy": figure_3.policy(0.31)}),
+    ):
+        swum = swim(figure_3.run(controller, parameters, 0.31))
+        assert_same(swum, row(figure_3.NAME, source=source, amplitude_rad=0.31))
+
+
+@pytest.mark.parametrize(
+    ("run", "row"),
+    [
+        (figure_5.run(0.6, 0.9), row(figure_5.NAME, C=0.6, w0Phi_over_Omega=0.9)),
+        (figure_5.inset_run(0.05, 0.0), row(figure_5.INSET, xi=0.05, C=0.0)),
+    ],
+    ids=["default fish", "fast servo"],
+)
+def test_swing_is_still_as_efficient_as_in_figure_5(run: Run, row: dict[str, Any]) -> None:
+    assert_same(swim(run), row)

@@ -1,0 +1,61 @@
+"""A replay is what a subscriber and a client of fishd expect, and cannot be steered."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rigs.processes import Subscriber
+from rigs.recordings import recorded, swum
+
+from fishd.client import Fish, Refused
+from fishd.core.errors import StartupError
+from fishd.recording import open_run
+from fishd.recording.replay import Replay
+
+
+@pytest.fixture
+def replay(tmp_path: Path) -> Iterator[Replay]:
+    run = open_run(recorded(swum(), tmp_path / "run", source="simulation"))
+    with Replay(run, "tcp://127.0.0.1:0", f"ipc://{tmp_path}/control") as made:
+        yield made
+
+
+def test_a_replay_is_the_recorded_bytes_at_the_recorded_speed(replay: Replay) -> None:
+    recorded = [entry.payload for entry in replay._run.entries]
+    with Subscriber(replay.telemetry) as subscriber:
+        player = threading.Thread(target=replay.play, args=(5.0,))
+        player.start()
+        heard = []
+        while len(heard) < len(recorded):
+            topic, payload = subscriber.socket.recv_multipart()
+            if topic != b"status":  # of a virtual run, in which none was recorded
+                heard.append(payload)
+        player.join()
+    assert heard == recorded
+
+
+def test_a_client_sees_the_replay_and_cannot_steer_it(replay: Replay) -> None:
+    player = threading.Thread(target=replay.play, args=(3.0,))
+    player.start()
+    with Fish(replay.control) as fish:
+        status = fish.status()
+        assert (status.name, status.telemetry) == ("replay of run", replay.telemetry)
+        (first, second) = (tick for _, tick in zip(range(2), fish.ticks(), strict=False))
+        assert second.seq == first.seq + 1
+        after = fish.status()
+        assert (after.mode, after.controller) == ("running", "swing")
+        assert after.seq >= second.seq
+        assert fish.config()["tick"] == 0.05
+        with pytest.raises(Refused, match="it can be watched, not steered"):
+            fish.stop()
+    player.join()
+
+
+def test_an_address_in_use_is_said_in_one_line(replay: Replay, tmp_path: Path) -> None:
+    with pytest.raises(StartupError, match=r"Address already in use.*with --address"):
+        Replay(replay._run, replay.telemetry, f"ipc://{tmp_path}/other")
+    with pytest.raises(StartupError, match="a fishd or another replay"):
+        Replay(replay._run, "tcp://127.0.0.1:0", replay.control)
+    with pytest.raises(StartupError, match="is no address to serve"):
+        Replay(replay._run, "nonsense", f"ipc://{tmp_path}/other")

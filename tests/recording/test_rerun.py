@@ -1,0 +1,136 @@
+"""A controller that chooses again on what was recorded gives the very same commands."""
+
+from pathlib import Path
+
+import pytest
+from rigs.harness import Rig, fragile_rig
+from rigs.recordings import recorded, write
+
+from fishd.core.errors import ParameterError, RecordingError
+from fishd.recording import RunWriter, open_run
+from fishd.recording.rerun import Rerun, rerun
+
+
+def rerun_of(rig: Rig, path: Path) -> Rerun:
+    return rerun(open_run(recorded(rig, path, source="simulation")))
+
+
+@pytest.mark.parametrize(
+    ("controller", "parameters", "change"),
+    [
+        ("swing", {"C": 0.7}, {"C": 0.4}),
+        ("square", {"frequency": 1.63}, {"frequency": 2.2}),
+        ("sine", {"frequency": 1.63}, {"amplitude": 0.2}),
+        ("hold", {"angle": 0.2}, {"angle": -0.1}),
+        ("ppo", {"policy": "default-fish"}, {}),
+    ],
+)
+def test_every_command_and_every_estimate_comes_out_to_the_last_bit(
+    tmp_path: Path, controller: str, parameters: dict[str, object], change: dict[str, object]
+) -> None:
+    rig = Rig("simulation.noise=0.002", "simulation.drift=0.005", "slew_limit=9")
+    rig.run(7)
+    rig.start(controller, **parameters)
+    rig.run_for(5)
+    rig.run(missed=3)
+    if change:
+        rig.retune(**change)
+    rig.run_for(5)
+    rig.loop.stop()
+    rig.run_for(1)
+    rig.start("swing")
+    rig.run_for(2)
+    result = rerun_of(rig, tmp_path / "run")
+    assert [stretch.recorded for stretch in result.stretches] == [controller, "swing"]
+    for stretch in result.stretches:
+        assert stretch.from_start
+        assert (stretch.equal, stretch.largest) == (stretch.ticks, 0.0)
+    assert sum(stretch.ticks for stretch in result.stretches) == 241
+    assert result.estimates.from_start
+    assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
+
+
+def test_a_change_of_the_code_would_be_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig()
+    rig.start("swing")
+    rig.run_for(5)
+    monkeypatch.setattr("fishd.controllers.swing.REFRACTORY", 0.4)
+    (stretch,) = rerun_of(rig, tmp_path / "run").stretches
+    assert stretch.equal < stretch.ticks
+    assert stretch.largest == pytest.approx(0.84)
+
+
+def test_who_swam_before_the_recording_began_is_said_to_have_an_unknown_past(
+    tmp_path: Path,
+) -> None:
+    rig = Rig()
+    rig.start("swing", C=0.4)
+    rig.run_for(20)
+    with RunWriter(tmp_path / "run") as writer:
+        writer.describe(rig.config)
+        for tick in rig.recorder.ticks[100:]:
+            writer.tick(tick)
+    result = rerun(open_run(writer.path), "swing", {"C": 0.4})
+    (stretch,) = result.stretches
+    assert not stretch.from_start
+    assert not result.estimates.from_start
+    assert stretch.ticks == 299  # of the first one, nobody knows how long ago the one before was
+    assert stretch.equal >= 295  # from its first reversal on, swing remembers nothing of before
+
+
+def test_ticks_that_are_missing_begin_a_stretch_of_unknown_past(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.start("swing")
+    rig.run_for(5)
+    ticks = rig.recorder.ticks
+    result = rerun(open_run(write(tmp_path / "run", ticks[:40] + ticks[43:])))
+    assert [stretch.from_start for stretch in result.stretches] == [True, False]
+    assert result.stretches[0].equal == 40
+
+
+def test_another_controller_sees_what_the_recorded_one_saw(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.start("square", frequency=1.667)
+    rig.run_for(10)
+    run = open_run(recorded(rig, tmp_path / "run"))
+    (stretch,) = rerun(run, "swing", {"C": 0.6}).stretches
+    assert (stretch.recorded, stretch.controller) == ("square", "swing")
+    assert 0 < stretch.equal < stretch.ticks
+    with pytest.raises(ParameterError, match="C: 7 is not valid"):
+        rerun(run, "swing", {"C": 7})
+
+
+def test_another_estimator_changes_what_the_controller_sees(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.start("swing")
+    rig.run_for(10)
+    result = rerun(open_run(recorded(rig, tmp_path / "run")), overrides=["estimator.leak=0.05"])
+    assert result.stretches[0].equal < result.stretches[0].ticks
+    assert result.estimates.equal < 10
+
+
+def test_a_fault_and_what_follows_it_are_rerun_too(tmp_path: Path) -> None:
+    rig, robot = fragile_rig()
+    rig.start("swing")
+    rig.run_for(3)
+    robot.suspect = "clipped"
+    rig.run(4)
+    assert rig.mode == "fault"
+    robot.suspect = ""
+    rig.run_for(1)
+    rig.loop.clear_fault()
+    rig.start("swing", C=0.2)
+    rig.run_for(3)
+    result = rerun_of(rig, tmp_path / "run")
+    assert [stretch.parameters["C"] for stretch in result.stretches] == [0.6, 0.2]
+    assert all(stretch.equal == stretch.ticks for stretch in result.stretches)
+    assert result.estimates.equal == result.estimates.ticks
+
+
+def test_a_program_that_chose_from_outside_cannot_be_asked_again(tmp_path: Path) -> None:
+    rig = Rig()
+    path = recorded(rig, tmp_path / "run")
+    with pytest.raises(RecordingError, match="remote asks a program"):
+        rerun(open_run(path), "remote")

@@ -1,0 +1,39 @@
+"""Recordings of virtual fish."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fishd.core.signals import Tick
+from fishd.recording import RunWriter
+from rigs.harness import Rig
+
+
+def swum(seconds: float = 3.0, *overrides: str) -> Rig:
+    """A virtual fish that has swum, and was retuned in the middle of it."""
+    rig = Rig(*overrides)
+    rig.start("swing")
+    rig.run_for(seconds / 2)
+    rig.retune(C=0.3)
+    rig.run_for(seconds / 2)
+    return rig
+
+
+def recorded(rig: Rig, path: Path, *, flush_every: int = 1000, **about: Any) -> Path:
+    """What the rig published, in its order."""
+    with RunWriter(path, **about) as writer:
+        writer.describe(rig.config)
+        for number, message in enumerate(rig.recorder.messages):
+            (writer.tick if isinstance(message, Tick) else writer.event)(message)  # type: ignore[arg-type]
+            if number % flush_every == 0:
+                writer.flush()
+    return writer.path
+
+
+def write(path: Path, ticks: Sequence[Tick]) -> Path:
+    """A recording of these ticks."""
+    with RunWriter(path) as writer:
+        writer.describe(Rig().config)
+        for tick in ticks:
+            writer.tick(tick)
+    return writer.path

@@ -1,0 +1,231 @@
+"""Every number that the paper of Fu et al. states, beside what the tables and equations here give.
+
+The tables are those that the figures are drawn from; `docs/paper.md` holds what `sections` says.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from common.report import table
+from fishd.config import Config
+from fishd.controllers.policy import file, library
+from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
+from fishd.virtual.plant.optimum import square_wave
+from paper import figure_2b, figure_3, figure_4, figure_5, swing_map
+from paper.runs import PLANT, column, read
+
+DOCUMENT = "paper.md"
+SOON, SLOW = 0.02, 100.0
+"""Amplitudes that stand for a small and a large Φ, in units of Φ_s."""
+NEAR = 0.05
+"""A number agrees with one of the paper that differs from it by less than this share."""
+
+
+class Claim(NamedTuple):
+    """A line of the table."""
+
+    paper: str
+    computed: str
+    agrees: bool | None
+    """None where nothing can be compared."""
+
+
+def sections() -> list[tuple[str, str, str]]:
+    """Document, name of the markers, and what belongs between them."""
+    words = {True: "yes", False: "**no**", None: "–"}
+    return [
+        (
+            DOCUMENT,
+            name,
+            table(
+                "the paper | computed here | agrees",
+                ((claim.paper, claim.computed, words[claim.agrees]) for claim in claims()),
+            ),
+        )
+        for name, claims in GROUPS.items()
+    ]
+
+
+def constants() -> Iterator[Claim]:
+    """What the fish is made of; the defaults of the configuration."""
+    stated = (
+        ("ω₀", 12.5, "omega0", "rad/s"),
+        ("ξ", 1.2, "xi", ""),
+        ("λ", 0.46, "coupling", ""),
+        ("Ω", 5.8, "servo_speed", "rad/s"),
+        ("Δ", 0.29, "servo_lag", "rad"),
+        ("K", 12.9e-3, "thrust_coefficient", "N s²/rad²"),
+    )
+    for symbol, value, name, unit in stated:
+        mine = getattr(PLANT, name)
+        yield Claim(
+            f"{symbol} = {value:g} {unit}".rstrip(), f"`plant.{name}` {mine:g}", mine == value
+        )
+    tick = Config().tick
+    yield Claim("one control step every 50 ms", f"`tick` {tick:g} s", tick == 0.05)
+
+
+def equations() -> Iterator[Claim]:
+    """What the equations say, without a tick."""
+    p = PLANT
+    yield _near("Φ_s = Ω/ω₀ = 0.464 rad", saturation_amplitude(p), 0.464, "{:.3f} rad")
+    resonance = p.omega0 / (2.0 * math.pi)
+    yield _near(
+        "fast servo: best frequency ≈ ω₀/2π = 1.99 Hz",
+        float(fast_servo(p, [1.0]).frequency[0]),
+        resonance,
+        "{:.3f} Hz, the maximum of the closed form",
+    )
+    peak = p.omega0 * math.sqrt(1.0 - p.xi**2 / 2.0) / (2.0 * math.pi)
+    yield _near("resonance of the fin angle ≈ 1.1 Hz", peak, 1.1, "{:.3f} Hz")
+    amplitude = SLOW * saturation_amplitude(p)
+    best, limit = best_square_waves(p, [amplitude]), slow_servo(p, [amplitude])
+    ratio = float(best.frequency[0] / limit.frequency[0])
+    yield _near(
+        "slow servo: best frequency Ω/4Φ", ratio, 1.0, f"{{:.4f}} of it at Φ = {SLOW:g} Φ_s"
+    )
+    yield _near(
+        "slow servo: thrust Kλ²Ω² = 91.8 mN",
+        1e3 * float(best.thrust[0]),
+        91.8,
+        f"{{:.2f}} mN at Φ = {SLOW:g} Φ_s",
+    )
+    best = best_square_waves(p, [0.42])
+    thrust, frequency = float(best.thrust[0]), float(best.frequency[0])
+    kept = square_wave(p, 0.42, 1.8).thrust / thrust
+    yield _near(
+        "optimum at Φ = 0.42 rad: about 1.8 Hz",
+        frequency,
+        1.8,
+        f"{{:.3f}} Hz, {1e3 * thrust:.2f} mN; 1.8 Hz gives {kept:.1%} of that",
+    )
+    ends = best_square_waves(p, [SOON * saturation_amplitude(p), 1.57]).frequency
+    yield Claim(
+        "best frequency falls from 2.5 to 1 Hz over the range of Φ",
+        f"from {ends[0]:.2f} Hz (Φ → 0) to {ends[1]:.2f} Hz (Φ = 1.57 rad)",
+        _close(float(ends[0]), 2.5) and _close(float(ends[1]), 1.0),
+    )
+
+
+def control() -> Iterator[Claim]:
+    """The best command of any shape."""
+    cases = read(figure_2b.CASES)
+    full = min(column(cases, "share_of_time_at_limit"))
+    ratios = column(cases, "thrust_over_best_square")
+    side = min(column(cases, "share_of_time_on_side_of_costate"))
+    yield Claim(
+        "the optimum is bang-bang: a square wave between ±Φ",
+        f"in {len(cases)} cases, optimal control has \\|φ_c\\| = Φ in at least {full:.1%} of the "
+        f"time, on the side of the costate in at least {side:.1%}",
+        full >= 0.98 and side >= 0.98,
+    )
+    yield Claim(
+        "… and so its thrust is that of the best square wave",
+        f"{min(ratios):.2%} to {max(ratios):.2%} of it",
+        min(ratios) >= 0.995 and max(ratios) <= 1.005,
+    )
+
+
+def waveforms() -> Iterator[Claim]:
+    """The loop with three waveforms."""
+    for tick in figure_4.TICKS:
+        waves = [
+            column(read(figure_4.NAME, waveform=wave, tick_s=tick), "thrust_mN")
+            for wave in figure_4.WAVES
+        ]
+        frequencies = column(read(figure_4.NAME, waveform="square", tick_s=tick), "frequency_Hz")
+        unlike = [f for f, a, b, c in zip(frequencies, *waves, strict=True) if not a > b > c]
+        where = f"{len(frequencies)} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} Hz"
+        but = f", but not at {', '.join(f'{f:g}' for f in unlike)} Hz" if unlike else ""
+        yield Claim(
+            "at Φ = 0.42 rad, square > sine > triangle at every frequency",
+            f"ticks of {1e3 * tick:g} ms: at {where}{but}",
+            not unlike,
+        )
+    (best,) = read(figure_3.NAME, source=figure_3.LOOP, amplitude_rad=figure_4.AMPLITUDE)
+    yield _near(
+        "optimum at Φ = 0.42 rad: about 1.8 Hz",
+        best["frequency_Hz"],
+        1.8,
+        f"ticks of 50 ms: {{:.3f}} Hz, {best['thrust_mN']:.2f} mN, "
+        f"{best['efficiency']:.1%} of the optimum",
+    )
+
+
+def swinging() -> Iterator[Claim]:
+    """Swinging control."""
+    best = read(figure_5.NAME, C=swing_map.RECOMMENDED)
+    everything = read(figure_5.NAME)
+    for claim, rows, bound in (
+        (swing_map.CLAIMS[0], best, swing_map.NEARLY_BEST),
+        (swing_map.CLAIMS[1], everything, swing_map.GOOD),
+    ):
+        low = min(rows, key=lambda row: row["efficiency"])
+        missed = [row for row in rows if row["efficiency"] <= bound]
+        yield Claim(
+            claim,
+            f"from {low['efficiency']:.1%} up (C = {low['C']:g}, ω₀Φ/Ω = "
+            f"{low['w0Phi_over_Omega']:g}); less in {len(missed)} of {len(rows)} cases",
+            not missed,
+        )
+    (weak,) = read(figure_5.INSET, xi=min(figure_5.DAMPINGS), C=0.0)
+    yield Claim(
+        "ξ → 0, fast servo, C = 0: close to 100 %",
+        f"{weak['efficiency']:.2%} at ξ = {weak['xi']:g}",
+        weak["efficiency"] > swing_map.NEARLY_BEST,
+    )
+
+
+def learning() -> Iterator[Claim]:
+    """PPO, with ticks of 50 ms."""
+    learned = read(figure_3.NAME, source=figure_3.LEARNT)
+    efficiencies = column(learned, "efficiency")
+    full = column(learned, "mean_command_over_limit")
+    yield Claim(
+        "learning finds the square wave between ±Φ",
+        f"mean \\|φ_c\\|/Φ {min(full):.3f} to {max(full):.3f}, thrust {min(efficiencies):.1%} to "
+        f"{max(efficiencies):.1%} of the best square wave, over {len(learned)} amplitudes",
+        min(full) > 0.98 and min(efficiencies) > swing_map.NEARLY_BEST,
+    )
+    steps = [_steps(figure_3.policy(amplitude)) for amplitude in figure_3.LEARNED]
+    yield Claim(
+        "10⁵ control steps, about 2 h",
+        f"{min(steps)} to {max(steps)} steps, {min(steps) * Config().tick / 60:.1f} to "
+        f"{max(steps) * Config().tick / 60:.1f} min of swimming, for the learned points of "
+        f"figure 3; 10⁵ steps are {1e5 * Config().tick / 60:.0f} min",
+        None,
+    )
+    yield Claim(
+        "an update every 768 steps, policy and value saved every 5000 steps",
+        "settings of [learning-paper.yaml](../config/learning-paper.yaml)",
+        None,
+    )
+    yield Claim(
+        "from images: 4 frames of 84 × 84, compressed to 512 numbers",
+        "not part of fishd: an external program can [swim the fish](remote.md)",
+        None,
+    )
+
+
+def _steps(policy: str) -> int:
+    """How long a policy has learned [control steps]."""
+    return file.read(library.find(policy)).card.provenance.steps
+
+
+def _near(paper: str, value: float, stated: float, text: str) -> Claim:
+    return Claim(paper, text.format(value), _close(value, stated))
+
+
+def _close(value: float, stated: float) -> bool:
+    return abs(value - stated) <= NEAR * abs(stated)
+
+
+GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
+    "constants": constants,
+    "equations": equations,
+    "optimal control": control,
+    "waveforms": waveforms,
+    "swinging control": swinging,
+    "learning": learning,
+}

@@ -1,0 +1,139 @@
+"""Figure 3, A to C: thrust, frequency and fin amplitude of the optimum against Φ."""
+
+import numpy as np
+
+from common.report import DOCS
+from fishd.config import Config
+from fishd.lab import drawing
+from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE
+from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
+from fishd.simulation import Report
+from paper.runs import FOLDER, PLANT, Row, Run, column, read, swim_all, write
+
+NAME = "figure-3"
+AMPLITUDES = (0.05, 0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
+LEARNED = (0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
+SHIPPED = 0.42
+"""The amplitude of the policy that comes with fishd; the others are in docs/figures/policies."""
+NEAR = np.linspace(0.8, 1.2, 13)
+"""Frequencies that are tried in the loop, over the best of the equations."""
+SECONDS, SETTLE = 40.0, 10.0
+RANGE = (0.04, 1.57)
+BEST, FAST, SLOW = "best square wave", "fast servo", "slow servo"
+LOOP, SWING, LEARNT = "square wave in the loop", "swing in the loop", "learned, in the loop"
+
+
+def policy(amplitude: float) -> str:
+    """The policy that has learned to swim at an amplitude [rad]."""
+    if amplitude == SHIPPED:
+        return "default-fish"
+    return str(DOCS / "figures" / "policies" / f"amplitude-{amplitude:.2f}.onnx")
+
+
+def run(controller: str, parameters: dict[str, float | str], amplitude: float) -> Run:
+    """With ticks of 50 ms, the default estimator and 1 mN of noise."""
+    return Run(controller, parameters, Config(amplitude_limit=amplitude), SECONDS, SETTLE)
+
+
+def compute(jobs: int) -> None:
+    """Curves from the equations, points from the loop."""
+    angles = np.geomspace(*RANGE, 50)
+    rows: list[Row] = []
+    for source, optima in (
+        (BEST, best_square_waves(PLANT, angles)),
+        (FAST, fast_servo(PLANT, angles)),
+        (SLOW, slow_servo(PLANT, angles)),
+    ):
+        columns = (optima.amplitude, optima.thrust, optima.frequency, optima.fin_amplitude)
+        rows += [_row(source, *values) for values in np.array(columns).T.tolist()]
+    best = best_square_waves(PLANT, AMPLITUDES).frequency
+    squares = swim_all(
+        (
+            run("square", {"frequency": float(factor * frequency)}, amplitude)
+            for amplitude, frequency in zip(AMPLITUDES, best, strict=True)
+            for factor in NEAR
+        ),
+        jobs,
+    )
+    for k in range(0, len(squares), len(NEAR)):
+        rows.append(_of(LOOP, max(squares[k : k + len(NEAR)], key=lambda r: r.mean_thrust)))
+    swings = swim_all((run("swing", {"C": 0.6}, amplitude) for amplitude in AMPLITUDES), jobs)
+    rows += [_of(SWING, report) for report in swings]
+    learned = swim_all((run("ppo", {"policy": policy(a)}, a) for a in LEARNED), jobs)
+    rows += [_of(LEARNT, report) for report in learned]
+    write(NAME, rows)
+
+
+def _of(source: str, report: Report) -> Row:
+    return _row(
+        source,
+        report.amplitude,
+        report.mean_thrust,
+        report.frequency,
+        report.fin_amplitude,
+        report.efficiency,
+        report.fullness,
+    )
+
+
+def _row(
+    source: str, amplitude: float, thrust: float, frequency: float, fin: float, *judged: float
+) -> Row:
+    efficiency, fullness = judged or ("", "")
+    return {
+        "source": source,
+        "amplitude_rad": amplitude,
+        "thrust_mN": 1e3 * thrust,
+        "frequency_Hz": frequency,
+        "fin_amplitude_rad": fin,
+        "efficiency": efficiency,
+        "mean_command_over_limit": fullness,
+    }
+
+
+def draw() -> None:
+    """Three panels side by side."""
+    curves = (
+        (BEST, {"color": BLACK, "lw": 1.6}),
+        (FAST, {"color": GREY, "ls": (0, (4, 2))}),
+        (SLOW, {"color": GREY, "ls": (0, (1, 1.5))}),
+    )
+    points = (
+        (LOOP, {"marker": "s", "mec": BLUE, "mfc": "none", "ms": 6}),
+        (SWING, {"marker": "x", "mec": BLACK, "ms": 5}),
+        (LEARNT, {"marker": "o", "mec": ORANGE, "mfc": ORANGE, "ms": 3.5}),
+    )
+    panels = (
+        ("A", "thrust_mN", "mean thrust (mN)", (0.2, 200)),
+        ("B", "frequency_Hz", "frequency (Hz)", (0.8, 4)),
+        ("C", "fin_amplitude_rad", "fin amplitude (rad)", (0.015, 1)),
+    )
+    with drawing.drawn(FOLDER / f"{NAME}.svg", (9.6, 3.6)) as figure:
+        for axes, (title, name, label, limits) in zip(figure.subplots(1, 3), panels, strict=True):
+            axes.axvline(saturation_amplitude(PLANT), color="0.85", lw=0.8)
+            for source, style in curves:
+                rows = read(NAME, source=source)
+                axes.plot(column(rows, "amplitude_rad"), column(rows, name), label=source, **style)
+            for source, style in points:
+                rows = read(NAME, source=source)
+                axes.plot(
+                    column(rows, "amplitude_rad"), column(rows, name), ls="", label=source, **style
+                )
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xlim(RANGE[0], 1.7)
+            axes.set_ylim(limits)
+            axes.set_xticks((0.05, 0.1, 0.2, 0.5, 1.0), ("0.05", "0.1", "0.2", "0.5", "1"))
+            axes.set_xticks((), minor=True)
+            axes.set_xlabel("amplitude Φ (rad)")
+            axes.set_ylabel(label)
+            axes.set_title(title)
+            if name == "frequency_Hz":
+                axes.set_yticks((1, 1.5, 2, 3, 4), ("1", "1.5", "2", "3", "4"))
+                axes.set_yticks((), minor=True)
+            else:
+                ticks = (1, 10, 100) if name == "thrust_mN" else (0.02, 0.05, 0.1, 0.2, 0.5, 1)
+                axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+            axes.text(saturation_amplitude(PLANT), limits[0], " $Φ_s$", va="bottom", color="0.4")
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=6)

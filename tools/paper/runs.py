@@ -1,0 +1,89 @@
+"""Runs of the robot's own loop on a simulated fish, side by side, and tables of what they gave."""
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import joblib
+
+from common.report import DOCS
+from fishd.config import Config
+from fishd.control.estimators.base import EstimatorSettings
+from fishd.simulation import Report, simulate
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.plant.parameters import PlantParameters
+
+FOLDER = DOCS / "figures"
+PLANT = PlantParameters()
+FINE_TICK = 0.005
+"""Of runs that stand for continuous time [s]."""
+PERFECT = SimulationSettings(noise=0.0)
+TRUE_VELOCITY = EstimatorSettings(
+    leak=PLANT.thrust_coefficient / PLANT.lateral_drag, bias_time=1000.0
+)
+"""The estimator that gives the true fin velocity, where the sensor has no noise and no offset."""
+Row = Mapping[str, float | str]
+
+
+class Run(NamedTuple):
+    """Who swims, on which fish, for how long."""
+
+    controller: str
+    parameters: dict[str, Any]
+    config: Config
+    seconds: float
+    settle: float
+
+
+def swim(run: Run) -> Report:
+    """One run; raises SystemExit where it ended in mode fault or another controller took over."""
+    report = simulate(run.config, run.controller, run.parameters, run.seconds, run.settle)
+    if trouble := report.reason or report.fallback:
+        raise SystemExit(f"{run.controller} {run.parameters}: {trouble.message}")
+    return report
+
+
+def swim_all(runs: Iterable[Run], jobs: int) -> list[Report]:
+    """All of them, in their order, on `jobs` cores."""
+    chosen: list[Report] = joblib.Parallel(jobs)(joblib.delayed(swim)(run) for run in runs)
+    return chosen
+
+
+def write(name: str, rows: Sequence[Row]) -> None:
+    """Write docs/figures/NAME.csv; the columns are the keys of the first row.
+
+    Four or five digits, so that the file is the same on every machine.
+    """
+    with (FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        table.writeheader()
+        table.writerows({key: _spelled(value) for key, value in row.items()} for row in rows)
+
+
+def read(name: str, **having: str | float) -> list[dict[str, Any]]:
+    """The rows of docs/figures/NAME.csv in which columns have given values; numbers as numbers."""
+    with (FOLDER / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+        rows = [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(file)]
+    return [row for row in rows if all(row[key] == value for key, value in having.items())]
+
+
+def column(rows: Iterable[Mapping[str, Any]], name: str) -> list[Any]:
+    """One column of some rows."""
+    return [row[name] for row in rows]
+
+
+def _spelled(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
+    if value == 0.0 or abs(value) < 1e-9:
+        return "0"
+    digits = max(0, 4 - math.floor(math.log10(abs(value))))
+    return f"{value:.{digits}f}".rstrip("0").rstrip(".") if digits else f"{value:.0f}"
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,0 +1,176 @@
+"""How near `swing` comes to the best square wave in the robot's own loop, for each C and amplitude.
+
+Each number is the median of several runs on a simulated fish with an imperfect force sensor; the
+runs differ in the seed of noise and drift.
+"""
+
+import csv
+import itertools
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from common.report import DOCS, table
+from fishd.config import Config
+from fishd.lab import drawing
+from fishd.lab.optimum import saturation_amplitude
+from fishd.virtual.imperfections import SimulationSettings
+from paper.runs import FOLDER, PERFECT, PLANT, Run, column, read, swim_all, write
+
+NAME = "swing-map"
+DOCUMENT = "swing-efficiency.md"
+REFERENCE = DOCS.parent / "tests" / "reference" / "swing_efficiency.csv"
+
+CRITERIA = tuple(tenths / 10 for tenths in range(11))
+"""C."""
+RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2.0, 3.0)
+"""ω₀Φ/Ω."""
+REAL = SimulationSettings(noise=0.001, offset_y=0.02, drift=0.02)
+SEEDS = 10
+SECONDS, SETTLE = 200.0, 20.0
+"""What is judged is three periods of the drift long."""
+
+RECOMMENDED, NEARLY_BEST = 0.6, 0.95
+"""The paper: C = 0.6 gives over 95 % of the optimum for every ω₀Φ/Ω."""
+ANY_UPTO, GOOD = 0.8, 0.7
+"""The paper: any C in 0 … 0.8 gives over 70 %."""
+CLAIMS = (
+    f"C = {RECOMMENDED:g}: over {100 * NEARLY_BEST:g} % for every ω₀Φ/Ω",
+    f"any C in 0 … {ANY_UPTO:g}: over {100 * GOOD:g} %",
+)
+_SHAPE = (len(CRITERIA), len(RATIOS))
+
+Array = NDArray[np.float64]
+
+
+def run(criterion: float, ratio: float, rig: SimulationSettings) -> Run:
+    """Of `swing` with ticks of 50 ms."""
+    config = Config(amplitude_limit=ratio * saturation_amplitude(PLANT), simulation=rig)
+    return Run("swing", {"C": criterion}, config, SECONDS, SETTLE)
+
+
+def compute(jobs: int) -> None:
+    """The map of the imperfect rig, and of a perfect one."""
+    rigs = [PERFECT, *(msgspec.structs.replace(REAL, seed=seed) for seed in range(SEEDS))]
+    cells = list(itertools.product(CRITERIA, RATIOS))
+    reports = swim_all((run(*cell, rig) for cell in cells for rig in rigs), jobs)
+    found = np.array([report.efficiency for report in reports]).reshape(len(cells), len(rigs))
+    exact = _continuous_time()
+    write(
+        NAME,
+        [
+            {
+                "C": criterion,
+                "w0Phi_over_Omega": ratio,
+                "median": float(np.median(real)),
+                "lowest": float(real.min()),
+                "highest": float(real.max()),
+                "perfect_sensor": float(perfect),
+                "continuous_time": exact.get((criterion, ratio), ""),
+            }
+            for (criterion, ratio), (perfect, *_), real in zip(
+                cells, found, found[:, 1:], strict=True
+            )
+        ],
+    )
+
+
+def _continuous_time() -> dict[tuple[float, float], float]:
+    """The same with the true fin velocity and no tick, where it was computed."""
+    with REFERENCE.open(newline="", encoding="utf-8") as file:
+        return {
+            (float(row["C"]), float(row["w0Phi_over_Omega"])): float(row["efficiency"])
+            for row in csv.DictReader(file)
+        }
+
+
+def _map(name: str) -> Array:
+    """A column of the table, of shape (criteria, ratios); NaN where there is nothing."""
+    values = [np.nan if value == "" else value for value in column(read(NAME), name)]
+    return np.array(values, dtype=np.float64).reshape(_SHAPE)
+
+
+def draw() -> None:
+    """The map of medians."""
+    from matplotlib.patches import Rectangle
+
+    median = _map("median")
+    with drawing.drawn(FOLDER / f"{NAME}.svg", (8, 6)) as figure:
+        axes = figure.subplots()
+        axes.spines[:].set_visible(False)
+        image = axes.pcolormesh(
+            100 * median, cmap="cividis", vmin=50, vmax=100, edgecolor="white", lw=0.3
+        )
+        for (row, each), value in np.ndenumerate(median):
+            colour = "black" if value > 0.75 else "white"
+            weight = "bold" if value > NEARLY_BEST else "normal"
+            text = axes.text(each + 0.5, row + 0.5, percent(value), color=colour, weight=weight)
+            text.set(ha="center", va="center", fontsize=10)
+        row = CRITERIA.index(RECOMMENDED)
+        axes.add_patch(Rectangle((0.02, row + 0.02), len(RATIOS) - 0.04, 0.96, fill=False, lw=2))
+        angles = [ratio * saturation_amplitude(PLANT) for ratio in RATIOS]
+        labels = [f"{r:g}\n{angle:.3f}" for r, angle in zip(RATIOS, angles, strict=True)]
+        axes.set_xticks(np.arange(len(RATIOS)) + 0.5, labels)
+        axes.set_yticks(np.arange(len(CRITERIA)) + 0.5, [f"{c:g}" for c in CRITERIA])
+        axes.tick_params(length=0)
+        axes.set_xlabel("ω₀Φ/Ω (1)\namplitude Φ (rad)")
+        axes.set_ylabel("swing criterion C (1)")
+        axes.set_title("Thrust of swing, in % of the best square wave")
+        figure.colorbar(image, extend="min", label="%  (bold: over 95 %)")
+
+
+def verdicts(median: Array) -> tuple[str, str]:
+    """What a map says to each of the claims."""
+    best, floor = median[CRITERIA.index(RECOMMENDED)], median[: CRITERIA.index(ANY_UPTO) + 1]
+    missed = [f"{RATIOS[i]:g}" for i in np.flatnonzero(best <= NEARLY_BEST)]
+    low = [f"C = {CRITERIA[i]:g} at {RATIOS[j]:g}" for i, j in np.argwhere(floor <= GOOD)]
+    return (
+        f"from {percent(np.nanmin(best))} % up; "
+        + (f"less at ω₀Φ/Ω = {', '.join(missed)}" if missed else "holds"),
+        f"from {percent(np.nanmin(floor))} % up; "
+        + (f"less for {', '.join(low)}" if low else "holds"),
+    )
+
+
+def percent(value: float, exact: float = np.nan) -> str:
+    """A share in percent, and in brackets what it should be; a dash where there is none."""
+    known = "" if np.isnan(exact) else f" ({percent(exact)})"
+    return "–" if np.isnan(value) else f"{100 * value:.1f}{known}"
+
+
+def sections() -> list[tuple[str, str, str]]:
+    """Document, name of the markers, and what belongs between them."""
+    median, exact, perfect = _map("median"), _map("continuous_time"), _map("perfect_sensor")
+    spread = _map("highest") - _map("lowest")
+    widest = np.unravel_index(np.argmax(spread), spread.shape)
+    row = CRITERIA.index(RECOMMENDED)
+    ratios = [f"{ratio:g}" for ratio in RATIOS]
+    everything = table(
+        " | ".join(["C \\ ω₀Φ/Ω", *ratios]),
+        (
+            [f"{c:g}", *map(percent, *both)]
+            for c, *both in zip(CRITERIA, median, exact, strict=True)
+        ),
+    )
+    claims = table(
+        "the paper | imperfect sensor | perfect sensor | continuous time",
+        zip(CLAIMS, *map(verdicts, (median, perfect, exact)), strict=True),
+    )
+    details = table(
+        " | ".join(["ω₀Φ/Ω", *ratios]),
+        [
+            ["amplitude Φ, rad", *(f"{x * saturation_amplitude(PLANT):.3f}" for x in RATIOS)],
+            ["imperfect sensor, median", *map(percent, median[row])],
+            ["imperfect sensor, worst seed", *map(percent, _map("lowest")[row])],
+            ["perfect sensor", *map(percent, perfect[row])],
+            ["continuous time", *map(percent, exact[row])],
+        ],
+    )
+    every = (
+        f"{everything}\n\nEach cell is the median of {SEEDS} runs; two of one cell differ by no "
+        f"more than {percent(spread[widest])} points "
+        f"(C = {CRITERIA[widest[0]]:g} and ω₀Φ/Ω = {RATIOS[widest[1]]:g})."
+    )
+    detailed = f"{claims}\n\nC = {RECOMMENDED:g} in detail, in %:\n\n{details}"
+    return [(DOCUMENT, "swing map", every), (DOCUMENT, "swing claims", detailed)]
