@@ -69,10 +69,11 @@ def drawn(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator["
     with rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         yield figure
-        _save(figure, Path(path))
+        save(figure, Path(path))
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save(figure: "Figure", path: Path) -> None:
+    """Write a figure; raises `FishdError`."""
     dates: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
     try:
         figure.savefig(path, dpi=DOTS_PER_INCH, metadata=dates.get(path.suffix.lower()))
