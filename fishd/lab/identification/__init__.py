@@ -3,8 +3,8 @@
 `identify` fits what was recorded, `experiment` lets a fish swim what tells most about it.
 """
 
+from fishd.lab.identification.estimation import DEFAULT, check, identify
 from fishd.lab.identification.experiment import experiment
-from fishd.lab.identification.identify import DEFAULT, check, identify
 from fishd.lab.identification.passages import Unidentifiable
 from fishd.lab.identification.result import Channel, Estimate, Fit, Identification
 

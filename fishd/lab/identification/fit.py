@@ -70,12 +70,11 @@ class Problem:
     """
 
     def __init__(self, passages: Sequence[Passage], names: Sequence[str], settle: float) -> None:
-        """settle: how long a passage that begins while the tail moves is not judged [s]"""
+        """settle: how long the beginning of a passage is not judged [s]"""
         self.names = tuple(names)
         self.noise = (Noise(1.0, 0.1, 0.005), Noise(1.0, 0.1, 0.005))
         self._passages = [
-            (one, 0 if one.at_rest else int(np.searchsorted(one.ends[1:] * one.tick, settle)))
-            for one in passages
+            (one, int(np.searchsorted(one.ends[1:] * one.tick, settle))) for one in passages
         ]
         self._cached: tuple[dict[str, float], list[Array]] | None = None
 

@@ -41,8 +41,6 @@ class Passage:
     """Mean F_x and F_y of each window as measured [N], shape (2, windows)."""
     times: Array
     """When each window ended, since the first tick of all [s], shape (windows,)."""
-    at_rest: bool
-    """True where the tail stood still as it began, so that its state is known."""
 
     @property
     def duration(self) -> float:
@@ -115,7 +113,6 @@ def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) 
     phi_c = columns["phi_c"][rows].astype(float)
     # The command of a tick acts until the next one; the forces of a tick are those before it.
     commands = np.repeat(phi_c[:-1], slots)
-    still = max(1, round(2.0 / tick))
     forces = np.stack((columns["fx"][rows], columns["fy"][rows])).astype(float)[:, 1:]
     times = begin + (columns["t"][rows][1:] - columns["t"][0]).astype(float)
     return Passage(
@@ -125,5 +122,4 @@ def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) 
         ends=np.concatenate(([0], np.cumsum(slots))),
         forces=forces,
         times=times,
-        at_rest=bool(len(commands) > still and not commands[:still].any()),
     )

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
 from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Problem, solve
-from fishd.lab.identification.passages import Passage, Unidentifiable, passages
+from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
 from fishd.lab.identification.response import Array
 from fishd.lab.identification.result import UNITS, Channel, Estimate, Fit, Identification
 from fishd.virtual.plant.parameters import PlantParameters
@@ -27,7 +27,7 @@ POSSIBLE = tuple(BOUNDS)
 
 _Z = 1.96
 _SETTLE = 2.0
-"""How long a passage is not judged that begins while the tail moves, at first [s]."""
+"""How long the beginning of a passage is not judged, since nobody knows what was before [s]."""
 _LONGEST_SETTLE = 20.0
 _FORGOTTEN = 7.0
 """Time constants of the fin after which its start is forgotten."""
@@ -70,8 +70,9 @@ def identify(
     values = {name: float(known[name]) for name in POSSIBLE}
     problem, values = _solved(parts, names, values)
     settle = _settling(values)
-    if settle > _SETTLE and not all(one.at_rest for one in parts):
-        problem = Problem(parts, names, settle)
+    if settle > _SETTLE:
+        longer = [one for one in parts if one.duration > settle + SHORTEST]
+        problem = Problem(longer or parts, names, settle if longer else _SETTLE)
         values = solve(problem, values)
     return _summary(parts, problem, values)
 
