@@ -14,6 +14,7 @@ NAMES = (
     "remote",
     "learning",
     "chatter",
+    "measurement",
     "sweep",
     "identification",
     "estimators",
