@@ -12,8 +12,8 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd.assembly import build_estimator
 from fishd.config import Config, adopt
-from fishd.control.estimators.lateral_force import LateralForceEstimator
 from fishd.control.guard import Guard
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
@@ -163,7 +163,7 @@ class _Rerun:
         recorded = self._run.config_of(self._number)
         self._config: Config = adopt(self._run.configs[self._number], self._overrides)
         self._estimates_again = self._config.estimator != recorded.estimator
-        self._estimator = LateralForceEstimator(self._config.estimator)
+        self._estimator = build_estimator(self._config)
         self.estimates.from_start &= tick.seq == 1
         config = self._config
         self._guard = Guard(

@@ -43,7 +43,7 @@ def test_verbs_stand_below_headings_that_say_what_one_wants() -> None:
     ("words", "meant"),
     [
         (["setcontroller"], "set-controller"),
-        (["learn", "evalute"], "evaluate"),
+        (["learn", "exprt"], "export"),
         (["config", "chek"], "check"),
         (["calibrate", "forces"], "force"),
         (["status", "--jsn"], "--json"),
