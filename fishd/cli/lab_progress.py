@@ -14,9 +14,13 @@ if TYPE_CHECKING:
 class Lines:
     """A line for each thing that is done, for logs and pipes."""
 
+    def __init__(self, err: bool) -> None:
+        """err: on standard error"""
+        self._err = err
+
     def done(self, line: str, amount: float) -> None:
         """Say what was done; amount: how much of the total is done by now."""
-        echo(line)
+        echo(line, err=self._err)
 
     def at(self, amount: float) -> None:
         """Say how much of the total is done by now."""
@@ -26,6 +30,7 @@ class Bar(Lines):
     """The same above a bar."""
 
     def __init__(self, progress: "Progress", task: "TaskID") -> None:
+        super().__init__(err=False)
         self._progress = progress
         self._task = task
 
@@ -41,11 +46,16 @@ class Bar(Lines):
 
 
 @contextmanager
-def showing(total: float, unit: str) -> Iterator[Lines]:
-    """A bar where standard output is a terminal, else lines; total: in `unit`."""
-    if not sys.stdout.isatty():
-        yield Lines()
+def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
+    """A bar where it can be seen, else lines.
+
+    total: in `unit`; err: on standard error, since the output is for a program
+    """
+    stream = sys.stderr if err else sys.stdout
+    if not stream.isatty():
+        yield Lines(err)
         return
+    from rich.console import Console
     from rich.progress import (
         BarColumn,
         Progress,
@@ -62,5 +72,5 @@ def showing(total: float, unit: str) -> Iterator[Lines]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns) as progress:
+    with Progress(*columns, console=Console(file=stream)) as progress:
         yield Bar(progress, progress.add_task("", total=total))

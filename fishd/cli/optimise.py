@@ -127,7 +127,7 @@ def _optimise(
     from fishd.lab.measurement import REST
     from fishd.lab.optimise.folder import SearchFolder, draw
     from fishd.lab.optimise.search import Search
-    from fishd.lab.optimise.trials import trials
+    from fishd.lab.optimise.trials import lengths, trials
 
     refuse_other(on, {"--config": file, "--set": overrides}, {})
     path = folder or Path("runs") / f"optimise-{datetime.now():%Y%m%d-%H%M%S}"
@@ -138,11 +138,15 @@ def _optimise(
             for end in ("low", "high"):
                 ends = {each.name: getattr(each, end) for each in ranges}
                 registry.check(name, {**parameters, **ends}, load(file, overrides).limits)
+        if budget < (least := 2.0 * REST + lengths(parameters)[1]):
+            raise ParameterError(
+                f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"
+            )
         run = SearchFolder(path, rig.name, config, [each.name for each in ranges])
         found, whole = None, True
         last: Trial | None = None
         try:
-            with interrupted_once(), rig, run, showing(budget, "s") as show:
+            with interrupted_once(), rig, run, showing(budget, "s", err=as_json) as show:
                 show.at(REST)
                 for last in trials(rig, name, parameters, search, budget):
                     run.keep(last)
@@ -155,7 +159,7 @@ def _optimise(
             whole = False
     if last is None or found is None:
         if whole:
-            raise ParameterError(f"a budget of {budget:g} s is too short for a single candidate")
+            raise ParameterError(f"a budget of {budget:g} s is too short for the first candidate")
         echo("fishctl: stopped before the first candidate was measured", err=True)
         return INTERRUPTED
     optimum = _optimum(name, search.trials, last, found)

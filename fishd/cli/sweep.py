@@ -1,7 +1,5 @@
 """The verb that measures thrust over a grid of parameters, and proposes the best."""
 
-import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -12,20 +10,16 @@ import click
 import msgspec
 
 from fishd.cli.config import set_option
-from fishd.cli.lab_progress import Lines, showing
 from fishd.cli.options import ControllerGroup, endpoint_option, json_option
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.sweep_output import again, conclude, telling
 from fishd.client import Fish
 from fishd.config import Config, load
-from fishd.core.console import INTERRUPTED
-from fishd.core.errors import FishdError, NoDaemon
+from fishd.core.errors import ConfigError, FishdError, NoDaemon
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
-    from fishd.lab.sweep.curves import Best
     from fishd.lab.sweep.folder import Begun, SweepFolder
     from fishd.lab.sweep.grid import Point
-    from fishd.lab.sweep.measuring import Result
 
 ON = click.option(
     "--on",
@@ -128,16 +122,17 @@ def _sweep(
     path = folder or Path("runs") / f"sweep-{datetime.now():%Y%m%d-%H%M%S}"
     if on == "robot":
         found = grid.points(names, parameters, takes)
-        whole, kept = _on_robot(path, found, seconds or 30.0, endpoint)
+        whole, kept = _on_robot(path, found, seconds or 30.0, endpoint, as_json)
         error_of = "the measurement"
     else:
         keys = dict(_varied(text) for text in vary)
         found = grid.points(names, parameters, takes, keys)
         lengths = {"settle": settle, "periods": periods}
-        whole, kept = _in_simulation(path, found, file, overrides, lengths, jobs, cluster)
+        crew = {"jobs": jobs, "cluster": cluster}
+        whole, kept = _in_simulation(path, found, file, overrides, lengths, crew, as_json)
         error_of = "the mean over beats"
     units = {field.name: field.unit for info in infos for field in info.parameters}
-    return _conclude(kept, found, units, error_of, whole, as_json)
+    return conclude(kept, found, units, error_of, whole, as_json)
 
 
 def refuse_other(on: str, of_simulation: dict[str, Any], of_robot: dict[str, Any]) -> None:
@@ -165,8 +160,8 @@ def _in_simulation(
     file: Path | None,
     overrides: tuple[str, ...],
     given: dict[str, Any],
-    jobs: int | None,
-    cluster: str | None,
+    crew: dict[str, Any],
+    err: bool,
 ) -> "tuple[bool, SweepFolder]":
     from fishd.lab.sweep import grid, running
     from fishd.lab.sweep.folder import Begun
@@ -178,18 +173,32 @@ def _in_simulation(
     for point in found:
         changed = tuple(point.keys.items())
         if changed not in fish:
-            fish[changed] = load(file, (*overrides, *(f"{k}={v}" for k, v in changed)))
+            fish[changed] = _fish_of(point, file, overrides)
         grid.check(point, fish[changed])
         pairs.append((point, fish[changed]))
     config = msgspec.to_builtins(load(file, overrides))
     begun = Begun("simulation", config, msgspec.to_builtins(lengths))
-    with _opened(path, begun, found) as folder, _showing(folder, found, "points", 1.0) as count:
-        whole = running.in_simulation(folder, pairs, lengths, count.done, jobs, cluster)
+    with (
+        _opened(path, begun, found) as folder,
+        telling(folder, found, "points", 1.0, err) as count,
+    ):
+        whole = running.in_simulation(folder, pairs, lengths, count.done, **crew)
     return whole, folder
 
 
+def _fish_of(point: "Point", file: Path | None, overrides: tuple[str, ...]) -> Config:
+    pairs = [f"{key}={value}" for key, value in point.keys.items()]
+    try:
+        return load(file, (*overrides, *pairs))
+    except ConfigError as error:
+        message = str(error)
+        for pair in pairs:
+            message = message.replace(f"--set {pair}", f"--vary {pair}")
+        raise ConfigError(message) from None
+
+
 def _on_robot(
-    path: Path, found: "list[Point]", seconds: float, endpoint: str | None
+    path: Path, found: "list[Point]", seconds: float, endpoint: str | None, err: bool
 ) -> "tuple[bool, SweepFolder]":
     from fishd.lab.measurement import plan
     from fishd.lab.rig import Disturbed, LiveRig
@@ -201,13 +210,16 @@ def _on_robot(
     with Fish(endpoint) as fish:
         unit = fish.status().force_unit
         begun = Begun("robot", fish.config(), {"seconds": seconds}, unit)
-        with _opened(path, begun, found) as folder, _showing(folder, found, "s", seconds) as count:
+        with (
+            _opened(path, begun, found) as folder,
+            telling(folder, found, "s", seconds, err) as count,
+        ):
             try:
                 whole = running.on_robot(
                     folder, found, LiveRig(fish), seconds, count.done, count.at
                 )
             except (Disturbed, NoDaemon) as error:
-                raise FishdError(f"{error}; to go on: {_again(path)}") from None
+                raise FishdError(f"{error}; to go on: {again(path)}") from None
     return whole, folder
 
 
@@ -220,106 +232,3 @@ def _opened(path: Path, begun: "Begun", found: "list[Point]") -> "Iterator[Sweep
         folder = SweepFolder(path, begun, list(columns))
         yield folder
         folder.sort(found)
-
-
-class _Count:
-    """Tells what is done, point by point."""
-
-    def __init__(self, show: Lines, before: int, each: float, unit: str) -> None:
-        self._show = show
-        self._finished = before
-        self._each = each
-        self._unit = unit
-
-    def done(self, point: "Point", result: "Result") -> None:
-        """A point is done."""
-        self._finished += 1
-        self._show.done(
-            f"{point.label()}: {_figures(result, self._unit)}", self._finished * self._each
-        )
-
-    def at(self, seconds: float) -> None:
-        """The present point has taken so long [s]."""
-        self._show.at(self._finished * self._each + seconds)
-
-
-@contextmanager
-def _showing(
-    folder: "SweepFolder", found: "list[Point]", unit: str, each: float
-) -> "Iterator[_Count]":
-    """each: what a point counts, in `unit`."""
-    before = sum(folder.key(point) in folder.results for point in found)
-    there = f", {before} of them there already" if before else ""
-    echo(f"{folder.path}: {counted(len(found), 'point')}{there}")
-    with showing(len(found) * each, unit) as show:
-        show.at(before * each)
-        yield _Count(show, before, each, folder.begun.force_unit)
-
-
-def _figures(result: "Result", unit: str) -> str:
-    if result.thrust is None:
-        return f"no thrust: {result.trouble}"
-    error = "" if result.error is None else f" ± {result.error * 1e3:.2f}"
-    beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
-    return f"{result.thrust * 1e3:.2f}{error} m{unit}{beats}"
-
-
-def _conclude(
-    folder: "SweepFolder",
-    found: "list[Point]",
-    units: dict[str, str],
-    error_of: str,
-    whole: bool,
-    as_json: bool,
-) -> int:
-    """Draw what there is, and say what is best; the exit status."""
-    from fishd.lab.sweep import curves, figure
-
-    drawn = curves.curves(folder, found)
-    unit = folder.begun.force_unit
-    bests = [(curve, best) for curve in drawn if (best := curves.best(curve))]
-    pictures = []
-    if bests:
-        stem = folder.path / "thrust"
-        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
-    if as_json:
-        print_json([best for _, best in bests])
-    else:
-        for curve, best in bests:
-            echo(f"{curve.label}: {_proposal(best, units.get(best.over, ''), unit)}")
-        echo(f"table: {folder.path / 'points.csv'}")
-        if pictures:
-            echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
-    if not whole:
-        done = sum(folder.key(point) in folder.results for point in found)
-        echo(
-            f"fishctl: stopped after {done} of {counted(len(found), 'point')}; to go on: "
-            f"{_again(folder.path)}",
-            err=True,
-        )
-        return INTERRUPTED
-    troubles = [point for point in found if folder.results[folder.key(point)].trouble]
-    return 1 if troubles else 0
-
-
-def _proposal(best: "Best", unit: str, force_unit: str) -> str:
-    symbol = "" if unit in ("", "1") else f" {unit}"
-    error = "" if best.error is None else f" ± {best.error * 1e3:.2f}"
-    thrust = f"{best.thrust * 1e3:.2f}{error} m{force_unit}"
-    if best.at_edge:
-        return (
-            f"best measured at {best.over} {best.x:g}{symbol}, {thrust}: at the edge of the grid, "
-            "so the best may lie beyond it"
-        )
-    if best.x_low is None or best.x_high is None:
-        return f"best measured at {best.over} {best.x:.4g}{symbol}: {thrust}"
-    interval = f"[{best.x_low:.4g}, {best.x_high:.4g}]"
-    return f"best {best.over} {best.x:.4g}{symbol} {interval}: {thrust}"
-
-
-def _again(folder: Path) -> str:
-    """The command line that goes on with a sweep."""
-    words = sys.argv[1:]
-    if not any(word == "--folder" or word.startswith("--folder=") for word in words):
-        words = [*words, "--folder", str(folder)]
-    return shlex.join(["fishctl", *words])

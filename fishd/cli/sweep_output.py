@@ -1,0 +1,121 @@
+"""What `fishctl sweep` says: each point as it is done, and what is best in the end."""
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fishd.cli.lab_progress import Lines, showing
+from fishd.cli.output import counted, echo, print_json
+from fishd.core.console import INTERRUPTED
+
+if TYPE_CHECKING:
+    from fishd.lab.sweep.curves import Best
+    from fishd.lab.sweep.folder import SweepFolder
+    from fishd.lab.sweep.grid import Point
+    from fishd.lab.sweep.measuring import Result
+
+
+class Count:
+    """Tells what is done, point by point."""
+
+    def __init__(self, show: Lines, before: int, each: float, unit: str) -> None:
+        self._show = show
+        self._finished = before
+        self._each = each
+        self._unit = unit
+
+    def done(self, point: "Point", result: "Result") -> None:
+        """A point is done."""
+        self._finished += 1
+        self._show.done(
+            f"{point.label()}: {_figures(result, self._unit)}", self._finished * self._each
+        )
+
+    def at(self, seconds: float) -> None:
+        """The present point has taken so long [s]."""
+        self._show.at(self._finished * self._each + seconds)
+
+
+@contextmanager
+def telling(
+    folder: "SweepFolder", found: "list[Point]", unit: str, each: float, err: bool
+) -> "Iterator[Count]":
+    """each: what a point counts, in `unit`."""
+    before = sum(folder.key(point) in folder.results for point in found)
+    there = f", {before} of them there already" if before else ""
+    echo(f"{folder.path}: {counted(len(found), 'point')}{there}", err=err)
+    with showing(len(found) * each, unit, err=err) as show:
+        show.at(before * each)
+        yield Count(show, before, each, folder.begun.force_unit)
+
+
+def _figures(result: "Result", unit: str) -> str:
+    if result.thrust is None:
+        return f"no thrust: {result.trouble}"
+    error = "" if result.error is None else f" ± {result.error * 1e3:.2f}"
+    beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
+    return f"{result.thrust * 1e3:.2f}{error} m{unit}{beats}"
+
+
+def conclude(
+    folder: "SweepFolder",
+    found: "list[Point]",
+    units: dict[str, str],
+    error_of: str,
+    whole: bool,
+    as_json: bool,
+) -> int:
+    """Draw what there is, and say what is best; the exit status."""
+    from fishd.lab.sweep import curves, figure
+
+    drawn = curves.curves(folder, found)
+    unit = folder.begun.force_unit
+    bests = [(curve, best) for curve in drawn if (best := curves.best(curve))]
+    pictures = []
+    if bests:
+        stem = folder.path / "thrust"
+        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
+    if as_json:
+        print_json([best for _, best in bests])
+    else:
+        for curve, best in bests:
+            echo(f"{curve.label}: {_proposal(best, units.get(best.over, ''), unit)}")
+        echo(f"table: {folder.path / 'points.csv'}")
+        if pictures:
+            echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
+    if not whole:
+        done = sum(folder.key(point) in folder.results for point in found)
+        echo(
+            f"fishctl: stopped after {done} of {counted(len(found), 'point')}; to go on: "
+            f"{again(folder.path)}",
+            err=True,
+        )
+        return INTERRUPTED
+    troubles = [point for point in found if folder.results[folder.key(point)].trouble]
+    return 1 if troubles else 0
+
+
+def _proposal(best: "Best", unit: str, force_unit: str) -> str:
+    symbol = "" if unit in ("", "1") else f" {unit}"
+    error = "" if best.error is None else f" ± {best.error * 1e3:.2f}"
+    thrust = f"{best.thrust * 1e3:.2f}{error} m{force_unit}"
+    if best.at_edge:
+        return (
+            f"best measured at {best.over} {best.x:g}{symbol}, {thrust}: at the edge of the grid, "
+            "so the best may lie beyond it"
+        )
+    if best.x_low is None or best.x_high is None:
+        return f"best measured at {best.over} {best.x:.4g}{symbol}: {thrust}"
+    interval = f"[{best.x_low:.4g}, {best.x_high:.4g}]"
+    return f"best {best.over} {best.x:.4g}{symbol} {interval}: {thrust}"
+
+
+def again(folder: Path) -> str:
+    """The command line that goes on with a sweep."""
+    words = sys.argv[1:]
+    if not any(word == "--folder" or word.startswith("--folder=") for word in words):
+        words = [*words, "--folder", str(folder)]
+    return shlex.join(["fishctl", *words])

@@ -1,0 +1,90 @@
+"""The search of the best parameters: few ticks of swimming, honest about what it does not know."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rigs.processes import fishctl, one_line
+
+from fishd.config import load
+from fishd.lab.optimise.search import Range, Search
+from fishd.lab.optimise.trials import trials, whole_ticks
+from fishd.lab.rig import VirtualRig
+from fishd.recording import read
+from fishd.simulation import simulate
+
+BEST = 25.736e-3
+"""Of the default fish, by a square wave of whole ticks, at 1.667 Hz [N]."""
+
+
+@pytest.mark.slow
+def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
+    generator = np.random.default_rng(3)
+    search = Search([Range("frequency", 0.5, 5.0), Range("amplitude", 0.1, 0.4)], seed=1)
+    for _ in range(11):
+        found = search.suggest()
+        thrust = 0.02 * np.exp(-4.0 * np.log(found["frequency"] / 1.7) ** 2)
+        thrust *= 1.0 - 20.0 * (found["amplitude"] - 0.3) ** 2
+        search.observe(found, thrust + generator.normal(0.0, 0.3e-3), 0.6e-3)
+    best = search.proposal()
+    assert best.parameters == pytest.approx({"frequency": 1.7, "amplitude": 0.3}, rel=0.15)
+    for name, truth in (("frequency", 1.7), ("amplitude", 0.3)):
+        assert best.low[name] <= truth <= best.high[name]
+    assert best.thrust == pytest.approx(0.02, abs=2.0 * best.error)
+
+
+def test_candidates_have_half_beats_of_whole_ticks_within_their_range() -> None:
+    ranges = [Range("frequency", 0.4, 4.0)]
+    assert whole_ticks({"frequency": 1.7}, ranges, 0.05) == {"frequency": pytest.approx(10 / 6)}
+    assert whole_ticks({"frequency": 3.99}, ranges, 0.05) == {"frequency": pytest.approx(10 / 3)}
+    assert whole_ticks({"C": 0.61}, [Range("C", 0.0, 1.0)], 0.05) == {"C": 0.61}
+
+
+@pytest.mark.slow
+def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
+    config = load("config/simulated.yaml")
+    search = Search([Range("frequency", 0.4, 5.0)], seed=1)
+    swum = 0
+    with VirtualRig(config) as rig:
+        for trial in trials(rig, "square", {}, search, 300.0):
+            swum, found = trial.swum, search.proposal()
+            if search.is_warm and found.improvement < 0.01:
+                break
+    assert swum <= 360
+    truth = simulate(config, "square", found.parameters).mean_thrust
+    assert truth >= 0.97 * BEST
+    assert found.thrust == pytest.approx(truth, abs=2.0 * found.error)
+
+
+@pytest.mark.slow
+def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    done = fishctl(*words, "--budget", "22")
+    assert done.returncode == 1
+    assert "the budget of 22 s is used" in done.stderr
+    assert "true thrust there" in done.stdout
+    rows = (folder / "trials.csv").read_text().splitlines()
+    assert rows[0] == "frequency,thrust,error,swum,passed"
+    passed = float(rows[-1].rpartition(",")[2])
+    assert len(read(folder / "search.mcap")) == round(passed / 0.05)
+    assert (folder / "thrust.svg").stat().st_size > 10_000
+    assert "exists already" in one_line(fishctl(*words))
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--over", "frequencie"], "did you mean 'frequency'?"),
+        (["--over", "frequency=3:1"], "is no range"),
+        (["--over", "frequency=1"], "LOW:HIGH"),
+        (["--over", "frequency=1:30"], "frequency"),
+        (["--over", "frequency", "--frequency", "2"], "is given, too"),
+        (["--over", "frequency", "--budget", "5"], "too short"),
+    ],
+)
+def test_what_cannot_be_searched_is_one_line(tmp_path: Path, words: list[str], named: str) -> None:
+    folder = tmp_path / "run"
+    found = fishctl("optimise", "square", *words, "--folder", str(folder))
+    assert named in one_line(found)
+    assert not folder.exists()

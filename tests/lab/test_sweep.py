@@ -1,0 +1,222 @@
+"""Sweeps: measured once, kept, gone on with, and safe to interrupt."""
+
+import csv
+import os
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rigs.processes import fishctl, one_line
+
+from fishd.config import Config, load
+from fishd.core.errors import ConfigError
+from fishd.core.signals import Event, Tick
+from fishd.lab.rig import Disturbed, VirtualRig
+from fishd.lab.sweep.folder import Begun, SweepFolder, owned
+from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.measuring import Lengths, Result, swim
+from fishd.lab.sweep.running import on_robot
+from fishd.recording import read
+
+DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
+SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
+
+
+class Dropped:
+    def tick(self, tick: Tick) -> None:
+        pass
+
+    def event(self, event: Event) -> None:
+        pass
+
+
+def nothing(*_: object) -> None:
+    pass
+
+
+def opened(path: Path, config: Config | None = None, seconds: float = 21.0) -> SweepFolder:
+    plain = msgspec.to_builtins(config or load())
+    path.mkdir(exist_ok=True)
+    begun = Begun("robot", plain, {"seconds": seconds})
+    return SweepFolder(path, begun, ["controller", "parameters.frequency"])
+
+
+def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
+    for frequency, millinewtons in ((1.0, 15.234453), (2.0, 23.829169)):  # of tests/reference
+        point = Point("square", {"frequency": frequency})
+        found = swim(point, load(None, DRIFTS), Lengths(), Dropped())
+        assert found.thrust == pytest.approx(millinewtons * 1e-3, rel=1e-4)
+        assert found.error == pytest.approx(0.0, abs=1e-9)
+
+
+def test_half_beats_that_are_no_whole_ticks_show_in_the_error() -> None:
+    found = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), Dropped())
+    assert found.thrust is not None
+    assert found.error is not None
+    assert 1e-6 < found.error < 1e-3
+    assert found.thrust == pytest.approx(25.6e-3, abs=found.error)
+
+
+def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Path) -> None:
+    config = load(None, DRIFTS)
+    folder = opened(tmp_path, config)
+    assert on_robot(folder, SQUARES, VirtualRig(config), 30.0, nothing)
+    for point, truth in zip(SQUARES, (20.57e-3, 25.74e-3, 23.83e-3), strict=True):
+        found = folder.results[folder.key(point)]
+        assert found.thrust is not None
+        assert found.error is not None
+        assert found.thrust == pytest.approx(truth, abs=2.0 * found.error)
+        assert found.error < 1.5e-3
+    recordings = sorted((tmp_path / "ticks").glob("*.mcap"))
+    assert [abs(len(read(each)) - 600) <= 2 for each in recordings] == [True] * 3
+
+
+class Interrupted(VirtualRig):
+    """Somebody presses Ctrl-C, or the terminal closes, while it swims for the third time."""
+
+    def __init__(self, config: Config, number: int) -> None:
+        super().__init__(config)
+        self._number = number
+        self._swims = 0
+        self.was_left = False
+
+    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
+        self._swims += 1
+        if self._swims == 3:
+            os.kill(os.getpid(), self._number)
+        return super().swim(controller, parameters, seconds)
+
+    def __exit__(self, *what: object) -> None:
+        os.kill(os.getpid(), self._number)  # once more, impatiently
+        super().__exit__(*what)
+        self.was_left = True
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_rests_the_fish_and_keeps_what_was_measured(tmp_path: Path, number: int) -> None:
+    rig = Interrupted(Config(), number)
+    measured: list[Point] = []
+
+    def done(point: Point, _: Result) -> None:
+        measured.append(point)
+
+    assert not on_robot(opened(tmp_path), SQUARES, rig, 21.0, done)
+    assert rig.was_left
+    assert measured == SQUARES[:1]
+    assert on_robot(opened(tmp_path), SQUARES, VirtualRig(Config()), 21.0, done)
+    assert measured == SQUARES
+
+
+class Taken(VirtualRig):
+    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
+        if parameters["frequency"] == 2.0:
+            raise Disturbed("the fish was told to let square swim, but sine swims")
+        return super().swim(controller, parameters, seconds)
+
+
+def test_a_fish_that_somebody_else_takes_loses_one_point_only(tmp_path: Path) -> None:
+    with pytest.raises(Disturbed):
+        on_robot(opened(tmp_path), SQUARES, Taken(Config()), 21.0, nothing)
+    assert len(opened(tmp_path).results) == 2
+
+
+def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
+    folder = opened(tmp_path)
+    for point in SQUARES:
+        folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
+    table = tmp_path / "points.csv"
+    table.write_bytes(table.read_bytes()[:-30])
+    assert len(opened(tmp_path).results) == 2
+    assert table.read_text().count("\n") == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "seconds", "named"),
+    [(["plant.xi=0.9"], 21.0, "plant.xi = 1.2, now it is 0.9"), ([], 30.0, "lengths.seconds")],
+)
+def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
+    tmp_path: Path, settings: Sequence[str], seconds: float, named: str
+) -> None:
+    opened(tmp_path)
+    opened(tmp_path, load(None, ["telemetry.address=tcp://127.0.0.1:1"]))  # which is no matter
+    with pytest.raises(ConfigError, match=named):
+        opened(tmp_path, load(None, settings), seconds)
+
+
+def test_two_sweeps_do_not_share_a_folder(tmp_path: Path) -> None:
+    with owned(tmp_path), pytest.raises(ConfigError, match="a sweep runs in it"), owned(tmp_path):
+        pass
+
+
+@pytest.fixture(scope="module")
+def _no_worker_stays() -> Iterator[None]:
+    from joblib.externals.loky import get_reusable_executor
+
+    yield
+    get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["sweep", "square,sine", "--periods", "3", "--settle", "1", "--folder", str(folder)]
+    words += ["--vary", "plant.xi=0.9,1.2", "--jobs", "2"]
+    first = fishctl(*words, "--frequency", "1.4:2:0.2")
+    assert (first.returncode, first.stderr) == (0, "")
+    assert "sine plant.xi=1.2: best frequency" in first.stdout
+    second = fishctl(*words, "--frequency", "1.2:2:0.2", "--json")
+    assert second.returncode == 0
+    assert "20 points, 16 of them there already" in second.stderr
+    best = msgspec.json.decode(second.stdout)
+    assert [(each["controller"], each["keys"]) for each in best] == [
+        (name, {"plant.xi": xi}) for xi in ("0.9", "1.2") for name in ("square", "sine")
+    ]
+    assert all(each["x_low"] < each["x"] < each["x_high"] for each in best)
+    with (folder / "points.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["parameters.frequency"] for row in rows[:5]] == ["1.2", "1.4", "1.6", "1.8", "2.0"]
+    assert all((folder / row["recording"]).is_file() for row in rows)
+    assert (folder / "thrust.png").stat().st_size > 10_000
+    assert (folder / "thrust.svg").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    words = ["sweep", "square", "--frequency", "1.5,2", "--periods", "3", "--settle", "1"]
+    with distributed.LocalCluster(
+        1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+    ) as cluster:
+        there = [*words, "--folder", str(tmp_path / "there")]
+        done = fishctl(*there, "--cluster", cluster.scheduler_address)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert fishctl(*words, "--folder", str(tmp_path / "here"), "--jobs", "1").returncode == 0
+    tables = [(tmp_path / each / "points.csv").read_text() for each in ("here", "there")]
+    here, there = ([row.rpartition(",")[0] for row in text.splitlines()] for text in tables)
+    assert here == there
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--frequency", "1:2"], "LOW:HIGH:STEP"),
+        (["--frequency", "1,20"], "frequency"),
+        (["--amplitude", "0.3,0.6"], "amplitude_limit"),
+        (["--vary", "plant.xj=1,2"], "--vary plant.xj=1"),
+        (["--vary", "plant.xi"], "write KEY=VALUES"),
+        (["--for", "30"], "is for --on robot"),
+        (["--on", "robot", "--vary", "plant.xi=1,2"], "keeps its configuration"),
+        (["--on", "robot", "--for", "5"], "too short"),
+    ],
+)
+def test_what_cannot_be_swept_is_one_line_before_anything_is_made(
+    tmp_path: Path, words: Sequence[str], named: str
+) -> None:
+    folder = tmp_path / "run"
+    assert named in one_line(fishctl("sweep", "square", *words, "--folder", str(folder)))
+    assert not folder.exists()

@@ -1,0 +1,66 @@
+"""What a sweep measures, and where its curves have their best."""
+
+import csv
+
+import numpy as np
+import pytest
+from rigs.documents import ROOT
+
+from fishd.core.errors import ParameterError
+from fishd.lab.sweep.grid import Point, axis, points, spread
+from fishd.lab.sweep.peak import peak
+
+
+def test_a_range_has_both_ends_and_decimals_that_are_exact() -> None:
+    assert list(map(float, spread("0.4:1.2:0.2"))) == [0.4, 0.6, 0.8, 1.0, 1.2]
+    assert list(map(float, spread("100:300:100,0.05, 1e-3"))) == [100.0, 200.0, 300.0, 0.05, 0.001]
+
+
+@pytest.mark.parametrize(
+    "text", ["1:2", "2:1:0.1", "1:2:0", "a:b:c", "1:inf:1", "1,,2", "0:1:1e-9"]
+)
+def test_what_is_no_range_says_what_is_needed(text: str) -> None:
+    with pytest.raises(ParameterError, match=r"LOW:HIGH:STEP|missing|more than"):
+        spread(text)
+
+
+def test_a_grid_has_every_combination_and_each_controller_only_its_own_parameters() -> None:
+    takes = {"square": ["frequency", "amplitude"], "swing": ["C", "amplitude"]}
+    values = {"frequency": [1.0, 2.0], "C": [0.6], "amplitude": [0.3]}
+    found = points(["square", "swing"], values, takes, {"plant.xi": ["0.6", "1.2"]})
+    assert len(found) == 6
+    assert found[-1] == Point("swing", {"C": 0.6, "amplitude": 0.3}, {"plant.xi": "1.2"})
+    assert axis(found) == "parameters.frequency"
+    with pytest.raises(ParameterError, match="no parameter 'phase'"):
+        points(["square"], {"phase": [0.1]}, takes)
+
+
+def test_the_best_of_a_noisy_curve_is_within_its_interval_as_often_as_it_says() -> None:
+    generator = np.random.default_rng(1)
+    x = np.arange(1.2, 2.25, 0.1)
+    hits = 0
+    for _ in range(300):
+        truth = generator.uniform(1.5, 1.9)
+        y = 25e-3 - 20e-3 * (x - truth) ** 2 + generator.normal(0.0, 0.3e-3, len(x))
+        found = peak(x.tolist(), y.tolist(), [0.6e-3] * len(x))
+        assert found.x_low is not None
+        assert found.x_high is not None
+        hits += found.x_low <= truth <= found.x_high
+    assert 0.92 <= hits / 300 <= 0.99
+
+
+@pytest.mark.parametrize(("waveform", "frequency"), [("square", 1.709), ("sine", 1.752)])
+def test_the_best_is_that_of_the_curve_and_not_of_the_grid(waveform: str, frequency: float) -> None:
+    with (ROOT / "tests/reference/thrust_vs_frequency.csv").open(encoding="utf-8") as file:
+        own = [row for row in csv.DictReader(file) if row["waveform"] == waveform]
+    x = [float(row["frequency_Hz"]) for row in own]
+    found = peak(x, [float(row["mean_thrust_mN"]) for row in own], [None] * len(x))
+    assert found.x == pytest.approx(frequency, abs=0.02)
+    assert found.x_low is not None
+    assert found.x_high is not None
+    assert found.x_low <= frequency <= found.x_high
+
+
+def test_a_best_at_the_edge_is_told_and_has_no_interval() -> None:
+    found = peak([1.0, 1.2, 1.4], [1.0, 2.0, 3.0], [0.1, 0.1, 0.1])
+    assert (found.x, found.at_edge, found.x_low) == (1.4, True, None)

@@ -1,0 +1,128 @@
+"""How long a sweep takes, and how many ticks of swimming a search needs.
+
+sweep      3 waveforms × 20 frequencies in simulation, as `fishctl sweep` does it, with its start
+search     the frequency of `square` on config/simulated.yaml, sensor drift included
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from functools import lru_cache
+from pathlib import Path
+
+import joblib
+import numpy as np
+from msgspec.structs import replace
+
+from common.report import DOCS, Options, Report, progress, table
+from fishd.config import Config, load
+from fishd.lab.optimise.search import Range, Search
+from fishd.lab.optimise.trials import trials
+from fishd.lab.rig import VirtualRig
+from fishd.simulation import simulate
+
+DOCUMENT = "sweeps.md"
+FISH = DOCS.parent / "config" / "simulated.yaml"
+FREQUENCIES = "0.2:4:0.2"
+RANGE = (0.4, 5.0)
+"""What `--over frequency` searches with ticks of 50 ms [Hz]."""
+ENOUGH, UNTIL, BUDGET = 0.97, 0.01, 300.0
+
+
+def sweep_seconds() -> tuple[float, float]:
+    """How long the whole command takes, and how much of all cores together [s]."""
+    fishctl = Path(sys.executable).with_name("fishctl")
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["sweep", "square,sine,triangle", "--frequency", FREQUENCIES, "--config", str(FISH)]
+        begun, used = time.perf_counter(), _of_children()
+        command = [str(fishctl), *words, "--folder", f"{folder}/run"]
+        subprocess.run(command, check=True, capture_output=True)
+        return time.perf_counter() - begun, _of_children() - used
+
+
+def _of_children() -> float:
+    found = os.times()
+    return found.children_user + found.children_system
+
+
+@lru_cache(maxsize=1000)
+def thrust(frequency: float) -> float:
+    """The true one of a square wave [N]; a sensor's noise and drift have no part in it."""
+    return simulate(load(FISH), "square", {"frequency": frequency}, 40.0).mean_thrust
+
+
+def search(config: Config, seed: int) -> tuple[int, int, int, float, bool]:
+    """Ticks of swimming until a proposal is good, until all later ones are, and until it ends;
+    the share of the best thrust in the end, and whether that proposal's interval has the best."""
+    config = replace(config, simulation=replace(config.simulation, seed=seed))
+    grid = [0.5 / (ticks * config.tick) for ticks in range(5, 8)]
+    frequencies = [*np.arange(1.5, 2.0, 0.02).tolist(), *grid]
+    best = max(frequencies, key=thrust)
+    found = Search([Range("frequency", *RANGE)], seed)
+    swum, shares = [], []
+    with VirtualRig(config) as rig:
+        for trial in trials(rig, "square", {}, found, BUDGET):
+            proposal = found.proposal()
+            swum.append(trial.swum)
+            at = round(proposal.parameters["frequency"], 3)
+            shares.append(thrust(at) / thrust(best))
+            if found.is_warm and proposal.improvement <= UNTIL:
+                break
+    good = [share >= ENOUGH for share in shares]
+    first = swum[good.index(True)] if any(good) else sys.maxsize
+    last_bad = max((index for index, each in enumerate(good) if not each), default=-1)
+    stays = swum[last_bad + 1] if last_bad + 1 < len(swum) else sys.maxsize
+    covers = proposal.low["frequency"] <= best <= proposal.high["frequency"]
+    return first, stays, swum[-1], shares[-1], covers
+
+
+OPTIONS: Options = {
+    "--seeds": {"type": int, "default": 10, "help": "searches; default 10"},
+    "--runs": {"type": int, "default": 3, "help": "sweeps; default 3"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Both; a minute."""
+    load_before = os.getloadavg()[0]
+    sweeps = []
+    for _ in range(options.runs):
+        sweeps.append(sweep_seconds())
+        progress("sweep", *(f"{seconds:.1f} s" for seconds in sweeps[-1]))
+    times, used = zip(*sweeps, strict=True)
+    config = load(FISH)
+    found = []
+    for seed in range(options.seeds):
+        found.append(search(config, seed))
+        progress("search", str(seed), str(found[-1]))
+    first, stays, ends, shares, covers = zip(*found, strict=True)
+    rows = [
+        ["ticks until the proposal gives 97 % of the best", *_spread(first)],
+        ["ticks until all later proposals do, too", *_spread(stays)],
+        ["ticks until it ended by itself", *_spread(ends)],
+        ["true thrust of what it proposed then, % of the best", *_spread(shares, 100.0)],
+    ]
+    text = table(f"search of the frequency, {len(found)} seeds | median | range", rows)
+    return Report(
+        {
+            "bench sweep": f"60 points on {joblib.cpu_count()} cores: "
+            f"{statistics.median(times):.1f} s (median of {len(times)}; "
+            f"{min(times):.1f} – {max(times):.1f} s), start and picture included, for "
+            f"{statistics.median(used):.1f} s of computing, begun at a load average of "
+            f"{load_before:.1f}.",
+            "bench search": f"{text}\n\nThe best frequency was within the interval of "
+            f"{sum(covers)} of {len(covers)}.",
+        },
+        {"sweep": sweeps, "search": found},
+    )
+
+
+def _spread(values: tuple[float, ...], factor: float = 1.0) -> tuple[str, str]:
+    shown = [factor * value for value in values]
+    digits = 1 if factor != 1.0 else 0
+    low, high = (f"{function(shown):.{digits}f}" for function in (min, max))
+    return f"{statistics.median(shown):.{digits}f}", f"{low} – {high}"
