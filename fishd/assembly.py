@@ -12,8 +12,10 @@ from msgspec.structs import replace
 
 from fishd.config import Config
 from fishd.config.drivers import claims_of
+from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.lateral_force import LateralForceEstimator
 from fishd.control.estimators.live_thrust import LiveThrust
+from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
 from fishd.control.reporting import Publisher
@@ -221,6 +223,10 @@ def assemble(
         if sensor.calibration.untouched:
             shown = f"the force is not calibrated, and shown in {sensor.unit}"
             lines += (f"{shown}: fishctl calibrate force",)
+            if config.estimator.kind == "observer":
+                lines += (
+                    "estimator.kind: observer needs forces in N, so the fin velocity is wrong",
+                )
         cut = _cut_by_calibration(config, servo)
         return (*lines, cut) if cut else lines
 
@@ -288,6 +294,13 @@ def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
             return
 
 
+def build_estimator(config: Config) -> Estimator:
+    """The one that `estimator.kind` names."""
+    if config.estimator.kind == "observer":
+        return Observer(config.estimator, config.plant, config.tick)
+    return LateralForceEstimator(config.estimator)
+
+
 def build_loop(
     config: Config,
     robot: Robot,
@@ -305,7 +318,7 @@ def build_loop(
         guard.restrict(*robot.calibrated.servo.reach)
     loop = ControlLoop(
         robot=robot,
-        estimator=LateralForceEstimator(config.estimator),
+        estimator=build_estimator(config),
         thrust=LiveThrust(config.estimator.zero_drift),
         guard=guard,
         limits=config.limits,

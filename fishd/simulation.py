@@ -1,28 +1,33 @@
-"""A whole run in virtual time: the robot's own loop on a simulated fish, and a report."""
+"""A whole run in virtual time: the robot's own loop on a simulated fish, its ticks or a report."""
 
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.assembly import build_loop, open_in_virtual_time
-from fishd.config import Config
+from fishd.config import Config, adopt, load
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, amplitude_of
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.errors import ParameterError
+from fishd.core.frames import frame
 from fishd.core.signals import Event, Reason, Tick
 from fishd.hardware.base import Robot
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.plant.optimum import best_square_wave
 from fishd.virtual.plant.tethered import TrueWindow
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 LONGEST = 1e8
 """Runs are shorter than this [s]: three years."""
@@ -195,6 +200,20 @@ class EncodingPublisher:
         self._encode(event)
 
 
+class KeepingPublisher:
+    """Keeps every tick; what matters of the events is in them."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+
+    def tick(self, tick: Tick) -> None:
+        """Keep it."""
+        self.ticks.append(tick)
+
+    def event(self, event: Event) -> None:
+        """Drop."""
+
+
 class VirtualRun:
     """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
 
@@ -242,6 +261,49 @@ def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], True
     return fish.robot(), fish.take_window
 
 
+def run(
+    config: Config | str | os.PathLike[str] | None = None,
+    controller: str = "swing",
+    parameters: Mapping[str, Any] | None = None,
+    seconds: float = 60.0,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+) -> "DataFrame":
+    """Let a controller swim a simulated fish, and give its ticks as a table: see `frame`.
+
+    config: a YAML file or what `fishd.config.load` made of one; None for the defaults
+    overrides: keys in dotted form, such as `{"plant.xi": 0.9}`
+
+    A controller that fails ends in mode `fault`, as on a robot: the column `mode` says so.
+    Raises `ConfigError`, `UnknownController`, `ParameterError`, and `MissingPackage` without
+    pandas (extra: lab).
+    """
+    _check_length("run", seconds)
+    settings = [f"{key}={_spelled(value)}" for key, value in (overrides or {}).items()]
+    if isinstance(config, Config):
+        config = adopt(msgspec.to_builtins(config), settings) if settings else config
+    else:
+        config = load(config, settings)
+    publisher = KeepingPublisher()
+    with VirtualRun(config, publisher) as virtual:
+        virtual.set_controller(controller, parameters or {})
+        for _ in range(max(1, round(seconds / config.tick))):
+            virtual.tick()
+    return frame(publisher.ticks)
+
+
+def _spelled(value: Any) -> str:
+    """A value as YAML has it; a number of numpy, too."""
+    return msgspec.json.encode(value.item() if hasattr(value, "item") else value).decode()
+
+
+def _check_length(what: str, seconds: float) -> None:
+    if not 0.0 <= seconds < LONGEST:  # NaN is not
+        raise ParameterError(
+            f"a {what} of {seconds:g} s is not possible: a number from 0 to {LONGEST:g} s is needed"
+        )
+
+
 def simulate(
     config: Config,
     name: str,
@@ -272,12 +334,8 @@ def judge(
     publisher: gets the record of every tick
     Raises `ParameterError` where the lengths do not fit one another.
     """
-    for what, length in (("run", seconds), ("time to settle", settle)):
-        if not 0.0 <= length < LONGEST:  # NaN is not
-            raise ParameterError(
-                f"a {what} of {length:g} s is not possible: a number from 0 to {LONGEST:g} s is "
-                "needed"
-            )
+    _check_length("run", seconds)
+    _check_length("time to settle", settle)
     ticks = round(seconds / config.tick)
     first = math.ceil(settle / config.tick - 1e-9) + 1
     if first >= ticks:
@@ -288,19 +346,19 @@ def judge(
     beats = Beats()
     begun = 0.0
     took_over: float | None = None
-    with VirtualRun(config, publisher) as run:
-        run.loop.set_controller(name, controller)
+    with VirtualRun(config, publisher) as virtual:
+        virtual.loop.set_controller(name, controller)
         for index in range(ticks):
             if index == first:  # the first ticks build what later ones reuse
                 begun = time.perf_counter()
-            angle = run.loop.applied
-            window = run.tick()
-            if run.loop.active.fallback and took_over is None:
+            angle = virtual.loop.applied
+            window = virtual.tick()
+            if virtual.loop.active.fallback and took_over is None:
                 took_over = index * config.tick
             if index >= first:
                 beats.add(angle, window)
         elapsed = time.perf_counter() - begun
-        loop = run.loop
+        loop = virtual.loop
         fallback = loop.active.fallback
         successor = loop.active.name if fallback else None
 

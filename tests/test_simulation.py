@@ -6,12 +6,15 @@ import re
 from functools import partial
 
 import msgspec
+import numpy as np
 import pytest
+from rigs.documents import ROOT
 from rigs.processes import fishctl, one_line
 
+from fishd import simulation
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.core.errors import ParameterError
+from fishd.core.errors import ConfigError, ParameterError
 from fishd.simulation import Beats, EncodingPublisher, Report, judge, simulate
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import Imperfections
@@ -209,3 +212,26 @@ def test_the_heading_says_that_another_controller_swam() -> None:
     assert (
         run(*policy, "--settle", "0").stdout.splitlines()[0].endswith("; the figures are of both")
     )
+
+
+def test_a_run_is_a_table_with_a_row_a_tick_and_the_same_numbers_as_a_report() -> None:
+    table = simulation.run(None, "square", {"frequency": 1.7}, 40.0)
+    assert list(table["seq"]) == list(range(1, 801))
+    assert set(table["phi_c"]) == {-0.42, 0.42}
+    assert "quantities.phase" in table
+    report = simulate(load(None), "square", {"frequency": 1.7}, 40.0)
+    assert table["fx"][300:].mean() == pytest.approx(report.mean_thrust, rel=0.01)
+
+
+def test_a_run_takes_a_path_or_a_configuration_and_keys_that_override_either() -> None:
+    path = str(ROOT / "config" / "simulated.yaml")
+    changes = {"tick": 0.02, "simulation.noise": np.float64(0.0)}
+    of_file, of_config = (
+        simulation.run(config, "swing", {}, 1.0, overrides=changes) for config in (path, load(path))
+    )
+    assert of_file.equals(of_config)
+    assert len(of_file) == 50
+    assert not of_file.equals(simulation.run(path, "swing", {}, 1.0, overrides={"tick": 0.02}))
+    for config in (path, load(path)):
+        with pytest.raises(ConfigError, match=r"plant\.omega: unknown key; did you mean 'omega0'"):
+            simulation.run(config, overrides={"plant.omega": 9})

@@ -28,10 +28,13 @@ VERBS = {
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
-    "Measure": {
+    "Experiment": {
         "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+        "compare": Verb("compare", "compare", "Compare controllers and policies on one fish."),
         "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
         "optimise": Verb("optimise", "optimise", "Search the best parameters of a controller."),
+        "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
+        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
     },
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
@@ -48,8 +51,7 @@ VERBS = {
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
-        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
-        "learn": Verb("learn", "learn", "Train policies, write them to files, compare them."),
+        "learn": Verb("learn", "learn", "Train policies, and write them to files."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },
     "Check and configure": {

@@ -19,7 +19,7 @@ _ROUNDED = "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a l
 
 
 def run_options(function: Any) -> Any:
-    """The options of a run in virtual time, of this verb and of `learn evaluate`."""
+    """The options of a run in virtual time."""
     for option in (
         json_option,
         fish_options,

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 from fishd.config import consistency as config_checks
 from fishd.config import drivers
 from fishd.config.overrides import apply_overrides
-from fishd.control.estimators.lateral_force import EstimatorSettings
+from fishd.control.estimators.base import EstimatorSettings
 from fishd.controllers.base import ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
@@ -141,7 +141,10 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     estimator: Annotated[EstimatorSettings, note("Fin velocity and thrust from the forces.")] = (
         EstimatorSettings()
     )
-    plant: Annotated[PlantParameters, note("The simulated fish: physics.")] = PlantParameters()
+    plant: Annotated[
+        PlantParameters,
+        note("Physics of the fish: of the simulated one, and of what the observer believes in."),
+    ] = PlantParameters()
     simulation: Annotated[
         SimulationSettings, note("The simulated fish: imperfections of the rig.")
     ] = SimulationSettings()
@@ -176,6 +179,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return Limits(
             amplitude=self.amplitude_limit,
             tick=self.tick,
+            scaled=self.estimator.kind == "observer",
             virtual=self.lockstep,
             chatter=self.chatter,
         )
@@ -221,6 +225,7 @@ def _check(config: Config) -> None:
     checks.check_pulses(servo, config.amplitude_limit)
     checks.check_pins(drivers.claims_of(sensor, servo), config.panel)
     checks.check_lockstep(config.robot, config.lockstep)
+    checks.check_estimator(config.robot, config.estimator.kind, config.plant)
     checks.check_virtual_pi(config.virtual_pi)
 
 

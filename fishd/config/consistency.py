@@ -17,6 +17,7 @@ from fishd.hardware.driver import Claim
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import PanelSettings, ServoSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.plant.parameters import PlantParameters
 
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
@@ -117,6 +118,16 @@ def check_lockstep(robot: str, lockstep: bool) -> None:
             ("lockstep",),
             f"true is not valid with robot: {robot}, whose time cannot stand still; "
             "robot: simulated is needed",
+        )
+
+
+def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
+    """An observer needs a model of the fish that swims."""
+    if kind == "observer" and robot == "pi" and plant == PlantParameters():
+        raise Problem(
+            ("estimator", "kind"),
+            "observer needs a model of this fish, and section plant is not given; 'fishctl "
+            "identify' writes it",
         )
 
 

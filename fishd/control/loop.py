@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
-from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
@@ -50,7 +50,7 @@ class ControlLoop:
     def __init__(
         self,
         robot: Robot,
-        estimator: LateralForceEstimator,
+        estimator: Estimator,
         thrust: LiveThrust,
         guard: Guard,
         limits: Limits,

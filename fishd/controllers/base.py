@@ -47,6 +47,8 @@ class Limits(Struct, frozen=True):
     """Φ: commands beyond ±Φ are clamped by the guard [rad]."""
     tick: float
     """Period of the loop [s]."""
+    scaled: bool = False
+    """The fin velocity is in rad/s, by the model of the fish, not up to an unknown scale."""
     virtual: bool = False
     """Time stands still while a controller thinks, so it may wait for others as long as it must."""
     chatter: ChatterSettings = ChatterSettings()

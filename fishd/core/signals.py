@@ -54,7 +54,8 @@ class Observation(Struct, frozen=True, gc=False):
     fy_rate: float
     """Rate of change of the lateral force [N/s]."""
     fin_velocity: float
-    """Fin angular velocity up to an unknown positive scale; its sign is that of the true one."""
+    """Fin angular velocity, up to an unknown positive scale; with the observer, in rad/s and when
+    the next instruction acts."""
     instruction_angle: float
     """The instruction angle applied since the previous tick [rad]."""
     previous_angle: float
@@ -90,7 +91,12 @@ class Tick(Struct, frozen=True, gc=False):
     fy: Annotated[float, unit("N", "Mean lateral force since the previous tick.")]
     fy_rate: Annotated[float, unit("N/s", "Rate of change of the lateral force.")]
     fin_velocity: Annotated[
-        float, unit("1", "Fin angular velocity as estimated, up to an unknown positive scale.")
+        float,
+        unit(
+            "1",
+            "Fin angular velocity as estimated, up to an unknown positive scale; with "
+            "`estimator.kind: observer` in rad/s, and that after the servo's delay.",
+        ),
     ]
     phi_c: Annotated[
         float, unit("rad", "Instruction angle that was sent to the servo in this tick.")

@@ -30,6 +30,7 @@ from fishd.core.schema import Problem
 from fishd.daemon.background_calls import BackgroundCalls
 from fishd.daemon.trial_calibration import (
     TrialCalibration,
+    calibrated_parts,
     calibrated_parts_at_rest,
     tared_sensor_at_rest,
 )
@@ -83,6 +84,10 @@ class CalibrationRequests:
         return self._servo.lease is not None
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
+        calibrated_parts(self._loop)
+        return self._used()
+
+    def _used(self) -> Calibrations:
         robot = self._loop.robot
         return Calibrations(
             force=robot.tared.calibration if robot.tared else ForceCalibration(),
@@ -199,7 +204,7 @@ class CalibrationRequests:
             self._loop.thrust.forget_zero()
         else:
             self._loop.thrust.forget()
-        return await self._calibrations(NoArguments())
+        return self._used()
 
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
         async with self._changing:
@@ -213,15 +218,15 @@ class CalibrationRequests:
                 self._announce("servo", path)
             else:
                 self._servo.try_out(calibration)
-            return await self._calibrations(NoArguments())
+            return self._used()
 
     async def _renew_lease(self, wanted: ServoLease) -> Calibrations:
         self._servo.renew(wanted.lease)
-        return await self._calibrations(NoArguments())
+        return self._used()
 
     async def _end_lease(self, wanted: ServoLease) -> Calibrations:
         self._servo.end(wanted.lease)
-        return await self._calibrations(NoArguments())
+        return self._used()
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:

@@ -1,8 +1,8 @@
 """The thrust of a controller with its interval: the fish swims and rests in turn."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,20 @@ BLOCK = 0.5
 """Rest is cut in pieces of this length [s]."""
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
+
+
+class Sample(NamedTuple):
+    """What a measurement needs to know of a tick."""
+
+    seq: int
+    """Number of the tick."""
+    fx: float
+    """Mean F_x since the tick before [N]."""
+    fin_velocity: float
+    phi_c: float
+    """Instruction angle from this tick on [rad]."""
+    swims: bool
+    """Is the fish told to swim?"""
 
 
 class Measured(NamedTuple):
@@ -66,7 +80,16 @@ def measure(
     for swims, length in plan(seconds, parameters):
         ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
         progress(len(ticks) * rig.tick)
-    return evaluate(ticks, controller, parameters, rig.tick)
+    found = evaluate(samples_of(ticks), rig.tick)
+    return found._replace(controller=controller, parameters=dict(parameters), ticks=ticks)
+
+
+def samples_of(ticks: Iterable[Tick]) -> list[Sample]:
+    """What a measurement needs to know of these."""
+    return [
+        Sample(each.seq, each.fx, each.fin_velocity, each.phi_c, each.mode == "running")
+        for each in ticks
+    ]
 
 
 class Summary(Struct, frozen=True):
@@ -121,26 +144,21 @@ def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, floa
     return [(False, REST * stretched), *cycle * count]
 
 
-def evaluate(
-    ticks: Sequence[Tick],
-    controller: str,
-    parameters: Mapping[str, Any],
-    tick: float,
-    settles: float = SWIM_SETTLES,
-) -> Measured:
-    """The thrust in ticks of a fish that swam and rested in turn, with one controller.
+def evaluate(samples: Sequence[Sample], tick: float, settles: float = SWIM_SETTLES) -> Measured:
+    """The thrust of a fish that swam and rested in turn; names no controller, and has no ticks.
 
     tick: period of the loop [s]
     settles: when a swim is steady [s]
     Raises `ParameterError` where there is too little to tell it from a drift.
     """
-    first = ticks[0].seq
-    found = [block for phase in _phases(ticks) for block in _blocks(phase, tick, first, settles)]
+    first = samples[0].seq
+    phases = list(_phases(samples))
+    found = [block for phase in phases for block in _blocks(phase, tick, first, settles)]
     swimming = [block for block in found if block.swims]
     if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
         raise ParameterError(
-            f"too little is left of {len(ticks) * tick:.3g} s to measure a thrust: whole beats of "
-            f"{controller} between rests are needed"
+            f"too little is left of {len(samples) * tick:.3g} s to measure a thrust: whole beats "
+            "between rests are needed"
         )
     time, force = np.array([(block.time, block.force) for block in found]).T
     swims = np.array([block.swims for block in found])
@@ -150,16 +168,16 @@ def evaluate(
     result = fit(blocks)
     lasting = sum(block.lasts for block in swimming)
     return Measured(
-        controller=controller,
-        parameters=dict(parameters),
+        controller="",
+        parameters={},
         thrust=result.force,
         error=result.error,
         frequency=sum(block.beats for block in swimming) / lasting,
         power=sum(block.power * block.lasts for block in swimming) / lasting,
-        swims=sum(1 for phase in _phases(ticks) if phase[0].mode == "running"),
+        swims=sum(phase[0].swims for phase in phases),
         blocks=blocks,
         drift=result.drift,
-        ticks=ticks,
+        ticks=[],
     )
 
 
@@ -172,23 +190,18 @@ class _Block(NamedTuple):
     swims: bool
 
 
-def _phases(ticks: Sequence[Tick]) -> Iterator[list[Tick]]:
-    """The ticks of each swim and each rest."""
-    phase = [ticks[0]]
-    for tick in ticks[1:]:
-        if tick.mode != phase[-1].mode:
-            yield phase
-            phase = []
-        phase.append(tick)
-    yield phase
+def _phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
+    """Each swim and each rest."""
+    for _, phase in groupby(samples, lambda sample: sample.swims):
+        yield list(phase)
 
 
-def _blocks(phase: list[Tick], tick: float, first: int, settles: float) -> Iterator[_Block]:
+def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Iterator[_Block]:
     """Whole beats of a swim, or pieces of a rest, once it has settled.
 
-    first: `seq` that time is counted from
+    first: index that time is counted from
     """
-    swims = phase[0].mode == "running"
+    swims = phase[0].swims
     begin = round((settles if swims else REST_SETTLES) / tick)
     ups = _reversals(phase) if swims else []
     cuts = [up for up in ups if up >= begin]
@@ -214,14 +227,14 @@ def _blocks(phase: list[Tick], tick: float, first: int, settles: float) -> Itera
         begun, beats = index, 0
 
 
-def _reversals(phase: list[Tick]) -> list[int]:
+def _reversals(phase: list[Sample]) -> list[int]:
     """Where the instruction angle becomes positive."""
     side, found = 0.0, []
-    for index, tick in enumerate(phase):
-        if tick.phi_c and math.copysign(1.0, tick.phi_c) != side:
+    for index, sample in enumerate(phase):
+        if sample.phi_c and math.copysign(1.0, sample.phi_c) != side:
             if side < 0.0:
                 found.append(index)
-            side = math.copysign(1.0, tick.phi_c)
+            side = math.copysign(1.0, sample.phi_c)
     return found
 
 

@@ -2,18 +2,21 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 from fishd.client import Fish
 from fishd.config import Config
 from fishd.core.errors import FishdError, FishError
-from fishd.core.signals import Event, Reason, Tick
-from fishd.simulation import VirtualRun
+from fishd.core.signals import Reason, Tick
+from fishd.simulation import KeepingPublisher, VirtualRun
 
 
 class Disturbed(FishdError):
     """The fish did not do what the experiment told it to; the message says what it did."""
+
+
+class Replaced(Disturbed):
+    """The controller gave up and another one took over, which the experiment did not ask for."""
 
 
 class Rig(Protocol):
@@ -52,8 +55,8 @@ class VirtualRig:
         self.name = "simulation"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
-        self._collected = _Collected([])
-        self._run = VirtualRun(config, self._collected)
+        self._kept = KeepingPublisher()
+        self._run = VirtualRun(config, self._kept)
 
     def __enter__(self) -> Self:
         return self
@@ -73,10 +76,11 @@ class VirtualRig:
 
     def _pass(self, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
-        self._collected.ticks = ticks
+        self._kept.ticks = ticks
         for _ in range(max(1, round(seconds / self.tick))):
             self._run.tick()
-            _check(ticks[-1], controller, self._run.loop.supervisor.reason)
+            loop = self._run.loop
+            _check(ticks[-1], controller, loop.supervisor.reason, loop.active.fallback)
         return ticks
 
 
@@ -102,7 +106,8 @@ class LiveRig:
             return
         with suppress(FishError):
             status = self._fish.status()
-            if (status.mode, status.controller) == ("running", self._controller):
+            ours = status.controller == self._controller or status.fallback
+            if status.mode == "running" and ours:
                 self._fish.stop()
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
@@ -124,24 +129,12 @@ class LiveRig:
             if not first <= tick.seq < first + 2 * count:  # of before, or of another fishd
                 continue
             if not _as_told(tick, controller):
-                _check(tick, controller, self._fish.status().reason)
+                status = self._fish.status()
+                _check(tick, controller, status.reason, status.fallback)
             ticks.append(tick)
             if tick.seq >= first + count - 1:
                 break
         return ticks
-
-
-@dataclass
-class _Collected:
-    """What the loop publishes: its latest ticks."""
-
-    ticks: list[Tick]
-
-    def tick(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def event(self, event: Event) -> None:
-        pass  # what matters of them is in the ticks
 
 
 def _as_told(tick: Tick, controller: str | None) -> bool:
@@ -150,11 +143,19 @@ def _as_told(tick: Tick, controller: str | None) -> bool:
     return (tick.mode, tick.controller) == ("running", controller)
 
 
-def _check(tick: Tick, controller: str | None, reason: Reason | None) -> None:
-    """Raises `Disturbed` where the fish does another thing than it was told to."""
+def _check(
+    tick: Tick, controller: str | None, reason: Reason | None, fallback: Reason | None
+) -> None:
+    """Raises `Disturbed` where the fish does another thing than it was told to.
+
+    reason: why it is in mode fault or estop; fallback: why another controller took over
+    """
     if _as_told(tick, controller):
         return
     told = f"told to let {controller} swim" if controller else "told to rest"
-    why = f" ({reason.message})" if reason else ""
+    cause = reason or fallback
+    why = f" ({cause.message})" if cause else ""
     does = f"{tick.controller} swims" if tick.mode == "running" else f"it is in mode {tick.mode}"
-    raise Disturbed(f"the fish was {told}, but {does}{why}: this measurement is lost")
+    replaced = controller and fallback and tick.mode == "running"
+    kind = Replaced if replaced else Disturbed
+    raise kind(f"the fish was {told}, but {does}{why}: this measurement is lost")

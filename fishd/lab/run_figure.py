@@ -19,7 +19,7 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
     """Write the picture; raises `FishdError` where it cannot be, and `MissingPackage`."""
     panels = 3 + len(traces.quantities)
     with drawn(path, (10.0, 1.9 + 1.45 * panels)) as figure:
-        figure.suptitle(text.line(traces.title), x=0.01, ha="left", fontsize=10)
+        figure.suptitle(_plain(traces.title), x=0.01, ha="left", fontsize=10)
         grid = figure.add_gridspec(1, 2, width_ratios=(3, 1))
         left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
         axes = list(left.subplots(panels, 1, sharex=True))
@@ -28,12 +28,12 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
         _thrust(axes[2], traces)
         for axis, (name, values) in zip(axes[3:], traces.quantities.items(), strict=True):
             axis.plot(traces.time, values, color=GREEN, linewidth=0.9)
-            axis.set_ylabel(text.quoted(name))
+            axis.set_ylabel(_plain(name))
         axes[-1].set_xlabel("time (s)")
         axes[0].set_xlim(traces.time[0], max(traces.time[-1], traces.time[0] + 0.1))
         for axis in axes:
             _events(axis, traces, named=axis is axes[0])
-        _portrait(right.add_subplot(right.add_gridspec(5, 1)[:3]), traces)
+        _portrait(right.add_subplot(right.add_gridspec(panels, 1)[:2]), traces)
 
 
 def _forces(axis: "Axes", traces: Traces) -> None:
@@ -64,6 +64,8 @@ def _command(axis: "Axes", traces: Traces) -> None:
 def _thrust(axis: "Axes", traces: Traces) -> None:
     axis.axhline(0.0, color="0.85", linewidth=0.6)
     axis.plot(traces.time, traces.thrust, color=BLUE, label="thrust over whole beats")
+    low, high = traces.thrust - traces.thrust_error, traces.thrust + traces.thrust_error
+    axis.fill_between(traces.time, low, high, color=BLUE, alpha=0.2, linewidth=0, label="95 %")
     axis.set_ylabel(f"thrust ({traces.unit})")
     other = axis.twinx()
     other.plot(traces.time, traces.frequency, color=GREY, linewidth=0.8)
@@ -96,7 +98,7 @@ def _events(axis: "Axes", traces: Traces, *, named: bool) -> None:
             axis.text(
                 time,
                 1.02 + 0.09 * (index % 2),  # neighbours do not cover one another
-                text.line(said, 40),
+                _plain(said),
                 transform=where,
                 fontsize=6.5,
                 color=colour,
@@ -116,3 +118,8 @@ def _portrait(axis: "Axes", traces: Traces) -> None:
     axis.axvline(0.0, color="0.85", linewidth=0.6)
     axis.plot(across[traces.portrait], up[traces.portrait], color=GREEN, linewidth=0.7, marker=".")
     axis.set_title(f"phase portrait, last {PORTRAIT:g} s")
+
+
+def _plain(words: str) -> str:
+    """A line that matplotlib does not read as mathematics."""
+    return text.line(words, 120).replace("$", r"\$")

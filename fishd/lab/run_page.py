@@ -72,6 +72,9 @@ def _lines(figure: Figure, traces: Traces) -> None:
     if traces.alpha is not None:
         add(2, "true fin angle α (rad)", traces.alpha, GREEN)
     add(3, f"thrust over whole beats ({traces.unit})", traces.thrust, BLUE)
+    for sign in (-1, 1):
+        edge = traces.thrust + sign * traces.thrust_error
+        add(3, f"{'−+'[sign > 0]} 95 %", edge, BLUE, dash="dot")
     for row, (name, values) in enumerate(traces.quantities.items(), start=4):
         add(row, _escaped(text.quoted(name)), values, GREEN)
     figure.update_yaxes(title_text=traces.unit, row=1, col=1)

@@ -35,6 +35,8 @@ class Traces(NamedTuple):
     """[rad]"""
     thrust: Array
     """As fishd told it, over whole beats [`unit`]."""
+    thrust_error: Array
+    """Half of its 95 % interval; NaN while the zero is not known [`unit`]."""
     frequency: Array
     """[Hz]"""
     fin_velocity: Array
@@ -76,6 +78,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         fy=1e3 * column(lambda tick: tick.fy),
         phi_c=column(lambda tick: tick.phi_c),
         thrust=1e3 * column(lambda tick: tick.thrust),
+        thrust_error=1e3 * column(lambda tick: tick.thrust_error),
         frequency=column(lambda tick: tick.frequency),
         fin_velocity=column(lambda tick: tick.fin_velocity),
         alpha=column(lambda tick: tick.alpha) if simulated else None,
@@ -104,8 +107,7 @@ def _with_breaks(ticks: list[Tick]) -> list[Tick | float]:
 
 
 def _quantities(tick: Tick) -> dict[str, float]:
-    found = getattr(tick, "quantities", UNSET)
-    return found if isinstance(found, dict) else {}
+    return {} if tick.quantities is UNSET else tick.quantities
 
 
 def _swims(tick: Tick) -> bool:

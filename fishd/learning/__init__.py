@@ -1,4 +1,4 @@
-"""Learning to swim: environments, PPO training, export and comparison (extra: learn).
+"""Learning to swim: environments, PPO training and export (extra: learn).
 
 To import it registers `fishd/Swim-v0` and `fishd/SwimOnDaemon-v0` with Gymnasium.
 """

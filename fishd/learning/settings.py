@@ -96,16 +96,16 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     settle: Annotated[
         float, unit("s", "Time at its beginning that is not judged.", ge=0, le=3600)
     ] = 5.0
-    rest: Annotated[
+    on_robot: Annotated[
         float,
         unit(
             "s",
-            "On a robot, the tail rests for so long before and after; its zero is then between "
-            "F_x of the last thirds, whatever the sensor drifts. 0: the sensor's own zero.",
-            ge=0,
-            le=60,
+            "Its length on a robot, where the fish swims and rests in turn, so that a drift of the "
+            "force sensor is told apart.",
+            ge=21,
+            le=3600,
         ),
-    ] = 3.0
+    ] = 30.0
     others: Annotated[
         int,
         note(

@@ -12,8 +12,8 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd.assembly import build_estimator
 from fishd.config import Config, adopt
-from fishd.control.estimators.lateral_force import LateralForceEstimator
 from fishd.control.guard import Guard
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
@@ -23,8 +23,8 @@ from fishd.core.foreign_code import contained
 from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
 
-ESTIMATES = ("fy_rate", "fin_velocity", "thrust", "frequency")
-"""What the estimator adds to a measurement."""
+ESTIMATES = ("fy_rate", "fin_velocity", "frequency")
+"""What the estimator adds to a measurement, and ticks tell; their thrust is that of the filter."""
 
 
 class Stretch(Struct):
@@ -114,6 +114,8 @@ class _Rerun:
         """The angle before that of the last tick [rad]."""
         self._started: tuple[str, dict[str, Any]] | None = None
         """A controller that takes over in the next tick, and its parameters."""
+        self._retunes: list[dict[str, Any]] = []
+        """Changes of its parameters that came before that tick."""
         self._swims: Controller[Any] | None = None
 
     def event(self, event: Event) -> None:
@@ -121,8 +123,12 @@ class _Rerun:
         data = event.data
         if event.kind in ("controller", "fallback"):
             self._started = data["controller"], data["parameters"]
-        elif event.kind == "parameters" and self._swims is not None:
-            self._retune(data["controller"], data["parameters"])
+            self._retunes = []
+        elif event.kind == "parameters":
+            if self._started is not None:
+                self._retunes.append(data["parameters"])
+            elif self._swims is not None:
+                self._retune(data["parameters"])
         elif event.kind in ("mode", "fault") and data.get("mode") != "running":
             self._swims = None
             if self._last is not None:
@@ -157,7 +163,7 @@ class _Rerun:
         recorded = self._run.config_of(self._number)
         self._config: Config = adopt(self._run.configs[self._number], self._overrides)
         self._estimates_again = self._config.estimator != recorded.estimator
-        self._estimator = LateralForceEstimator(self._config.estimator)
+        self._estimator = build_estimator(self._config)
         self.estimates.from_start &= tick.seq == 1
         config = self._config
         self._guard = Guard(
@@ -200,6 +206,9 @@ class _Rerun:
             assert started
             # At its first tick fishd begins as it is configured to; nobody hears it say so.
             self._begin(tick, *started, from_start=known or tick.seq == 1)
+            for values in self._retunes:
+                self._retune(values)
+            self._retunes = []
             assert self._swims
             contained(self._swims.activate, seen)
         assert self._swims
@@ -229,12 +238,12 @@ class _Rerun:
             Stretch(recorded, parameters, name, tick.t, tick.seq, from_start=from_start)
         )
 
-    def _retune(self, name: str, parameters: dict[str, Any]) -> None:
+    def _retune(self, parameters: dict[str, Any]) -> None:
+        """Change parameters as was recorded; another controller than the recorded one keeps its."""
         stretch, swims = self.stretches[-1], self._swims
-        if swims is None or stretch.controller != name or stretch.recorded != name:
-            return
-        values = {**parameters, **self._parameters}
-        contained(swims.retune, registry.check(name, values, swims.limits))
+        if swims is not None and stretch.controller == stretch.recorded:
+            values = {**parameters, **self._parameters}
+            contained(swims.retune, registry.check(stretch.controller, values, swims.limits))
 
     def _parameters_of(self, tick: Tick, upcoming: list[Event | Status | Tick]) -> dict[str, Any]:
         """Those of a controller whose start is not in the recording: as the next status says."""

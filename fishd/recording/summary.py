@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 from fishd.core.signals import Event, Status, Tick
 
@@ -38,8 +38,11 @@ class Summary(Struct, frozen=True):
     restarts: int = 0
     """How often another fishd took the place of the one before."""
     thrust: float | None = None
-    """Mean F_x of all ticks in which a controller swam, as measured: drift and offset are in it,
-    and so are starts; None where none swam [N]."""
+    """Mean `thrust` of the ticks in which the tail beat and the sensor's zero was known, weighted
+    by its interval; where it never was, mean F_x while a controller swam, as measured; None where
+    none swam [N]."""
+    thrust_error: float | None = None
+    """Half of the 95 % interval of that thrust, mean; None where the zero was never known [N]."""
     swimming: dict[str, int] = {}
     """Ticks in mode running, by controller."""
 
@@ -58,6 +61,9 @@ class TickHead(Struct, frozen=True, gc=False):
     controller: str
     fx: float
     missed: int
+    thrust: float
+    frequency: float
+    thrust_error: float | UnsetType = UNSET
 
 
 class Tally:
@@ -70,6 +76,7 @@ class Tally:
         self._ticks = self._events = self._marks = self._missed = self._restarts = 0
         self._pid = self._known = 0
         self._impulse = 0.0
+        self._weight = self._thrust = self._error = 0.0
         self._swimming: dict[str, int] = {}
 
     def add(self, message: TickHead | Tick | Event | Status) -> None:
@@ -87,6 +94,12 @@ class Tally:
         self._ticks += 1
         if tick.mode == "running":
             self._impulse += tick.fx
+            if tick.thrust_error is not UNSET and tick.frequency:
+                # Errors of one recording are alike: they weigh the ticks, and do not average out.
+                weight = 1.0 / max(tick.thrust_error, 1e-9) ** 2
+                self._weight += weight
+                self._thrust += weight * tick.thrust
+                self._error += weight * tick.thrust_error
             self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
         if last is None:
             self._first_t = tick.t
@@ -126,6 +139,10 @@ class Tally:
     def summary(self) -> Summary:
         """All that was added."""
         swam = sum(self._swimming.values())
+        thrust = self._impulse / swam if swam else None
+        error = None
+        if self._weight:
+            thrust, error = self._thrust / self._weight, self._error / self._weight
         return Summary(
             begins=self._first_t,
             ends=self._last.t if self._last else 0.0,
@@ -136,7 +153,8 @@ class Tally:
             lost=sum(gap.lost for gap in self.gaps),
             missed=self._missed,
             restarts=self._restarts,
-            thrust=self._impulse / swam if swam else None,
+            thrust=thrust,
+            thrust_error=error,
             swimming=dict(self._swimming),
         )
 

@@ -55,15 +55,14 @@ class RunWriter:
         path = Path(path)
         self.path = path if path.name.endswith(SUFFIX) else path.with_name(path.name + SUFFIX)
         self.tally = Tally()
+        run = self.path.name.removesuffix(SUFFIX)
+        about = provenance(run, source, operator, subject, note, extra or {})
         self._file = PartFile(self.path)
         self._closed = False
         self._encode = msgspec.json.Encoder().encode
         self._writer = Writer(self._file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="", library="fishd")
-        run = self.path.name.removesuffix(SUFFIX)
-        self._writer.add_metadata(
-            "fishd.run", provenance(run, source, operator, subject, note, extra or {})
-        )
+        self._writer.add_metadata("fishd.run", about)
         self._channels = {
             topic: self._writer.register_channel(
                 topic,

@@ -33,8 +33,8 @@ def test_verbs_stand_below_headings_that_say_what_one_wants() -> None:
     lines = CliRunner().invoke(fishctl, ["--help"]).stdout.splitlines()
     headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
     assert headings == [
-        "Options:", "Watch:", "Swim and stop:", "Measure:", "Calibrate:", "Simulate and learn:",
-        "Check and configure:",
+        "Options:", "Watch:", "Swim and stop:", "Measure:", "Record:", "Calibrate:", "Experiment:",
+        "Simulate and learn:", "Check and configure:",
     ]  # fmt: skip
     assert "explain" not in "\n".join(lines)
 
@@ -43,7 +43,7 @@ def test_verbs_stand_below_headings_that_say_what_one_wants() -> None:
     ("words", "meant"),
     [
         (["setcontroller"], "set-controller"),
-        (["learn", "evalute"], "evaluate"),
+        (["learn", "exprt"], "export"),
         (["config", "chek"], "check"),
         (["calibrate", "forces"], "force"),
         (["status", "--jsn"], "--json"),

@@ -287,3 +287,14 @@ def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
     assert line.startswith("fish.yaml:1: name: ")
     assert "a text of 1 to 40 printable characters (or null) is needed" in line
     assert load(None, ["name=Große Fische 2"]).name == "Große Fische 2"
+
+
+def test_an_observer_of_a_robot_needs_a_plant_of_its_own(tmp_path: Path) -> None:
+    text = "robot: pi\nestimator:\n  kind: observer\n"
+    assert complaint(text, tmp_path) == (
+        "fish.yaml:3: estimator.kind: observer needs a model of this fish, and section plant is "
+        "not given; 'fishctl identify' writes it"
+    )
+    file = tmp_path / "fish.yaml"
+    file.write_text(text + "plant:\n  omega0: 11.2\n")
+    assert load(file).limits.scaled

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from rigs.harness import Rig
 
-from fishd.control.estimators.lateral_force import EstimatorSettings, LateralForceEstimator
+from fishd.control.estimators.base import EstimatorSettings
+from fishd.control.estimators.lateral_force import LateralForceEstimator
 from fishd.control.estimators.tail_beat import TailBeat
 from fishd.core.signals import Measurement
 

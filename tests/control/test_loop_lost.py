@@ -178,7 +178,7 @@ def line(**given: object) -> str:
 def test_the_status_line_shows_no_thrust_without_a_force_and_says_that_the_servo_is_lost() -> None:
     assert "21.70 ± 0.00 mN" in line()
     assert "servo" not in line()
-    assert "thrust      – mN" in line(sensor_lost=True)
+    assert "thrust             – mN" in line(sensor_lost=True)
     assert line(servo_lost=True).endswith("servo not reached")
 
 

@@ -39,10 +39,10 @@ def test_set_offers_keys_of_the_configuration() -> None:
     assert "plain,plant=" not in offered("config", "show", "--set", "pl")
 
 
-def test_evaluate_offers_controllers_and_policies() -> None:
-    assert offered("learn", "evaluate", "sw") == ["file,sw", "plain,swing"]
-    assert "plain,default-fish" in offered("learn", "evaluate", "swing", "def")
-    assert "plain,remote" not in offered("learn", "evaluate", "")
+def test_compare_offers_controllers_and_policies() -> None:
+    assert offered("compare", "sw") == ["file,sw", "plain,swing"]
+    assert "plain,default-fish" in offered("compare", "swing", "def")
+    assert "plain,remote" not in offered("compare", "")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")

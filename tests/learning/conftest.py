@@ -9,7 +9,7 @@ from rigs.processes import Daemon, running, sets
 
 EXTRA = ("gymnasium", "joblib", "onnx", "onnxruntime", "stable_baselines3", "tensorboard", "torch")
 MISSING = [name for name in EXTRA if find_spec(name) is None]
-WITHOUT = ("test_comparison.py", "test_learning_settings.py")
+WITHOUT = ("test_learning_curves.py", "test_learning_settings.py")
 
 
 def pytest_report_header() -> str | None:

@@ -179,3 +179,8 @@ def test_scales_for_another_amplitude_than_that_of_the_fishd_are_refused(daemon:
 def test_without_a_fishd_it_says_where_it_looked(tmp_path: Path) -> None:
     with pytest.raises(NoDaemon, match="control"):
         gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=f"ipc://{tmp_path}/control")
+
+
+def test_no_policy_learns_from_a_fin_velocity_that_it_will_not_be_shown() -> None:
+    with pytest.raises(ConfigError, match="observer is not possible with fin_velocity"):
+        gymnasium.make("fishd/Swim-v0", overrides=("estimator.kind=observer",))

@@ -6,15 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
-from fishd.learning.compare.comparison import best_on_grid
+from fishd.lab.compare.contestants import best_on_grid
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import in_simulation, judge, on_link, worst_of_others
-from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import SimulatedLink, at_edge, drawn
 from fishd.learning.settings import (
     EnvironmentSettings,
@@ -158,38 +156,16 @@ def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
     assert in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
 
 
-@pytest.mark.parametrize(("rest", "drifted"), [(3.0, 0.0), (0.0, 0.02)])
-def test_on_a_robot_the_force_at_rest_is_taken_for_zero(
-    tmp_path: Path, rest: float, drifted: float
-) -> None:
-    def thrust(offset: float) -> float:
-        config = load(None, [f"simulation.offset_x={offset}"])
-        env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings())
-        env.reset(seed=1)
-        trial = on_link(env, square_of_six_ticks, EvaluationSettings(rest=rest), lambda: False)
-        assert trial
-        return trial.thrust
-
-    assert thrust(0.02) - thrust(0.0) == pytest.approx(drifted, abs=2e-4)
-
-
-def test_a_steady_drift_during_an_evaluation_is_taken_off(tmp_path: Path) -> None:
-    class Drifting(SimulatedLink):
-        slope = 0.0  # N/s
-
-        def step(self, angle: float) -> StepResult:
-            sensed = super().step(angle)
-            seen = sensed.observation
-            return StepResult(replace(seen, fx=seen.fx + self.slope * seen.time))
-
-    def thrust(slope: float, rest: float) -> float:
-        link = Drifting(CONFIG)
-        link.slope = slope
-        env = SwimEnv(link, CONFIG, EnvironmentSettings())
-        env.reset(seed=1)
-        trial = on_link(env, square_of_six_ticks, EvaluationSettings(rest=rest), lambda: False)
-        assert trial
-        return trial.thrust
-
-    assert thrust(1e-3, 3.0) == pytest.approx(thrust(0.0, 3.0), abs=2e-4)
-    assert thrust(1e-3, 0.0) > thrust(0.0, 0.0) + 0.01
+@pytest.mark.parametrize(
+    "drift", ["offset_x=0.02", "drift_rate=0.001", "drift=0.005", "drift_walk=0.0005"]
+)
+def test_on_a_robot_whatever_the_sensor_drifts_is_told_apart(drift: str) -> None:
+    config = load(None, [f"simulation.{drift}", "simulation.seed=3"])
+    env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings())
+    env.reset(seed=1)
+    found = on_link(env, square_of_six_ticks, EvaluationSettings(), lambda: False)
+    assert found
+    assert found.error
+    assert found.thrust == pytest.approx(square_wave(config.plant, 0.42, 1 / 0.6).thrust, abs=1e-3)
+    assert abs(found.efficiency - 1.0) < 0.04
+    assert found.frequency == pytest.approx(1 / 0.6, rel=0.03)

@@ -7,5 +7,18 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
+NAMES = (
+    "tick",
+    "sampler",
+    "policy",
+    "remote",
+    "learning",
+    "chatter",
+    "measurement",
+    "sweep",
+    "identification",
+    "estimators",
+)
+
 if __name__ == "__main__":
-    sys.exit(run("bench", ("tick", "sampler", "policy", "remote", "learning", "chatter", "sweep")))
+    sys.exit(run("bench", NAMES))

@@ -23,7 +23,7 @@ from bench.trainings import Trained, rig, settings_of, several
 from common.report import DOCS, Options, Report, progress, spread, table
 from fishd.config import Config
 from fishd.controllers import registry
-from fishd.learning.compare.comparison import best_on_grid
+from fishd.lab.compare.contestants import best_on_grid
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.simulated_link import SimulatedLink

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fishd.learning.compare import figures
+from fishd.lab.drawing import drawn
 
 _CURVES = (
     ("#0072b2", "-", 2.6),
@@ -31,12 +31,11 @@ def learning_curves(
 
     curves: for each training its seeds, each as steps and efficiencies
     goal: drawn as a line
-    Raises `FishdError` where matplotlib is missing or the file cannot be made.
+    Raises `FishdError` where the file cannot be made, and `MissingPackage`.
     """
-    plt = figures.pyplot()
     steps_shown = max(seeds[0][0][-1] for seeds in curves.values())
-    with plt.rc_context(figures.STYLE):
-        figure, axis = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    with drawn(path, (6.4, 3.8)) as figure:
+        axis = figure.subplots()
         for (color, style, width), (label, seeds) in zip(cycle(_CURVES), curves.items()):
             steps = np.array(seeds[0][0])
             efficiency = 100.0 * np.array([efficiencies for _, efficiencies in seeds])
@@ -50,7 +49,7 @@ def learning_curves(
             100.0 * goal,
             color="0.45",
             linewidth=0.7,
-            linestyle=figures.DASHED,
+            linestyle="--",
             label=f"{100.0 * goal:.0f} %",
         )
         axis.set_xscale("log")
@@ -61,5 +60,4 @@ def learning_curves(
         axis.set_ylim(_LOWEST, 101)
         axis.set_xlabel("control steps")
         axis.set_ylabel(f"efficiency (% of the best square wave, from {_LOWEST} % up)")
-        figure.legend(loc="outside lower center", ncols=3, fontsize=7)
-        figures.save(plt, figure, path)
+        figure.legend(loc="outside lower center", ncols=3)

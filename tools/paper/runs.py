@@ -9,7 +9,7 @@ import joblib
 
 from common.report import DOCS
 from fishd.config import Config
-from fishd.control.estimators.lateral_force import EstimatorSettings
+from fishd.control.estimators.base import EstimatorSettings
 from fishd.simulation import Report, simulate
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters

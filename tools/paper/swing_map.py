@@ -28,8 +28,8 @@ RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2.0, 3.0)
 """ω₀Φ/Ω."""
 REAL = SimulationSettings(noise=0.001, offset_y=0.02, drift=0.02)
 SEEDS = 10
-SECONDS, SETTLE = 200.0, 20.0
-"""What is judged is three periods of the drift long."""
+SECONDS, SETTLE = 140.0, 20.0
+"""What is judged is two periods of the drift long."""
 
 RECOMMENDED, NEARLY_BEST = 0.6, 0.95
 """The paper: C = 0.6 gives over 95 % of the optimum for every ω₀Φ/Ω."""

@@ -8,4 +8,9 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 from common.report import run  # noqa: E402
 
 if __name__ == "__main__":
-    sys.exit(run("reliability", ("deaths", "kills", "misbehaviour", "attacks", "soak", "systemd")))
+    sys.exit(
+        run(
+            "reliability",
+            ("deaths", "kills", "misbehaviour", "attacks", "soak", "systemd", "recording"),
+        )
+    )

@@ -38,12 +38,15 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     measures: nothing changes.
     """
     with Fish(endpoint) as fish:
-        before = fish.calibrations().force
+        simulated = fish.status().robot == "simulated"
+        before = None if simulated else fish.calibrations().force
         after = fish.tare(seconds)
     if as_json:
         print_json(after)
         return
     for when, force in (("before", before), ("after", after.force)):
+        if force is None:
+            continue
         echo(f"{when:<7} x0 {force.x0 * 1e3:+9.2f} mN   y0 {force.y0 * 1e3:+9.2f} mN")
     kept = f"and saved in {after.force_file}" if after.force_file else "until this fish ends"
     echo(text.line(f"in use, {kept}"))

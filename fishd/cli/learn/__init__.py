@@ -8,11 +8,10 @@ VERBS = {
     "Verbs": {
         "ppo": Verb("learn.ppo", "ppo", "Train a policy, in simulation or on the robot."),
         "export": Verb("learn.export", "export", "Write a trained policy to one .onnx file."),
-        "evaluate": Verb("learn.evaluate", "evaluate", "Compare policies and controllers."),
     }
 }
 
 
 @click.group(cls=Verbs, verbs=VERBS)
 def learn() -> None:
-    """Learn to swim: train policies, write them to files, compare them."""
+    """Learn to swim: train policies, and write them to files."""

@@ -112,7 +112,7 @@ def record(
             recorder.run(stopping, seconds)
     except RecordingError as error:
         if recorder.began:
-            _tell_fishd(endpoint, f"recording {path.name} ended: {error}")
+            _tell_fishd(endpoint, f"recording {recorder.writer.path.name} ended: {error}")
         raise
     finally:
         if recorder.began:

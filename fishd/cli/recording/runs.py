@@ -14,6 +14,7 @@ from fishd.cli.recording.record import folder_option
 from fishd.core import text
 from fishd.core.errors import RecordingError
 from fishd.recording.folder import Glance, glances, runs_folder
+from fishd.recording.summary import Summary
 
 WIDE = 1000
 
@@ -24,8 +25,9 @@ WIDE = 1000
 def runs(folder: Path | None, as_json: bool) -> int:
     """List the recordings, the oldest first.
 
-    'thrust' is the mean longitudinal force while it swam, as measured: the drift and the offset of
-    the sensor are in it. 'lost' are ticks that fishd made and that are not in the file.
+    'thrust' is the mean while it swam, in mN (mV until the sensor is calibrated), with its 95 %
+    interval. Where the zero of the sensor was never known, it is the mean force as measured, drift
+    and offset included, ± ?. 'lost' are ticks that fishd made and that are not in the file.
     """
     place = folder or runs_folder()
     found = list(glances(place))
@@ -65,12 +67,11 @@ def _print(found: list[Glance]) -> None:
         table.add_column(head, overflow="fold")
     for glance in found:
         summary = glance.summary
-        thrust = "–" if summary.thrust is None else f"{summary.thrust * 1e3:.2f} m{_unit(glance)}"
         table.add_row(
             text.line(glance.name),
             _began(glance.about.get("started", "")),
             _length(summary.duration),
-            thrust,
+            _thrust(summary),
             str(summary.ticks),
             str(summary.lost),
             str(summary.marks),
@@ -81,8 +82,13 @@ def _print(found: list[Glance]) -> None:
     Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(table)
 
 
-def _unit(glance: Glance) -> str:
-    return glance.about.get("force_unit", "N")
+def _thrust(summary: Summary) -> str:
+    """In thousandths of the sensor's unit; with its interval where the zero was known."""
+    if summary.thrust is None:
+        return "–"
+    if summary.thrust_error is None:
+        return f"{summary.thrust * 1e3:.2f} ± ?"
+    return f"{summary.thrust * 1e3:.2f} ± {summary.thrust_error * 1e3:.2f}"
 
 
 def _remarks(glance: Glance) -> list[str]:

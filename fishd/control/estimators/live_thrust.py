@@ -56,6 +56,8 @@ class LiveThrust:
         self._zero = self._factor = 0.0
         self._zero_variance, self._covariance = UNKNOWN**2, 0.0
         self._factor_variance: float | None = None
+        self._anchored = False
+        """Is the zero known, or a factor from when it was?"""
         self._time = -math.inf
         self._at_rest = 0.0
         self._noises = {True: _Noise(), False: _Noise()}
@@ -73,7 +75,7 @@ class LiveThrust:
 
     def forget(self) -> None:
         """The sensor's calibration was changed: nothing found so far holds."""
-        self._factor, self._factor_variance = 0.0, None
+        self._factor, self._factor_variance, self._anchored = 0.0, None, False
         self.forget_zero()
 
     def calibrate(self, factor: float, error: float) -> None:
@@ -83,6 +85,7 @@ class LiveThrust:
         error: half of its 95 % interval
         """
         self._factor, self._factor_variance = factor, (error / INTERVAL) ** 2
+        self._anchored = True
         self.forget_zero()
 
     def update(self, seen: Observation, running: bool) -> None:
@@ -128,8 +131,14 @@ class LiveThrust:
                 self._beats.popleft()
             if self._factor_variance is None and power > 0.0:
                 self._factor_variance = (UNKNOWN / power) ** 2
+        else:
+            self._anchored = True
         self._wait(time)
-        self._learn(block.force, power, self._noises[self._swims].add(block))
+        noise = self._noises[self._swims]
+        if self._learn(block.force, power, noise.variance):
+            noise.compare(block.force)
+        else:
+            noise.forget()
         self._at_rest = block.force - self._zero
 
     def _wait(self, time: float) -> None:
@@ -140,21 +149,25 @@ class LiveThrust:
         if self._factor_variance is not None:
             self._factor_variance += (FACTOR_WALKS * self._factor) ** 2 * passed
 
-    def _learn(self, force: float, power: float, variance: float) -> None:
-        """A step of the filter: force = zero + factor * power + noise of that variance."""
+    def _learn(self, force: float, power: float, variance: float) -> bool:
+        """A step of the filter: force = zero + factor * power + noise of that variance.
+
+        False where the zero has jumped.
+        """
         a, b, c = self._zero_variance, self._covariance, self._factor_variance or 0.0
         surprise = force - self._zero - self._factor * power
         along, across = a + b * power, b + c * power
         total = along + across * power + variance
         if power == 0.0 and surprise**2 > BROKEN**2 * total:
             self._zero, self._zero_variance, self._covariance = force, variance, 0.0
-            return
+            return False
         self._zero += along / total * surprise
         self._factor += across / total * surprise
         self._zero_variance = max(0.0, a - along * along / total)
         self._covariance = b - along * across / total
         if self._factor_variance is not None:
             self._factor_variance = max(0.0, c - across * across / total)
+        return True
 
     def _know(self, seen: Observation) -> None:
         """Thrust and error now."""
@@ -170,7 +183,8 @@ class LiveThrust:
             error = INTERVAL * math.sqrt(self._zero_variance + self._wander * passed)
         else:
             thrust, error = 0.0, math.inf
-        self.thrust, self.error = (thrust, error) if error < MOST_KNOWN else (None, 0.0)
+        known = self._anchored and error < MOST_KNOWN
+        self.thrust, self.error = (thrust, error) if known else (None, 0.0)
 
 
 class _Block:
@@ -200,12 +214,16 @@ class _Noise:
     """Variance of the force of blocks, from one to the next, so that hardly any drift is in it."""
 
     def __init__(self) -> None:
-        self._variance = _NOISE**2
+        self.variance = _NOISE**2
         self._before: float | None = None
 
-    def add(self, block: _Block) -> float:
+    def compare(self, force: float) -> None:
+        """Take in the force of another block."""
         if self._before is not None:
-            found = 0.5 * (block.force - self._before) ** 2
-            self._variance += _FORGETS * (found - self._variance)
-        self._before = block.force
-        return self._variance
+            found = 0.5 * (force - self._before) ** 2
+            self.variance += _FORGETS * (found - self.variance)
+        self._before = force
+
+    def forget(self) -> None:
+        """The next block is not to be compared with those before."""
+        self._before = None

@@ -108,6 +108,13 @@ def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
         policy = file.read(path)
         try:
             policy.card.check_fit(limits.tick, limits.amplitude)
+            if limits.scaled and any(
+                seen.name == "fin_velocity" for seen in policy.card.observation
+            ):
+                raise PolicyError(
+                    "it was trained to see fin_velocity as estimator.kind: lateral_force gives it, "
+                    "and fishd runs with observer"
+                )
         except PolicyError as error:
             raise PolicyError(f"{path}: {error}") from None
         return policy.card, Network(policy)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
-from fishd.lab.measurement import REST, SWIM_SETTLES, evaluate
+from fishd.lab.measurement import REST, SWIM_SETTLES, evaluate, samples_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig
 
@@ -62,7 +62,7 @@ def trials(
             return
         swim = rig.swim(controller, parameters, length)
         after = rig.rest(REST)
-        found = evaluate([*rest, *swim, *after], controller, parameters, rig.tick, settles)
+        found = evaluate(samples_of([*rest, *swim, *after]), rig.tick, settles)
         swum += len(swim)
         passed += length + REST
         search.observe(candidate, found.thrust, found.error)

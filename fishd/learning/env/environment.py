@@ -48,7 +48,15 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
 
     The scales come from the physics, not from running averages: nothing drifts during training, and
     a policy file carries a few numbers that a person can check.
+
+    Raises `ConfigError` for a fin velocity that no policy would know.
     """
+    if config.estimator.kind != "lateral_force" and "fin_velocity" in settings.observation:
+        raise ConfigError(
+            "estimator.kind: observer is not possible with fin_velocity in "
+            "environment.observation: policies see it as lateral_force gives it; use that, or "
+            "leave fin_velocity out"
+        )
     force = settings.force_scale or force_scale(config)
     omega0 = config.plant.omega0
     scales: dict[FeatureName, float] = {

@@ -1,7 +1,6 @@
 """Evaluations without exploration: how does a policy swim, in simulation or on the robot?"""
 
 import itertools
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from fishd import simulation
 from fishd.config import Config, Start
 from fishd.core.signals import Observation
+from fishd.lab.measurement import Sample, evaluate, plan
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import FunctionController, NullPublisher, at_edge
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
@@ -38,6 +38,8 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     """Time in the tank until then [s]."""
     thrust: float
     """Mean thrust: the true one of a simulated fish, the measured one of a robot [N]."""
+    error: float | None = None
+    """Half of the 95 % interval of a measured thrust [N]; a true one needs none."""
     efficiency: float
     """Thrust over that of the configured fish's best square wave."""
     frequency: float
@@ -106,32 +108,28 @@ def on_link(
 ) -> Evaluation | None:
     """Evaluate on the fish that learns, by its measured thrust; None where `stop` says so.
 
-    The tail rests before and after, so that a drift of the sensor can be subtracted. The fish must
-    not be in a pause. Raises `LinkLost`.
+    The fish swims and rests in turn, as in `fishd.lab.measurement`. It must not be in a pause.
+    Raises `LinkLost`.
     """
     tick, amplitude = env.link.tick, env.link.amplitude
-    began, zero_then = _force_at_rest(env, settings.rest, stop)
-    settled = round(settings.settle / tick)
-    times, thrusts, angles = [], [], []
-    for index in range(math.ceil(settings.seconds / tick)):
-        if stop():
-            return None
-        angle = max(-amplitude, min(amplitude, decide(env.latest)))
-        env.advance(angle)
-        if index >= settled:
-            times.append(env.latest.time)
-            thrusts.append(env.latest.fx)
-            angles.append(angle)
-    ended, zero_now = _force_at_rest(env, settings.rest, stop)
-    if stop():
-        return None
-    zero = np.interp(float(np.mean(times)), [began, ended], [zero_then, zero_now])
-    thrust = float(np.mean(thrusts) - zero)
-    shares = np.array(angles) / amplitude
+    samples: list[Sample] = []
+    for swims, seconds in plan(settings.on_robot, {}):
+        for _ in range(round(seconds / tick)):
+            if stop():
+                return None
+            angle = max(-amplitude, min(amplitude, decide(env.latest))) if swims else 0.0
+            seen = env.latest
+            samples.append(
+                Sample(round(seen.time / tick), seen.fx, seen.fin_velocity, angle, swims)
+            )
+            env.advance(angle)
+    shares = np.array([each.phi_c for each in samples if each.swims]) / amplitude
     frequency, fullness = beat_frequency(shares, tick), float(np.mean(np.abs(shares)))
+    found = evaluate(samples, tick)
     return Evaluation(
-        thrust=thrust,
-        efficiency=thrust / env.best_thrust,
+        thrust=found.thrust,
+        error=found.error,
+        efficiency=found.thrust / env.best_thrust,
         frequency=frequency,
         fullness=fullness,
         stalled=_is_stalled(frequency, fullness, tick),
@@ -164,18 +162,3 @@ def _shaken(decide: Decide, config: Config) -> Decide:
         return decide(observation)
 
     return decided
-
-
-def _force_at_rest(env: SwimEnv, seconds: float, stop: Callable[[], bool]) -> tuple[float, float]:
-    """Mean time [s] and mean F_x [N] of the last third of a rest; a force of 0 for no rest."""
-    times, forces = [], []
-    for _ in range(math.ceil(seconds / env.link.tick)):
-        if stop():
-            break
-        env.advance(0.0)
-        times.append(env.latest.time)
-        forces.append(env.latest.fx)
-    if not forces:
-        return env.latest.time, 0.0
-    last = max(1, len(forces) // 3)
-    return float(np.mean(times[-last:])), float(np.mean(forces[-last:]))

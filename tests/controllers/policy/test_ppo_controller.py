@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from msgspec.structs import replace
 from onnx import TensorProto, helper, numpy_helper
 from rigs.harness import LIMITS, Rig, observe
 from rigs.policy_files import FLIP, answer, card, linear, of_nodes, random_layers, write
@@ -203,3 +204,12 @@ def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path
     run = call(FISHCTL, "simulate", "ppo", "--policy", str(path), env=environment)
     assert (run.returncode, run.stderr) == (0, "")
     assert list(home.iterdir()) == []
+
+
+def test_a_policy_is_refused_that_never_saw_a_fin_velocity_in_rad_per_second(
+    tmp_path: Path,
+) -> None:
+    path = write(tmp_path, to_onnx(linear(1.0), "tanh", card(("fin_velocity", 0.002))))
+    assert "trained to see fin_velocity as estimator.kind: lateral_force gives it" in refusal(
+        path, replace(LIMITS, scaled=True)
+    )

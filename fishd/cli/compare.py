@@ -1,0 +1,232 @@
+"""The verb that compares policies and controllers on the same fish, simulated or live."""
+
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import click
+
+from fishd.cli.completion import complete_contestant
+from fishd.cli.config import fish_options
+from fishd.cli.lab_progress import showing
+from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.output import echo, print_json
+from fishd.cli.sweep import ON, refuse_other
+from fishd.client import Fish
+from fishd.config import adopt, load
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError, ParameterError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fishd.lab.compare.comparison import Standing, Trace
+    from fishd.lab.compare.contestants import Contestant
+
+WIDE = 1000
+"""Columns of a table in a file or a pipe, where nothing is wrapped."""
+SECONDS, SETTLE = 60.0, 10.0
+
+
+class _Outcome(NamedTuple):
+    standings: "list[Standing]"
+    traces: "list[Trace]"
+    left_out: "list[tuple[Contestant, FishdError]]"
+    amplitude: float  # rad
+    unit: str = "N"
+    ended: str = ""  # why before everyone had swum, if so
+    status: int = 0
+
+
+@click.command()
+@click.argument(
+    "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
+)
+@ON
+@click.option(
+    "--runs",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    help="Runs of each contestant; in simulation, with different noise.",
+)
+@click.option(
+    "--for",
+    "live_seconds",
+    type=float,
+    help=f"On a robot: length of each run, swimming and resting in turn [s]. [default: {SECONDS}]",
+)
+@click.option(
+    "--seconds", type=float, help=f"In simulation: length of each run [s]. [default: {SECONDS}]"
+)
+@click.option(
+    "--settle",
+    type=float,
+    help=f"In simulation: time before figures are taken [s]. [default: {SETTLE}]",
+)
+@fish_options
+@endpoint_option
+@json_option
+@click.option(
+    "--plot",
+    "picture",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Draw command, fin, force and result of each into this file (.png, .svg).",
+)
+def compare(
+    contestants: tuple[str, ...],
+    on: str,
+    runs: int,
+    live_seconds: float | None,
+    seconds: float | None,
+    settle: float | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    endpoint: str | None,
+    as_json: bool,
+    picture: Path | None,
+) -> int:
+    """Compare policies and controllers on the same fish.
+
+    A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
+    with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. Without any: the
+    best square wave, swing, and the named policies that are made for this fish.
+
+    In simulation thrust is the true one, and efficiency that over the thrust of the best square
+    wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
+    rest, and shows what was measured. ± is the 95 % interval: of a measurement, or of the mean of
+    several runs. |φ_c|/Φ is the mean size of the command, square its mean size over its rms:
+    square wave 1, sine 0.900, triangle 0.866. Exit status 1 when one is refused on this fish, such
+    as a policy for another amplitude, or ends in mode fault; the others swim all the same.
+    """
+    of_simulation = {
+        "--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides,
+    }  # fmt: skip
+    refuse_other(on, of_simulation, {"--for": live_seconds})
+    if picture:
+        from fishd.lab import drawing
+
+        drawing.check(picture)
+    if on == "robot":
+        length = SECONDS if live_seconds is None else live_seconds
+        outcome = _on_robot(contestants, length, runs, endpoint)
+    else:
+        lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
+        outcome = _in_simulation(contestants, file, overrides, *lengths, runs)
+    if picture and outcome.standings:
+        from fishd.lab.compare.figures import draw
+
+        draw(picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
+    return _report(outcome, as_json)
+
+
+def _in_simulation(
+    texts: tuple[str, ...],
+    file: Path | None,
+    overrides: tuple[str, ...],
+    seconds: float,
+    settle: float,
+    runs: int,
+) -> _Outcome:
+    from fishd.lab.compare import comparison
+    from fishd.lab.compare.contestants import default_contestants, parse, refusal
+
+    config = load(file, overrides)
+    chosen = [parse(text) for text in texts] or default_contestants(config)
+    left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
+    able = [one for one in chosen if one not in (out for out, _ in left_out)]
+    swum = able or chosen
+    with showing(len(swum) * runs * seconds, "s swum") as bar:
+        found = comparison.compare(config, swum, seconds, settle, runs, bar.at)
+    return _Outcome(*found, left_out, config.amplitude_limit)
+
+
+def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str | None) -> _Outcome:
+    from fishd.lab.compare.contestants import absolute, default_contestants, parse
+    from fishd.lab.compare.live import LiveComparison
+    from fishd.lab.rig import LiveRig
+
+    ended, status = "", 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too lets the fish rest
+    chosen = [absolute(parse(text)) for text in texts]
+    with Fish(endpoint) as fish:
+        chosen = chosen or default_contestants(adopt(fish.config()))
+        unit = fish.status().force_unit
+        with LiveRig(fish) as rig, showing(len(chosen) * runs * seconds, "s") as bar:
+            live = LiveComparison(rig, chosen)
+            try:
+                live.swim(seconds, runs, bar.at)
+            except KeyboardInterrupt:
+                ended, status = "interrupted; the fish rests", INTERRUPTED
+            except ParameterError:
+                raise
+            except FishdError as error:
+                ended, status = str(error), 1
+    return _Outcome(
+        live.standings(), live.traces(), live.left_out, rig.amplitude, unit, ended, status
+    )
+
+
+def _report(outcome: _Outcome, as_json: bool) -> int:
+    """Print it; gives the exit status."""
+    standings = outcome.standings
+    if as_json:
+        print_json(standings)
+    elif standings:
+        from rich.console import Console
+
+        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings, outcome.unit))
+    for one, why in outcome.left_out:
+        echo(f"fishctl: {one.label}: left out: {why}", err=True)
+    for standing in standings:
+        for took_over in standing.fallbacks:
+            echo(f"fishctl: {standing.contestant}: another took over: {took_over}", err=True)
+    faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
+    for contestant, fault in faults:
+        echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
+    if outcome.ended:
+        echo(f"fishctl: {outcome.ended}", err=True)
+    return outcome.status or (1 if faults or outcome.left_out else 0)
+
+
+def _table(standings: "list[Standing]", unit: str) -> "Table":
+    from rich.table import Table
+
+    simulated = all(standing.runs for standing in standings)
+    several = simulated and len(standings[0].runs) > 1
+    caption = _of_simulated(standings) if simulated else None
+    table = Table(caption=caption, caption_justify="left", box=None, pad_edge=False)
+    table.add_column("contestant", overflow="fold")
+    heads = ["efficiency"] if simulated else []
+    heads += ["lowest – highest"] if several else []
+    for head in (*heads, f"m{unit}", "Hz", "|φ_c|/Φ", "square"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for standing in standings:
+        cells = [f"{standing.efficiency:.1%}"] if simulated else []
+        if several:
+            shares = [run.efficiency for run in standing.runs]
+            cells.append(f"{min(shares):.1%} – {max(shares):.1%}")
+        error = "" if standing.error is None else f" ± {standing.error * 1e3:.2f}"
+        table.add_row(
+            standing.contestant,
+            *cells,
+            f"{standing.thrust * 1e3:.2f}{error}",
+            f"{standing.frequency:.3f}",
+            f"{standing.fullness:.3f}",
+            f"{standing.squareness:.3f}",
+        )
+    return table
+
+
+def _of_simulated(standings: "list[Standing]") -> str | None:
+    """What efficiency is of, where it is the same for all."""
+    best = {
+        (run.best_square_thrust, run.best_square_frequency)
+        for standing in standings
+        for run in standing.runs
+    }
+    if len(best) != 1:
+        return None
+    ((thrust, frequency),) = best
+    return f"The best square wave: {thrust * 1e3:.2f} mN at {frequency:.3f} Hz."

@@ -1,0 +1,234 @@
+"""The verb that identifies a fish from its forces."""
+
+import math
+import shlex
+from contextlib import ExitStack
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fishd.cli.config import set_option
+from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.output import echo, print_json
+from fishd.client import Fish
+from fishd.config import Config, adopt, load
+from fishd.core import files
+from fishd.core.errors import FishdError
+from fishd.core.interruption import interrupted_once
+from fishd.core.signals import Tick
+
+if TYPE_CHECKING:
+    from fishd.lab.identification import Estimate, Identification
+_SHOWN: dict[str, tuple[float, str]] = {
+    "N": (1e3, "mN"),
+    "s": (1e3, "ms"),
+    "N s^2/rad^2": (1e3, "mN s²/rad²"),
+    "N s/rad": (1e3, "mN s/rad"),
+    "1": (1.0, ""),
+}
+_SYMBOLS = {
+    "omega0": "ω₀",
+    "xi": "ξ",
+    "coupling": "λ",
+    "servo_speed": "Ω",
+    "servo_lag": "Δ",
+    "thrust_coefficient": "K",
+    "lateral_drag": "K_d",
+}
+
+
+@click.command()
+@click.argument("runs", nargs=-1, type=click.Path(path_type=Path), metavar="[RUN]...")
+@click.option("--experiment", is_flag=True, help="Let a fish swim what tells most about it, first.")
+@click.option(
+    "--on",
+    type=click.Choice(["simulation", "robot"]),
+    help="With --experiment: a fish simulated in virtual time, or that of the fishd that runs, "
+    "real or not. [default: simulation]",
+)
+@click.option(
+    "--for",
+    "seconds",
+    type=click.FloatRange(min=30.0, max=3600.0),
+    help="With --experiment: how long it takes. [default: 180]",
+)
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="With --experiment: keep its ticks, as a recording.",
+)
+@click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path, readable=False),
+    help="Configuration whose plant a fit begins with, and of the simulated fish. [default: that "
+    "of the running fishd for --on robot, else the defaults]",
+)
+@set_option
+@click.option(
+    "--fit",
+    metavar="NAME,...",
+    help="What to fit; the rest is as in the plant of the configuration. [default: omega0, xi, "
+    "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_drag, servo_delay, backlash, "
+    "rotation; also: cable_slack, servo_dead_zone]",
+)
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write the sections plant and simulation of a configuration into this file.",
+)
+@click.option("--force", is_flag=True, help="Overwrite FILE.")
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Draw forces, fit and residual into this file (.png, .svg, .pdf).",
+)
+@endpoint_option
+@json_option
+def identify(
+    runs: tuple[Path, ...],
+    experiment: bool,
+    on: str | None,
+    seconds: float | None,
+    record: Path | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    fit: str | None,
+    target: Path | None,
+    force: bool,
+    plot: Path | None,
+    endpoint: str | None,
+    as_json: bool,
+) -> None:
+    """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
+
+    RUN is a recording. Several are fitted together, as one fish. Or let --experiment swim one now.
+
+    --to writes what `fishd --config` and `fishctl simulate --config` read.
+    """
+    if experiment == bool(runs):
+        raise click.UsageError("name recordings to identify, or use --experiment: one of the two")
+    for option, value in (("--on", on), ("--for", seconds), ("--record", record)):
+        if value is not None and not experiment:
+            raise click.UsageError(f"{option} goes with --experiment")
+    if target and target.exists() and not force:
+        raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
+    if record:
+        record = record.with_name(f"{record.name.removesuffix('.mcap')}.mcap")
+        if record.exists():
+            raise FishdError(f"{record}: exists already; --record names another")
+    if plot:
+        from fishd.lab.drawing import check
+
+        check(plot)
+
+    from fishd.lab import identification as lab
+
+    names = lab.DEFAULT if fit is None else tuple(filter(None, fit.replace(" ", "").split(",")))
+    lab.check(names)  # before minutes of swimming
+    if experiment:
+        config, fish = _config(on, file, overrides, endpoint)
+        tables: list[Any] = [_swum(config, fish, seconds or 180.0, record)]
+        origin = "an experiment"
+    else:
+        config, tables = load(file, overrides), list(runs)
+        origin = ", ".join(run.name for run in runs)
+    found = lab.identify(tables, start=config.plant, fit=names)
+    if plot:
+        from fishd.lab.identification.figure import draw
+
+        draw(found, plot)
+    if as_json:
+        print_json(found.to_builtins())
+    else:
+        _print(found)
+    for remark in found.remarks:
+        echo(f"fishctl: careful: {remark}", err=True)
+    if target:
+        _write(target, found.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
+
+
+def _config(
+    on: str | None, file: Path | None, overrides: tuple[str, ...], endpoint: str | None
+) -> tuple[Config, Fish | None]:
+    """The configuration that a fit begins with, and the fish of the fishd that runs, if that swims.
+
+    Raises `ConfigError`, and `NoDaemon`.
+    """
+    if on != "robot":
+        return load(file, overrides), None
+    fish = Fish(endpoint)
+    if fish.status().force_unit != "N":
+        raise FishdError(
+            "the force sensor is not calibrated, so no force is known in newtons: "
+            "fishctl calibrate force"
+        )
+    return load(file, overrides) if file else adopt(fish.config(), overrides), fish
+
+
+def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None) -> Any:
+    """The ticks of an experiment, and a recording of them where one is wanted."""
+    from fishd.lab.identification import experiment
+    from fishd.lab.rig import LiveRig, Rig, VirtualRig
+
+    def keep(ticks: list[Tick]) -> None:
+        from fishd.recording import RunWriter
+
+        if record:
+            note = "fishctl identify --experiment"
+            with RunWriter(record, source=config.robot, note=note) as writer:
+                writer.describe(config)
+                for tick in ticks:
+                    writer.tick(tick)
+
+    with ExitStack() as stack:
+        stack.enter_context(interrupted_once())
+        rig: Rig = LiveRig(stack.enter_context(fish)) if fish else VirtualRig(config)
+        stack.enter_context(rig)
+        if fish:
+            echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
+        return experiment(rig, seconds, keep=keep)
+
+
+def _write(target: Path, text: str) -> None:
+    try:
+        files.write_atomically(target, text)
+    except OSError as error:
+        raise FishdError(f"{target}: cannot be written: {error.strerror}") from None
+    echo(
+        f"{target}: written; to swim it: fishctl simulate swing --config {shlex.quote(str(target))}"
+    )
+
+
+def _print(found: "Identification") -> None:
+    rows = [("", "value", "95 % interval", "unit")]
+    rows += [_row(estimate) for estimate in found.estimates if estimate.fitted]
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    for name, value, interval, unit in rows:
+        line = f"{name:<{widths[0]}}  {value:>{widths[1]}}  {interval:<{widths[2]}}  {unit}"
+        echo(line.rstrip())
+    echo()
+    for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
+        rest = f"noise {channel.noise * 1e3:.2f} mN, drift {channel.drift * 1e3:.1f} mN"
+        echo(f"{symbol}: {channel.explained:.3%} of it explained; {rest}")
+    parts = "" if found.passages == 1 else f", in {found.passages} parts without a gap"
+    echo(f"fitted to {found.seconds:.0f} s of swimming{parts}")
+
+
+def _row(estimate: "Estimate") -> tuple[str, str, str, str]:
+    """Name, value, interval and unit, in the unit that people read."""
+    factor, unit = _SHOWN.get(estimate.unit, (1.0, estimate.unit))
+    if estimate.name == "rotation":
+        factor, unit = math.degrees(1.0), "°"
+    symbol = _SYMBOLS.get(estimate.name)
+    value, low, high = (factor * x for x in (estimate.value, estimate.low, estimate.high))
+    # Two digits of what is not known.
+    digits = max(0, 1 - math.floor(math.log10(max(high - low, 1e-9)))) if high > low else 4
+    shown = [f"{x:.{min(digits, 6)}f}" for x in (value, low, high)]
+    name = f"{estimate.name} {symbol}" if symbol else estimate.name
+    return name, shown[0], f"{shown[1]} to {shown[2]}", unit

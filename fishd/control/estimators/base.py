@@ -1,0 +1,120 @@
+"""What an estimator is, which one there are to choose from, and what they have in common."""
+
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal
+
+from msgspec import Struct
+
+from fishd.control.estimators.tail_beat import TailBeat
+from fishd.core.schema import note, unit
+from fishd.core.signals import Measurement, Observation
+
+
+class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How fin velocity and thrust are found."""
+
+    kind: Annotated[
+        Literal["lateral_force", "observer"],
+        note(
+            "lateral_force integrates F_y and knows nothing of the fish; observer is a Kalman "
+            "filter on the fish of section plant, as fishctl identify finds it."
+        ),
+    ] = "lateral_force"
+    leak: Annotated[
+        float,
+        unit(
+            "s",
+            "Of lateral_force: time constant by which the integral of the lateral force forgets.",
+            gt=0,
+            le=100,
+        ),
+    ] = 0.3
+    bias_time: Annotated[
+        float,
+        unit(
+            "s",
+            "Of lateral_force: time constant of the average that tracks the offset of F_y.",
+            gt=0,
+            le=1000,
+        ),
+    ] = 2.0
+    zero_drift: Annotated[
+        float,
+        unit(
+            "N/√s",
+            "How fast the zero of F_x wanders, standard deviation after a second: by this the "
+            "interval of the thrust grows.",
+            ge=0,
+            le=1,
+        ),
+    ] = 6e-4
+    force_noise: Annotated[
+        float, unit("N", "Of observer: noise of F_y, rms of the mean over one tick.", gt=0, le=1)
+    ] = 1e-3
+    offset_drift: Annotated[
+        float,
+        unit("N/√s", "Of observer: by how much the offset of F_y wanders in a second.", ge=0, le=1),
+    ] = 1e-3
+    disturbance: Annotated[
+        float,
+        unit(
+            "rad/s/√s",
+            "Of observer: by how much what the model lacks changes the fin velocity in a second.",
+            gt=0,
+            le=1000,
+        ),
+    ] = 1.0
+    sensor_rotation: Annotated[
+        float,
+        unit(
+            "rad",
+            "Of observer: angle by which the sensor's axes are turned against the fish.",
+            ge=-1.5,
+            le=1.5,
+        ),
+    ] = 0.0
+
+
+class Estimator(ABC):
+    """Adds force rate, fin velocity, thrust and tail-beat frequency to each measurement."""
+
+    def __init__(self) -> None:
+        self._fy: float | None = None
+        self._angle: float | None = None
+        self._beat = TailBeat()
+
+    def rest(self) -> None:
+        """Note that nobody moves the tail any more: it does not beat."""
+        self._beat.rest()
+
+    def update(
+        self, measurement: Measurement, instruction_angle: float, time: float, dt: float
+    ) -> Observation:
+        """The observation for the tick at `time`.
+
+        instruction_angle: applied since the previous tick [rad]
+        time: start of the tick [s, monotonic]
+        dt: time since the previous tick [s]
+        """
+        fy = measurement.fy
+        fy_rate = (fy - self._fy) / dt if self._fy is not None else 0.0
+        self._fy = fy
+        before = instruction_angle if self._angle is None else self._angle
+        self._angle = instruction_angle
+        self._beat.update(instruction_angle, measurement.fx, dt)
+        return Observation(
+            time=time,
+            dt=dt,
+            fx=measurement.fx,
+            fy=fy,
+            fy_rate=fy_rate,
+            fin_velocity=self.fin_velocity(measurement, instruction_angle, dt),
+            instruction_angle=instruction_angle,
+            previous_angle=before,
+            thrust=self._beat.thrust,
+            frequency=self._beat.frequency,
+        )
+
+    @abstractmethod
+    def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
+        """The fin velocity now, after one more measurement; called once a tick."""

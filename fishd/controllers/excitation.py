@@ -1,0 +1,73 @@
+"""`excitation`: the command from whose forces a fish can be identified."""
+
+from typing import Annotated, Any
+
+from msgspec import Struct
+
+from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.core.errors import ParameterError
+from fishd.core.schema import unit
+from fishd.core.signals import Observation
+
+
+class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Parameters of `excitation`."""
+
+    lowest: Annotated[
+        float, unit("Hz", "Frequency at which the sweep begins and ends.", gt=0, le=10)
+    ] = 0.5
+    highest: Annotated[float, unit("Hz", "Frequency at which it turns back.", gt=0, le=10)] = 3.0
+    sweep_time: Annotated[
+        float, unit("s", "Time from lowest to highest and back.", ge=1, le=3600)
+    ] = 20.0
+    amplitude: Annotated[
+        Amplitude,
+        unit("rad", "The larger instruction angle; null: the robot's amplitude_limit."),
+    ] = None
+    smaller: Annotated[
+        float, unit("1", "The smaller instruction angle, as a share of the larger.", gt=0, le=1)
+    ] = 0.4
+    beats: Annotated[
+        int, unit("1", "Whole beats of each of the two amplitudes in turn.", ge=1, le=1000)
+    ] = 4
+
+
+class Excitation(Controller[ExcitationParameters]):
+    """Sweep a square wave's frequency, in groups of beats of two amplitudes: tells fish apart.
+
+    The sweep tells of fin and delay. A large step saturates the servo and a small one does not, so
+    the two amplitudes tell its highest speed from its lag, and backlash from both.
+    """
+
+    Parameters = ExcitationParameters
+
+    def __init__(self, parameters: ExcitationParameters, limits: Limits) -> None:
+        super().__init__(parameters, limits)
+        self._progress = 0.0
+        """0 to 1 over one sweep, there and back."""
+        self._phase = 0.0
+        """In beats, since the start."""
+
+    @classmethod
+    def check(cls, parameters: Any, limits: Limits) -> None:
+        """Refuse bounds in the wrong order, and an amplitude beyond Φ."""
+        super().check(parameters, limits)
+        if parameters.highest < parameters.lowest:
+            raise ParameterError(
+                f"highest: {parameters.highest:g} Hz is below lowest, {parameters.lowest:g} Hz",
+                ("highest",),
+            )
+
+    def activate(self, observation: Observation) -> None:
+        """Start on the side of the present angle."""
+        self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
+
+    def update(self, observation: Observation) -> float:
+        """Plus or minus one of the two amplitudes [rad]."""
+        p = self.parameters
+        group, phase = int(self._phase // p.beats), self._phase % 1.0
+        self._progress = (self._progress + observation.dt / p.sweep_time) % 1.0
+        height = 1.0 - abs(1.0 - 2.0 * self._progress)
+        self._phase += (p.lowest + (p.highest - p.lowest) * height) * observation.dt
+        side = 1.0 if phase < 0.5 else -1.0
+        return side * amplitude_of(p, self.limits) * (p.smaller if group % 2 else 1.0)

@@ -1,0 +1,149 @@
+"""Policies and controllers on the same fish: who swims best, and how square is the command?"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
+from statistics import fmean, stdev
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from fishd.config import Config, Start
+from fishd.controllers import registry
+from fishd.core.signals import Tick
+from fishd.lab.compare.contestants import Contestant, parse, refusal
+from fishd.simulation import KeepingPublisher, Report, judge
+
+TRACE = 3.0
+"""How much of the end of a run a picture shows [s]."""
+_BEAT = 2.0
+"""How much more is kept, so that there is an upward reversal to begin with [s]."""
+
+
+class Trace(NamedTuple):
+    """The end of a run, tick by tick."""
+
+    time: list[float]  # s, 0 at the end
+    command: list[float]  # φ_c applied from `time` on, rad
+    thrust: list[float]  # F_x as measured, mean over the tick before `time`, N
+    fin: list[float]  # true α at `time`, rad; NaN where nobody knows it
+
+
+class Standing(Struct, frozen=True, kw_only=True):
+    """How a contestant did: means over its runs."""
+
+    contestant: str
+    controller: str
+    parameters: dict[str, Any]
+    thrust: float
+    """[N]"""
+    error: float | None
+    """Half of its 95 % interval [N]; None for one run in simulation, which has no error."""
+    frequency: float
+    """[Hz]"""
+    fullness: float
+    """Mean |φ_c|/Φ."""
+    squareness: float
+    """Mean |φ_c| over the rms of φ_c: square 1, sine 0.900, triangle 0.866."""
+    thrusts: list[float]
+    """Of each run [N]."""
+    efficiency: float | None = None
+    """Thrust over that of the best square wave, which is known of a simulated fish only."""
+    faults: list[str] = []
+    """Why runs ended in mode fault, if any did."""
+    fallbacks: list[str] = []
+    """Why another controller took over in runs, if one did; the figures are those of both."""
+    runs: list[Report] = []
+    """Of a simulated fish."""
+
+
+def compare(
+    config: Config,
+    contestants: Iterable[Contestant | str],
+    seconds: float = 60.0,
+    settle: float = 10.0,
+    runs: int = 1,
+    progress: Callable[[float], None] = lambda seconds: None,
+) -> tuple[list[Standing], list[Trace]]:
+    """Let each swim the fish of `config`; standings and last traces, in the order given.
+
+    contestants: texts are parsed: see `parse`
+    runs: each contestant swims so many times, with noise of seed, seed + 1, ...
+    progress: called with the time that has been swum [s]
+
+    Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
+    `UnknownController`, before anything swims.
+    """
+    chosen = [parse(one) if isinstance(one, str) else one for one in contestants]
+    for contestant in chosen:
+        if error := refusal(config, contestant):
+            raise error
+    limits = replace(config.limits, virtual=True)
+    standings, traces, swum = [], [], count(1)
+    for label, name, parameters in chosen:
+        reports = []
+        for run in range(runs):
+            noise = replace(config.simulation, seed=config.simulation.seed + run)
+            fish = replace(config, simulation=noise, start=Start())
+            controller = registry.create(name, parameters, limits)
+            end = _End(config.tick)
+            reports.append(judge(fish, name, controller, seconds, settle, end))
+            progress(next(swum) * seconds)
+        standings.append(_standing(label, reports))
+        traces.append(trace(end.ticks))
+    return standings, traces
+
+
+def trace(ticks: Sequence[Tick]) -> Trace:
+    """As much of the end of these ticks as a picture needs."""
+    end = ticks[-1].t
+    shown = [tick for tick in ticks if tick.t >= end - TRACE - _BEAT - 1e-6]
+    return Trace(
+        [tick.t - end for tick in shown],
+        [tick.phi_c for tick in shown],
+        [tick.fx for tick in shown],
+        [tick.alpha if isinstance(tick.alpha, float) else math.nan for tick in shown],
+    )
+
+
+def _standing(label: str, reports: list[Report]) -> Standing:
+    thrusts = [report.mean_thrust for report in reports]
+    return Standing(
+        contestant=label,
+        controller=reports[0].controller,
+        parameters=reports[0].parameters,
+        thrust=fmean(thrusts),
+        error=_error_of_mean(thrusts),
+        thrusts=thrusts,
+        efficiency=fmean(report.efficiency for report in reports),
+        frequency=fmean(report.frequency for report in reports),
+        fullness=fmean(report.fullness for report in reports),
+        squareness=fmean(report.squareness for report in reports),
+        faults=[report.reason.message for report in reports if report.reason],
+        fallbacks=[report.fallback.message for report in reports if report.fallback],
+        runs=reports,
+    )
+
+
+def _error_of_mean(values: Sequence[float]) -> float | None:
+    """Half of the 95 % interval of the mean, by Student's t; None for a single value."""
+    if len(values) < 2:
+        return None
+    from scipy.special import stdtrit  # of scipy.stats, which takes a second to load
+
+    return float(stdtrit(len(values) - 1, 0.975)) * stdev(values) / math.sqrt(len(values))
+
+
+class _End(KeepingPublisher):
+    """A publisher that keeps the latest ticks."""
+
+    def __init__(self, tick: float) -> None:
+        super().__init__()
+        self._most = max(2, round((TRACE + _BEAT) / tick) + 1)
+
+    def tick(self, tick: Tick) -> None:
+        """Keep it; forget the oldest from time to time."""
+        super().tick(tick)
+        if len(self.ticks) > 2 * self._most:
+            del self.ticks[: -self._most]

@@ -1,0 +1,149 @@
+"""Pictures of a comparison: command, fin, force and result of each contestant."""
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fishd.lab.compare.comparison import TRACE, Standing, Trace
+from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn
+
+_SPREAD = "0.2"
+_FORCES = ("$F_x$, drift subtracted", "$F_x$ as measured")
+_THRUSTS = ("thrust, measured", "true mean $F_x$")
+"""What is drawn of a live fish, and of a simulated one."""
+
+
+def draw(
+    path: str | os.PathLike[str],
+    standings: Sequence[Standing],
+    traces: Sequence[Trace],
+    amplitude: float,
+    unit: str = "N",
+) -> None:
+    """Command, fin and force at the end of each contestant's run, and a bar of its result.
+
+    That is its efficiency, or, of a fish that could only be measured, its thrust.
+    amplitude: Φ [rad]; unit: of the forces
+    Raises `FishdError` where the file cannot be made, and `MissingPackage`.
+    """
+    rows = len(standings)
+    simulated = all(standing.runs for standing in standings)
+    most = max(standing.thrust + (standing.error or 0.0) for standing in standings)
+    with drawn(path, (7.6, 0.7 + 1.25 * rows)) as figure:
+        axes = figure.subplots(rows, 3, squeeze=False, width_ratios=(3, 3, 1.8))
+        forces = [1e3 * force for trace in traces for force in trace.thrust]
+        limits = min(0.0, *forces) - 4.0, 1.15 * max(0.0, *forces) + 1.0
+        axes[0][1].set_title("force", fontweight="normal")
+        axes[0][2].set_title("efficiency" if simulated else "thrust", fontweight="normal")
+        for (left, middle, right), standing, trace in zip(axes, standings, traces, strict=True):
+            shown = _from_upward_reversal(trace)
+            left.set_title(standing.contestant)
+            _draw_angles(left, shown, amplitude)
+            _draw_force(middle, standing, shown, limits, unit)
+            if simulated:
+                _draw_efficiency(right, standing)
+            else:
+                _draw_thrust(right, standing, most)
+            _describe(right, standing, unit)
+        for axis in axes[:-1].flat:
+            axis.tick_params(labelbottom=False)
+        for axis in axes[-1][:2]:
+            axis.set_xlabel("time (s)")
+        what = "% of the best\nsquare wave" if simulated else f"m{unit}"
+        axes[-1][2].set_xlabel(what)
+        named = [axis.get_legend_handles_labels() for axis in axes[0]]
+        handles, labels = ([one for pair in named for one in pair[k]] for k in (0, 1))
+        figure.legend(handles, labels, loc="outside lower left", ncols=3)
+
+
+def _from_upward_reversal(trace: Trace) -> Trace:
+    """`TRACE` seconds of it, from where the command turns upward: contestants can be compared."""
+    command = trace.command
+    turns = [k for k in range(1, len(command)) if command[k - 1] <= 0.0 < command[k]]
+    earliest = trace.time[0] + max(0.0, -trace.time[0] - TRACE)
+    first = next((k for k in turns if trace.time[k] <= earliest + 1e-9), 0)
+    begin = trace.time[first]
+    last = max(k for k, time in enumerate(trace.time) if time <= begin + TRACE + 1e-9)
+    chosen = slice(first, last + 1)
+    times = [time - begin for time in trace.time[chosen]]
+    return Trace(times, command[chosen], trace.thrust[chosen], trace.fin[chosen])
+
+
+def _draw_angles(axis: Any, trace: Trace, amplitude: float) -> None:
+    # Not as a step plot: it would turn to the command after the last time shown.
+    line = {"color": BLACK, "linewidth": 0.9, "label": "command $φ_c$"}
+    axis.stairs(trace.command[:-1], trace.time, baseline=None, **line)
+    if not any(map(math.isnan, trace.fin)):
+        axis.plot(trace.time, trace.fin, color=ORANGE, linewidth=1.0, label="fin angle α")
+    axis.set_ylim(-1.15 * amplitude, 1.15 * amplitude)
+    axis.set_yticks((-amplitude, 0.0, amplitude), ("−Φ", "0", "Φ"))
+    axis.set_xlim(0.0, trace.time[-1])
+    axis.set_ylabel(f"angle\n(Φ = {amplitude:g} rad)")
+
+
+def _draw_force(
+    axis: Any, standing: Standing, trace: Trace, limits: tuple[float, float], unit: str
+) -> None:
+    thrust = 1e3 * np.array(trace.thrust)
+    axis.axhline(0.0, color="0.8", linewidth=0.6)
+    axis.plot(trace.time, thrust, color=BLUE, linewidth=0.9, label=_FORCES[bool(standing.runs)])
+    label = _THRUSTS[bool(standing.runs)] + _of_runs(", mean", standing)
+    mean = 1e3 * standing.thrust
+    axis.axhline(mean, color=BLUE, linewidth=0.7, linestyle="--", label=label)
+    axis.set_ylim(limits)
+    axis.set_xlim(0.0, trace.time[-1])
+    axis.set_ylabel(f"$F_x$ (m{unit})")
+
+
+def _draw_efficiency(axis: Any, standing: Standing) -> None:
+    shares = [100.0 * run.efficiency for run in standing.runs]
+    value = sum(shares) / len(shares)
+    label = "efficiency" + _of_runs(", mean", standing)
+    whisker = _of_runs("lowest to highest", standing)
+    _draw_bar(axis, label, value, value - min(shares), max(shares) - value, whisker)
+    axis.set_xlim(0.0, max(105.0, 1.02 * max(shares)))
+
+
+def _draw_thrust(axis: Any, standing: Standing, most: float) -> None:
+    value, error = 1e3 * standing.thrust, 1e3 * (standing.error or 0.0)
+    _draw_bar(axis, "thrust", value, error, error, "95 % interval")
+    low = min(0.0, 1.05 * (value - error))
+    axis.set_xlim(low, 1.05e3 * max(most, 1e-9))
+
+
+def _draw_bar(
+    axis: Any, label: str, value: float, below: float, above: float, whisker: str
+) -> None:
+    """A bar with its number, and with a whisker where that has a name."""
+    axis.barh(0.0, value, height=0.45, color="0.75", label=label)
+    if whisker:
+        style = {"fmt": "none", "ecolor": _SPREAD, "elinewidth": 0.8, "capsize": 2}
+        axis.errorbar(value, 0.0, xerr=[[below], [above]], label=whisker, **style)
+    axis.text(0.02, 0.0, f"{value:.1f}", va="center", fontsize=8, transform=_across(axis))
+    axis.set_ylim(-1.0, 0.4)
+    axis.set_yticks(())
+    axis.spines["left"].set_visible(False)
+
+
+def _describe(axis: Any, standing: Standing, unit: str) -> None:
+    error = "" if standing.error is None else f" ± {1e3 * standing.error:.2f}"
+    text = (
+        f"{1e3 * standing.thrust:.2f}{error} m{unit}, {standing.frequency:.2f} Hz\n"
+        f"$|φ_c|/Φ$ {standing.fullness:.2f}, square {standing.squareness:.2f}"
+    )
+    style = {"va": "top", "fontsize": 6, "color": "0.35", "transform": _across(axis)}
+    axis.text(0.0, -0.34, text, **style)
+
+
+def _across(axis: Any) -> Any:
+    """Places by the share of the width, and by the height as drawn."""
+    return axis.get_yaxis_transform()
+
+
+def _of_runs(what: str, standing: Standing) -> str:
+    """`what` and of how many runs; nothing where there is only one."""
+    runs = len(standing.thrusts)
+    return f"{what} of {runs} runs" if runs > 1 else ""

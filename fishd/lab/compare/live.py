@@ -1,0 +1,115 @@
+"""Policies and controllers on a fish that can only be measured: its thrust, and the interval."""
+
+import math
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from msgspec.structs import replace
+
+from fishd.core.errors import FishdError, ParameterError, Refused, UnknownController
+from fishd.core.signals import Tick
+from fishd.lab.compare.comparison import Standing, Trace, trace
+from fishd.lab.compare.contestants import Contestant, parse
+from fishd.lab.measurement import Measured, measure, plan
+from fishd.lab.rig import Replaced, Rig
+
+OF_A_CONTESTANT = ("bad-parameter", "controller-error", "too-slow", "unknown-controller")
+"""Refusals that say nothing of the next contestant."""
+
+
+class LiveComparison:
+    """Measures contestants on one fish, one after the other; keeps what was measured."""
+
+    def __init__(self, rig: Rig, contestants: Iterable[Contestant | str]) -> None:
+        """contestants: texts are parsed: see `parse`, which raises `ParameterError`"""
+        self.contestants = [parse(one) if isinstance(one, str) else one for one in contestants]
+        self.left_out: list[tuple[Contestant, FishdError]] = []
+        """Who could not be measured, and why."""
+        self._rig = rig
+        self._measured: list[list[Measured]] = [[] for _ in self.contestants]
+
+    def swim(
+        self,
+        seconds: float = 60.0,
+        runs: int = 1,
+        progress: Callable[[float], None] = lambda seconds: None,
+    ) -> None:
+        """Let each swim and rest in turn, for so long in each run.
+
+        With several runs everyone swims once, then everyone again, so that what changes slowly
+        meets all of them. Who cannot swim is left out, and the others go on.
+
+        progress: called with the time that has passed, or need not pass any more [s]
+        Raises `ParameterError` for a time that is too short, `Disturbed` and `NoDaemon`.
+        """
+        for contestant in self.contestants:
+            plan(seconds, contestant.parameters)
+        out = set[int]()
+        turns = [index for _ in range(runs) for index in range(len(self.contestants))]
+        for turn, index in enumerate(turns):
+            begun = turn * seconds
+            if index in out:
+                continue
+            contestant = self.contestants[index]
+            try:
+                found = measure(
+                    self._rig,
+                    contestant.controller,
+                    contestant.parameters,
+                    seconds,
+                    lambda passed, begun=begun: progress(begun + passed),  # type: ignore[misc]
+                )
+            except (Replaced, ParameterError, UnknownController, Refused) as error:
+                if isinstance(error, Refused) and error.code not in OF_A_CONTESTANT:
+                    raise
+                self.left_out.append((contestant, error))
+                out.add(index)
+                continue
+            self._measured[index].append(found)
+
+    def standings(self) -> list[Standing]:
+        """Of all that were measured, in the order given."""
+        pairs = zip(self.contestants, self._measured, strict=True)
+        return [_standing(one.label, found, self._rig) for one, found in pairs if found]
+
+    def traces(self) -> list[Trace]:
+        """The ends of their last swims, without the drift."""
+        return [_trace(found[-1]) for found in self._measured if found]
+
+
+def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
+    """Runs count by the inverse squares of their errors."""
+    weights = [1.0 / run.error**2 for run in runs]
+    total = sum(weights)
+    angles = [abs(tick.phi_c) for run in runs for tick in run.ticks if tick.mode == "running"]
+    mean = sum(angles) / len(angles)
+    rms = math.sqrt(sum(angle**2 for angle in angles) / len(angles))
+    return Standing(
+        contestant=label,
+        controller=runs[0].controller,
+        parameters=dict(runs[0].parameters),
+        thrust=sum(w * run.thrust for w, run in zip(weights, runs, strict=True)) / total,
+        error=1.0 / math.sqrt(total),
+        thrusts=[run.thrust for run in runs],
+        frequency=sum(w * run.frequency for w, run in zip(weights, runs, strict=True)) / total,
+        fullness=mean / rig.amplitude,
+        squareness=mean / rms if rms else 0.0,
+    )
+
+
+def _trace(run: Measured) -> Trace:
+    swim = _last_swim(run)
+    begun = run.ticks[0].t
+    drift = np.interp([tick.t - begun for tick in swim], run.blocks.time, run.drift)
+    corrected = [replace(t, fx=t.fx - float(d)) for t, d in zip(swim, drift, strict=True)]
+    return trace(corrected)
+
+
+def _last_swim(run: Measured) -> list[Tick]:
+    swim: list[Tick] = []
+    for each in reversed(run.ticks):
+        if each.mode == "running":
+            swim.append(each)
+        elif swim:
+            break
+    return swim[::-1]

@@ -1,0 +1,166 @@
+"""What a fish of given parameters answers to recorded commands, fast enough for a fit.
+
+The same equations as fishd.virtual.plant, for a whole run at once: the servo in closed form, tick
+by tick; the fin, which is linear, by its exact discrete filter on a grid that is shifted by the
+delay, so that every jump of the command falls on it.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+
+_FINEST = 0.0025
+"""Steps of the grid are at most this long [s]."""
+_MOST_SAMPLES = 40
+"""More samples in a period than this are as good as the continuous force."""
+_EARLIER = 2
+"""Slots before the first command, in which the servo already holds it."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What stands between the command and the fin, and the fin; the symbols of docs/concepts.md."""
+
+    omega0: float
+    """ω₀ [rad/s]"""
+    xi: float
+    """ξ [1]"""
+    servo_speed: float
+    """Ω [rad/s]"""
+    servo_lag: float
+    """Δ [rad]"""
+    servo_delay: float = 0.0
+    """[s]"""
+    backlash: float = 0.0
+    """[rad]"""
+    cable_slack: float = 0.0
+    """[rad]"""
+    servo_dead_zone: float = 0.0
+    """[rad]"""
+
+
+def response(
+    drive: Drive, commands: Array, ends: NDArray[np.int_], tick: float, samples: int
+) -> Array:
+    """Window means of [−α α̈, −α̈, −α̇] for λ = 1, of shape (3, len(ends) − 1).
+
+    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third.
+
+    commands: φ_c in each slot of one period [rad], from the start on
+    ends: slots at whose starts windows end; the first one begins where the first window does
+    tick: one period [s]
+    samples: how many samples, spread evenly over each period, the means are taken over
+    """
+    samples = min(samples, _MOST_SAMPLES)
+    stride = math.ceil(tick / (samples * _FINEST))
+    steps = stride * samples
+    h = tick / steps
+    before = _EARLIER + math.ceil(drive.servo_delay / tick - 1e-9)
+    held = np.concatenate((np.full(before, commands[0]), commands))
+    pull = _pull(drive, held, steps, tick)
+    alpha, rate = _fin(drive, pull, h)
+    # Slot k of the commands begins at k·tick; its command acts from grid point (k + before)·steps
+    # on, which is servo_delay later. So its first sample is at this grid point:
+    position = before * steps - drive.servo_delay / h + 0.5 * stride
+    first = math.floor(position)
+    part = position - first
+    slots = int(ends[-1])
+
+    def taken(values: Array, later: int = 0, each: int = 1) -> Array:
+        return values[each * first + later :: each * stride][: slots * samples]
+
+    acceleration = -drive.xi * drive.omega0 * rate - drive.omega0**2 * (alpha - pull[::2])
+    here, there = taken(rate), taken(rate, 1)
+    a = _hermite(taken(alpha), taken(alpha, 1), here, there, part, h)
+    v = _hermite(here, there, taken(acceleration), taken(acceleration, 1), part, h)
+    pulls = taken(pull, 0, 2), taken(pull, 1, 2), taken(pull, 2, 2)
+    pulled = sum(w * u for w, u in zip(_parabola(part), pulls, strict=True))
+    minus = drive.xi * drive.omega0 * v + drive.omega0**2 * (a - pulled)
+    sums = np.stack((a * minus, minus, -v)).reshape(3, slots, samples).sum(axis=2)
+    means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
+    return means
+
+
+def _pull(drive: Drive, held: Array, steps: int, tick: float) -> Array:
+    """What drives the fin, in wheel angle [rad], at the grid points and half way between them."""
+    speed, lag = drive.servo_speed, drive.servo_lag
+    dead, play = drive.servo_dead_zone, drive.backlash
+    decay = math.exp(-speed * tick / lag)
+    sinh, asinh = math.sinh, math.asinh
+    targets, sinhs, tails = [], [], []
+    phi = tail = float(held[0])
+    for command in held.tolist():
+        if dead:
+            gap = command - phi
+            command = phi if abs(gap) <= dead else command - math.copysign(dead, gap)
+        targets.append(command)
+        size = sinh((command - phi) / lag)
+        sinhs.append(size)
+        tails.append(tail)
+        phi = command - lag * asinh(size * decay)
+        if play:
+            tail = max(phi - play, min(phi + play, tail))
+    times = np.arange(2 * steps) * (0.5 * tick / steps)
+    left = np.arcsinh(np.multiply.outer(np.array(sinhs), np.exp(times * (-speed / lag))))
+    wheel = np.array(targets)[:, None] - lag * left
+    if play:  # within a slot the wheel turns one way only
+        wheel = np.clip(np.array(tails)[:, None], wheel - play, wheel + play)
+    pull = np.append(wheel.ravel(), tail if play else phi)
+    if drive.cable_slack:
+        pull = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
+    return pull
+
+
+def _fin(drive: Drive, pull: Array, h: float) -> tuple[Array, Array]:
+    """α and α̇ at the grid points for λ = 1, from rest at the first pull."""
+    free, push = _discrete(drive.omega0, drive.xi, h)
+    relative = pull - pull[0]
+    cells = np.stack((relative[:-2:2], relative[1:-1:2], relative[2::2]))
+    kick_a, kick_v = push @ cells
+    (p, q), (r, s) = free.tolist()
+    # x(n+1) = free x(n) + kick(n), solved for each of its two parts: both obey the characteristic
+    # equation of `free`.
+    denominator = [1.0, -(p + s), p * s - q * r]
+    zero = np.zeros(1)
+    a_before, v_before = np.concatenate((zero, kick_a[:-1])), np.concatenate((zero, kick_v[:-1]))
+    alpha = lfilter([1.0], denominator, kick_a + q * v_before - s * a_before)
+    rate = lfilter([1.0], denominator, kick_v + r * a_before - p * v_before)
+    return np.concatenate((zero, alpha)) + pull[0], np.concatenate((zero, rate))
+
+
+@lru_cache(maxsize=64)
+def _discrete(omega0: float, xi: float, h: float) -> tuple[Array, Array]:
+    """(2, 2) free motion over h; (2, 3) what pulls at start, middle and end add, as a parabola."""
+    fin = np.array([[0.0, 1.0], [-(omega0**2), -xi * omega0]])
+    chain = np.zeros((5, 5))
+    chain[:2, :2] = fin
+    chain[1, 2] = omega0**2
+    chain[2, 3] = chain[3, 4] = 1.0
+    moved = expm(chain * h)
+    # The states 2, 3, 4 of the chain are the pull and its derivatives at the start of a cell.
+    fit = np.array([[1.0, 0.0, 0.0], [-3 / h, 4 / h, -1 / h], [4 / h**2, -8 / h**2, 4 / h**2]])
+    return moved[:2, :2], moved[:2, 2:] @ fit
+
+
+def _hermite(
+    values: Array, next_values: Array, slopes: Array, next_slopes: Array, part: float, h: float
+) -> Array:
+    """Cubic interpolation in cells of length h, at `part` of each, with 0 ≤ part < 1."""
+    s, t = part, 1.0 - part
+    return (
+        (1.0 + 2.0 * s) * t * t * values
+        + (1.0 + 2.0 * t) * s * s * next_values
+        + h * s * t * (t * slopes - s * next_slopes)
+    )
+
+
+def _parabola(s: float) -> tuple[float, float, float]:
+    """Weights at `s` of what is at the start, the middle and the end of a cell."""
+    return (1.0 - s) * (1.0 - 2.0 * s), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0)

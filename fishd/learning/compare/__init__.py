@@ -1,1 +1,0 @@
-"""Contestants against one another: scores, tables and figures."""

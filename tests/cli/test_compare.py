@@ -1,0 +1,60 @@
+"""`fishctl compare`: a table, JSON and a picture, of simulated fish and of a running fishd."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from rigs.processes import fishctl
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return fishctl("compare", *arguments)
+
+
+def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "contest.png"
+    done = run("swing:C=0.5", "hold", "--seconds", "15", "--settle", "5", "--plot", str(picture))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "swing:C=0.5" in done.stdout
+    assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
+
+
+def test_the_command_prints_json_with_every_run() -> None:
+    done = run("swing", "square", "--seconds", "15", "--settle", "5", "--runs", "2", "--json")
+    first, second = json.loads(done.stdout)
+    assert (first["contestant"], second["contestant"]) == ("swing", "square")
+    assert len(first["runs"]) == 2
+    assert {"efficiency", "thrust", "frequency", "fullness", "squareness"} <= set(first)
+
+
+def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
+    other = ("--set", "amplitude_limit=0.31", "--seconds", "15", "--settle", "5")
+    done = run("swing", "default-fish", *other, "--json")
+    assert [standing["contestant"] for standing in json.loads(done.stdout)] == ["swing"]
+    assert done.stderr.startswith("fishctl: default-fish: left out: ppo: policy: ")
+    assert "0.42 rad" in done.stderr
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "status"),
+    [
+        (["swing:C=2"], "fishctl: swing: C: 2 is not valid: a number in [0, 1]", 1),
+        (["swing", "--seconds", "1"], "fishctl: nothing is left to judge", 1),
+        (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
+    ],
+)
+def test_a_wrong_command_is_one_line(arguments: list[str], message: str, status: int) -> None:
+    done = run(*arguments)
+    assert message in done.stderr
+    assert (done.stdout, done.returncode, done.stderr.count("\n")) == ("", status, 1)
+
+
+def test_it_is_said_that_another_controller_took_over_from_a_policy() -> None:
+    done = run("default-fish", "--seconds", "20", "--set", "plant.cable_slack=0.2")
+    assert done.returncode == 0
+    assert "fishctl: default-fish: another took over: ppo gave up: " in done.stderr

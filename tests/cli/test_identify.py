@@ -1,0 +1,68 @@
+"""`fishctl identify`: from an experiment to a configuration, a recording and a picture."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fishd.cli.main import fishctl
+from fishd.config import load
+from fishd.core.errors import FishdError
+
+
+def invoke(*arguments: str) -> Result:
+    return CliRunner().invoke(fishctl, ("identify", *arguments))
+
+
+@pytest.mark.slow
+def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_path: Path) -> None:
+    fish, record, picture = (tmp_path / name for name in ("fish.yaml", "run.mcap", "fit.png"))
+    swim = ("--experiment", "--for", "40", "--record", str(record), "--plot", str(picture))
+    done = invoke(*swim, "--set", "plant.omega0=11", "--to", str(fish))
+    assert done.exit_code == 0, done.output
+    assert "omega0 ω₀" in done.stdout
+    assert f"{fish}: written; to swim it: fishctl simulate swing --config {fish}" in done.stdout
+    assert load(fish).plant.omega0 == pytest.approx(11.0, rel=0.01)
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+    again = invoke(str(record), "--fit", "omega0, xi", "--set", "plant.omega0=11", "--json")
+    assert again.exit_code == 0
+    estimates = json.loads(again.stdout)["estimates"]
+    assert estimates["omega0"]["low"] < 11.0 < estimates["omega0"]["high"]
+    assert not estimates["coupling"]["fitted"]
+
+    refused = invoke(str(record), "--to", str(fish))
+    assert isinstance(refused.exception, FishdError)
+    assert "exists already; --force overwrites it, --to names another" in str(refused.exception)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ((), "name recordings to identify, or use --experiment: one of the two"),
+        (("run.mcap", "--experiment"), "one of the two"),
+        (("run.mcap", "--for", "60"), "--for goes with --experiment"),
+        (("--experiment", "--for", "5"), "5.0 is not in the range"),
+    ],
+)
+def test_a_command_line_that_makes_no_sense_is_refused(
+    words: tuple[str, ...], complaint: str
+) -> None:
+    done = invoke(*words)
+    assert done.exit_code == 2
+    assert complaint in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("nowhere.mcap",), "nowhere.mcap"),
+        (("--experiment", "--fit", "omega"), "did you mean 'omega0'?"),
+    ],
+)
+def test_what_cannot_be_fitted_is_one_line(words: tuple[str, ...], complaint: str) -> None:
+    done = invoke(*words)
+    assert isinstance(done.exception, FishdError)
+    assert complaint in str(done.exception)
+    assert "\n" not in str(done.exception)

@@ -1,0 +1,106 @@
+"""The thrust that is shown says how well it is known."""
+
+from collections.abc import Sequence
+
+import pytest
+from msgspec import UNSET
+from msgspec.structs import replace
+
+from fishd.config import load
+from fishd.core.signals import Tick
+from fishd.lab.rig import VirtualRig
+
+CONFIG = load(None, ["simulation.drift=0.005", "simulation.noise=0.001"])
+TRUTH = 25.74e-3
+
+
+def rig(seed: int = 0) -> VirtualRig:
+    return VirtualRig(replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed)))
+
+
+def known(ticks: Sequence[Tick]) -> tuple[float, float]:
+    """Thrust and error of the last of them."""
+    error = ticks[-1].thrust_error
+    assert error is not UNSET
+    return ticks[-1].thrust, error
+
+
+def test_nothing_is_known_of_a_fish_that_never_rested() -> None:
+    with rig() as fish:
+        ticks = fish.swim("swing", {}, 30.0)
+        assert {tick.thrust_error for tick in ticks} == {UNSET}
+        assert ticks[-1].thrust == pytest.approx(TRUTH, abs=8e-3)  # as the sensor shows it
+
+
+def test_after_a_rest_of_three_seconds_it_holds_the_truth() -> None:
+    for seed in range(10):
+        with rig(seed) as fish:
+            fish.rest(3.0)
+            for _ in range(3):
+                thrust, error = known(fish.swim("swing", {}, 20.0))
+                assert abs(thrust - TRUTH) < error < 5e-3
+
+
+def test_it_is_known_better_after_each_change_and_worse_with_time() -> None:
+    with rig() as fish:
+        fish.rest(3.0)
+        _, first = known(fish.swim("swing", {}, 8.0))
+        fish.rest(3.0)
+        _, second = known(fish.swim("swing", {}, 8.0))
+        _, later = known(fish.swim("swing", {}, 600.0))
+        assert second < 0.8 * first
+        assert later > 1.3 * second
+
+
+def test_another_wave_is_known_at_once() -> None:
+    with rig() as fish:
+        fish.rest(3.0)
+        fish.swim("swing", {}, 8.0)
+        fish.rest(3.0)
+        fish.swim("swing", {}, 8.0)
+        thrust, error = known(fish.swim("sine", {"frequency": 5.0 / 3.0}, 8.0))
+        assert abs(thrust - 17.6e-3) < error
+
+
+def test_at_rest_there_is_none() -> None:
+    with rig() as fish:
+        fish.rest(3.0)
+        fish.swim("swing", {}, 8.0)
+        thrust, error = known(fish.rest(3.0))
+        assert abs(thrust) < error < 2e-3
+
+
+def test_who_holds_still_rests_whoever_has_command() -> None:
+    with rig() as fish:
+        _, error = known(fish.swim("hold", {}, 6.0))
+        assert error < 3e-3
+
+
+def test_a_measured_factor_is_used_at_once_and_without_a_zero() -> None:
+    with rig() as fish:
+        ticks = fish.swim("swing", {}, 20.0)
+        power = sum(tick.fin_velocity**2 for tick in ticks[-240:]) / 240
+        fish._run.loop.thrust.calibrate(TRUTH / power, 0.2e-3 / power)
+        thrust, error = known(fish.swim("swing", {}, 8.0))
+        assert thrust == pytest.approx(TRUTH, abs=0.3e-3)
+        assert error < 0.6e-3
+
+
+def test_a_new_zero_of_the_sensor_is_found_again_and_the_factor_stays() -> None:
+    with rig() as fish:
+        fish.rest(3.0)
+        fish.swim("swing", {}, 8.0)
+        fish._run.loop.thrust.forget_zero()
+        assert abs(known(fish.swim("swing", {}, 8.0))[0] - TRUTH) < 3e-3
+        fish._run.loop.thrust.forget()
+        assert fish.swim("swing", {}, 8.0)[-1].thrust_error is UNSET
+
+
+def test_a_load_that_is_hung_on_at_rest_is_no_drift() -> None:
+    with rig() as fish:
+        fish.rest(4.0)
+        sensor = fish._run.loop.robot.tared
+        assert sensor
+        sensor.recalibrate(replace(sensor.calibration, x0=0.05))
+        thrust, error = known(fish.rest(4.0))
+        assert abs(thrust) < error < 2e-3

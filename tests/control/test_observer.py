@@ -1,0 +1,55 @@
+"""The observer: the fin velocity in rad/s from F_y and a model of the fish."""
+
+import numpy as np
+import pytest
+from rigs.harness import Rig, fragile_rig
+
+from fishd.core.errors import SensorError
+from fishd.simulation import simulate
+
+OBSERVER = "estimator.kind=observer"
+REAL = ("simulation.offset_y=0.02", "simulation.drift=0.005")
+
+
+def error(rig: Rig, seconds: float, delay: int = 0) -> float:
+    """Rms error of the fin velocity `delay` ticks later, as a share of its rms."""
+    ticks = rig.run_for(seconds)
+    true = np.array([tick.alpha_rate for tick in ticks], dtype=float)[delay:]
+    seen = np.array([tick.fin_velocity for tick in ticks])[: len(true)]
+    return float(np.sqrt(np.mean((seen - true) ** 2) / np.mean(true**2)))
+
+
+@pytest.mark.parametrize("plant", [(), ("plant.backlash=0.02", "plant.cable_slack=0.02")])
+def test_it_gives_the_fin_velocity_in_rad_per_second(plant: tuple[str, ...]) -> None:
+    rig = Rig(OBSERVER, *REAL, *plant)
+    rig.start("square", frequency=1.7)
+    rig.run_for(10)
+    assert error(rig, 20) < 0.02
+
+
+def test_it_looks_ahead_by_the_delay_of_the_servo() -> None:
+    rig = Rig(OBSERVER, *REAL, "plant.servo_delay=0.1")
+    rig.start("square", frequency=1.25)
+    rig.run_for(10)
+    assert error(rig, 20, delay=2) < 0.25  # the commands of these two ticks are not known yet
+
+
+def test_skipped_slots_and_a_sensor_that_fails_once_cost_little() -> None:
+    rig, robot = fragile_rig(OBSERVER)
+    rig.start("square", frequency=1.7)
+    rig.run_for(10)
+    rig.run(1, missed=3)
+    robot.read_error = SensorError("not now")
+    rig.run(2)
+    robot.read_error = None
+    rig.run(20)
+    assert error(rig, 10) < 0.02
+
+
+@pytest.mark.parametrize(("kind", "least", "most"), [("observer", 0.97, 1.0),
+                                                     ("lateral_force", 0.6, 0.9)])  # fmt: skip
+def test_swing_on_it_does_not_mind_a_slow_servo(kind: str, least: float, most: float) -> None:
+    from fishd.config import load
+
+    config = load(None, [f"estimator.kind={kind}", "plant.servo_delay=0.1", *REAL])
+    assert least < simulate(config, "swing", {}, seconds=60).efficiency <= most

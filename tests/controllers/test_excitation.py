@@ -1,0 +1,28 @@
+"""`excitation`: a swept square wave of two amplitudes."""
+
+from itertools import groupby
+
+import pytest
+from rigs.harness import LIMITS, commands
+
+from fishd.controllers import registry
+from fishd.core.errors import ParameterError
+
+
+def test_it_sweeps_there_and_back_in_groups_of_beats_of_two_amplitudes() -> None:
+    given = commands(registry.create("excitation", {}, LIMITS), 400)
+    assert sorted({abs(angle) for angle in given}) == pytest.approx([0.168, 0.42])
+    halves = [(angle, len(list(same))) for angle, same in groupby(given)]
+    assert halves[0] == (0.42, pytest.approx(20, abs=3))
+    assert min(length for _, length in halves) in (3, 4)  # 3 Hz
+    groups = [len(list(same)) for _, same in groupby(abs(angle) for angle, _ in halves)]
+    assert set(groups[:-1]) == {8}
+
+
+def test_it_begins_on_the_side_where_the_tail_is() -> None:
+    assert commands(registry.create("excitation", {}, LIMITS), 1, angle=-0.1) == [-0.42]
+
+
+def test_a_sweep_that_goes_down_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"highest: 0\.3 Hz is below lowest, 0\.5 Hz"):
+        registry.create("excitation", {"highest": 0.3}, LIMITS)

@@ -1,0 +1,169 @@
+"""Identification: a fish from its forces, with what can and cannot be told of it."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from msgspec.structs import asdict
+from rigs.harness import Rig
+
+from fishd.config import load
+from fishd.core.errors import ParameterError
+from fishd.core.frames import frame
+from fishd.lab.identification import Identification, Unidentifiable, experiment, identify
+from fishd.lab.identification.response import Drive, response
+from fishd.lab.rig import VirtualRig
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import TetheredFish
+
+TICK = 0.05
+REAL = (
+    "simulation.offset_x=0.02",
+    "simulation.offset_y=0.02",
+    "simulation.drift=0.005",
+    "simulation.rotation=0.0873",
+    "plant.omega0=11",
+    "plant.servo_delay=0.04",
+    "plant.backlash=0.02",
+)
+FISH = load(None, REAL).plant
+NEARLY_KNOWN = ("omega0", "servo_delay", "rotation")
+
+
+def swum(*overrides: str, seconds: float = 90.0) -> pd.DataFrame:
+    with VirtualRig(load(None, overrides)) as rig:
+        return experiment(rig, seconds)
+
+
+@pytest.fixture(scope="module")
+def table() -> pd.DataFrame:
+    """Without what no robot knows, and what an estimator makes of it."""
+    return swum(*REAL).drop(columns=["alpha", "alpha_rate", "phi", "fin_velocity"])
+
+
+@pytest.fixture(scope="module")
+def found(table: pd.DataFrame) -> Identification:
+    return identify(table)
+
+
+@pytest.mark.slow
+def test_it_finds_the_fish_and_the_rig_from_forces_and_commands_alone(
+    found: Identification,
+) -> None:
+    config = load(None, REAL)
+    truth = asdict(config.plant) | asdict(config.simulation)
+    for name in ("omega0", "xi", "coupling", "servo_speed", "servo_lag", "thrust_coefficient",
+                 "lateral_drag", "rotation"):  # fmt: skip
+        assert found[name].value == pytest.approx(truth[name], rel=0.01), name
+        assert found[name].low < found[name].value < found[name].high
+    assert found["servo_delay"].value == pytest.approx(0.04, abs=5e-4)
+    assert found["backlash"].value == pytest.approx(0.02, abs=1e-3)
+    assert found.remarks == ()
+
+
+@pytest.mark.slow
+def test_offsets_are_those_of_the_sensor_and_the_drift_is_told_apart(found: Identification) -> None:
+    # One period and a half of a drift of 5 mN: its mean is within 2 π of a third.
+    assert abs(found["offset_y"].value - 0.02) < 5e-3 / 2
+    assert all(channel.drift == pytest.approx(0.010, rel=0.1) for channel in found.channels)
+    assert all(channel.noise == pytest.approx(1e-3, rel=0.05) for channel in found.channels)
+
+
+@pytest.mark.slow
+def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text(found.to_yaml("a test"), encoding="utf-8")
+    config = load(file)
+    assert asdict(config.plant) == pytest.approx(found.plant | {"servo_reaction": 0.0}, rel=1e-5)
+    assert config.simulation.rotation == pytest.approx(found["rotation"].value, rel=1e-5)
+
+
+def test_gaps_and_skipped_slots_cost_only_what_is_missing(table: pd.DataFrame) -> None:
+    lost = table.drop(index=range(700, 720)).drop(index=range(1200, 1201))
+    found = identify(lost, start=FISH, fit=NEARLY_KNOWN)
+    assert found.passages == 3
+    assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
+    assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
+    assert all(channel.white for channel in found.channels)
+
+
+def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
+    rig = Rig(*REAL)
+    rig.start("excitation")
+    for _ in range(30):
+        rig.run(1, missed=3)
+        rig.run(29)
+    found = identify(frame(rig.recorder.ticks), start=FISH, fit=NEARLY_KNOWN)
+    assert found.passages == 1
+    assert found.seconds == pytest.approx(30 * 33 * TICK, abs=0.2)
+    assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
+    assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
+
+
+def width(found: Identification) -> float:
+    return found["omega0"].high - found["omega0"].low
+
+
+def test_several_runs_are_one_fish(table: pd.DataFrame) -> None:
+    halves = [table.iloc[:900], table.iloc[900:]]
+    both, one = (identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (halves, halves[1]))
+    assert both.passages == 2
+    assert width(both) < 0.8 * width(one)
+
+
+@pytest.mark.slow
+def test_data_that_cannot_tell_say_so() -> None:
+    with VirtualRig(load(None, ["simulation.noise=0.003"])) as rig:
+        ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
+    found = identify(frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag"))
+    assert any("known to 10 % at best" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "complaint"),
+    [
+        (lambda t: t.drop(columns=["fy"]), "no table of ticks: the column fy is missing"),
+        (lambda t: t.iloc[:0], "there is no passage of 5 s without a gap"),
+        (lambda t: t.iloc[:90], "there is no passage of 5 s without a gap"),
+        (lambda t: t.assign(phi_c=0.0), "φ_c is zero all the time"),
+        (lambda t: t.assign(t=1.0), "the times of these ticks do not increase"),
+        (lambda t: t.assign(servo_on=False), "there is no passage of 5 s without a gap"),
+    ],
+)
+def test_a_table_with_nothing_to_fit_is_refused(
+    table: pd.DataFrame, spoil: object, complaint: str
+) -> None:
+    with pytest.raises(Unidentifiable, match=complaint):
+        identify(spoil(table))  # type: ignore[operator]
+
+
+def test_a_name_that_cannot_be_fitted_is_refused(table: pd.DataFrame) -> None:
+    with pytest.raises(ParameterError, match="'omega' cannot be fitted; did you mean 'omega0'"):
+        identify(table, fit=["omega"])
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        PlantParameters(servo_delay=0.023),
+        PlantParameters(servo_delay=0.05, backlash=0.03),
+        PlantParameters(cable_slack=0.03, servo_dead_zone=0.02),
+    ],
+)
+def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> None:
+    chance = np.random.default_rng(1)
+    commands = np.repeat(chance.uniform(-0.42, 0.42, 60), chance.integers(2, 12, 60))
+    commands[:20] = 0.0
+    fish = TetheredFish(plant)
+    windows = [fish.advance(angle, TICK, 10) for angle in commands]
+    drive = Drive(**{name: getattr(plant, name) for name in Drive.__dataclass_fields__})
+    a, b, c = response(drive, commands, np.arange(len(commands) + 1), TICK, 10)
+    inertia, drag, scale = plant.thrust_coefficient, plant.lateral_drag, plant.coupling
+    fx = inertia * scale * scale * a
+    fy = inertia * scale * b + drag * scale * c
+    # Far below the noise of 1 mN; play is lost and found between two points of the grid.
+    assert fx == pytest.approx([w.sampled_thrust for w in windows], abs=2e-5)
+    assert fy == pytest.approx([w.sampled_lateral_force for w in windows], abs=1e-4)
+    assert math.sqrt(np.mean((fy - [w.sampled_lateral_force for w in windows]) ** 2)) < 1e-5

@@ -1,0 +1,100 @@
+"""Contestants on a fish that can only be measured, here one in virtual time."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from fishd.config import load
+from fishd.core.errors import ParameterError, Refused
+from fishd.core.signals import Tick
+from fishd.lab.compare import LiveComparison, compare
+from fishd.lab.rig import Disturbed, VirtualRig
+
+DRIFTS = load(None, ["simulation.drift=0.005", "simulation.noise=0.001"])
+
+
+def test_a_drifting_sensor_ranks_by_the_true_thrust_which_lies_in_each_interval() -> None:
+    names = ["sine:frequency=1.7", "swing", "square:frequency=1"]
+    with VirtualRig(DRIFTS) as rig:
+        live = LiveComparison(rig, names)
+        live.swim(30.0)
+    true, _ = compare(DRIFTS, names)
+    for found, known in zip(live.standings(), true, strict=True):
+        assert found.contestant == known.contestant
+        assert found.error is not None
+        assert abs(found.thrust - known.thrust) < found.error < 2e-3
+        assert found.squareness == pytest.approx(known.squareness, abs=0.01)
+        assert found.frequency == pytest.approx(known.frequency, abs=0.03)
+
+
+def test_several_runs_come_in_turn_and_narrow_the_interval() -> None:
+    told: list[str] = []
+    passed: list[float] = []
+
+    class Listening(VirtualRig):
+        def swim(
+            self, controller: str, parameters: Mapping[str, Any], seconds: float
+        ) -> list[Tick]:
+            if told[-1:] != [controller]:
+                told.append(controller)
+            return super().swim(controller, parameters, seconds)
+
+    with Listening(DRIFTS) as rig:
+        live = LiveComparison(rig, ["swing", "sine"])
+        live.swim(25.0, runs=2, progress=passed.append)
+        both, first = live.standings()[0], live._measured[0][0]
+    assert told == ["swing", "sine", "swing", "sine"]
+    assert len(both.thrusts) == 2
+    assert both.error is not None
+    assert both.error < first.error
+    assert passed == sorted(passed)
+    assert passed[-1] == pytest.approx(100.0, rel=0.02)
+
+
+def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on() -> None:
+    config = load(None, ["plant.cable_slack=0.2"])
+    with VirtualRig(config) as rig:
+        live = LiveComparison(rig, ["swing:C=7", "default-fish", "swing"])
+        live.swim(25.0, runs=2)
+    assert [standing.contestant for standing in live.standings()] == ["swing"]
+    (one, refusal), (other, gave_up) = live.left_out
+    assert (one.label, other.label) == ("swing:C=7", "default-fish")
+    assert "number in [0, 1]" in str(refusal)
+    assert "ppo gave up" in str(gave_up)
+
+
+class Disturbing(VirtualRig):
+    """Somebody stops the fish in the second measurement."""
+
+    swims = 0
+
+    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
+        self.swims += 1
+        if self.swims > 2:
+            raise Disturbed("the fish was told to let sine swim, but it is in mode idle")
+        return super().swim(controller, parameters, seconds)
+
+
+def test_nobody_swims_on_after_somebody_interfered_and_what_was_measured_is_kept() -> None:
+    with Disturbing(DRIFTS) as rig:
+        live = LiveComparison(rig, ["swing", "sine", "square"])
+        with pytest.raises(Disturbed):
+            live.swim(25.0)
+    assert [standing.contestant for standing in live.standings()] == ["swing"]
+    assert len(live.traces()) == 1
+    assert rig.swims == 3
+
+
+def test_a_time_that_is_too_short_and_a_latched_fault_end_it_before_anyone_swims() -> None:
+    class Latched(VirtualRig):
+        def swim(self, *_: Any) -> list[Tick]:
+            raise Refused("fault", "fishd is in fault")
+
+    with Latched(DRIFTS) as rig:
+        live = LiveComparison(rig, ["swing", "sine"])
+        with pytest.raises(ParameterError, match="too short"):
+            live.swim(10.0)
+        with pytest.raises(Refused):
+            live.swim(25.0)
+    assert (live.standings(), live.left_out) == ([], [])

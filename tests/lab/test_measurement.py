@@ -1,0 +1,86 @@
+"""Thrust is told apart from whatever the force sensor drifts, with an interval that holds."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from fishd.config import Config, load
+from fishd.core.errors import ParameterError
+from fishd.lab import drift
+from fishd.lab.measurement import Measured, measure, plan
+from fishd.lab.rig import Disturbed, VirtualRig
+from fishd.simulation import simulate
+
+RIG = load(None, ["simulation.rotation=0.05", "simulation.offset_y=0.01"])
+DRIFTS = {
+    "none": {},
+    "a sine of 60 s": {"drift": 5e-3},
+    "a sine of 20 s": {"drift": 5e-3, "drift_period": 20.0},
+    "a walk": {"drift_walk": 5e-4},
+    "a line": {"drift_rate": 2e-4},
+}
+
+
+def measured(config: Config, seconds: float = 30.0, controller: str = "swing") -> Measured:
+    with VirtualRig(config) as rig:
+        return measure(rig, controller, {}, seconds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DRIFTS)
+def test_the_interval_holds_the_true_thrust_whatever_the_drift(name: str) -> None:
+    truth = simulate(RIG, "swing", {}).mean_thrust * np.cos(RIG.simulation.rotation)
+    misses = 0
+    for seed in range(8):
+        config = replace(RIG, simulation=replace(RIG.simulation, seed=seed, **DRIFTS[name]))
+        found = measured(config)
+        assert found.thrust == pytest.approx(truth, abs=1.5e-3)
+        misses += abs(found.thrust - truth) > found.error
+    assert misses <= 2  # of 8, where one in twenty is meant
+
+
+def test_a_drift_that_the_plain_average_falls_for_is_taken_off() -> None:
+    config = replace(RIG, simulation=replace(RIG.simulation, drift_rate=1e-3))
+    found = measured(config)
+    plain = np.mean([tick.fx for tick in found.ticks if tick.mode == "running"])
+    assert plain > found.thrust + 10e-3
+    assert found.thrust == pytest.approx(measured(RIG).thrust, abs=0.2e-3)
+    assert found.drift[-1] - found.drift[0] == pytest.approx(
+        1e-3 * (found.blocks.time[-1] - found.blocks.time[0]), rel=0.05
+    )
+
+
+def test_a_fish_that_holds_still_has_no_thrust() -> None:
+    found = measured(RIG, controller="hold")
+    assert abs(found.thrust) < max(found.error, 0.3e-3)
+    assert found.frequency == 0.0
+
+
+@pytest.mark.parametrize(("seconds", "frequency"), [(30.0, 1.7), (60.0, 0.4), (21.0, 3.0)])
+def test_a_plan_takes_its_time_and_begins_and_ends_at_rest(
+    seconds: float, frequency: float
+) -> None:
+    phases = plan(seconds, {"frequency": frequency})
+    assert sum(length for _, length in phases) == pytest.approx(seconds)
+    assert [swims for swims, _ in phases] == [False, *[True, False] * (len(phases) // 2)]
+    assert min(length for swims, length in phases if swims) > 3.0 / frequency + 1.0
+
+
+@pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0])
+def test_what_is_too_short_is_told_with_what_is_needed(seconds: float) -> None:
+    with pytest.raises(ParameterError, match=r"two swims of 6 s .* need 20\.2 s"):
+        plan(seconds, {})
+
+
+def test_a_fault_in_the_middle_ends_the_measurement_and_says_which() -> None:
+    with VirtualRig(RIG) as rig:
+        rig.rest(1.0)
+        rig._run.loop.estop("somebody fell in")
+        with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(somebody"):
+            rig.rest(1.0)
+
+
+def test_swimming_alone_cannot_be_told_from_a_drift() -> None:
+    blocks = drift.Blocks(np.arange(9.0), np.ones(9), np.ones(9), np.ones(9, dtype=bool))
+    with pytest.raises(ValueError, match="of rest are needed"):
+        drift.fit(blocks)

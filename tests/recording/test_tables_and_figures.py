@@ -1,0 +1,72 @@
+"""Tables and figures of a recording."""
+
+import json
+import re
+from pathlib import Path
+
+import pandas
+import pyarrow.parquet
+import pytest
+from rigs.processes import fishctl, one_line
+from rigs.recordings import recorded, swum, write
+
+from fishd.lab.run_traces import traces
+from fishd.recording import open_run
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(swum(), tmp_path_factory.mktemp("runs") / "run", note="<b>stiff</b> & $new_{$")
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_a_table_has_every_bit_of_every_tick(path: Path, tmp_path: Path, form: str) -> None:
+    done = fishctl("export", str(path), f"--{form}", "--to", str(tmp_path))
+    table, events = map(Path, done.stdout.split())
+    reader = {"csv": pandas.read_csv, "parquet": pandas.read_parquet}[form]
+    found = reader(table)
+    assert list(found.columns) == list(open_run(path).frame().columns)
+    for name in ("t", "fx", "fin_velocity", "phi_c", "thrust"):
+        assert found[name].tolist() == [getattr(tick, name) for tick in open_run(path).ticks]
+    assert reader(events)["kind"].tolist() == ["controller", "mode", "parameters"]
+    again = fishctl("export", str(path), f"--{form}", "--to", str(tmp_path))
+    assert "is there already; --force replaces it" in one_line(again)
+    assert fishctl("export", str(path), f"--{form}", "--to", str(tmp_path), "--force").stdout
+    if form == "parquet":
+        about = json.loads(pyarrow.parquet.read_schema(table).metadata[b"fishd"])
+        assert about["configs"]["0"]["tick"] == 0.05
+
+
+@pytest.mark.slow  # to load matplotlib and plotly takes seconds
+def test_a_recording_is_drawn_as_a_picture_and_as_a_page_that_loads_nothing(
+    path: Path, tmp_path: Path
+) -> None:
+    done = fishctl("plot", str(path), "--to", str(tmp_path), "--from", "0.5")
+    picture, page = map(Path, done.stdout.split())
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    html = page.read_text()
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", html)
+    assert "Plotly.newPlot" in html
+    assert "<b>stiff</b>" not in html
+    nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
+    assert "there is no tick between these times; it is 3.0 s long" in one_line(nothing)
+
+
+def test_where_ticks_are_missing_a_curve_has_a_break(tmp_path: Path) -> None:
+    ticks = swum().recorder.ticks
+    drawn = traces(open_run(write(tmp_path / "run", ticks[:20] + ticks[30:])))
+    assert len(drawn.time) == 51
+    assert [index for index, value in enumerate(drawn.fx) if value != value] == [20]
+
+
+def test_recordings_are_listed_with_what_is_missing(path: Path, tmp_path: Path) -> None:
+    ticks = swum().recorder.ticks
+    write(tmp_path / "second", ticks[:20] + ticks[30:])
+    (tmp_path / "broken.mcap").write_text("nothing")
+    done = fishctl("runs", "--folder", str(tmp_path))
+    assert re.search(r"^second .* 50 +10 +0  swing", done.stdout, re.MULTILINE)
+    assert "broken.mcap is no MCAP file" in done.stderr
+    (listed,) = json.loads(fishctl("runs", "--json", "--folder", str(path.parent)).stdout)
+    assert (listed["name"], listed["state"], listed["lost"]) == ("run", "finished", 0)
+    nothing = fishctl("runs", "--folder", str(tmp_path / "none"))
+    assert "there is no recording in" in nothing.stdout
