@@ -39,6 +39,13 @@ def measure_options(function: Any) -> Any:
             help="The fish of a running fishd, or one in virtual time.",
         ),
         click.option(
+            "--settle",
+            type=click.FloatRange(0.0, 600.0),
+            default=1.5,
+            show_default=True,
+            help="How long the fin takes to swim steadily, and to come to rest [s].",
+        ),
+        click.option(
             "--for",
             "seconds",
             type=float,
@@ -66,6 +73,7 @@ def _measure(
     name: str,
     parameters: dict[str, Any],
     seconds: float,
+    settle: float,
     where: str,
     picture: Path | None,
     file: Path | None,
@@ -86,13 +94,13 @@ def _measure(
         rig: Rig
         if where == "simulation":
             rig = stack.enter_context(VirtualRig(load(file, overrides)))
-            found = run(rig, name, parameters, seconds)
+            found = run(rig, name, parameters, seconds, settle=settle)
         else:
             fish = stack.enter_context(Fish(endpoint))
             rig = stack.enter_context(LiveRig(fish))
             with showing(seconds, "s") as bar:
-                found = run(rig, name, parameters, seconds, bar.at)
-            if found.thrust > found.error:
+                found = run(rig, name, parameters, seconds, bar.at, settle)
+            if found.thrust > found.error and not found.remark:
                 fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
         if picture:
             from fishd.lab.measurement_figure import draw
@@ -102,6 +110,8 @@ def _measure(
         print_json(summary(found, rig.tick))
     else:
         echo(_line(found))
+    if found.remark:
+        echo(f"fishctl: {found.remark}; measure again with a longer --settle", err=True)
 
 
 def _line(found: "Measured") -> str:

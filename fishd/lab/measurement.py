@@ -21,6 +21,8 @@ REST_SETTLES = 1.0
 """The water and the fin are still after so long, fading included [s]."""
 BLOCK = 0.5
 """Rest is cut in pieces of this length [s]."""
+UNSTEADY, RESTLESS = 0.05, 0.01
+"""The power of the fin may change by this share in a swim, and be this share of it at rest."""
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
 
@@ -60,6 +62,8 @@ class Measured(NamedTuple):
     """The force without swimming, block by block [N]."""
     ticks: Sequence[Tick]
     """Every tick, in order."""
+    remark: str
+    """Why the thrust may be wrong by more than its error; empty where nothing speaks for that."""
 
 
 def measure(
@@ -68,19 +72,21 @@ def measure(
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
     progress: Callable[[float], None] = lambda seconds: None,
+    settle: float = SWIM_SETTLES,
 ) -> Measured:
     """Let a controller swim and rest in turn for so long, and find its thrust.
 
     The drift of the sensor is told apart by the rests: see `fishd.lab.drift`.
     progress: called with the time that has passed [s]
+    settle: how long the fin takes until it swims steadily, or hangs still as before [s]
 
     Raises `ParameterError` for a time that is too short, `Disturbed`, and what `Rig.swim` raises.
     """
     ticks: list[Tick] = []
-    for swims, length in plan(seconds, parameters):
+    for swims, length in plan(seconds, parameters, settle):
         ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
         progress(len(ticks) * rig.tick)
-    found = evaluate(samples_of(ticks), rig.tick)
+    found = evaluate(samples_of(ticks), rig.tick, settle, _still(settle))
     return found._replace(controller=controller, parameters=dict(parameters), ticks=ticks)
 
 
@@ -124,36 +130,53 @@ def summary(found: Measured, tick: float) -> Summary:
     )
 
 
-def plan(seconds: float, parameters: Mapping[str, Any]) -> list[tuple[bool, float]]:
+def plan(
+    seconds: float, parameters: Mapping[str, Any], settle: float = SWIM_SETTLES
+) -> list[tuple[bool, float]]:
     """When to swim (True) and to rest, and for how long each [s]; `seconds` in all.
 
-    A slow beat makes a swim longer. Raises `ParameterError` where two swims do not fit.
+    A slow beat makes a swim longer, a long time to settle both.
+    Raises `ParameterError` where two swims do not fit.
     """
     frequency = parameters.get("frequency")
-    swim = SWIM
+    swim = settle + SWIM - SWIM_SETTLES
     if isinstance(frequency, int | float) and frequency > 0.0:
-        swim = max(SWIM, SWIM_SETTLES + 3.0 / frequency)
-    count = math.floor((seconds - REST) / (swim + REST)) if math.isfinite(seconds) else 0
+        swim = max(swim, settle + 3.0 / frequency)
+    rest = _still(settle) + REST - REST_SETTLES
+    count = math.floor((seconds - rest) / (swim + rest)) if math.isfinite(seconds) else 0
     if count < 2:
         raise ParameterError(
             f"a measurement of {seconds:g} s is too short: two swims of {swim:.3g} s between three "
-            f"rests of {REST:g} s need {2 * swim + 3 * REST:.3g} s"
+            f"rests of {rest:.3g} s need {2 * swim + 3 * rest:.4g} s"
         )
-    stretched = seconds / (REST + count * (swim + REST))
-    cycle = [(True, swim * stretched), (False, REST * stretched)]
-    return [(False, REST * stretched), *cycle * count]
+    stretched = seconds / (rest + count * (swim + rest))
+    cycle = [(True, swim * stretched), (False, rest * stretched)]
+    return [(False, rest * stretched), *cycle * count]
 
 
-def evaluate(samples: Sequence[Sample], tick: float, settles: float = SWIM_SETTLES) -> Measured:
+def _still(settle: float) -> float:
+    """When the fin of a fish that takes so long to swim steadily hangs still [s]."""
+    return REST_SETTLES + max(0.0, settle - SWIM_SETTLES)
+
+
+def evaluate(
+    samples: Sequence[Sample],
+    tick: float,
+    settles: float = SWIM_SETTLES,
+    stills: float = REST_SETTLES,
+) -> Measured:
     """The thrust of a fish that swam and rested in turn; names no controller, and has no ticks.
 
     tick: period of the loop [s]
-    settles: when a swim is steady [s]
+    settles, stills: when a swim is steady, and a rest is still [s]
     Raises `ParameterError` where there is too little to tell it from a drift.
     """
     first = samples[0].seq
     phases = list(_phases(samples))
-    found = [block for phase in phases for block in _blocks(phase, tick, first, settles)]
+    kept = [
+        list(_blocks(phase, tick, first, settles if phase[0].swims else stills)) for phase in phases
+    ]
+    found = [block for blocks in kept for block in blocks]
     swimming = [block for block in found if block.swims]
     if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
         raise ParameterError(
@@ -178,7 +201,23 @@ def evaluate(samples: Sequence[Sample], tick: float, settles: float = SWIM_SETTL
         blocks=blocks,
         drift=result.drift,
         ticks=[],
+        remark=_remark(kept),
     )
+
+
+def _remark(kept: Sequence[Sequence["_Block"]]) -> str:
+    """What speaks against a measurement, of the blocks of each swim and rest."""
+    swims = [blocks for blocks in kept if len(blocks) > 1 and blocks[0].swims]
+    rests = [block.power for blocks in kept[1:] for block in blocks if not block.swims]
+    begins = sum(block.power for blocks in swims for block in blocks[: len(blocks) // 2])
+    ends = sum(block.power for blocks in swims for block in blocks[-(len(blocks) // 2) :])
+    if begins and abs(ends / begins - 1.0) > UNSTEADY:
+        return f"the fin was not steady: its power changed by {ends / begins - 1.0:+.0%} in a swim"
+    count = sum(len(blocks) // 2 for blocks in swims)
+    if begins and rests and np.mean(rests) > RESTLESS * begins / count:
+        share = np.mean(rests) * count / begins
+        return f"the fin did not rest: it had {share:.0%} of its power left"
+    return ""
 
 
 class _Block(NamedTuple):
@@ -200,9 +239,10 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
     """Whole beats of a swim, or pieces of a rest, once it has settled.
 
     first: index that time is counted from
+    settles: when it has [s]
     """
     swims = phase[0].swims
-    begin = round((settles if swims else REST_SETTLES) / tick)
+    begin = round(settles / tick)
     ups = _reversals(phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1

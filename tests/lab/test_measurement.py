@@ -84,3 +84,14 @@ def test_swimming_alone_cannot_be_told_from_a_drift() -> None:
     blocks = drift.Blocks(np.arange(9.0), np.ones(9), np.ones(9), np.ones(9, dtype=bool))
     with pytest.raises(ValueError, match="of rest are needed"):
         drift.fit(blocks)
+
+
+def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() -> None:
+    slow = replace(RIG, plant=replace(RIG.plant, xi=0.05))
+    found = measured(slow, 60.0)
+    assert "the fin was not steady: its power changed by +" in found.remark
+    with VirtualRig(slow) as rig:
+        found = measure(rig, "swing", {}, 240.0, settle=14.0)
+    truth = simulate(slow, "swing", {}, 200.0, 60.0).mean_thrust * np.cos(0.05)
+    assert found.remark == ""
+    assert abs(found.thrust - truth) < found.error < 0.02 * truth
