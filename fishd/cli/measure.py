@@ -1,6 +1,5 @@
 """The verb that finds a controller's thrust with its interval, on a live or a simulated fish."""
 
-import signal
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from fishd.cli.options import ControllerGroup, endpoint_option, json_option
 from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
 from fishd.config import load
+from fishd.core.interruption import interrupted_once
 
 if TYPE_CHECKING:
     from fishd.lab.measurement import Measured
@@ -81,8 +81,8 @@ def _measure(
         raise click.UsageError(
             "--config and --set describe a fish in virtual time: --on simulation"
         )
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too leaves the fish at rest
     with ExitStack() as stack:
+        stack.enter_context(interrupted_once())  # whatever ends it leaves the fish at rest
         rig: Rig
         if where == "simulation":
             rig = stack.enter_context(VirtualRig(load(file, overrides)))

@@ -90,8 +90,9 @@ def _recorder(path: Path) -> "RunWriter":
     try:
         from fishd.recording import RunWriter
     except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
         raise MissingPackage(
-            f"--record needs the package {error.name}; with pip: pip install 'fishd[record]'"
+            f"--record needs the package {package}; with pip: pip install 'fishd[record]'"
         ) from None
     return RunWriter(path, source="simulation")
 

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fishd.core.errors import MissingPackage, ParameterError
+from fishd.core.errors import ParameterError
 from fishd.virtual.plant.drive_train import relax
 from fishd.virtual.plant.optimum import SteadyState, best_square_wave
 from fishd.virtual.plant.parameters import PlantParameters
@@ -84,7 +84,7 @@ def optimal_control(
     The equations are those of Fu et al.: slack, backlash, dead zone, delay and reaction of the
     servo are left out. intervals: even; a reversal can be at the end of each.
 
-    Raises `ParameterError` without damping, where thrust has no bound, and `MissingPackage`.
+    Raises `ParameterError` without damping, where thrust has no bound.
     """
     if not (amplitude > 0.0 and intervals >= 8 and intervals % 2 == 0):
         raise ValueError(f"no optimal control for {amplitude} rad and {intervals} intervals")
@@ -161,12 +161,7 @@ class _Problem:
         return max(first, second, key=lambda climb: climb.thrust)
 
     def _climbed(self, share: Array, period: float, usual: float) -> _Climb:
-        try:
-            from scipy.optimize import minimize
-        except ModuleNotFoundError:
-            raise MissingPackage(
-                "optimal control needs scipy, which is not installed: pip install 'fishd[lab]'"
-            ) from None
+        from scipy.optimize import minimize  # the rest of the lab's optima does without
 
         def descend(x: Array) -> tuple[float, Array]:
             thrust, slope, _ = self.evaluate(x)
