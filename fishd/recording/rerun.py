@@ -162,7 +162,10 @@ class _Rerun:
         self._before = 0.0
         recorded = self._run.config_of(self._number)
         self._config: Config = adopt(self._run.configs[self._number], self._overrides)
-        self._estimates_again = self._config.estimator != recorded.estimator
+        modelled = self._config.estimator.kind == "observer"
+        self._estimates_again = self._config.estimator != recorded.estimator or (
+            modelled and self._config.plant != recorded.plant
+        )
         self._estimator = build_estimator(self._config)
         self.estimates.from_start &= tick.seq == 1
         config = self._config

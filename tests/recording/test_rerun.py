@@ -50,6 +50,19 @@ def test_every_command_and_every_estimate_comes_out_to_the_last_bit(
     assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
 
 
+def test_the_model_based_estimator_is_rerun_too_and_sees_another_fish_where_asked(
+    tmp_path: Path,
+) -> None:
+    rig = Rig("estimator.kind=observer", "simulation.noise=0.002")
+    rig.start("swing")
+    rig.run_for(10)
+    run = open_run(recorded(rig, tmp_path / "run"))
+    result = rerun(run)
+    assert result.stretches[0].equal == result.estimates.equal == 200
+    other = rerun(run, overrides=["plant.omega0=9"])
+    assert other.stretches[0].equal < 200
+
+
 def test_a_change_of_the_code_would_be_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

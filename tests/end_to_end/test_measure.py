@@ -1,0 +1,65 @@
+"""`fishctl measure` on a real fishd: what it finds, what it tells fishd, and how it ends."""
+
+import signal
+import time
+
+import msgspec
+import pytest
+from rigs.processes import FISHCTL, Daemon, Process, running, wait_until
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-def]
+    with running(tmp_path_factory.mktemp("daemon"), "--set", "simulation.drift=0.005") as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def daemon(drifting: Daemon) -> Daemon:
+    return drifting.at_rest()
+
+
+def begun(daemon: Daemon) -> Process:
+    """A measurement whose fish has begun to swim."""
+    found = Process(FISHCTL, "--endpoint", daemon.endpoint, "measure", "swing", "--for", "60")
+    wait_until(lambda: daemon.status().mode == "running")
+    return found
+
+
+def test_it_finds_the_thrust_and_fishd_shows_it_from_then_on(daemon: Daemon) -> None:
+    ended = daemon.fishctl("measure", "swing", "--for", "21", "--json")
+    assert ended.returncode == 0, ended.stderr
+    found = msgspec.json.decode(ended.stdout)
+    assert found["thrust"] == pytest.approx(25.74e-3, abs=1.5e-3)
+    assert 0.0 < found["error"] < 1.5e-3
+    assert daemon.status().mode == "idle"
+    daemon.fishctl("set-controller", "swing")
+    time.sleep(5.0)
+    status = daemon.status()
+    assert status.thrust_error is not None
+    assert status.thrust_error < 2e-3
+    assert status.thrust == pytest.approx(found["thrust"], abs=status.thrust_error)
+
+
+def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -> None:
+    measuring = begun(daemon)
+    assert daemon.fishctl("set-controller", "square").returncode == 0
+    status, out, err = measuring.finish()
+    assert (status, out) == (1, "")
+    assert "told to let swing swim, but square swims: this measurement is lost" in err
+    assert daemon.status().controller == "square"
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_whoever_ends_it_leaves_the_fish_at_rest(daemon: Daemon, how: signal.Signals) -> None:
+    assert begun(daemon).end(how)[0] == 130
+    assert daemon.status().mode == "idle"
+
+
+def test_an_emergency_stop_ends_it_and_says_so(daemon: Daemon) -> None:
+    measuring = begun(daemon)
+    daemon.fishctl("estop")
+    status, _, err = measuring.finish()
+    assert status == 1
+    assert "in mode estop (requested with fishctl)" in err
+    assert daemon.status().mode == "estop"
