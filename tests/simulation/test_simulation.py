@@ -126,7 +126,8 @@ def test_only_whole_beats_are_counted() -> None:
     for angle, thrust in [(1.0, 9.0)] * 3 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
         beats.add(angle, TrueWindow(0.5, thrust, 0.1 * thrust))
     found = beats.means()
-    assert found[:3] == pytest.approx((1.5, 1.0, 0.15))
+    figures = (found.thrust, found.frequency, found.fin_amplitude)
+    assert figures == pytest.approx((1.5, 1.0, 0.15))
 
 
 @pytest.mark.parametrize(
