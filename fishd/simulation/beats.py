@@ -64,12 +64,12 @@ class BeatMeans(NamedTuple):
     """Means over beats."""
 
     thrust: float  # N
-    thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
     frequency: float  # Hz
     fin_amplitude: float  # rad
     mean_angle: float  # of |φ_c|, rad
     squareness: float  # mean |φ_c| over rms φ_c
     half_beats: tuple[int, int]  # shortest and longest, ticks
+    thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
 
 
 def _deviation(beats: Sequence[tuple[float, float]]) -> float:

@@ -126,8 +126,18 @@ def test_only_whole_beats_are_counted() -> None:
     for angle, thrust in [(1.0, 9.0)] * 3 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
         beats.add(angle, TrueWindow(0.5, thrust, 0.1 * thrust))
     found = beats.means()
-    figures = (found.thrust, found.frequency, found.fin_amplitude)
-    assert figures == pytest.approx((1.5, 1.0, 0.15))
+    assert found[:3] == pytest.approx((1.5, 1.0, 0.15))
+    assert (beats.count, found.thrust_deviation) == (3, 0.0)
+    for thrust in (3.0, 2.0, 1.0, 2.0):  # beats of other thrust
+        beats.add(1.0, TrueWindow(0.5, thrust, 0.1))
+        beats.add(-1.0, TrueWindow(0.5, 1.0, 0.1))
+    assert beats.means().thrust_deviation > 0.0
+
+
+def test_a_run_without_two_beats_has_no_spread() -> None:
+    beats = Beats()
+    beats.add(0.1, TrueWindow(0.5, 1.0, 0.1))
+    assert math.isnan(beats.means().thrust_deviation)
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,7 @@ class LiveThrust:
         self._side = 0.0
         self._block: _Block | None = None
         self._beats: deque[_Block] = deque()
+        self._power = 0.0
 
     def forget_zero(self) -> None:
         """The sensor's zero was set: find it anew, in the next rest."""
@@ -129,6 +130,8 @@ class LiveThrust:
             self._beats.append(block)
             while len(self._beats) > 1 and sum(beat.lasts for beat in self._beats) > SPAN:
                 self._beats.popleft()
+            lasts = sum(beat.lasts for beat in self._beats)
+            self._power = sum(beat.power * beat.lasts for beat in self._beats) / lasts
             if self._factor_variance is None and power > 0.0:
                 self._factor_variance = (UNKNOWN / power) ** 2
         else:
@@ -173,11 +176,9 @@ class LiveThrust:
         """Thrust and error now."""
         passed = seen.time - self._time
         if self._swims and self._beats and self._factor_variance is not None:
-            lasts = sum(beat.lasts for beat in self._beats)
-            power = sum(beat.power * beat.lasts for beat in self._beats) / lasts
-            thrust = self._factor * power
+            thrust = self._factor * self._power
             spread = self._factor_variance + (FACTOR_WALKS * self._factor) ** 2 * passed
-            error = math.hypot(INTERVAL * power * math.sqrt(spread), SHAPE * thrust)
+            error = math.hypot(INTERVAL * self._power * math.sqrt(spread), SHAPE * thrust)
         elif not self._swims:
             thrust = self._at_rest
             error = INTERVAL * math.sqrt(self._zero_variance + self._wander * passed)
