@@ -1,0 +1,17 @@
+"""A run in virtual time: the robot's own loop on a simulated fish, its ticks or a report."""
+
+from fishd.simulation.beats import Beats
+from fishd.simulation.report import Report, judge, simulate
+from fishd.simulation.table import run
+from fishd.simulation.virtual_run import EncodingPublisher, KeepingPublisher, VirtualRun
+
+__all__ = [
+    "Beats",
+    "EncodingPublisher",
+    "KeepingPublisher",
+    "Report",
+    "VirtualRun",
+    "judge",
+    "run",
+    "simulate",
+]

@@ -1,0 +1,118 @@
+"""What a plant truly did over whole beats."""
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fishd.virtual.plant.tethered import TrueWindow
+
+
+class Beats:
+    """Adds up what the plant truly did over whole beats, from upward reversal to upward reversal.
+
+    A run without a whole beat is judged over all its time.
+    """
+
+    def __init__(self) -> None:
+        self._whole = _Sums()
+        self._open = _Sums()
+        self._began = False
+        self._side = 0.0
+        self._each: list[tuple[float, float]] = []  # impulse N s, duration s
+
+    @property
+    def count(self) -> int:
+        """How many whole beats there were."""
+        return len(self._each)
+
+    def add(self, angle: float, window: TrueWindow) -> None:
+        """Add a window; angle: the instruction angle during it [rad]."""
+        side = math.copysign(1.0, angle) if angle else self._side
+        if side != self._side and self._side:
+            self._open.close_half()
+            if side > 0.0:
+                if self._began:
+                    self._whole += self._open
+                    self._each.append((self._open.impulse, self._open.duration))
+                self._began = True
+                self._open = _Sums()
+        self._side = side
+        self._open.add(angle, window)
+
+    def means(self) -> "BeatMeans":
+        """Means over the whole beats."""
+        sums = self._whole
+        frequency = 0.5 * sums.halves / sums.duration if sums.halves else 0.0
+        if not sums.halves:
+            sums = self._open
+            sums.close_half()
+        mean = sums.angle / sums.duration
+        rms = math.sqrt(sums.angle_squared / sums.duration)
+        return BeatMeans(
+            thrust=sums.impulse / sums.duration,
+            thrust_deviation=_deviation(self._each),
+            frequency=frequency,
+            fin_amplitude=sums.peaks / sums.halves,
+            mean_angle=mean,
+            squareness=mean / rms if rms else 0.0,
+            half_beats=(sums.shortest, sums.longest) if frequency else (0, 0),
+        )
+
+
+class BeatMeans(NamedTuple):
+    """Means over beats."""
+
+    thrust: float  # N
+    frequency: float  # Hz
+    fin_amplitude: float  # rad
+    mean_angle: float  # of |φ_c|, rad
+    squareness: float  # mean |φ_c| over rms φ_c
+    half_beats: tuple[int, int]  # shortest and longest, ticks
+    thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
+
+
+def _deviation(beats: Sequence[tuple[float, float]]) -> float:
+    """Standard error of impulse over duration, a ratio of two means; NaN for fewer than two beats.
+
+    Cochran, Sampling Techniques, 3rd edition, equation 6.9.
+    """
+    n = len(beats)
+    if n < 2:
+        return math.nan
+    duration = sum(lasts for _, lasts in beats)
+    mean = sum(impulse for impulse, _ in beats) / duration
+    squares = sum((impulse - mean * lasts) ** 2 for impulse, lasts in beats)
+    return math.sqrt(squares * n / (n - 1)) / duration
+
+
+class _Sums:
+    def __init__(self) -> None:
+        self.duration = self.impulse = self.peaks = self.angle = self.angle_squared = 0.0
+        self.halves = 0
+        self.shortest, self.longest = sys.maxsize, 0
+        self._peak = 0.0
+        self._ticks = 0
+
+    def add(self, angle: float, window: TrueWindow) -> None:
+        self.duration += window.duration
+        self.impulse += window.thrust * window.duration
+        self.angle += abs(angle) * window.duration
+        self.angle_squared += angle**2 * window.duration
+        self._peak = max(self._peak, window.fin_peak)
+        self._ticks += 1
+
+    def close_half(self) -> None:
+        self.halves += 1
+        self.peaks += self._peak
+        self.shortest = min(self.shortest, self._ticks)
+        self.longest = max(self.longest, self._ticks)
+        self._peak = 0.0
+        self._ticks = 0
+
+    def __iadd__(self, other: "_Sums") -> "_Sums":
+        for name in ("duration", "impulse", "peaks", "angle", "angle_squared", "halves"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.shortest = min(self.shortest, other.shortest)
+        self.longest = max(self.longest, other.longest)
+        return self

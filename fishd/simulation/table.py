@@ -1,0 +1,50 @@
+"""A run in virtual time as a table, for notebooks."""
+
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from fishd.config import Config, adopt, load
+from fishd.core.frames import frame
+from fishd.simulation.virtual_run import KeepingPublisher, VirtualRun, check_length
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+def run(
+    config: Config | str | os.PathLike[str] | None = None,
+    controller: str = "swing",
+    parameters: Mapping[str, Any] | None = None,
+    seconds: float = 60.0,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+) -> "DataFrame":
+    """Let a controller swim a simulated fish, and give its ticks as a table: see `frame`.
+
+    config: a YAML file or what `fishd.config.load` made of one; None for the defaults
+    overrides: keys in dotted form, such as `{"plant.xi": 0.9}`
+
+    A controller that fails ends in mode `fault`, as on a robot: the column `mode` says so.
+    Raises `ConfigError`, `UnknownController`, `ParameterError`, and `MissingPackage` without
+    pandas (extra: lab).
+    """
+    check_length("run", seconds)
+    settings = [f"{key}={_spelled(value)}" for key, value in (overrides or {}).items()]
+    if isinstance(config, Config):
+        config = adopt(msgspec.to_builtins(config), settings) if settings else config
+    else:
+        config = load(config, settings)
+    publisher = KeepingPublisher()
+    with VirtualRun(config, publisher) as virtual:
+        virtual.set_controller(controller, parameters or {})
+        for _ in range(max(1, round(seconds / config.tick))):
+            virtual.tick()
+    return frame(publisher.ticks)
+
+
+def _spelled(value: Any) -> str:
+    """A value as YAML has it; a number of numpy, too."""
+    return msgspec.json.encode(value.item() if hasattr(value, "item") else value).decode()

@@ -1,0 +1,106 @@
+"""fishd's loop on a simulated fish in virtual time, and where its ticks go."""
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import Any, Self
+
+import msgspec
+from msgspec.structs import replace
+
+from fishd.assembly import build_loop, open_in_virtual_time
+from fishd.config import Config
+from fishd.control.reporting import Publisher
+from fishd.controllers import registry
+from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Event, Tick
+from fishd.hardware.base import Robot
+from fishd.virtual.fish import SimulatedFish
+from fishd.virtual.plant.tethered import TrueWindow
+
+LONGEST = 1e8
+"""Runs are shorter than this [s]: three years."""
+
+
+class EncodingPublisher:
+    """Does the work of telemetry up to the socket, so that timing says what the robot would do."""
+
+    def __init__(self) -> None:
+        self._encode = msgspec.json.Encoder().encode
+
+    def tick(self, tick: Tick) -> None:
+        """Encode and drop."""
+        self._encode(tick)
+
+    def event(self, event: Event) -> None:
+        """Encode and drop."""
+        self._encode(event)
+
+
+class KeepingPublisher:
+    """Keeps every tick; what matters of the events is in them."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+
+    def tick(self, tick: Tick) -> None:
+        """Keep it."""
+        self.ticks.append(tick)
+
+    def event(self, event: Event) -> None:
+        """Drop."""
+
+
+class VirtualRun:
+    """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
+
+    def __init__(self, config: Config, publisher: Publisher) -> None:
+        """publisher: gets the record of every tick, and every event"""
+        self.config = config
+        clock = VirtualClock()
+        with ExitStack() as stack:
+            robot, self._take_window = _swimmer(config, stack)
+            self.loop = build_loop(config, robot, clock, publisher)
+            stack.callback(self.loop.close)
+            self._stack = stack.pop_all()
+        self._slots = virtual_slots(clock, config.tick)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the controller and the robot; may be called twice."""
+        self._stack.close()
+
+    def set_controller(self, name: str, parameters: Mapping[str, Any]) -> None:
+        """Make a controller the active one, from the next tick on.
+
+        Raises `UnknownController`, `ParameterError`, and `Refused` in mode fault.
+        """
+        limits = replace(self.config.limits, virtual=True)
+        self.loop.set_controller(name, registry.create(name, parameters, limits))
+
+    def tick(self) -> TrueWindow:
+        """One tick; what truly happened between its read and the one before."""
+        self.loop.tick(next(self._slots))
+        return self._take_window()
+
+
+def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], TrueWindow]]:
+    """What swims, and how to ask what it truly did since the last time."""
+    if config.robot == "virtual-pi":
+        robot, pi = open_in_virtual_time(config, stack)
+        return robot, pi.tank.take_window
+    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    return fish.robot(), fish.take_window
+
+
+def check_length(what: str, seconds: float) -> None:
+    """Raise `ParameterError` where a length of time is not possible; what: what it is of."""
+    if not 0.0 <= seconds < LONGEST:  # NaN is not
+        raise ParameterError(
+            f"a {what} of {seconds:g} s is not possible: a number from 0 to {LONGEST:g} s is needed"
+        )

@@ -1,0 +1,51 @@
+"""`fishctl compare --on robot` and a running fishd: it may be interrupted at any time."""
+
+import re
+import signal
+import subprocess
+
+import pytest
+from rigs.processes import FISHCTL, PATIENCE, Daemon, wait_until
+
+from fishd.client import Fish
+
+
+def comparing(daemon: Daemon, *arguments: str) -> subprocess.Popen[str]:
+    command = [FISHCTL, "--endpoint", daemon.endpoint, "compare", "--on", "robot", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_the_fish_rest(daemon: Daemon, number: int) -> None:
+    process = comparing(daemon, "swing", "sine")
+    wait_until(lambda: daemon.status().mode == "running")
+    process.send_signal(number)
+    out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, out, err) == (130, "", "fishctl: interrupted; the fish rests\n")
+    assert daemon.status().mode == "idle"
+
+
+def test_nobody_swims_on_where_somebody_stops_the_fish(daemon: Daemon) -> None:
+    process = comparing(daemon, "swing", "sine")
+    wait_until(lambda: daemon.status().mode == "running")
+    with Fish(daemon.endpoint) as fish:
+        fish.stop()
+    out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, out) == (1, "")
+    assert re.fullmatch(
+        r"fishctl: [^\n]*told to let swing swim, but it is in mode idle[^\n]*\n", err
+    )
+    assert daemon.status().mode == "idle"
+
+
+def test_a_latched_stop_and_a_wrong_option_are_one_line(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        fish.estop("the net")
+        done = daemon.fishctl("compare", "--on", "robot", "swing")
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+        assert "the net" in done.stderr
+        fish.clear_fault()
+    for option in ("--settle=3", "--set=tick=0.02"):
+        done = daemon.fishctl("compare", "--on", "robot", "swing", option)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert option.partition("=")[0] in done.stderr
