@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line
+from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running
 from rigs.swimming import brief_job, rows, wait_for, while_it_trains
 
 from fishd.cli.learn.ppo import report
@@ -209,8 +209,8 @@ def test_on_a_terminal_it_shows_a_bar(
 
 @pytest.fixture
 def hasty(settings: str) -> str:
-    """Settings with rollouts and evaluations that take little time in the tank."""
-    text = SETTINGS.replace("seconds: 4.0, settle: 2.0", "seconds: 1.0, settle: 0.2, rest: 0.3")
+    """Settings with rollouts that take little time in the tank, and no evaluations."""
+    text = SETTINGS.replace("seconds: 4.0, settle: 2.0", "every: 0")
     text = text.replace("n_steps: 64", "n_steps: 16, batch_size: 16").replace("128", "32")
     Path(settings).write_text(text, encoding="utf-8")
     return settings
@@ -230,12 +230,26 @@ def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
     assert (config.tick, config.simulation.noise) == (0.05, 0.001)  # all of it is that of fishd
     assert found.stderr == ""
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["16", "32"]
-    evaluations = rows(folder / "evaluations.csv")
-    assert float(evaluations[0]["tank_time"]) >= 0.8 + 1.0  # those are swum in the tank, too
     card = checkpoints.read_card(checkpoints.newest(folder))
     assert (card.provenance.on, card.tick) == ("robot", 0.05)
     with Fish(daemon.endpoint) as fish:
         assert fish.status().mode == "idle"
+
+
+def test_an_evaluation_on_a_running_fishd_swims_and_rests_in_turn(
+    tmp_path: Path, hasty: str
+) -> None:
+    text = Path(hasty).read_text(encoding="utf-8")
+    Path(hasty).write_text(text.replace("every: 0", "every: 2, on_robot: 21"), encoding="utf-8")
+    with running(tmp_path, "--set", "lockstep=true") as daemon:
+        found = learn(
+            *("ppo", "--on", "robot", "--endpoint", daemon.endpoint),
+            *("--settings", hasty, "--folder", str(tmp_path / "run")),
+        )
+    assert found.returncode == 0, found.stderr
+    (evaluation,) = rows(tmp_path / "run" / "evaluations.csv")
+    assert float(evaluation["tank_time"]) >= 21.0  # those are swum in the tank, too
+    assert 0.0 < float(evaluation["error"]) < 5e-3
 
 
 def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
