@@ -70,7 +70,7 @@ def test_the_three_topics_can_be_told_apart_by_prefix(daemon: Daemon) -> None:
         assert events.until(kind="mark")["message"] in ("first", "second")
 
 
-def test_the_shipped_configuration_rests_then_swims_and_says_so_every_second(
+def test_the_shipped_configuration_rests_swims_and_says_so_every_second(
     tmp_path: Path,
 ) -> None:
     with running(tmp_path, "--config", SHIPPED, "--print-status") as daemon:
