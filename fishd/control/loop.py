@@ -223,7 +223,8 @@ class ControlLoop:
         try:
             seen = self._estimator.update(measurement, self.applied, slot.deadline, dt)
             if not self.supervisor.sensor_lost:
-                self.thrust.update(seen, self.supervisor.mode is Mode.RUNNING)
+                running = self.supervisor.mode is Mode.RUNNING
+                self.thrust.update(seen, running, self.active.wave)
             return seen
         except Exception as error:
             self._fail("estimate-error", "the estimator failed", error)

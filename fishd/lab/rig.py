@@ -28,6 +28,8 @@ class Rig(Protocol):
     """Period of its loop [s]."""
     amplitude: float
     """Φ [rad]"""
+    unit: str
+    """Of its forces: `N`, or that of its sensor until that is calibrated."""
 
     def __enter__(self) -> Self:
         """Nothing moves yet."""

@@ -10,6 +10,7 @@ makes it better known.
 
 import math
 from collections import deque
+from typing import Any
 
 from fishd.core.signals import Observation
 
@@ -28,7 +29,10 @@ LONGEST_BEAT = 10.0
 FACTOR_WALKS = 0.002
 """How fast the factor becomes uncertain: share of it, standard deviation after a second."""
 SHAPE = 0.01
-"""The factor is not the same for every wave: it differs by this share."""
+"""The factor is not the same for every beat of a wave: it differs by this share."""
+OTHER_WAVE = 0.3
+"""Nor for every wave, where `estimator.leak` is not that of the fish: standard deviation, a share
+of it. The zero is still known when the wave changes, so the factor is soon known again."""
 INTERVAL = 1.96
 """Half of a 95 % interval, over the standard deviation."""
 BROKEN = 8.0
@@ -41,6 +45,10 @@ _NOISE = 2e-3
 """What blocks are thought to vary by until there are two to compare [N]."""
 _FORGETS = 0.1
 """Share of the newest comparison in the variance of blocks."""
+
+
+Wave = tuple[str, dict[str, Any]]
+"""A controller's name, and its parameters."""
 
 
 class LiveThrust:
@@ -62,6 +70,9 @@ class LiveThrust:
         self._at_rest = 0.0
         self._noises = {True: _Noise(), False: _Noise()}
         self._swims = False
+        self._wave: Wave = ("", {})
+        self._factor_wave: Wave | None = None
+        """Which wave the factor was found from."""
         self._angle = self._still = 0.0
         self._phase = 0.0
         self._side = 0.0
@@ -86,20 +97,25 @@ class LiveThrust:
         error: half of its 95 % interval
         """
         self._factor, self._factor_variance = factor, (error / INTERVAL) ** 2
-        self._anchored = True
-        self.forget_zero()
+        self._anchored, self._covariance = True, 0.0
 
-    def update(self, seen: Observation, running: bool) -> None:
-        """Take in a tick; running: is a controller active?"""
+    def update(self, seen: Observation, running: bool, wave: Wave) -> None:
+        """Take in a tick.
+
+        running: is a controller active?
+        wave: which one it is, and with which parameters; another object where it is another one
+        """
         moved = seen.instruction_angle != self._angle
         self._still = 0.0 if moved else self._still + seen.dt
         self._angle = seen.instruction_angle
         swims = running and self._still < STILL
-        if swims != self._swims:
-            self._swims, self._phase, self._side = swims, 0.0, 0.0
+        if swims != self._swims or (swims and wave is not self._wave):
+            self._swims, self._wave, self._phase, self._side = swims, wave, 0.0, 0.0
             self._block = None
             self._beats.clear()
             self._at_rest = 0.0
+            if swims:
+                self._take_up(wave)
         self._phase += seen.dt
         # Of the instruction angle during this window: a beat ends with the window before it.
         ends = self._reversed(seen.instruction_angle) if swims else True
@@ -114,6 +130,12 @@ class LiveThrust:
                 self._block = None
                 self._beats.clear()
         self._know(seen)
+
+    def _take_up(self, wave: Wave) -> None:
+        """Another wave than that of the factor makes the factor uncertain."""
+        if self._factor_variance is not None and wave != self._factor_wave:
+            self._factor_variance += (OTHER_WAVE * self._factor) ** 2
+        self._factor_wave = wave
 
     def _reversed(self, angle: float) -> bool:
         """Has the instruction angle become positive?"""
@@ -182,6 +204,10 @@ class LiveThrust:
         elif not self._swims:
             thrust = self._at_rest
             error = INTERVAL * math.sqrt(self._zero_variance + self._wander * passed)
+        elif seen.frequency:  # the first beats, or the first of another wave
+            thrust = seen.thrust - self._zero
+            spread = self._zero_variance + self._wander * passed + self._noises[True].variance
+            error = INTERVAL * math.sqrt(spread)
         else:
             thrust, error = 0.0, math.inf
         known = self._anchored and error < MOST_KNOWN
