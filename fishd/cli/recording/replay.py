@@ -1,14 +1,16 @@
 """The verb that publishes a recording as if it were live."""
 
+import shlex
 import signal
 from contextlib import suppress
 from pathlib import Path
 
 import click
 
+from fishd.cli.options import FiniteRange
 from fishd.cli.output import echo
 from fishd.cli.recording.record import folder_option
-from fishd.core.addresses import control_address
+from fishd.core.addresses import control_address, find_control
 from fishd.recording import open_run
 from fishd.recording.folder import find
 from fishd.recording.replay import Replay
@@ -20,7 +22,7 @@ TELEMETRY = "tcp://127.0.0.1:9872"
 @click.argument("run")
 @click.option(
     "--speed",
-    type=click.FloatRange(0.01, 1000),
+    type=FiniteRange(0.01, 1000),
     default=1.0,
     show_default=True,
     help="How much faster than it was recorded.",
@@ -49,9 +51,8 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
     with Replay(recorded, address, control or control_address()) as player:
         seconds = recorded.summary.duration / speed
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
-        if control:
-            echo(f"watch it with: fishctl --endpoint {control} watch")
-        else:
-            echo("watch it with: fishctl watch")
+        found = find_control() == player.control
+        endpoint = "" if found else f"--endpoint {shlex.quote(player.control)} "
+        echo(f"watch it with: fishctl {endpoint}watch")
         with suppress(KeyboardInterrupt):
             player.play(speed)
