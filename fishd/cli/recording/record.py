@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.options import endpoint_option
+from fishd.cli.options import FiniteRange, endpoint_option
 from fishd.cli.output import counted, echo
 from fishd.client import Fish
 from fishd.core import text
@@ -61,7 +61,7 @@ class Size(click.ParamType[int]):
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     metavar="SECONDS",
     help="End by itself after this time; by default Ctrl-C ends it.",
 )
