@@ -71,6 +71,8 @@ class Recorder:
         self._described: Description | None = None
         self._seq = 0
         self._gone = False
+        self._refused = 0
+        """Messages that are none of fishd's."""
         self.reason = "stopped"
         """Why the recording ended, as the file says."""
 
@@ -88,6 +90,8 @@ class Recorder:
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         """Finish the file, also after an error; raises `RecordingError`."""
         self._telemetry.close()
+        if self._refused > 1:
+            self._tell(f"messages that are none of fishd's, left out: {self._refused}")
         self.writer.close(self.reason if error is None else text.named(error))
 
     @property
@@ -139,7 +143,9 @@ class Recorder:
         try:
             message = self.writer.message(topic, payload)
         except msgspec.DecodeError:
-            self._tell(f"a message of topic {topic} is none of fishd's: left out")
+            self._refused += 1
+            if self._refused == 1:  # a flood of them is told when all is over
+                self._tell(f"a message of topic {topic} is none of fishd's: left out")
             return
         if isinstance(message, TickHead):
             if message.seq <= self._seq:

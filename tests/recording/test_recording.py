@@ -5,7 +5,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
+from msgspec.structs import replace
 from rigs.harness import Rig
 from rigs.recordings import recorded, swum, write
 
@@ -119,6 +121,21 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
     run = recover(writer.part)
     assert 0 < len(run.ticks) < 600
     assert run.ticks == (ticks * 10)[: len(run.ticks)]
+
+
+@pytest.mark.parametrize("t", [1e300, -1.0, 1.1e10])
+def test_a_message_from_no_time_is_left_out_and_the_recording_goes_on(
+    tmp_path: Path, t: float
+) -> None:
+    ticks = swum(0.4).recorder.ticks
+    with RunWriter(tmp_path / "run") as writer:
+        writer.message("tick", msgspec.json.encode(ticks[0]))
+        with pytest.raises(msgspec.DecodeError, match="is no time"):
+            writer.message("tick", msgspec.json.encode(replace(ticks[1], t=t)))
+        writer.message("tick", msgspec.json.encode(ticks[2]))
+    run = open_run(writer.path)
+    assert run.ticks == [ticks[0], ticks[2]]
+    assert run.summary == glance(writer.path).summary
 
 
 def test_a_run_that_never_began_leaves_no_file(tmp_path: Path) -> None:

@@ -17,6 +17,8 @@ from fishd.recording.folder import Glance, glances, runs_folder
 from fishd.recording.summary import Summary
 
 WIDE = 1000
+LONGEST = 1e9
+"""No recording is longer than these thirty years [s]."""
 
 
 @click.command()
@@ -87,8 +89,13 @@ def _thrust(summary: Summary) -> str:
     if summary.thrust is None:
         return "–"
     if summary.thrust_error is None:
-        return f"{summary.thrust * 1e3:.2f} ± ?"
-    return f"{summary.thrust * 1e3:.2f} ± {summary.thrust_error * 1e3:.2f}"
+        return f"{_thousandths(summary.thrust)} ± ?"
+    return f"{_thousandths(summary.thrust)} ± {_thousandths(summary.thrust_error)}"
+
+
+def _thousandths(value: float) -> str:
+    shown = value * 1e3
+    return f"{shown:.2f}" if abs(shown) < 1e6 else f"{shown:.3g}"
 
 
 def _remarks(glance: Glance) -> list[str]:
@@ -115,6 +122,8 @@ def _began(iso: str) -> str:
 
 
 def _length(seconds: float) -> str:
+    if not 0.0 <= seconds <= LONGEST:  # of a file in which no times stand
+        return f"{seconds:.3g} s"
     minutes, rest = divmod(seconds, 60.0)
     hours, minutes = divmod(int(minutes), 60)
     if hours:
