@@ -100,6 +100,12 @@ class Recorder:
         return self._writer is not None
 
     @property
+    def status(self) -> Status:
+        """What fishd said of itself when it was asked last."""
+        assert self._described
+        return self._described.status
+
+    @property
     def writer(self) -> RunWriter:
         """The recording that is being written."""
         assert self._writer is not None
@@ -157,9 +163,8 @@ class Recorder:
             for gap in self.writer.gaps[known:]:
                 self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
         elif isinstance(message, Status):
-            assert self._described
             # Once its ticks come, so that the file says whose they are.
-            if message.pid != self._described.status.pid and self._seq <= message.seq:
+            if message.pid != self.status.pid and self._seq <= message.seq:
                 self._ask_again()
         elif message.kind == "calibration":
             self._ask_again()

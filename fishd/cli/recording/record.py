@@ -109,6 +109,8 @@ def record(
     try:
         with recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it")
+            if (mode := recorder.status.mode) != "running":
+                _tell(f"the fish is at rest (mode {mode}); it swims with: fishctl set-controller")
             recorder.run(stopping, seconds)
     except RecordingError as error:
         if recorder.began:
