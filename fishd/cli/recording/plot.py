@@ -6,11 +6,9 @@ from pathlib import Path
 import click
 
 from fishd.cli.output import echo
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import folder_option, opened
 from fishd.lab.run_figure import picture
 from fishd.lab.run_traces import traces
-from fishd.recording import open_run
-from fishd.recording.folder import find
 
 
 @click.command()
@@ -37,7 +35,7 @@ def plot(
     RUN is a path, a name in the folder of recordings, or 'latest'. NAME.png is a picture; NAME.html
     is a page to zoom into, which needs no network. Either replaces an older one.
     """
-    recorded = open_run(find(run, folder))
+    recorded = opened(run, folder)
     drawn = traces(recorded, begin, end)
     if only != "html":
         path = target / f"{recorded.name}.png"

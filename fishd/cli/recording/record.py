@@ -12,21 +12,14 @@ import click
 
 from fishd.cli.options import FiniteRange, endpoint_option
 from fishd.cli.output import counted, echo
+from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import FOLDER_VARIABLE, made, new_path, runs_folder
+from fishd.recording.folder import made, new_path, runs_folder
 from fishd.recording.recorder import Recorder
-
-folder_option = click.option(
-    "--folder",
-    type=click.Path(path_type=Path, file_okay=False),
-    help=f"Where recordings are; default: ${FOLDER_VARIABLE}, else fishd/runs in "
-    "$XDG_DATA_HOME or ~/.local/share.",
-)
-
 
 UNITS = {"MB": 10**6, "GB": 10**9}
 LEAST = 10**7

@@ -9,10 +9,8 @@ import click
 
 from fishd.cli.options import FiniteRange
 from fishd.cli.output import echo
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import folder_option, opened
 from fishd.core.addresses import control_address, find_control
-from fishd.recording import open_run
-from fishd.recording.folder import find
 from fishd.recording.replay import Replay
 
 TELEMETRY = "tcp://127.0.0.1:9872"
@@ -46,7 +44,7 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
     RUN is a path, a name in the folder of recordings, or 'latest'. It ends with the recording, or
     with Ctrl-C. A silence of more than 5 s is cut short.
     """
-    recorded = open_run(find(run, folder))
+    recorded = opened(run, folder)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with Replay(recorded, address, control or control_address()) as player:
         seconds = recorded.summary.duration / speed

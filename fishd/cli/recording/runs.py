@@ -10,7 +10,7 @@ import msgspec
 
 from fishd.cli.options import json_option
 from fishd.cli.output import counted, echo, print_json
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import damage, folder_option
 from fishd.core import text
 from fishd.core.errors import RecordingError
 from fishd.recording.folder import Glance, glances, runs_folder
@@ -51,6 +51,7 @@ def _as_json(glance: Glance) -> dict[str, Any]:
         "name": glance.name,
         "path": str(glance.path),
         "state": _state(glance),
+        "damaged": glance.damaged,
         "duration": glance.summary.duration,
         **msgspec.structs.asdict(glance.summary),
         "about": glance.about,
@@ -103,6 +104,7 @@ def _remarks(glance: Glance) -> list[str]:
     restarts = glance.summary.restarts
     return [
         *([state] if state != "finished" else []),
+        *([damage(glance.damaged)] if glance.damaged is not None else []),
         *([counted(restarts, "restart")] if restarts else []),
         *(glance.about[key] for key in ("subject", "note") if glance.about.get(key)),
     ]
