@@ -1,7 +1,7 @@
 """The folder of recordings: where it is, what is in it, and which recording a name means."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -55,6 +55,13 @@ def made(folder: Path) -> Path:
     except OSError as error:
         raise RecordingError(f"{folder} cannot be made: {error.strerror}") from None
     return folder
+
+
+def check_new(paths: Iterable[Path], *, replace: bool) -> None:
+    """Raise `RecordingError` where one of these is there already, unless it may be replaced."""
+    for path in paths:
+        if path.exists() and not replace:
+            raise RecordingError(f"{path} is there already; --force replaces it")
 
 
 def new_path(folder: Path, prefix: str = "") -> Path:
