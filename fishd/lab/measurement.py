@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import Struct
 
+from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
@@ -15,12 +16,6 @@ from fishd.lab.rig import Rig
 
 SWIM, REST = 6.0, 2.75
 """How long the fish swims and rests in turn [s]."""
-SWIM_SETTLES = 1.5
-"""A swim is steady after so long [s]; what the force was before is left out."""
-REST_SETTLES = 1.0
-"""The water and the fin are still after so long, fading included [s]."""
-BLOCK = 0.5
-"""Rest is cut in pieces of this length [s]."""
 UNSTEADY, RESTLESS = 0.05, 0.01
 """The power of the fin may change by this share in a swim, and be this share of it at rest."""
 LONGEST = 3600.0
@@ -287,7 +282,7 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
             "lengthens swims"
         )
     if not beating:
-        cuts = list(range(begin, len(phase), max(1, round(BLOCK / tick))))
+        cuts = list(range(begin, len(phase), max(1, round(PIECE / tick))))
     begun, beats = 0, 0
     for index in range(1, len(cuts)):
         beats += 1
