@@ -47,6 +47,8 @@ def recover(path: Path) -> Run:
 def _copy(run: Run, file: PartFile) -> None:
     writer = Writer(file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
     writer.start(profile="", library="fishd")
+    if not run.about:  # that part is damaged
+        writer.add_metadata("fishd.run", {"run": run.name})
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
 
@@ -59,7 +61,7 @@ def _copy(run: Run, file: PartFile) -> None:
         return channels[number]
 
     for record in records(run.path):
-        if isinstance(record, Message):
+        if isinstance(record, Message) and (record.channel_id in {*channels, *TOPICS}):
             writer.add_message(
                 channel_of(record.channel_id),
                 record.log_time,
@@ -67,11 +69,14 @@ def _copy(run: Run, file: PartFile) -> None:
                 record.publish_time,
                 record.sequence,
             )
-        elif isinstance(record, Schema):
+        elif isinstance(record, Schema) and record.id not in schemas:
             schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel):
+        elif isinstance(record, Channel) and record.id not in channels:
             channels[record.id] = writer.register_channel(
-                record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                record.topic,
+                record.message_encoding,
+                schemas.get(record.schema_id, 0),
+                record.metadata,
             )
         elif isinstance(record, Metadata) and record.name != "fishd.end":
             writer.add_metadata(record.name, record.metadata)

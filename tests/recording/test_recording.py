@@ -100,6 +100,21 @@ def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> N
     assert worst == 10
 
 
+def test_what_names_a_recording_and_its_channels_may_be_damaged_too(tmp_path: Path) -> None:
+    path = recorded(swum(), tmp_path / "run", flush_every=10)
+    whole, ticks = path.read_bytes(), open_run(path).ticks
+    first_chunk = whole.index(b"\x04\0\0\0zstd")
+    for offset in (whole.index(b"fishd.run") - 4, first_chunk + 60, len(whole) // 2):
+        content = bytearray(path.read_bytes())
+        content[offset] ^= 0x55
+        path.write_bytes(content)
+    run, recovered = open_run(path), recover(path)
+    assert run.about == {}
+    assert 0 < len(run.ticks) < len(ticks)
+    assert recovered.ticks == run.ticks
+    assert not recovered.is_damaged
+
+
 def test_what_is_recovered_of_a_damaged_recording_is_whole(tmp_path: Path) -> None:
     path = recorded(swum(), tmp_path / "run", flush_every=10)
     content = bytearray(path.read_bytes())
