@@ -3,6 +3,7 @@
 import errno
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -14,6 +15,7 @@ from rigs.recordings import recorded, swum, write
 from fishd.core.errors import RecordingError
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording.folder import find, glance, glances
+from fishd.recording.recorder import Recorder
 from fishd.recording.recover import recover
 from fishd.simulation import simulate
 
@@ -174,6 +176,21 @@ def test_a_message_from_no_time_is_left_out_and_the_recording_goes_on(
     run = open_run(writer.path)
     assert run.ticks == [ticks[0], ticks[2]]
     assert run.summary == glance(writer.path).summary
+
+
+def test_a_flood_of_what_is_none_of_fishds_is_counted_and_told_twice(tmp_path: Path) -> None:
+    said: list[str] = []
+    tick = swum(0.2).recorder.ticks[0]
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
+    recorder._writer = recorder._open_writer()
+    for t in (tick.t, 1e300, 1e301, -1.0):
+        recorder._take("tick", msgspec.json.encode(replace(tick, t=t)))
+    recorder.__exit__(None, None, None)
+    assert said == [
+        "a message of topic tick is none of fishd's: left out",
+        "messages that are none of fishd's, left out: 3",
+    ]
+    assert len(open_run(tmp_path / "run.mcap").ticks) == 1
 
 
 def test_a_run_that_never_began_leaves_no_file(tmp_path: Path) -> None:
