@@ -6,7 +6,14 @@ from typing import Any, Protocol, Self
 
 from fishd.client import Fish
 from fishd.config import Config
-from fishd.core.errors import FishdError, FishError, Refused
+from fishd.core.errors import (
+    FishdError,
+    FishError,
+    ParameterError,
+    PolicyError,
+    Refused,
+    UnknownController,
+)
 from fishd.core.signals import Reason, Tick
 from fishd.simulation import KeepingPublisher, VirtualRun
 
@@ -20,6 +27,16 @@ class Disturbed(FishdError):
 
 class Replaced(Disturbed):
     """The controller gave up and another one took over, which the experiment did not ask for."""
+
+
+_OF_ONE = ("bad-parameter", "controller-error", "too-slow", "unknown-controller")
+
+
+def is_of_one(error: FishdError) -> bool:
+    """Does it concern one controller with its parameters only, so that the next one may swim?"""
+    if isinstance(error, Refused):
+        return error.code in _OF_ONE
+    return isinstance(error, Replaced | ParameterError | PolicyError | UnknownController)
 
 
 def refuse_lost(ticks: Sequence[Tick], lengths: Iterable[float], tick: float) -> None:
