@@ -110,8 +110,10 @@ def _sweep(
     endpoint: str | None,
     as_json: bool,
 ) -> int:
+    from fishd.lab import drawing
     from fishd.lab.sweep import grid
 
+    drawing.check_installed()
     of_simulation = {
         "--config": file, "--set": overrides, "--vary": vary, "--settle": settle,
         "--periods": periods, "--jobs": jobs, "--cluster": cluster,
@@ -145,13 +147,13 @@ def refuse_other(on: str, of_simulation: dict[str, Any], of_robot: dict[str, Any
             raise click.UsageError(f"{name} {where}")
 
 
-def _varied(text: str) -> tuple[str, list[str]]:
-    from fishd.lab.sweep.grid import spread
+def _varied(text: str) -> tuple[str, list[Any]]:
+    from fishd.lab.sweep.grid import spread, typed
 
     key, equals, values = text.partition("=")
     if not (equals and key.strip()):
         raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.05,0.6,1.2")
-    return key.strip(), spread(values)
+    return key.strip(), list(dict.fromkeys(map(typed, spread(values))))
 
 
 def _in_simulation(

@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import msgspec
@@ -173,7 +174,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert "20 points, 16 of them there already" in second.stderr
     best = msgspec.json.decode(second.stdout)
     assert [(each["controller"], each["keys"]) for each in best] == [
-        (name, {"plant.xi": xi}) for xi in ("0.9", "1.2") for name in ("square", "sine")
+        (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")
     ]
     assert all(each["x_low"] < each["x"] < each["x_high"] for each in best)
     with (folder / "points.csv").open(newline="") as file:
@@ -182,6 +183,45 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert all((folder / row["recording"]).is_file() for row in rows)
     assert (folder / "thrust.png").stat().st_size > 10_000
     assert (folder / "thrust.svg").stat().st_size > 10_000
+
+
+def swept(folder: Path, *words: str) -> CompletedProcess[str]:
+    brief = ("--periods", "3", "--settle", "1", "--jobs", "1", "--folder", str(folder))
+    return fishctl("sweep", words[0], *brief, *words[1:])
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_points_without_an_axis_are_a_line_each(tmp_path: Path) -> None:
+    one = swept(tmp_path / "one", "swing")
+    assert (one.returncode, one.stderr) == (0, "")
+    assert "\nswing: 25.7" in one.stdout
+    assert not (tmp_path / "one" / "thrust.png").exists()
+    two = swept(tmp_path / "two", "square,sine", "--frequency", "1.7", "--json")
+    best = msgspec.json.decode(two.stdout)
+    assert [(each["controller"], each["over"], each["x"]) for each in best] == [
+        ("square", "", None),
+        ("sine", "", None),
+    ]
+    assert best[0]["thrust"] > best[1]["thrust"] > 16e-3
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> None:
+    vary = ("--vary", "plant.servo_speed=8,10,12", "--amplitude", "0.3")
+    done = swept(tmp_path / "run", "square", "--frequency", "1.7", *vary)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\nsquare: best measured at plant.servo_speed 12, " in done.stdout
+    assert (tmp_path / "run" / "thrust.png").stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
+    slack = ("--set", "plant.cable_slack=0.2", "--settle", "15")
+    done = swept(tmp_path / "run", "ppo", "--policy", "default-fish", *slack)
+    assert done.returncode == 1
+    assert "no thrust: ppo gave up" in done.stdout
+    assert done.stdout.endswith("points.csv\n")
 
 
 @pytest.mark.slow

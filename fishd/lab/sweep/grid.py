@@ -1,6 +1,7 @@
 """The points of a sweep: every combination of controllers, parameter values and configured keys."""
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from typing import Any
@@ -14,6 +15,8 @@ from fishd.core.errors import ParameterError
 
 MOST = 100_000
 """A grid has no more points."""
+_WHOLE = 2.0**53
+"""Below this, a number that is whole is exact."""
 PARAMETER = "parameters."
 """What the column of a controller's parameter begins with; that of a configured key is its name."""
 
@@ -57,6 +60,17 @@ def spread(text: str) -> list[str]:
     if "" in found:
         raise ParameterError(f"'{text}' is not valid: a value is missing in it")
     return list(dict.fromkeys(found))
+
+
+def typed(text: str) -> int | float | str:
+    """A number where it is one: a whole one without a fraction; else the text itself."""
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    if not math.isfinite(number):
+        return text
+    return int(number) if number.is_integer() and abs(number) < _WHOLE else number
 
 
 def _range(piece: str) -> list[str]:
