@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
+from msgspec.structs import replace
 
 from fishd.cli.config import set_option
 from fishd.cli.options import ControllerGroup, endpoint_option, json_option
 from fishd.cli.sweep_output import again, conclude, telling
 from fishd.client import Fish
 from fishd.config import Config, load
+from fishd.controllers.base import Limits
 from fishd.core.errors import ConfigError, FishdError, NoDaemon
 from fishd.core.signals import ControllerInfo
 
@@ -176,7 +178,7 @@ def _in_simulation(
         changed = tuple(point.keys.items())
         if changed not in fish:
             fish[changed] = _fish_of(point, file, overrides)
-        grid.check(point, fish[changed])
+        grid.check(point, replace(fish[changed].limits, virtual=True))
         pairs.append((point, fish[changed]))
     config = msgspec.to_builtins(load(file, overrides))
     begun = Begun("simulation", config, msgspec.to_builtins(lengths))
@@ -204,14 +206,15 @@ def _on_robot(
 ) -> "tuple[bool, SweepFolder]":
     from fishd.lab.measurement import plan
     from fishd.lab.rig import Disturbed, LiveRig
-    from fishd.lab.sweep import running
+    from fishd.lab.sweep import grid, running
     from fishd.lab.sweep.folder import Begun
 
     for point in found:
         plan(seconds, point.parameters)  # which says that it is too short, before anything moves
     with Fish(endpoint) as fish:
-        unit = fish.status().force_unit
-        begun = Begun("robot", fish.config(), {"seconds": seconds}, unit)
+        status = fish.status()
+        grid.check_remote(found, Limits(status.amplitude_limit, status.tick))
+        begun = Begun("robot", fish.config(), {"seconds": seconds}, status.force_unit)
         with (
             _opened(path, begun, found) as folder,
             telling(folder, found, "s", seconds, err) as count,

@@ -16,7 +16,7 @@ from fishd.config import Config, load
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Event, Tick
 from fishd.lab.rig import Disturbed, VirtualRig
-from fishd.lab.sweep.folder import Begun, SweepFolder, owned
+from fishd.lab.sweep.folder import MEASURED, Begun, SweepFolder, owned
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, Result, swim
 from fishd.lab.sweep.running import on_robot
@@ -122,6 +122,60 @@ def test_a_fish_that_somebody_else_takes_loses_one_point_only(tmp_path: Path) ->
     with pytest.raises(Disturbed):
         on_robot(opened(tmp_path), SQUARES, Taken(Config()), 21.0, nothing)
     assert len(opened(tmp_path).results) == 2
+
+
+def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
+    config = load(None, ["plant.cable_slack=0.2"])
+    found = [
+        Point("square", {"frequency": 50.0}),
+        Point("ppo", {"policy": "default-fish"}),
+        Point("hold", {}),
+        Point("square", {"frequency": 1.5}),
+    ]
+    begun = Begun("robot", msgspec.to_builtins(config), {"seconds": 21.0})
+    columns = ["controller", "parameters.frequency", "parameters.policy"]
+    folder = SweepFolder(tmp_path, begun, columns)
+    assert on_robot(folder, found, VirtualRig(config), 21.0, nothing)
+    kept = SweepFolder(tmp_path, begun, columns).results
+    troubles = [kept[folder.key(point)].trouble for point in found]
+    assert "frequency" in troubles[0]
+    assert "ppo gave up" in troubles[1]
+    assert troubles[2:] == ["", ""]
+    assert len(list((tmp_path / "ticks").iterdir())) == 2
+
+
+@pytest.mark.parametrize("key", ["estimator.zero_drift", "a_key_of_then"])
+def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path, key: str) -> None:
+    opened(tmp_path)
+    begun = tmp_path / "sweep.json"
+    data = msgspec.json.decode(begun.read_bytes())
+    if key == "a_key_of_then":
+        data["config"][key] = 1
+    else:
+        del data["config"]["estimator"]["zero_drift"]
+    begun.write_bytes(msgspec.json.encode(data | {"version": "0.0.1"}))
+    has = "has" if key == "a_key_of_then" else "has no"
+    with pytest.raises(ConfigError, match=f"fishd 0.0.1, whose configuration {has} config.{key}"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("head", "named"),
+    [
+        ("controller,parameters.frequency,thrust,error,recording", "it has no column beat_freq"),
+        (f"controller,parameters.C,{','.join(MEASURED)},recording", "of controller, parameters.C;"),
+    ],
+)
+def test_a_table_with_other_columns_is_refused_with_what_differs(
+    tmp_path: Path, head: str, named: str
+) -> None:
+    opened(tmp_path)
+    (tmp_path / "points.csv").write_text(head + "\n")
+    with pytest.raises(ConfigError, match=named):
+        opened(tmp_path)
 
 
 def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
