@@ -66,6 +66,8 @@ class Rig(Protocol):
     """Period of its loop [s]."""
     amplitude: float
     """Φ [rad]"""
+    unit: str
+    """Of its forces: `N`, or that of its sensor until that is calibrated."""
 
     def __enter__(self) -> Self:
         """Nothing moves yet."""
@@ -91,6 +93,7 @@ class VirtualRig:
 
     def __init__(self, config: Config) -> None:
         self.name = "simulation"
+        self.unit = "N"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
         self._kept = KeepingPublisher()
@@ -132,6 +135,7 @@ class LiveRig:
         """Raises `NoDaemon`."""
         status = fish.status()
         self.name = status.robot
+        self.unit = status.force_unit
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self._fish = fish

@@ -305,7 +305,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         (["--vary", "plant.xi"], "write KEY=VALUES"),
         (["--for", "30"], "is for --on robot"),
         (["--on", "robot", "--vary", "plant.xi=1,2"], "keeps its configuration"),
-        (["--on", "robot", "--for", "5"], "too short"),
+        (["--on", "robot", "--for", "5"], "not possible"),
     ],
 )
 def test_what_cannot_be_swept_is_one_line_before_anything_is_made(
