@@ -139,10 +139,6 @@ def identify(
         config, tables = load(file, overrides), list(runs)
         origin = ", ".join(run.name for run in runs)
     found = lab.identify(tables, start=config.plant, fit=names)
-    if plot:
-        from fishd.lab.identification.figure import draw
-
-        draw(found, plot)
     if as_json:
         print_json(found.to_builtins())
     else:
@@ -151,6 +147,10 @@ def identify(
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
         _write(target, found.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
+    if plot:
+        from fishd.lab.identification.figure import draw
+
+        draw(found, plot)
 
 
 def _config(

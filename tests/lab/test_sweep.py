@@ -13,7 +13,7 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import Config, load
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Event, Tick
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.lab.sweep.folder import MEASURED, Begun, SweepFolder, owned
@@ -276,6 +276,30 @@ def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Pa
     assert done.returncode == 1
     assert "no thrust: ppo gave up" in done.stdout
     assert done.stdout.endswith("points.csv\n")
+
+
+@pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--over=frequency")])
+def test_what_cannot_be_drawn_here_is_told_before_anything_swims(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Sequence[str]
+) -> None:
+    monkeypatch.setattr("fishd.lab.drawing.find_spec", lambda _: None)
+    folder = tmp_path / "run"
+    assert "pip install 'fishd[lab]'" in one_line(fishctl(*verb, "--folder", str(folder)))
+    assert not folder.exists()
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_what_is_best_is_printed_though_its_picture_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise FishdError("thrust.png: the figure cannot be written: No space left on device")
+
+    monkeypatch.setattr("fishd.lab.sweep.figure.draw", full)
+    done = swept(tmp_path / "run", "square", "--frequency", "1.5,1.7,1.9")
+    assert "\nsquare: best frequency 1.7" in done.stdout
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "No space left" in done.stderr
 
 
 @pytest.mark.slow
