@@ -64,14 +64,14 @@ _SYMBOLS = {
     "--config",
     "file",
     type=click.Path(path_type=Path, readable=False),
-    help="Configuration whose plant a fit begins with, and of the simulated fish. [default: that "
-    "of the running fishd for --on robot, else the defaults]",
+    help="Configuration that a fit begins with, and of the simulated fish. [default: that of "
+    "the running fishd for --on robot, else the defaults]",
 )
 @set_option
 @click.option(
     "--fit",
     metavar="NAME,...",
-    help="What to fit; the rest is as in the plant of the configuration. [default: omega0, xi, "
+    help="What to fit; the rest is as in the configuration. [default: omega0, xi, "
     "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_drag, servo_delay, backlash, "
     "rotation; also: cable_slack, servo_dead_zone]",
 )
@@ -138,7 +138,7 @@ def identify(
     else:
         config, tables = load(file, overrides), list(runs)
         origin = ", ".join(run.name for run in runs)
-    found = lab.identify(tables, start=config.plant, fit=names)
+    found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names)
     if plot:
         from fishd.lab.identification.figure import draw
 

@@ -102,6 +102,17 @@ def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
     assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
 
 
+def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) -> None:
+    config = load(None, (*REAL, "plant.servo_reaction=1e-4"))
+    found = identify(table, start=config.plant, rig=config.simulation, fit=["omega0", "xi"])
+    assert found["rotation"].value == config.simulation.rotation
+    assert not found["rotation"].fitted
+    assert found["omega0"].low < 11.0 < found["omega0"].high
+    assert all(channel.white for channel in found.channels)
+    assert found.plant["servo_reaction"] == 1e-4
+    assert "servo_reaction is as in the configuration" in found.remarks[0]
+
+
 def width(found: Identification) -> float:
     return found["omega0"].high - found["omega0"].low
 

@@ -16,6 +16,7 @@ from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Pro
 from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
 from fishd.lab.identification.response import Array
 from fishd.lab.identification.result import UNITS, Channel, Estimate, Fit, Identification
+from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
 if TYPE_CHECKING:
@@ -50,12 +51,14 @@ def identify(
     runs: "DataFrame | str | os.PathLike[str] | Sequence[DataFrame | str | os.PathLike[str]]",
     *,
     start: PlantParameters | None = None,
+    rig: SimulationSettings | None = None,
     fit: Sequence[str] = DEFAULT,
 ) -> Identification:
     """Fit a fish and its rig to what some runs of it have measured.
 
     runs: tables of ticks (`fishd.recording.read`, `experiment`), or paths of recordings
     start: where to begin, and the value of what is not fitted; by default the fish of Fu et al.
+    rig: the same for `rotation`; by default the sensor is not turned
     fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`
 
     Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
@@ -65,8 +68,8 @@ def identify(
     parts = passages([_table(run) for run in _several(runs)])
     if not any(one.commands.any() for one in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
-    first = start or PlantParameters()
-    known = msgspec.structs.asdict(first) | {"rotation": 0.0}
+    known = msgspec.structs.asdict(start or PlantParameters())
+    known["rotation"] = (rig or SimulationSettings()).rotation
     values = {name: float(known[name]) for name in POSSIBLE}
     problem, values = _solved(parts, names, values)
     settle = _settling(values)
@@ -74,7 +77,7 @@ def identify(
         longer = [one for one in parts if one.duration > settle + SHORTEST]
         problem = Problem(longer or parts, names, settle if longer else _SETTLE)
         values = solve(problem, values)
-    return _summary(parts, problem, values)
+    return _summary(parts, problem, values, known)
 
 
 def _several(runs: object) -> list[object]:
@@ -144,15 +147,20 @@ def _settling(values: dict[str, float]) -> float:
 
 
 def _summary(
-    parts: Sequence[Passage], problem: Problem, values: dict[str, float]
+    parts: Sequence[Passage],
+    problem: Problem,
+    values: dict[str, float],
+    known: dict[str, float],
 ) -> Identification:
+    """What is found; `known` holds what the model does not use, too."""
+    all_values = {**known, **values}
     residuals = problem.residuals(values)
     innovations = problem.whitened(residuals)
     jacobian = problem.jacobian(values)
     covariance, untold = _covariance(jacobian, innovations)
     deviations = np.sqrt(np.diag(covariance))
     spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
-    estimates = [_estimate(name, values[name], spread) for name in UNITS if name in values]
+    estimates = [_estimate(name, all_values[name], spread) for name in UNITS if name in all_values]
     means = np.concatenate(residuals, axis=1).mean(axis=1)
     slopes = problem.slopes_of_means(values)
     count = innovations.shape[1]
@@ -262,6 +270,10 @@ def _remarks(
     untold: Array | None,
 ) -> tuple[str, ...]:
     remarks = []
+    if any(e.name == "servo_reaction" and e.value for e in estimates):
+        remarks.append(
+            "servo_reaction is as in the configuration, but no fit takes it into account"
+        )
     if untold is not None:
         involved = [name for name, part in zip(names, untold, strict=True) if abs(part) > 0.3]
         remarks.append(

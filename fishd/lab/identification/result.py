@@ -17,6 +17,7 @@ UNITS = {
     "backlash": "rad",
     "cable_slack": "rad",
     "servo_dead_zone": "rad",
+    "servo_reaction": "N s^2/rad",
     "rotation": "rad",
     "offset_x": "N",
     "offset_y": "N",
