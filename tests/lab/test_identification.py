@@ -80,6 +80,15 @@ def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path
     assert config.simulation.rotation == pytest.approx(found["rotation"].value, rel=1e-5)
 
 
+@pytest.mark.parametrize("seconds", [135.0, 180.0])
+def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(seconds: float) -> None:
+    for seed in range(2):
+        table = swum(*REAL, f"simulation.seed={seed}", seconds=seconds)
+        found = identify(table, start=FISH, rig=load(None, REAL).simulation, fit=["coupling"])
+        for name in ("offset_x", "offset_y"):
+            assert found[name].low < 0.02 < found[name].high, (seed, name)
+
+
 def test_gaps_and_skipped_slots_cost_only_what_is_missing(table: pd.DataFrame) -> None:
     lost = table.drop(index=range(700, 720)).drop(index=range(1200, 1201))
     found = identify(lost, start=FISH, fit=NEARLY_KNOWN)

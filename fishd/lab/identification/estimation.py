@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import chi2
+from scipy.stats import chi2, t
 
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
@@ -43,6 +43,8 @@ _SMOOTH = 5.0
 _SINGULAR = 1e-10
 """Information below this share of the largest is none."""
 OFFSETS = ("offset_x", "offset_y")
+_STRETCHES = (4, 5)
+"""Into how many stretches runs are cut, whose means tell how well the mean of a drift is known."""
 _LAGS = 20
 """Ticks that what is left over may be correlated for."""
 
@@ -161,12 +163,13 @@ def _summary(
     deviations = np.sqrt(np.diag(covariance))
     spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
     estimates = [_estimate(name, all_values[name], spread) for name in UNITS if name in all_values]
-    means = np.concatenate(residuals, axis=1).mean(axis=1)
+    left = np.concatenate(residuals, axis=1)
     slopes = problem.slopes_of_means(values)
-    count = innovations.shape[1]
-    for name, mean, slope, noise in zip(OFFSETS, means, slopes, problem.noise, strict=True):
-        error = _Z * float(np.sqrt(slope @ covariance @ slope + noise.white**2 / count))
-        estimates.append(Estimate(name, float(mean), float(mean) - error, float(mean) + error))
+    for name, of, slope, noise in zip(OFFSETS, left, slopes, problem.noise, strict=True):
+        told = _Z * np.sqrt(slope @ covariance @ slope + noise.white**2 / of.size)
+        error = float(np.hypot(told, _wandering(of)))
+        mean = float(of.mean())
+        estimates.append(Estimate(name, mean, mean - error, mean + error))
     drifts = [_smoothed(each, parts[0].tick) for each in residuals]
     channels = tuple(
         Channel(
@@ -215,6 +218,20 @@ def _covariance(jacobian: Array, innovations: Array) -> tuple[Array, Array | Non
     wider = np.sqrt(np.maximum(np.diag(robust) / np.diag(inverse), 1.0))
     unscaled = wider / size
     return inverse * np.outer(unscaled, unscaled), vectors[:, 0] if weak[0] else None
+
+
+def _wandering(residual: Array) -> float:
+    """Half of the 95 % interval of a mean, by how much the means of stretches differ [N].
+
+    Whatever the drift is, as long as a stretch is as good as another (Ibragimov and Müller,
+    "t-statistic based correlation and heterogeneity robust inference").
+    """
+    halves = []
+    for count in _STRETCHES:  # a drift whose period is one stretch is seen by the other cut
+        means = [stretch.mean() for stretch in np.array_split(residual, count)]
+        deviation = np.std(means, ddof=1) / np.sqrt(count)
+        halves.append(float(t.ppf(0.975, count - 1) * deviation))
+    return max(halves)
 
 
 def _estimate(name: str, value: float, spread: dict[str, float]) -> Estimate:
