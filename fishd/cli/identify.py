@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import set_option
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.client import Fish
 from fishd.config import Config, adopt, load
@@ -51,7 +51,7 @@ _SYMBOLS = {
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(min=30.0, max=3600.0),
+    type=FiniteRange(min=30.0, max=3600.0),
     help="With --experiment: how long it takes. [default: 180]",
 )
 @click.option(

@@ -44,6 +44,8 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
         (("run.mcap", "--experiment"), "one of the two"),
         (("run.mcap", "--for", "60"), "--for goes with --experiment"),
         (("--experiment", "--for", "5"), "5.0 is not in the range"),
+        (("--experiment", "--for", "nan"), "'nan' is not valid: a finite number is needed"),
+        (("--experiment", "--for", "inf"), "inf is not in the range"),
     ],
 )
 def test_a_command_line_that_makes_no_sense_is_refused(

@@ -1,6 +1,7 @@
 """Identification: a fish from its forces, with what can and cannot be told of it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from rigs.harness import Rig
 from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.frames import frame
-from fishd.lab.identification import Identification, Unidentifiable, experiment, identify
+from fishd.lab.identification import Estimate, Identification, Unidentifiable, experiment, identify
 from fishd.lab.identification.response import Drive, response
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.plant.parameters import PlantParameters
@@ -87,6 +88,25 @@ def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(seconds: floa
         found = identify(table, start=FISH, rig=load(None, REAL).simulation, fit=["coupling"])
         for name in ("offset_x", "offset_y"):
             assert found[name].low < 0.02 < found[name].high, (seed, name)
+
+
+@pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])
+def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> None:
+    with VirtualRig(load()) as rig, pytest.raises(ParameterError, match="30 s or more are needed"):
+        experiment(rig, seconds)
+
+
+def test_the_configuration_has_no_digits_that_the_interval_does_not_know(
+    table: pd.DataFrame, tmp_path: Path
+) -> None:
+    found = identify(table, start=FISH, fit=["coupling"])
+    others = tuple(each for each in found.estimates if each.name != "servo_delay")
+    found = replace(found, estimates=(Estimate("servo_delay", 3.9e-14, 0.0, 4e-5), *others))
+    file = tmp_path / "fish.yaml"
+    file.write_text(found.to_yaml(), encoding="utf-8")
+    assert "servo_delay: 0  # 0 to 4e-05 s" in file.read_text(encoding="utf-8")
+    width = found["coupling"].high - found["coupling"].low
+    assert load(file).plant.coupling == pytest.approx(found["coupling"].value, abs=0.01 * width)
 
 
 def test_gaps_and_skipped_slots_cost_only_what_is_missing(table: pd.DataFrame) -> None:
