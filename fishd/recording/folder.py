@@ -73,6 +73,8 @@ def named(run: str, folder: Path | None = None) -> Path:
 
     `.mcap` is added where it is missing, and that folder is made; raises `RecordingError`.
     """
+    if Path(run).name in ("", ".."):  # "/", "." and their like
+        raise RecordingError(f"'{run}' is no name of a recording")
     path = Path(run).expanduser() if "/" in run else made(folder or runs_folder()) / run
     return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 

@@ -103,6 +103,7 @@ def test_a_command_line_that_makes_no_sense_is_refused(
     ("words", "complaint"),
     [
         (("nowhere.mcap",), "nowhere.mcap"),
+        (("--experiment", "--record", "/"), "'/' is no name of a recording"),
         (("--experiment", "--fit", "omega"), "did you mean 'omega0'?"),
     ],
 )
