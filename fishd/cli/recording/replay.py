@@ -1,7 +1,6 @@
 """The verb that publishes a recording as if it were live."""
 
 import shlex
-import signal
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from fishd.cli.options import FiniteRange
 from fishd.cli.output import echo
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.core.addresses import control_address, find_control
+from fishd.core.interruption import interrupted_once
 from fishd.recording.replay import Replay
 
 TELEMETRY = "tcp://127.0.0.1:9872"
@@ -45,12 +45,14 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
     with Ctrl-C. A silence of more than 5 s is cut short.
     """
     recorded = opened(run, folder)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with Replay(recorded, address, control or control_address()) as player:
+    with (
+        suppress(KeyboardInterrupt),
+        interrupted_once(),
+        Replay(recorded, address, control or control_address()) as player,
+    ):
         seconds = recorded.summary.duration / speed
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
         found = find_control() == player.control
         endpoint = "" if found else f"--endpoint {shlex.quote(player.control)} "
         echo(f"watch it with: fishctl {endpoint}watch")
-        with suppress(KeyboardInterrupt):
-            player.play(speed)
+        player.play(speed)
