@@ -2,13 +2,18 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from fishd.client import Fish
 from fishd.config import Config
+from fishd.control.reporting import Publisher
 from fishd.core.errors import FishdError, FishError
-from fishd.core.signals import Reason, Tick
-from fishd.simulation import KeepingPublisher, VirtualRun
+from fishd.core.signals import Event, Reason, Tick
+from fishd.simulation import VirtualRun
+
+if TYPE_CHECKING:
+    from fishd.recording.provenance import Source
+    from fishd.recording.writer import RunWriter
 
 
 class Disturbed(FishdError):
@@ -28,6 +33,15 @@ class Rig(Protocol):
     """Period of its loop [s]."""
     amplitude: float
     """Φ [rad]"""
+    force_unit: str
+    """`N`, or that of a sensor that is not calibrated."""
+    source: "Source"
+    """What a recording says of where its ticks are from."""
+    listener: Publisher | None
+    """Is given each tick and event as it comes, in order; what it raises ends a swim or a rest."""
+
+    def describe(self, writer: "RunWriter") -> None:
+        """Put what the ticks are made with into a recording; raises `RecordingError`."""
 
     def __enter__(self) -> Self:
         """Nothing moves yet."""
@@ -55,8 +69,15 @@ class VirtualRig:
         self.name = "simulation"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
-        self._kept = KeepingPublisher()
-        self._run = VirtualRun(config, self._kept)
+        self.source: Source = "simulation"
+        self.listener: Publisher | None = None
+        self._heard = _Heard()
+        self._run = VirtualRun(config, self._heard)
+        self.force_unit = self._run.loop.robot.force_unit
+
+    def describe(self, writer: "RunWriter") -> None:
+        """As `Rig.describe`."""
+        writer.describe(self._run.config, self._run.about())
 
     def __enter__(self) -> Self:
         return self
@@ -76,9 +97,12 @@ class VirtualRig:
 
     def _pass(self, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
-        self._kept.ticks = ticks
         for _ in range(max(1, round(seconds / self.tick))):
             self._run.tick()
+            for message in self._heard.taken():
+                _hand_on(message, self.listener)
+                if isinstance(message, Tick):
+                    ticks.append(message)
             loop = self._run.loop
             _check(ticks[-1], controller, loop.supervisor.reason, loop.active.fallback)
         return ticks
@@ -93,9 +117,18 @@ class LiveRig:
         self.name = status.robot
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
+        self.force_unit = status.force_unit
+        self.source: Source = "fishd"
+        self.listener: Publisher | None = None
         self._fish = fish
-        self._ticks = fish.ticks()
+        self._messages = fish.ticks_and_events()
         self._controller: str | None = None
+
+    def describe(self, writer: "RunWriter") -> None:
+        """As `Rig.describe`; raises `NoDaemon`, too."""
+        from fishd.recording.recorder import description
+
+        description(self._fish).write(writer)
 
     def __enter__(self) -> Self:
         return self
@@ -125,7 +158,10 @@ class LiveRig:
     def _pass(self, first: int, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
         count = max(1, round(seconds / self.tick))
-        for tick in self._ticks:
+        for tick in self._messages:
+            _hand_on(tick, self.listener)
+            if not isinstance(tick, Tick):
+                continue
             if not first <= tick.seq < first + 2 * count:  # of before, or of another fishd
                 continue
             if not _as_told(tick, controller):
@@ -135,6 +171,33 @@ class LiveRig:
             if tick.seq >= first + count - 1:
                 break
         return ticks
+
+
+class _Heard:
+    """Keeps ticks and events in their order until they are taken."""
+
+    def __init__(self) -> None:
+        self._messages: list[Tick | Event] = []
+
+    def tick(self, tick: Tick) -> None:
+        self._messages.append(tick)
+
+    def event(self, event: Event) -> None:
+        self._messages.append(event)
+
+    def taken(self) -> list[Tick | Event]:
+        """All of them, once."""
+        messages, self._messages = self._messages, []
+        return messages
+
+
+def _hand_on(message: Tick | Event, listener: Publisher | None) -> None:
+    if listener is None:
+        return
+    if isinstance(message, Tick):
+        listener.tick(message)
+    else:
+        listener.event(message)
 
 
 def _as_told(tick: Tick, controller: str | None) -> bool:

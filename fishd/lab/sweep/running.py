@@ -6,10 +6,10 @@ from fishd.config import Config
 from fishd.core.interruption import interrupted_once, on_signal
 from fishd.lab.parallel import workers
 from fishd.lab.rig import Rig
+from fishd.lab.rig_recording import recorded
 from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, Result, Task, on_rig, simulated
-from fishd.recording.writer import RunWriter
 
 STOP = "stop"
 """A file of this name in the folder ends a sweep in simulation."""
@@ -68,13 +68,10 @@ def on_robot(
             for point in found:
                 if folder.key(point) in folder.results:
                     continue
-                result, ticks = on_rig(point, rig, seconds, progress)
                 extra = {name: str(value) for name, value in point.columns().items()}
                 path = folder.recording_of(point)
-                with RunWriter(path, source=rig.name, note=point.label(), extra=extra) as writer:
-                    writer.describe(folder.begun.config)
-                    for tick in ticks:
-                        writer.tick(tick)
+                with recorded(rig, path, point.label(), extra):
+                    result = on_rig(point, rig, seconds, progress)
                 folder.keep(point, result, path)
                 done(point, result)
     except KeyboardInterrupt:
