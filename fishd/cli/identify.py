@@ -15,9 +15,9 @@ from fishd.cli.output import echo, print_json
 from fishd.client import Fish
 from fishd.config import Config, adopt, load
 from fishd.core import files
+from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
 from fishd.core.interruption import interrupted_once
-from fishd.core.signals import Tick
 
 if TYPE_CHECKING:
     from fishd.lab.identification import Estimate, Identification
@@ -104,7 +104,7 @@ def identify(
     plot: Path | None,
     endpoint: str | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
 
     RUN is a recording. Several are fitted together, as one fish. Or let --experiment swim one now.
@@ -133,7 +133,12 @@ def identify(
     lab.check(names)  # before minutes of swimming
     if experiment:
         config, fish = _config(on, file, overrides, endpoint)
-        tables: list[Any] = [_swum(config, fish, seconds or 180.0, record)]
+        try:
+            tables: list[Any] = [_swum(config, fish, seconds or 180.0, record)]
+        except KeyboardInterrupt:
+            kept = f"; what it swam is in {record}" if record and record.exists() else ""
+            echo(f"fishctl: stopped before its end, so nothing is fitted{kept}", err=True)
+            return INTERRUPTED
         origin = "an experiment"
     else:
         config, tables = load(file, overrides), list(runs)
@@ -151,6 +156,7 @@ def identify(
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
         _write(target, found.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
+    return 0
 
 
 def _config(
@@ -163,11 +169,6 @@ def _config(
     if on != "robot":
         return load(file, overrides), None
     fish = Fish(endpoint)
-    if fish.status().force_unit != "N":
-        raise FishdError(
-            "the force sensor is not calibrated, so no force is known in newtons: "
-            "fishctl calibrate force"
-        )
     return load(file, overrides) if file else adopt(fish.config(), overrides), fish
 
 
@@ -175,24 +176,22 @@ def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None
     """The ticks of an experiment, and a recording of them where one is wanted."""
     from fishd.lab.identification import experiment
     from fishd.lab.rig import LiveRig, Rig, VirtualRig
-
-    def keep(ticks: list[Tick]) -> None:
-        from fishd.recording import RunWriter
-
-        if record:
-            note = "fishctl identify --experiment"
-            with RunWriter(record, source=config.robot, note=note) as writer:
-                writer.describe(config)
-                for tick in ticks:
-                    writer.tick(tick)
+    from fishd.lab.rig_recording import recorded
 
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())
         rig: Rig = LiveRig(stack.enter_context(fish)) if fish else VirtualRig(config)
         stack.enter_context(rig)
+        if rig.force_unit != "N":
+            raise FishdError(
+                "the force sensor is not calibrated, so no force is known in newtons: "
+                "fishctl calibrate force"
+            )
+        if record:
+            stack.enter_context(recorded(rig, record, "fishctl identify --experiment"))
         if fish:
             echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
-        return experiment(rig, seconds, keep=keep)
+        return experiment(rig, seconds)
 
 
 def _write(target: Path, text: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2
 
+from fishd.core import text
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
 from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Problem, solve
@@ -84,9 +85,16 @@ def _several(runs: object) -> list[object]:
 
 def _table(run: object) -> "DataFrame":
     if isinstance(run, str | os.PathLike):
-        from fishd.recording import read
+        from fishd.recording import open_run
 
-        return read(run)
+        recorded = open_run(run)
+        if recorded.force_unit != "N":
+            raise Unidentifiable(
+                f"{recorded.path}: its forces are in {text.quoted(recorded.force_unit)}, not in "
+                "newtons: the force sensor was not calibrated; calibrate it by 'fishctl calibrate "
+                "force', and record it again"
+            )
+        return recorded.frame()
     return run  # type: ignore[return-value]
 
 
