@@ -182,7 +182,7 @@ def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None
         stack.enter_context(interrupted_once())
         rig: Rig = LiveRig(stack.enter_context(fish)) if fish else VirtualRig(config)
         stack.enter_context(rig)
-        if rig.force_unit != "N":
+        if rig.unit != "N":
             raise FishdError(
                 "the force sensor is not calibrated, so no force is known in newtons: "
                 "fishctl calibrate force"

@@ -142,7 +142,7 @@ def _optimise(
             raise ParameterError(
                 f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"
             )
-        unit = rig.force_unit
+        unit = rig.unit
         run = SearchFolder(path, [each.name for each in ranges])
         found, whole = None, True
         last: Trial | None = None

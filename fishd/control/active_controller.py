@@ -27,6 +27,8 @@ class ActiveController:
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
         self.parameters = _plain(self.controller)
         """Its parameters, as JSON has them."""
+        self.wave = (self.name, self.parameters)
+        """The two, as another object after each change."""
         self.quantities: dict[str, float] = {}
         """Its own, as of its latest update; empty where it has none to show."""
         self.quantity_units: dict[str, str] = {}
@@ -40,6 +42,7 @@ class ActiveController:
         units = {each.name: each.unit for each in quantities_of(type(controller))}
         former, self.parameters = self.controller, _plain(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
+        self.wave = (name, self.parameters)
         self.quantities, self.quantity_units = {}, units
         self.dispose(former, f"the controller before {name}")
 
@@ -75,6 +78,7 @@ class ActiveController:
         """Give it new, already checked parameters; raises what it raises."""
         contained(self.controller.retune, parameters)
         self.parameters = _plain(self.controller)
+        self.wave = (self.name, self.parameters)
         self._reporter.controller("parameters", self.name, self.parameters)
 
     def warm_up(self) -> None:

@@ -33,8 +33,8 @@ class Rig(Protocol):
     """Period of its loop [s]."""
     amplitude: float
     """Φ [rad]"""
-    force_unit: str
-    """`N`, or that of a sensor that is not calibrated."""
+    unit: str
+    """Of its forces: `N`, or that of its sensor until that is calibrated."""
     source: "Source"
     """What a recording says of where its ticks are from."""
     listener: Publisher | None
@@ -73,7 +73,7 @@ class VirtualRig:
         self.listener: Publisher | None = None
         self._heard = _Heard()
         self._run = VirtualRun(config, self._heard)
-        self.force_unit = self._run.loop.robot.force_unit
+        self.unit = self._run.loop.robot.force_unit
 
     def describe(self, writer: "RunWriter") -> None:
         """As `Rig.describe`."""
@@ -115,9 +115,9 @@ class LiveRig:
         """Raises `NoDaemon`."""
         status = fish.status()
         self.name = status.robot
+        self.unit = status.force_unit
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
-        self.force_unit = status.force_unit
         self.source: Source = "fishd"
         self.listener: Publisher | None = None
         self._fish = fish

@@ -80,7 +80,7 @@ def test_forces_in_volts_are_never_called_newtons(tmp_path: Path) -> None:
     with VirtualRig(config) as rig, recorded(rig, path, ""):
         rig.swim("swing", {}, 10.0)
     run = open_run(path)
-    assert (rig.force_unit, run.force_unit, traces(run).unit) == ("V", "V", "mV")
+    assert (rig.unit, run.force_unit, traces(run).unit) == ("V", "V", "mV")
     with pytest.raises(Unidentifiable, match=r"run.mcap: its forces are in V, not in newtons"):
         identify(path)
 

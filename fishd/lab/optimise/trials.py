@@ -4,8 +4,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core.schema import Field
-from fishd.lab.measurement import REST, SWIM_SETTLES, evaluate, samples_of
+from fishd.lab.measurement import REST, evaluate, samples_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig
 
