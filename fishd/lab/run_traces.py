@@ -72,7 +72,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
     return Traces(
         title=_title(run),
-        unit=f"m{run.force_unit}",
+        unit=f"m{run.summary.force_unit}",
         time=time,
         fx=1e3 * column(lambda tick: tick.fx),
         fy=1e3 * column(lambda tick: tick.fy),

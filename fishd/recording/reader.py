@@ -88,12 +88,6 @@ class Run:
                 f"{error}"
             ) from None
 
-    @property
-    def force_unit(self) -> str:
-        """Unit of its forces: `N` only where all are in newtons, else that of the others."""
-        units = (about.get("force_unit", "N") for about in self.daemons)
-        return next((unit for unit in units if unit != "N"), "N")
-
     @cached_property
     def ticks(self) -> list[Tick]:
         """All ticks, in the order in which they came; raises `RecordingError`."""
@@ -132,6 +126,8 @@ class Run:
     @cached_property
     def _tally(self) -> Tally:
         tally = Tally()
+        for about in self.daemons:
+            tally.measures_in(about.get("force_unit", "N"))
         for message in self.messages():
             tally.add(message)
         return tally

@@ -48,6 +48,8 @@ class Summary(Struct, frozen=True):
     """
     swimming: dict[str, int] = {}
     """Ticks in mode running, by controller."""
+    force_unit: str = "N"
+    """Unit of its forces: `N` only where all are in newtons, else that of the others."""
 
     @property
     def duration(self) -> float:
@@ -82,6 +84,12 @@ class Tally:
         self._known_ticks = 0
         self._thrust = self._error = 0.0
         self._swimming: dict[str, int] = {}
+        self._force_unit = "N"
+
+    def measures_in(self, force_unit: str) -> None:
+        """Take note of the unit of the forces from now on."""
+        if self._force_unit == "N":
+            self._force_unit = force_unit
 
     def add(self, message: TickHead | Tick | Event | Status) -> None:
         """Add any message."""
@@ -158,6 +166,7 @@ class Tally:
             thrust=thrust,
             thrust_error=error,
             swimming=dict(self._swimming),
+            force_unit=self._force_unit,
         )
 
 

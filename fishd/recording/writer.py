@@ -121,6 +121,7 @@ class RunWriter:
         """
         number = str(self.tally.restarts)
         self._writer.add_metadata("fishd.daemon", {"number": number, **(daemon or {})})
+        self.tally.measures_in((daemon or {}).get("force_unit", "N"))
         yaml = to_yaml(config if isinstance(config, Config) else dict(config))
         self._attach(CONFIG, "application/yaml", yaml.encode())
 

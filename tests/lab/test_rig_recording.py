@@ -1,5 +1,6 @@
 """What a rig does is recorded while it does it, with all that a rerun and a reader need."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -80,7 +81,9 @@ def test_forces_in_volts_are_never_called_newtons(tmp_path: Path) -> None:
     with VirtualRig(config) as rig, recorded(rig, path, ""):
         rig.swim("swing", {}, 10.0)
     run = open_run(path)
-    assert (rig.unit, run.force_unit, traces(run).unit) == ("V", "V", "mV")
+    assert (rig.unit, run.summary.force_unit, traces(run).unit) == ("V", "V", "mV")
+    listed = fishctl("runs", "--folder", str(tmp_path)).stdout
+    assert re.search(r"^run .* -?\d+\.\d\d ± \S+ mV ", listed, re.MULTILINE)
     with pytest.raises(Unidentifiable, match=r"run.mcap: its forces are in V, not in newtons"):
         identify(path)
 
@@ -90,4 +93,4 @@ def test_a_simulated_run_says_what_its_forces_are_in(tmp_path: Path) -> None:
     words = ("--config", "config/virtual-pi.yaml", *sets(f"state_folder={tmp_path}"))
     done = fishctl("simulate", "swing", "--seconds", "11", *words, "--record", str(path))
     assert done.returncode == 0, done.stderr
-    assert open_run(path).force_unit == "V"
+    assert open_run(path).summary.force_unit == "V"

@@ -33,9 +33,8 @@ def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
     assert list(table.fx) == [tick.fx for tick in rig.recorder.ticks]
 
 
-@pytest.mark.parametrize("rig", [(), ("simulation.drift=0.005", "simulation.offset_x=0.02")])
-def test_its_thrust_is_the_mean_over_all_its_swimming(rig: tuple[str, ...]) -> None:
-    fish, tally, impulse = Rig(*rig), Tally(), 0.0
+def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
+    fish, tally, impulse = Rig("simulation.offset_x=0.02"), Tally(), 0.0
     fish.run_for(10)
     for controller, parameters in (("swing", {}), ("square", {"frequency": 0.8})):
         fish.start(controller, **parameters)
@@ -47,8 +46,8 @@ def test_its_thrust_is_the_mean_over_all_its_swimming(rig: tuple[str, ...]) -> N
     thrust, error = tally.summary.thrust, tally.summary.thrust_error
     assert thrust is not None
     assert error is not None
-    assert thrust == pytest.approx(impulse / 2400, abs=error)
-    assert error < 2.0e-3
+    assert thrust == pytest.approx(impulse / 2400, abs=0.5e-3)
+    assert 0.5e-3 < error < 5.0e-3
 
 
 def test_an_older_recording_is_never_overwritten(tmp_path: Path) -> None:

@@ -88,9 +88,10 @@ def _table(run: object) -> "DataFrame":
         from fishd.recording import open_run
 
         recorded = open_run(run)
-        if recorded.force_unit != "N":
+        unit = recorded.summary.force_unit
+        if unit != "N":
             raise Unidentifiable(
-                f"{recorded.path}: its forces are in {text.quoted(recorded.force_unit)}, not in "
+                f"{recorded.path}: its forces are in {text.quoted(unit)}, not in "
                 "newtons: the force sensor was not calibrated; calibrate it by 'fishctl calibrate "
                 "force', and record it again"
             )
