@@ -44,6 +44,6 @@ def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     )
     assert daemon.status().mode == "idle"
     run = open_run(path)
-    assert run.reason == "ended by KeyboardInterrupt"
+    assert run.reason == "ended by Interrupted"
     assert run.summary.swimming["excitation"] >= 15
     assert "excitation" in [event.data.get("controller") for event in run.events]
