@@ -1,6 +1,5 @@
 """The verb that compares policies and controllers on the same fish, simulated or live."""
 
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,6 +16,7 @@ from fishd.client import Fish
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
+from fishd.core.interruption import interrupted_once
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -95,10 +95,11 @@ def compare(
 
     In simulation thrust is the true one, and efficiency that over the thrust of the best square
     wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
-    rest, and shows what was measured. ± is the 95 % interval: of a measurement, or of the mean of
-    several runs. |φ_c|/Φ is the mean size of the command, square its mean size over its rms:
-    square wave 1, sine 0.900, triangle 0.866. Exit status 1 when one is refused on this fish, such
-    as a policy for another amplitude, or ends in mode fault; the others swim all the same.
+    rest, and shows what was measured. ± is the 95 % interval of the mean thrust of all runs, from
+    how they differ and, on a robot, from the error of each measurement. |φ_c|/Φ is the mean size
+    of the command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866.
+    Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
+    in mode fault; the others swim all the same.
     """
     of_simulation = {
         "--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides,
@@ -114,11 +115,12 @@ def compare(
     else:
         lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
         outcome = _in_simulation(contestants, file, overrides, *lengths, runs)
+    status = _report(outcome, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
 
         draw(picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
-    return _report(outcome, as_json)
+    return status
 
 
 def _in_simulation(
@@ -148,9 +150,8 @@ def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str |
     from fishd.lab.rig import LiveRig
 
     ended, status = "", 0
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too lets the fish rest
     chosen = [absolute(parse(text)) for text in texts]
-    with Fish(endpoint) as fish:
+    with interrupted_once(), Fish(endpoint) as fish:  # whatever ends it leaves the fish at rest
         chosen = chosen or default_contestants(adopt(fish.config()))
         unit = fish.status().force_unit
         with LiveRig(fish) as rig, showing(len(chosen) * runs * seconds, "s") as bar:

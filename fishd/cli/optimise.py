@@ -124,11 +124,13 @@ def _optimise(
     endpoint: str | None,
     as_json: bool,
 ) -> int:
+    from fishd.lab import drawing
     from fishd.lab.measurement import REST
     from fishd.lab.optimise.folder import SearchFolder, draw
     from fishd.lab.optimise.search import Search
     from fishd.lab.optimise.trials import lengths, trials
 
+    drawing.check_installed()
     refuse_other(on, {"--config": file, "--set": overrides}, {})
     path = folder or Path("runs") / f"optimise-{datetime.now():%Y%m%d-%H%M%S}"
     with _fish(on, file, overrides, endpoint) as rig:
@@ -173,11 +175,13 @@ def _optimise(
         report = simulate(load(file, overrides), name, {**parameters, **found.parameters})
         optimum = replace(optimum, true_thrust=report.mean_thrust, efficiency=report.efficiency)
     units = {each: field.unit for each, field in _fields().items()}
-    picture = draw(path, search, found, units, unit)
     if as_json:
         print_json(optimum)
     else:
-        _say(optimum, unit, units, path, picture)
+        _say(optimum, unit, units, path)
+    pictures = draw(path, search, found, units, unit)
+    if not as_json:
+        echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
     if not whole:
         echo("fishctl: stopped before its end: this is the best so far", err=True)
         return INTERRUPTED
@@ -271,9 +275,7 @@ def _optimum(name: str, trials: int, last: "Trial", found: "Proposal") -> Optimu
     )
 
 
-def _say(
-    found: Optimum, unit: str, units: dict[str, str], path: Path, pictures: list[Path]
-) -> None:
+def _say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
     for name, value in found.parameters.items():
         symbol = "" if units[name] in ("", "1") else f" {units[name]}"
         interval = f"[{found.low[name]:.4g}, {found.high[name]:.4g}]"
@@ -289,4 +291,3 @@ def _say(
         f"{found.seconds:.0f} s with the rests"
     )
     echo(f"table: {path / 'trials.csv'}")
-    echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")

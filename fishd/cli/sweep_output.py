@@ -68,23 +68,22 @@ def conclude(
     whole: bool,
     as_json: bool,
 ) -> int:
-    """Draw what there is, and say what is best; the exit status."""
+    """Say what is best, and draw what there is; the exit status."""
     from fishd.lab.sweep import curves, figure
 
     drawn = curves.curves(folder, found)
     unit = folder.begun.force_unit
     bests = [(curve, best) for curve in drawn if (best := curves.best(curve))]
-    pictures = []
-    if bests:
-        stem = folder.path / "thrust"
-        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
     if as_json:
         print_json([best for _, best in bests])
     else:
         for curve, best in bests:
             echo(f"{curve.label}: {_proposal(best, units.get(best.over, ''), unit)}")
         echo(f"table: {folder.path / 'points.csv'}")
-        if pictures:
+    if any(curve.peak for curve in drawn):
+        stem = folder.path / "thrust"
+        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
+        if not as_json:
             echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
     if not whole:
         done = sum(folder.key(point) in folder.results for point in found)
@@ -102,6 +101,8 @@ def _proposal(best: "Best", unit: str, force_unit: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
     error = "" if best.error is None else f" ± {best.error * 1e3:.2f}"
     thrust = f"{best.thrust * 1e3:.2f}{error} m{force_unit}"
+    if best.x is None:
+        return thrust
     if best.at_edge:
         return (
             f"best measured at {best.over} {best.x:g}{symbol}, {thrust}: at the edge of the grid, "

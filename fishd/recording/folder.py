@@ -68,6 +68,17 @@ def new_path(folder: Path, prefix: str = "") -> Path:
     return path
 
 
+def named(run: str, folder: Path | None = None) -> Path:
+    """The path of a new recording: as given where it has a `/`, else in the folder of recordings.
+
+    `.mcap` is added where it is missing, and that folder is made; raises `RecordingError`.
+    """
+    if Path(run).name in ("", ".."):  # "/", "." and their like
+        raise RecordingError(f"'{run}' is no name of a recording")
+    path = Path(run).expanduser() if "/" in run else made(folder or runs_folder()) / run
+    return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
+
+
 def paths(folder: Path) -> list[Path]:
     """All recordings of a folder, finished or not, the oldest first."""
     try:

@@ -1,11 +1,12 @@
 """A replay is what a subscriber and a client of fishd expect, and cannot be steered."""
 
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rigs.processes import Subscriber
+from rigs.processes import FISHCTL, Process, Subscriber, wait_until
 from rigs.recordings import recorded, swum
 
 from fishd.client import Fish, Refused
@@ -33,6 +34,17 @@ def test_a_replay_is_the_recorded_bytes_at_the_recorded_speed(replay: Replay) ->
                 heard.append(payload)
         player.join()
     assert heard == recorded
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_replay_ends_by_a_signal_and_leaves_no_socket(tmp_path: Path, number: int) -> None:
+    run = recorded(swum(), tmp_path / "run", source="simulation")
+    socket = tmp_path / "control"
+    words = ("--speed", "0.01", "--address", "tcp://127.0.0.1:0", "--control", f"ipc://{socket}")
+    process = Process(FISHCTL, "replay", str(run), *words)
+    wait_until(socket.exists)
+    assert process.end(number)[::2] == (0, "")
+    assert not socket.exists()
 
 
 def test_a_client_sees_the_replay_and_cannot_steer_it(replay: Replay) -> None:

@@ -17,7 +17,7 @@ from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import FOLDER_VARIABLE, made, new_path, runs_folder
+from fishd.recording.folder import FOLDER_VARIABLE, made, named, new_path, runs_folder
 from fishd.recording.recorder import Recorder
 
 folder_option = click.option(
@@ -104,7 +104,7 @@ def record(
         _record_for_ever(partial(recorder_of, box.open, due=box.due), stopping, seconds)
         return
     progress = _draw if sys.stdout.isatty() else lambda writer: None
-    path = _path(run, place)
+    path = named(run, place) if run else new_path(place)
     recorder = recorder_of(partial(begin, path), progress=progress)
     try:
         with recorder:
@@ -136,12 +136,6 @@ def _record_for_ever(
                 _tell(f"waiting: {error}")
             waiting = True
             stopping.wait(1.0)
-
-
-def _path(run: str | None, folder: Path) -> Path:
-    if run is None:
-        return new_path(folder)
-    return Path(run).expanduser() if "/" in run else folder / run
 
 
 class _Signals:

@@ -1,6 +1,5 @@
 """The verb that publishes a recording as if it were live."""
 
-import signal
 from contextlib import suppress
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import click
 from fishd.cli.output import echo
 from fishd.cli.recording.record import folder_option
 from fishd.core.addresses import control_address
+from fishd.core.interruption import interrupted_once
 from fishd.recording import open_run
 from fishd.recording.folder import find
 from fishd.recording.replay import Replay
@@ -45,13 +45,15 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
     with Ctrl-C. A silence of more than 5 s is cut short.
     """
     recorded = open_run(find(run, folder))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with Replay(recorded, address, control or control_address()) as player:
+    with (
+        suppress(KeyboardInterrupt),
+        interrupted_once(),
+        Replay(recorded, address, control or control_address()) as player,
+    ):
         seconds = recorded.summary.duration / speed
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
         if control:
             echo(f"watch it with: fishctl --endpoint {control} watch")
         else:
             echo("watch it with: fishctl watch")
-        with suppress(KeyboardInterrupt):
-            player.play(speed)
+        player.play(speed)

@@ -1,7 +1,9 @@
 """Lets a fish swim what tells most about it."""
 
+import math
 from typing import TYPE_CHECKING
 
+from fishd.core.errors import ParameterError
 from fishd.core.frames import frame
 from fishd.lab.rig import Rig
 
@@ -18,11 +20,11 @@ def experiment(rig: Rig, seconds: float = 180.0) -> "DataFrame":
     """Rest, then swim `excitation` at the rig's whole amplitude; a row a tick.
 
     seconds: how long all of it takes [s]
-    Raises ValueError for less than `SHORTEST`, `Disturbed` where somebody else takes the fish, and
-    what the rig raises.
+    Raises `ParameterError` for less than `SHORTEST` or for ever, `Disturbed` where somebody else
+    takes the fish, and what the rig raises.
     """
-    if not seconds >= SHORTEST:
-        raise ValueError(f"an experiment of {seconds:g} s is too short; {SHORTEST:g} s are needed")
+    if not SHORTEST <= seconds < math.inf:
+        raise ParameterError(f"an experiment of {seconds:g} s: {SHORTEST:g} s or more are needed")
     ticks = rig.rest(REST)
     ticks += rig.swim("excitation", {}, seconds - REST)
     return frame(ticks)

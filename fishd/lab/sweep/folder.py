@@ -114,10 +114,7 @@ class SweepFolder:
         try:
             before, *rows = tables.read(path)
             if tuple(before) != head:
-                raise ConfigError(
-                    f"{path}: this sweep has other parameters or keys: it was of "
-                    f"{', '.join(before[: -len(MEASURED) - 1])}; give another --folder"
-                )
+                raise ConfigError(f"{path}: {_other(before)}; give another --folder")
             complete = [row for row in rows if len(row) == len(head)]
             for row in complete:
                 measured = dict(zip(head, row, strict=True))
@@ -153,6 +150,19 @@ def owned(path: Path) -> Iterator[None]:
         raise ConfigError(f"{error.filename}: {error.strerror}") from None
 
 
+def _other(head: Sequence[str]) -> str:
+    """Why a table with another head is not gone on with."""
+    measured = (*MEASURED, RECORDING)
+    if tuple(head[-len(measured) :]) == measured:
+        return (
+            "this sweep has other parameters or keys: it was of "
+            f"{', '.join(head[: -len(measured)])}"
+        )
+    missing = [name for name in measured if name not in head]
+    why = f"it has no column {', '.join(missing)}" if missing else "it has other columns"
+    return f"not a table as this fishd ({__version__}) writes it: {why}"
+
+
 def _make(path: Path, begun: Begun) -> None:
     file = path / BEGUN
     if file.exists():
@@ -171,16 +181,32 @@ def _check_same(file: Path, begun: Begun) -> None:
     except FileProblem as problem:
         raise ConfigError(f"{file}: {problem}") from None
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"{file}: no sweep began so: {error}") from None
-    before, now = (_leaves(msgspec.to_builtins(each)) for each in (data, begun))
-    for key in dict.fromkeys([*before, *now]):
-        if key == "version" or key.removeprefix("config.").partition(".")[0] in OTHERS:
-            continue
-        if before.get(key) != now.get(key):
+        raise ConfigError(
+            f"{file}: not as this fishd ({__version__}) writes it: {error}; give another --folder"
+        ) from None
+    before, now = (_relevant(each) for each in (data, begun))
+    for key in (key for key in before if key in now):
+        if before[key] != now[key]:
             raise ConfigError(
-                f"{file}: this sweep was begun with {key} = {before.get(key)}, now it is "
-                f"{now.get(key)}; give the same, or another --folder"
+                f"{file}: this sweep was begun with {key} = {before[key]}, now it is {now[key]}; "
+                "give the same, or another --folder"
             )
+    if others := [key for key in (*before, *now) if not (key in before and key in now)]:
+        who = f"fishd {data.version}" if data.version != __version__ else "another fishd"
+        has = "has" if others[0] in before else "has no"
+        raise ConfigError(
+            f"{file}: this sweep was begun with {who}, whose configuration {has} {others[0]}, "
+            "unlike that of now; give another --folder"
+        )
+
+
+def _relevant(begun: Begun) -> dict[str, Any]:
+    """What thrust depends on, by dotted keys."""
+    return {
+        key: value
+        for key, value in _leaves(msgspec.to_builtins(begun)).items()
+        if key != "version" and key.removeprefix("config.").partition(".")[0] not in OTHERS
+    }
 
 
 def _leaves(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

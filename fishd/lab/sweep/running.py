@@ -57,6 +57,7 @@ def on_robot(
 ) -> bool:
     """Measure on a rig what is missing; False where a signal ended that before.
 
+    A point whose controller is refused, or gives up, has trouble, and the next one is measured.
     The fish rests afterwards, whatever ends it.
 
     seconds: for each point [s]
