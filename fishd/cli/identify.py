@@ -12,7 +12,7 @@ import click
 from fishd.cli.config import set_option
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.config import Config, adopt, load
 from fishd.core import files
