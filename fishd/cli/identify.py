@@ -16,10 +16,9 @@ from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.config import Config, adopt, load
 from fishd.core import files
+from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
 from fishd.core.interruption import interrupted_once
-from fishd.core.signals import Tick
-from fishd.recording import RunWriter
 from fishd.recording.folder import find, named
 
 if TYPE_CHECKING:
@@ -109,7 +108,7 @@ def identify(
     plot: Path | None,
     endpoint: str | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. Several are fitted together, as
@@ -138,7 +137,12 @@ def identify(
     lab.check(names)  # before minutes of swimming
     if experiment:
         config, fish = _config(on, file, overrides, endpoint)
-        tables: list[Any] = [_swum(config, fish, seconds or 180.0, kept)]
+        try:
+            tables: list[Any] = [_swum(config, fish, seconds or 180.0, kept)]
+        except KeyboardInterrupt:
+            where = f"; what it swam is in {kept}" if kept and kept.exists() else ""
+            echo(f"fishctl: stopped before its end, so nothing is fitted{where}", err=True)
+            return INTERRUPTED
         origin = f"an experiment with {_swimmer(on, file, overrides)}"
     else:
         config, tables = load(file, overrides), [find(run, folder) for run in runs]
@@ -158,6 +162,7 @@ def identify(
         from fishd.lab.identification.figure import draw
 
         draw(found, plot)
+    return 0
 
 
 def _swimmer(on: str | None, file: Path | None, overrides: tuple[str, ...]) -> str:
@@ -178,11 +183,6 @@ def _config(
     if on != "robot":
         return load(file, overrides), None
     fish = Fish(endpoint)
-    if fish.status().force_unit != "N":
-        raise FishdError(
-            "the force sensor is not calibrated, so no force is known in newtons: "
-            "fishctl calibrate force"
-        )
     return load(file, overrides) if file else adopt(fish.config(), overrides), fish
 
 
@@ -190,22 +190,22 @@ def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None
     """The ticks of an experiment, and a recording of them where one is wanted."""
     from fishd.lab.identification import experiment
     from fishd.lab.rig import LiveRig, Rig, VirtualRig
-
-    def keep(ticks: list[Tick]) -> None:
-        if record:
-            note = "fishctl identify --experiment"
-            with RunWriter(record, source=config.robot, note=note) as writer:
-                writer.describe(config)
-                for tick in ticks:
-                    writer.tick(tick)
+    from fishd.lab.rig_recording import recorded
 
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())
         rig: Rig = LiveRig(stack.enter_context(fish)) if fish else VirtualRig(config)
         stack.enter_context(rig)
+        if rig.unit != "N":
+            raise FishdError(
+                "the force sensor is not calibrated, so no force is known in newtons: "
+                "fishctl calibrate force"
+            )
+        if record:
+            stack.enter_context(recorded(rig, record, "fishctl identify --experiment"))
         if fish:
             echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
-        return experiment(rig, seconds, keep=keep)
+        return experiment(rig, seconds)
 
 
 def _write(target: Path, text: str) -> None:

@@ -16,7 +16,7 @@ from fishd.cli.options import ControllerGroup, ParameterType, endpoint_option, j
 from fishd.cli.output import counted, echo, print_json
 from fishd.cli.sweep import ON, refuse_other
 from fishd.client import Fish
-from fishd.config import Config, Start, load
+from fishd.config import Start, load
 from fishd.controllers import registry
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ParameterError
@@ -133,7 +133,7 @@ def _optimise(
     drawing.check_installed()
     refuse_other(on, {"--config": file, "--set": overrides}, {})
     path = folder or Path("runs") / f"optimise-{datetime.now():%Y%m%d-%H%M%S}"
-    with _fish(on, file, overrides, endpoint) as (rig, config, unit):
+    with _fish(on, file, overrides, endpoint) as rig:
         ranges = [_range(text, name, parameters, rig) for text in over]
         search = Search(ranges, seed)
         if on == "simulation":
@@ -144,11 +144,17 @@ def _optimise(
             raise ParameterError(
                 f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"
             )
-        run = SearchFolder(path, rig.name, config, [each.name for each in ranges])
+        unit = rig.unit
+        run = SearchFolder(path, [each.name for each in ranges])
         found, whole = None, True
         last: Trial | None = None
         try:
-            with interrupted_once(), rig, run, showing(budget, "s", err=as_json) as show:
+            with (
+                interrupted_once(),
+                rig,
+                run.recorded(rig),
+                showing(budget, "s", err=as_json) as show,
+            ):
                 show.at(REST)
                 for last in trials(rig, name, parameters, search, budget):
                     run.keep(last)
@@ -192,16 +198,15 @@ def _optimise(
 @contextlib.contextmanager
 def _fish(
     on: str, file: Path | None, overrides: tuple[str, ...], endpoint: str | None
-) -> "Iterator[tuple[Rig, Config | dict[str, Any], str]]":
-    """What swims, its configuration, and the unit of its forces."""
+) -> "Iterator[Rig]":
+    """What swims."""
     from fishd.lab.rig import LiveRig, VirtualRig
 
     if on == "simulation":
-        config = replace(load(file, overrides), start=Start())
-        yield VirtualRig(config), config, "N"
+        yield VirtualRig(replace(load(file, overrides), start=Start()))
         return
     with Fish(endpoint) as fish:
-        yield LiveRig(fish), fish.config(), fish.status().force_unit
+        yield LiveRig(fish)
 
 
 def _fields() -> dict[str, Field]:

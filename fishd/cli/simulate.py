@@ -70,8 +70,15 @@ def _simulate(
     config = load(file, overrides)
     if recording:
         with _recorder(recording) as writer:
-            writer.describe(config)
-            report = run(config, name, parameters, seconds, settle, writer)
+            report = run(
+                config,
+                name,
+                parameters,
+                seconds,
+                settle,
+                writer,
+                lambda virtual: writer.describe(config, virtual.about()),
+            )
     else:
         report = run(config, name, parameters, seconds, settle)
     if as_json:

@@ -116,10 +116,11 @@ def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
     return socket
 
 
-def subscriber(context: "zmq.Context[S]", address: str, topic: bytes) -> S:
-    """A socket for one topic of telemetry; raises `NoDaemon` when the address is none."""
+def subscriber(context: "zmq.Context[S]", address: str, *topics: bytes) -> S:
+    """A socket for topics of telemetry; raises `NoDaemon` when the address is none."""
     socket = context.socket(zmq.SUB)
-    socket.set(zmq.SUBSCRIBE, topic)
+    for topic in topics:
+        socket.set(zmq.SUBSCRIBE, topic)
     _connect(socket, address)
     return socket
 

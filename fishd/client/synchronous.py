@@ -142,11 +142,19 @@ class Fish(Connection):
 
     def ticks(self) -> Iterator[Tick]:
         """Every tick from now on; raises `NoDaemon` when none comes in time."""
-        return self._subscribe(b"tick", Tick)
+        return self._subscribe({b"tick": Tick})
 
     def events(self) -> Iterator[Event]:
         """Every event from now on, however long it takes."""
-        return self._subscribe(b"event", Event)
+        return self._subscribe({b"event": Event}, forever=True)
+
+    def ticks_and_events(self) -> Iterator[Tick | Event]:
+        """Every tick and event from now on, in the order in which they were published.
+
+        Raises `NoDaemon` when none comes in time.
+        """
+        kinds: dict[bytes, type[Tick | Event]] = {b"tick": Tick, b"event": Event}
+        return self._subscribe(kinds)
 
     def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
         """Ask; patience: how long the answer may take, beyond the time-out [s]."""
@@ -164,16 +172,18 @@ class Fish(Connection):
                 return result
         raise self.silent(patience)
 
-    def _subscribe(self, topic: bytes, kind: type[T]) -> Iterator[T]:
+    def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:
+        """Messages of these topics; forever: however long they take."""
         address = self.telemetry_address or self.status().telemetry
-        patience = -1 if kind is Event else int(self.timeout * 1e3)
-        decoder = msgspec.json.Decoder(kind)
-        socket = subscriber(self._context, address, topic)
+        patience = -1 if forever else int(self.timeout * 1e3)
+        decoders = {topic: msgspec.json.Decoder(kind) for topic, kind in kinds.items()}
+        socket = subscriber(self._context, address, *kinds)
 
         def messages() -> Iterator[T]:
             with closing(socket):
                 while socket.poll(patience):
-                    yield decoder.decode(socket.recv_multipart()[1])
+                    topic, payload = socket.recv_multipart()
+                    yield decoders[topic].decode(payload)
             raise self.telemetry_silent()
 
         return messages()

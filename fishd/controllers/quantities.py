@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 from fishd.core import text
 from fishd.core.foreign_code import contained, real_number
@@ -14,9 +14,25 @@ LONGEST_NAME = 40
 """[characters]"""
 
 
-class _Declared(NamedTuple):
-    unit: str
-    description: str
+class _Declared:
+    """Of no account once a controller has a value of its own: its attribute comes first."""
+
+    def __init__(self, unit: str, description: str) -> None:
+        self.unit, self.description = unit, description
+        self._name = ""
+
+    def __set_name__(self, _: type[Any], name: str) -> None:
+        self._name = name
+
+    def __get__(self, controller: object, _: type[Any] | None = None) -> Any:
+        if controller is None:
+            return self
+        raise AttributeError(
+            f"quantity '{self._name}' has no value before one is assigned to it, such as "
+            f"self.{self._name} = 0.0 in __init__",
+            name=self._name,
+            obj=controller,
+        )
 
 
 def quantity(unit: str, description: str) -> Any:
@@ -24,7 +40,8 @@ def quantity(unit: str, description: str) -> Any:
 
     `frequency: float = quantity("Hz", "Present frequency of the sweep.")` in the class of a
     controller, and `self.frequency = 1.5` wherever it changes. What it is after `update` goes into
-    the tick. It is left out before it is assigned, and while it is None or no finite real number.
+    the tick. It is left out before it is assigned, and while it is None or no finite real number;
+    to read it before it is assigned raises AttributeError.
 
     unit: in SI notation, `1` where there is none
     description: one sentence
@@ -40,17 +57,17 @@ def quantities_of(controller: type[Any]) -> tuple[QuantityInfo, ...]:
     found = dict(_declarations(controller))
     if len(found) > MOST:
         raise TypeError(f"it has {len(found)} quantities; at most {MOST} are possible")
-    for name, (unit, description) in found.items():
+    for name, declared in found.items():
         if not name.isidentifier() or len(name) > LONGEST_NAME:
             raise TypeError(
                 f"'{text.quoted(name)}' cannot name a quantity: a Python name of at most "
                 f"{LONGEST_NAME} characters is needed"
             )
-        if not (isinstance(unit, str) and isinstance(description, str)):
+        if not (isinstance(declared.unit, str) and isinstance(declared.description, str)):
             raise TypeError(f"unit and description of quantity '{name}' must be texts")
     return tuple(
-        QuantityInfo(name, text.quoted(unit), text.line(description))
-        for name, (unit, description) in found.items()
+        QuantityInfo(name, text.quoted(declared.unit), text.line(declared.description))
+        for name, declared in found.items()
     )
 
 

@@ -43,13 +43,17 @@ class Swing(Controller[SwingParameters]):
     """
 
     Parameters = SwingParameters
-    top_speed: float = quantity("1", "The fin's highest speed since the last reversal.")
-    reversal_speed: float = quantity("1", "C times `top_speed`: the fin reverses when so slow.")
+    top_speed: float = quantity(
+        "1",
+        "The fin's highest speed in a half beat: of this one, once past it; before, of the last.",
+    )
+    reversal_speed: float = quantity("1", "C times `top_speed`: the tail reverses when so slow.")
     since_reversal: float = quantity("s", "Time since the last reversal.")
 
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._direction = 1.0
+        self._top_speed = 0.0  # since the last reversal
         self.top_speed = 0.0
         self.reversal_speed = 0.0
         self.since_reversal = 0.0
@@ -63,14 +67,17 @@ class Swing(Controller[SwingParameters]):
         self.since_reversal += observation.dt
         speed = self._direction * observation.fin_velocity
         parameters = self.parameters
-        slowed = self.top_speed > 0.0 and speed <= parameters.C * self.top_speed
-        self.top_speed = max(self.top_speed, speed)
+        slowed = self._top_speed > 0.0 and speed <= parameters.C * self._top_speed
+        self._top_speed = max(self._top_speed, speed)
         settled = self.since_reversal > REFRACTORY * parameters.longest_half_period
         # Half a tick early is nearer to the longest half period than half a tick late.
         overdue = self.since_reversal + 0.5 * self.limits.tick > parameters.longest_half_period
-        if (slowed and settled) or overdue:
+        reverses = (slowed and settled) or overdue
+        if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
+            self.top_speed = self._top_speed
+        if reverses:
             self._direction = -self._direction
-            self.top_speed = 0.0
+            self._top_speed = 0.0
             self.since_reversal = 0.0
         self.reversal_speed = parameters.C * self.top_speed
         return self._direction * amplitude_of(parameters, self.limits)

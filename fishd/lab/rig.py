@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from fishd.client import Fish
 from fishd.config import Config
+from fishd.control.reporting import Publisher
 from fishd.core.errors import (
     FishdError,
     FishError,
@@ -14,8 +15,12 @@ from fishd.core.errors import (
     Refused,
     UnknownController,
 )
-from fishd.core.signals import Reason, Tick
-from fishd.simulation import KeepingPublisher, VirtualRun
+from fishd.core.signals import Event, Reason, Tick
+from fishd.simulation import VirtualRun
+
+if TYPE_CHECKING:
+    from fishd.recording.provenance import Source
+    from fishd.recording.writer import RunWriter
 
 LOST = 0.02
 """A measurement may miss this share of its ticks."""
@@ -68,6 +73,13 @@ class Rig(Protocol):
     """Φ [rad]"""
     unit: str
     """Of its forces: `N`, or that of its sensor until that is calibrated."""
+    source: "Source"
+    """What a recording says of where its ticks are from."""
+    listener: Publisher | None
+    """Is given each tick and event as it comes, in order; what it raises ends a swim or a rest."""
+
+    def describe(self, writer: "RunWriter") -> None:
+        """Put what the ticks are made with into a recording; raises `RecordingError`."""
 
     def __enter__(self) -> Self:
         """Nothing moves yet."""
@@ -93,11 +105,17 @@ class VirtualRig:
 
     def __init__(self, config: Config) -> None:
         self.name = "simulation"
-        self.unit = "N"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
-        self._kept = KeepingPublisher()
-        self._run = VirtualRun(config, self._kept)
+        self.source: Source = "simulation"
+        self.listener: Publisher | None = None
+        self._heard = _Heard()
+        self._run = VirtualRun(config, self._heard)
+        self.unit = self._run.loop.robot.force_unit
+
+    def describe(self, writer: "RunWriter") -> None:
+        """As `Rig.describe`."""
+        writer.describe(self._run.config, self._run.about())
 
     def __enter__(self) -> Self:
         return self
@@ -117,9 +135,12 @@ class VirtualRig:
 
     def _pass(self, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
-        self._kept.ticks = ticks
         for _ in range(_count(seconds, self.tick)):
             self._run.tick()
+            for message in self._heard.taken():
+                _hand_on(message, self.listener)
+                if isinstance(message, Tick):
+                    ticks.append(message)
             loop = self._run.loop
             _check(ticks[-1], controller, loop.supervisor.reason, loop.active.fallback)
         return ticks
@@ -138,14 +159,22 @@ class LiveRig:
         self.unit = status.force_unit
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
+        self.source: Source = "fishd"
+        self.listener: Publisher | None = None
         self._fish = fish
-        self._ticks = fish.ticks()
+        self._messages = fish.ticks_and_events()
         self._pid = status.pid
         self._latest = 0
         """Number of the latest tick that came."""
         self._controller: str | None = None
         self._asked = False
         """Was a controller asked for, and nothing heard of it since?"""
+
+    def describe(self, writer: "RunWriter") -> None:
+        """As `Rig.describe`; raises `NoDaemon`, too."""
+        from fishd.recording.recorder import description
+
+        description(self._fish).write(writer)
 
     def __enter__(self) -> Self:
         return self
@@ -183,7 +212,10 @@ class LiveRig:
         end = first + _count(seconds, self.tick)
         if first <= self._latest:
             raise _restarted()
-        for tick in self._ticks:
+        for tick in self._messages:
+            _hand_on(tick, self.listener)
+            if not isinstance(tick, Tick):
+                continue
             self._check_same_fishd(tick)
             if tick.seq < first:
                 continue
@@ -210,6 +242,33 @@ class LiveRig:
 
 def _restarted() -> Disturbed:
     return Disturbed("fishd was restarted: this measurement is lost")
+
+
+class _Heard:
+    """Keeps ticks and events in their order until they are taken."""
+
+    def __init__(self) -> None:
+        self._messages: list[Tick | Event] = []
+
+    def tick(self, tick: Tick) -> None:
+        self._messages.append(tick)
+
+    def event(self, event: Event) -> None:
+        self._messages.append(event)
+
+    def taken(self) -> list[Tick | Event]:
+        """All of them, once."""
+        messages, self._messages = self._messages, []
+        return messages
+
+
+def _hand_on(message: Tick | Event, listener: Publisher | None) -> None:
+    if listener is None:
+        return
+    if isinstance(message, Tick):
+        listener.tick(message)
+    else:
+        listener.event(message)
 
 
 def _as_told(tick: Tick, controller: str | None) -> bool:

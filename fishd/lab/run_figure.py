@@ -3,6 +3,8 @@
 import os
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fishd.core import text
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
 from fishd.lab.run_traces import (
@@ -82,7 +84,8 @@ def _thrust(axis: "Axes", traces: Traces) -> None:
     axis.axhline(0.0, color="0.85", linewidth=0.6)
     axis.plot(traces.time, traces.thrust, color=BLUE, label="thrust over whole beats")
     low, high = traces.thrust - traces.thrust_error, traces.thrust + traces.thrust_error
-    axis.fill_between(traces.time, low, high, color=BLUE, alpha=0.2, linewidth=0, label="95 %")
+    if np.isfinite(traces.thrust_error).any():
+        axis.fill_between(traces.time, low, high, color=BLUE, alpha=0.2, linewidth=0, label="95 %")
     axis.set_ylim(*limits(LEAST_FORCE, traces.thrust, low, high))
     axis.set_ylabel(f"thrust ({traces.unit})")
     other = axis.twinx()

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from plotly.graph_objects import Figure, Scattergl
 from plotly.subplots import make_subplots
 
@@ -89,7 +90,8 @@ def _lines(figure: Figure, traces: Traces) -> None:
     if traces.alpha is not None:
         add(2, "true fin angle α (rad)", traces.alpha, GREEN)
     add(3, f"thrust over whole beats ({traces.unit})", traces.thrust, BLUE)
-    for sign in (-1, 1):
+    known = np.isfinite(traces.thrust_error).any()
+    for sign in (-1, 1) if known else ():
         edge = traces.thrust + sign * traces.thrust_error
         add(3, f"{'−+'[sign > 0]} 95 %", edge, BLUE, dash="dot")
     for row, (name, values) in enumerate(traces.quantities.items(), start=4):

@@ -92,7 +92,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
     return Traces(
         title=_title(run),
-        unit="m" + (run.daemons[0].get("force_unit", "N") if run.daemons else "N"),
+        unit=f"m{run.summary.force_unit}",
         time=time,
         fx=1e3 * column(lambda tick: tick.fx),
         fy=1e3 * column(lambda tick: tick.fy),

@@ -8,20 +8,21 @@ from collections.abc import Mapping
 from datetime import datetime
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 from fishd import __version__
 
 FORMAT = "1"
 """Version of the layout of a recording."""
 
+Source = Literal["fishd", "simulation"]
+"""What made the ticks: a running fishd, whatever its robot is, or a run in virtual time."""
+
 
 def provenance(
-    run: str, source: str, operator: str, subject: str, note: str, extra: Mapping[str, str]
+    run: str, source: Source, operator: str, subject: str, note: str, extra: Mapping[str, str]
 ) -> dict[str, str]:
-    """The metadata `fishd.run` of a recording that begins now.
-
-    source: `fishd`, `simulation`, or what else made the ticks
-    """
+    """The metadata `fishd.run` of a recording that begins now."""
     return {
         **extra,
         "run": run,

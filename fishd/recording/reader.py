@@ -145,6 +145,8 @@ class Run:
     @cached_property
     def _tally(self) -> Tally:
         tally = Tally()
+        for about in self.daemons:
+            tally.measures_in(about.get("force_unit", "N"))
         for message in self.messages():
             tally.add(message)
         return tally

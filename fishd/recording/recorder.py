@@ -142,7 +142,7 @@ class Recorder:
     def _open(self) -> None:
         assert self._described
         self._writer = self._open_writer()
-        self._describe(self._described)
+        self._described.write(self._writer)
 
     def _take(self, topic: str, payload: bytes) -> None:
         known = len(self.writer.gaps)
@@ -172,24 +172,13 @@ class Recorder:
     def _ask(self) -> "Description":
         """What fishd says of itself; raises `FishError`."""
         with Fish(self._endpoint) as fish:
-            status, config = fish.status(), fish.config()
-            try:
-                return Description(status, config, fish.calibrations())
-            except Refused:  # a simulated fish may have none
-                return Description(status, config, None)
+            return description(fish)
 
     def _ask_again(self) -> None:
         """A fishd that does not answer is asked again at its next status."""
         with suppress(FishError):
             self._described = self._ask()
-            self._describe(self._described)
-
-    def _describe(self, found: "Description") -> None:
-        """Put what fishd says of itself into the file; raises `RecordingError`."""
-        about = {name: str(getattr(found.status, name)) for name in ABOUT}
-        self.writer.describe(found.config, about)
-        if found.calibrations is not None:
-            self.writer.calibrated(found.calibrations)
+            self._described.write(self.writer)
 
     def _look_for_fishd(self) -> None:
         """Telemetry comes back by itself, unless fishd has another address now."""
@@ -216,6 +205,22 @@ class Description(NamedTuple):
     status: Status
     config: dict[str, Any]
     calibrations: Calibrations | None
+
+    def write(self, writer: RunWriter) -> None:
+        """Put it into a recording; raises `RecordingError`."""
+        about = {name: str(getattr(self.status, name)) for name in ABOUT}
+        writer.describe(self.config, about)
+        if self.calibrations is not None:
+            writer.calibrated(self.calibrations)
+
+
+def description(fish: Fish) -> Description:
+    """What the fishd of a fish says of itself; raises `FishError`."""
+    status, config = fish.status(), fish.config()
+    try:
+        return Description(status, config, fish.calibrations())
+    except Refused:  # a simulated fish may have none
+        return Description(status, config, None)
 
 
 class OutOfRoom(RecordingError):

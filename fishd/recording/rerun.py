@@ -235,7 +235,7 @@ class _Rerun:
     ) -> None:
         name = self._name or recorded
         given = {**parameters, **self._parameters} if name == recorded else self._parameters
-        limits = replace(self._config.limits, virtual=self._run.about.get("source") != "fishd")
+        limits = replace(self._config.limits, virtual=self._run.about.get("source") == "simulation")
         self._swims = registry.create(name, given, limits)
         self.stretches.append(
             Stretch(recorded, parameters, name, tick.t, tick.seq, from_start=from_start)

@@ -38,13 +38,18 @@ class Summary(Struct, frozen=True):
     restarts: int = 0
     """How often another fishd took the place of the one before."""
     thrust: float | None = None
-    """Mean `thrust` of the ticks in which the tail beat and the sensor's zero was known, weighted
-    by its interval; where it never was, mean F_x while a controller swam, as measured; None where
-    none swam [N]."""
+    """Mean `thrust` over the time in which the tail beat and the sensor's zero was known; where it
+    never was, mean F_x while a controller swam, as measured; None where none swam [N]."""
     thrust_error: float | None = None
-    """Half of the 95 % interval of that thrust, mean; None where the zero was never known [N]."""
+    """Half of its 95 % interval; None where the zero was never known [N].
+
+    It is the mean of that of the ticks: the errors of one recording are those of one zero, and do
+    not average out.
+    """
     swimming: dict[str, int] = {}
     """Ticks in mode running, by controller."""
+    force_unit: str = "N"
+    """Unit of its forces: `N` only where all are in newtons, else that of the others."""
 
     @property
     def duration(self) -> float:
@@ -76,8 +81,15 @@ class Tally:
         self._ticks = self._events = self._marks = self._missed = self._restarts = 0
         self._pid = self._known = 0
         self._impulse = 0.0
-        self._weight = self._thrust = self._error = 0.0
+        self._known_ticks = 0
+        self._thrust = self._error = 0.0
         self._swimming: dict[str, int] = {}
+        self._force_unit = "N"
+
+    def measures_in(self, force_unit: str) -> None:
+        """Take note of the unit of the forces from now on."""
+        if self._force_unit == "N":
+            self._force_unit = force_unit
 
     def add(self, message: TickHead | Tick | Event | Status) -> None:
         """Add any message."""
@@ -95,11 +107,9 @@ class Tally:
         if tick.mode == "running":
             self._impulse += tick.fx
             if tick.thrust_error is not UNSET and tick.frequency:
-                # Errors of one recording are alike: they weigh the ticks, and do not average out.
-                weight = 1.0 / max(tick.thrust_error, 1e-9) ** 2
-                self._weight += weight
-                self._thrust += weight * tick.thrust
-                self._error += weight * tick.thrust_error
+                self._known_ticks += 1
+                self._thrust += tick.thrust
+                self._error += tick.thrust_error
             self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
         if last is None:
             self._first_t = tick.t
@@ -141,8 +151,8 @@ class Tally:
         swam = sum(self._swimming.values())
         thrust = self._impulse / swam if swam else None
         error = None
-        if self._weight:
-            thrust, error = self._thrust / self._weight, self._error / self._weight
+        if self._known_ticks:
+            thrust, error = self._thrust / self._known_ticks, self._error / self._known_ticks
         return Summary(
             begins=self._first_t,
             ends=self._last.t if self._last else 0.0,
@@ -156,6 +166,7 @@ class Tally:
             thrust=thrust,
             thrust_error=error,
             swimming=dict(self._swimming),
+            force_unit=self._force_unit,
         )
 
 

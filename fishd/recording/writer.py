@@ -16,7 +16,7 @@ from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.part_file import SUFFIX, PartFile
-from fishd.recording.provenance import provenance
+from fishd.recording.provenance import Source, provenance
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
 
@@ -39,7 +39,7 @@ class RunWriter:
         self,
         path: str | Path,
         *,
-        source: str = "fishd",
+        source: Source = "fishd",
         operator: str = "",
         subject: str = "",
         note: str = "",
@@ -47,7 +47,7 @@ class RunWriter:
     ) -> None:
         """
         path: of the finished file; `.mcap` is added where it is missing
-        source: what made the ticks, such as `simulation`
+        source: what made the ticks: `fishd`, or `simulation` for a run in virtual time
         operator: who recorded; by default the name of this user
         subject: which fish, note: what for
         extra: what else is to be kept with it, such as the point of a sweep
@@ -123,6 +123,7 @@ class RunWriter:
         """
         number = str(self.tally.restarts)
         self._writer.add_metadata("fishd.daemon", {"number": number, **(daemon or {})})
+        self.tally.measures_in((daemon or {}).get("force_unit", "N"))
         yaml = to_yaml(config if isinstance(config, Config) else dict(config))
         self._attach(CONFIG, "application/yaml", yaml.encode())
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -69,14 +69,17 @@ def simulate(
     seconds: float = 60.0,
     settle: float = 10.0,
     publisher: Publisher | None = None,
+    begun: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
     """Let a controller swim a simulated fish for `seconds`, and judge it after `settle` seconds.
 
     publisher: gets the record of every tick, and every event
+    begun: called before the first of them
     Raises `UnknownController` and `ParameterError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
-    return judge(config, name, controller, seconds, settle, publisher or EncodingPublisher())
+    publisher = publisher or EncodingPublisher()
+    return judge(config, name, controller, seconds, settle, publisher, begun)
 
 
 def judge(
@@ -86,10 +89,11 @@ def judge(
     seconds: float,
     settle: float,
     publisher: Publisher,
+    begun: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
     """As `simulate`, with a controller that is ready-made.
 
-    publisher: gets the record of every tick
+    publisher, begun: as for `simulate`
     Raises `ParameterError` where the lengths do not fit one another.
     """
     check_length("run", seconds)
@@ -102,20 +106,21 @@ def judge(
             f"{settle:g} s that it may take to settle"
         )
     beats = Beats()
-    begun = 0.0
+    since = 0.0
     took_over: float | None = None
     with VirtualRun(config, publisher) as virtual:
+        begun(virtual)
         virtual.loop.set_controller(name, controller)
         for index in range(ticks):
             if index == first:  # the first ticks build what later ones reuse
-                begun = time.perf_counter()
+                since = time.perf_counter()
             angle = virtual.loop.applied
             window = virtual.tick()
             if virtual.loop.active.fallback and took_over is None:
                 took_over = index * config.tick
             if index >= first:
                 beats.add(angle, window)
-        elapsed = time.perf_counter() - begun
+        elapsed = time.perf_counter() - since
         loop = virtual.loop
         fallback = loop.active.fallback
         successor = loop.active.name if fallback else None

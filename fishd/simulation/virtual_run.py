@@ -7,6 +7,7 @@ from typing import Any, Self
 import msgspec
 from msgspec.structs import replace
 
+from fishd import __version__
 from fishd.assembly import build_loop, open_in_virtual_time
 from fishd.config import Config
 from fishd.control.reporting import Publisher
@@ -74,6 +75,19 @@ class VirtualRun:
     def close(self) -> None:
         """Let go of the controller and the robot; may be called twice."""
         self._stack.close()
+
+    def about(self) -> dict[str, str]:
+        """What is to be known of this fishd: its robot and limits, and the unit of its forces."""
+        loop = self.loop
+        return {
+            "version": __version__,
+            "robot": loop.robot.name,
+            "tick": str(loop.limits.tick),
+            "amplitude_limit": str(loop.limits.amplitude),
+            "lowest": str(loop.guard.lowest),
+            "highest": str(loop.guard.highest),
+            "force_unit": loop.robot.force_unit,
+        }
 
     def set_controller(self, name: str, parameters: Mapping[str, Any]) -> None:
         """Make a controller the active one, from the next tick on.

@@ -9,7 +9,7 @@ from click.testing import CliRunner, Result
 
 from fishd.cli.main import fishctl
 from fishd.config import load
-from fishd.core.errors import FishdError
+from fishd.core.errors import FishdError, RecordingError
 
 
 def invoke(*arguments: str) -> Result:
@@ -38,6 +38,17 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     refused = invoke(str(record), "--to", str(fish))
     assert isinstance(refused.exception, FishdError)
     assert "exists already; --force overwrites it, --to names another" in str(refused.exception)
+
+
+def test_a_recording_that_cannot_be_written_is_told_before_the_fish_swims(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    swum: list[object] = []
+    monkeypatch.setattr("fishd.lab.identification.experiment", lambda *_: swum.append(1))
+    done = invoke("--experiment", "--record", str(tmp_path / "nowhere/run.mcap"))
+    assert isinstance(done.exception, RecordingError)
+    assert "nowhere/run.mcap.part cannot be written: No such file" in str(done.exception)
+    assert swum == []
 
 
 def test_a_run_is_a_name_in_the_folder_of_recordings_or_the_latest(

@@ -11,6 +11,7 @@ from rigs.harness import Rig, Scripted
 from fishd.controllers import quantity, registry
 from fishd.controllers.base import Controller
 from fishd.core.frames import frame
+from fishd.core.signals import Observation
 
 
 class Showing(Scripted):
@@ -35,6 +36,8 @@ def test_every_tick_shows_the_speeds_that_swing_reverses_by() -> None:
                for tick in ticks)  # fmt: skip
     table = frame(ticks)
     assert list(table["quantities.reversal_speed"]) == list(0.5 * table["quantities.top_speed"])
+    top = table["quantities.top_speed"]
+    assert top[40:].min() > 0.5 * top[40:].max()
     reversed_now = np.sign(table["phi_c"]).diff() != 0
     assert list(table["quantities.since_reversal"] == 0.0)[1:] == list(reversed_now)[1:]
 
@@ -97,6 +100,24 @@ def test_too_much_to_show_is_refused_where_the_class_is_made(
     declared = {name: quantity("1", "One of many.") for name in names}
     with pytest.raises(TypeError, match=complaint):
         type("Many", (Controller,), declared)
+
+
+def test_to_count_on_from_nothing_is_told_with_what_would_be_right() -> None:
+    class Counting(Scripted):
+        beats: float = quantity("1", "How many there were.")
+
+        def update(self, _: Observation) -> float:
+            self.beats += 1
+            return 0.0
+
+    rig = Rig()
+    rig.start(Counting(lambda _: 0.0))
+    rig.run(1)
+    assert rig.reason == "controller-error"
+    message = rig.loop.supervisor.reason.message  # type: ignore[union-attr]
+    assert "quantity 'beats' has no value before one is assigned to it" in message
+    assert "such as self.beats = 0.0 in __init__" in message
+    assert getattr(Counting(lambda _: 0.0), "beats", 5.0) == 5.0
 
 
 def test_what_a_controller_can_show_is_described_with_its_parameters() -> None:

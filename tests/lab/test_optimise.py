@@ -10,7 +10,8 @@ from fishd.config import load
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials, whole_ticks
 from fishd.lab.rig import VirtualRig
-from fishd.recording import read
+from fishd.recording import open_run
+from fishd.recording.rerun import rerun
 from fishd.simulation import simulate
 
 BEST = 25.736e-3
@@ -67,7 +68,11 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     rows = (folder / "trials.csv").read_text().splitlines()
     assert rows[0] == "frequency,thrust,error,swum,passed"
     passed = float(rows[-1].rpartition(",")[2])
-    assert len(read(folder / "search.mcap")) == round(passed / 0.05)
+    run = open_run(folder / "search.mcap")
+    assert len(run.ticks) == round(passed / 0.05)
+    again = rerun(run).stretches
+    assert len(again) == len(rows) - 1
+    assert all(each.from_start and each.equal == each.ticks for each in again)
     assert (folder / "thrust.svg").stat().st_size > 10_000
     assert "exists already" in one_line(fishctl(*words))
 

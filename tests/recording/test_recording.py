@@ -17,6 +17,7 @@ from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording.folder import find, glance, glances
 from fishd.recording.recorder import Recorder
 from fishd.recording.recover import recover
+from fishd.recording.summary import Tally
 from fishd.simulation import simulate
 
 
@@ -34,6 +35,23 @@ def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
     assert (run.gaps, run.summary.swimming) == ([], {"swing": 60})
     table = read(path)
     assert list(table.fx) == [tick.fx for tick in rig.recorder.ticks]
+
+
+def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
+    fish, tally, impulse = Rig("simulation.offset_x=0.02"), Tally(), 0.0
+    fish.run_for(10)
+    for controller, parameters in (("swing", {}), ("square", {"frequency": 0.8})):
+        fish.start(controller, **parameters)
+        for _ in range(1200):
+            fish.run()
+            impulse += fish.fish.take_window().thrust
+    for tick in fish.recorder.ticks:
+        tally.tick(tick)
+    thrust, error = tally.summary.thrust, tally.summary.thrust_error
+    assert thrust is not None
+    assert error is not None
+    assert thrust == pytest.approx(impulse / 2400, abs=0.5e-3)
+    assert 0.5e-3 < error < 5.0e-3
 
 
 def test_an_older_recording_is_never_overwritten(tmp_path: Path) -> None:

@@ -1,11 +1,14 @@
 """A controller that chooses again on what was recorded gives the very same commands."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rigs.harness import Rig, fragile_rig
 from rigs.recordings import recorded, write
 
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, RecordingError
 from fishd.recording import RunWriter, open_run
 from fishd.recording.rerun import Rerun, rerun
@@ -140,6 +143,27 @@ def test_a_fault_and_what_follows_it_are_rerun_too(tmp_path: Path) -> None:
     assert [stretch.parameters["C"] for stretch in result.stretches] == [0.6, 0.2]
     assert all(stretch.equal == stretch.ticks for stretch in result.stretches)
     assert result.estimates.equal == result.estimates.ticks
+
+
+@pytest.mark.parametrize(
+    ("source", "virtual"), [("fishd", False), ("pi", False), ("simulation", True)]
+)
+def test_time_stands_still_for_a_controller_only_where_it_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, virtual: bool
+) -> None:
+    rig = Rig()
+    rig.start("swing")
+    rig.run_for(1)
+    path = recorded(rig, tmp_path / "run", source=source)
+    seen = []
+
+    def create(name: str, parameters: dict[str, object], limits: Limits) -> object:
+        seen.append(limits.virtual)
+        return registry.create(name, parameters, limits)
+
+    monkeypatch.setattr("fishd.recording.rerun.registry", SimpleNamespace(create=create))
+    rerun(open_run(path))
+    assert seen == [virtual]
 
 
 def test_a_program_that_chose_from_outside_cannot_be_asked_again(tmp_path: Path) -> None:

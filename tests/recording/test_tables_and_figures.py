@@ -11,6 +11,8 @@ from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
 from rigs.recordings import recorded, swum, write
 
+from fishd.lab.run_figure import picture
+from fishd.lab.run_page import page
 from fishd.lab.run_traces import LEAST_FORCE, limits, traces
 from fishd.recording import open_run
 
@@ -57,6 +59,22 @@ def test_a_recording_is_drawn_as_a_picture_and_as_a_page_that_loads_nothing(
     assert again.stdout == f"{picture}\n"
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
     assert "there is no tick between these times; it is 3.0 s long" in one_line(nothing)
+
+
+@pytest.mark.slow
+def test_an_interval_is_in_the_legend_where_there_is_one(tmp_path: Path) -> None:
+    known = Rig()
+    known.run_for(10)
+    known.start("swing")
+    known.run_for(5)
+    for rig, expected in ((swum(), False), (known, True)):
+        name = f"known-{expected}"
+        drawn = traces(open_run(recorded(rig, tmp_path / name)))
+        picture(drawn, tmp_path / f"{name}.svg")
+        page(drawn, tmp_path / f"{name}.html")
+        for suffix in ("svg", "html"):
+            content = (tmp_path / f"{name}.{suffix}").read_text()
+            assert ("95 %" in content) == expected, suffix
 
 
 def test_where_ticks_are_missing_a_curve_has_a_break(tmp_path: Path) -> None:

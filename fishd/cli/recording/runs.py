@@ -27,8 +27,8 @@ LONGEST = 1e9
 def runs(folder: Path | None, as_json: bool) -> int:
     """List the recordings, the oldest first.
 
-    'thrust' is the mean while it swam, in mN (mV until the sensor is calibrated), with its 95 %
-    interval. Where the zero of the sensor was never known, it is the mean force as measured, drift
+    'thrust' is the mean while it swam, in mN unless another unit is told, with its 95 % interval.
+    Where the zero of the sensor was never known, it is the mean force as measured, drift
     and offset included, ± ?. 'lost' are ticks that fishd made and that are not in the file.
     """
     place = folder or runs_folder()
@@ -86,12 +86,12 @@ def _print(found: list[Glance]) -> None:
 
 
 def _thrust(summary: Summary) -> str:
-    """In thousandths of the sensor's unit; with its interval where the zero was known."""
+    """In mN, or thousandths of another unit; with its interval where the zero was known."""
     if summary.thrust is None:
         return "–"
-    if summary.thrust_error is None:
-        return f"{_thousandths(summary.thrust)} ± ?"
-    return f"{_thousandths(summary.thrust)} ± {_thousandths(summary.thrust_error)}"
+    error = "?" if summary.thrust_error is None else _thousandths(summary.thrust_error)
+    unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
+    return f"{_thousandths(summary.thrust)} ± {error}{unit}"
 
 
 def _thousandths(value: float) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, t
 
+from fishd.core import text
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
 from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Problem, solve
@@ -89,9 +90,17 @@ def _several(runs: object) -> list[object]:
 
 def _table(run: object) -> "DataFrame":
     if isinstance(run, str | os.PathLike):
-        from fishd.recording import read
+        from fishd.recording import open_run
 
-        return read(run)
+        recorded = open_run(run)
+        unit = recorded.summary.force_unit
+        if unit != "N":
+            raise Unidentifiable(
+                f"{recorded.path}: its forces are in {text.quoted(unit)}, not in "
+                "newtons: the force sensor was not calibrated; calibrate it by 'fishctl calibrate "
+                "force', and record it again"
+            )
+        return recorded.frame()
     return run  # type: ignore[return-value]
 
 

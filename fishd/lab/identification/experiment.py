@@ -1,12 +1,10 @@
 """Lets a fish swim what tells most about it."""
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from fishd.core.errors import ParameterError
 from fishd.core.frames import frame
-from fishd.core.signals import Tick
 from fishd.lab.rig import Rig
 
 if TYPE_CHECKING:
@@ -18,20 +16,15 @@ SHORTEST = 30.0
 """Less swimming tells too little [s]."""
 
 
-def experiment(
-    rig: Rig, seconds: float = 180.0, keep: Callable[[list[Tick]], None] | None = None
-) -> "DataFrame":
+def experiment(rig: Rig, seconds: float = 180.0) -> "DataFrame":
     """Rest, then swim `excitation` at the rig's whole amplitude; a row a tick.
 
     seconds: how long all of it takes [s]
-    keep: is given all ticks, once it has swum
     Raises `ParameterError` for less than `SHORTEST` or for ever, `Disturbed` where somebody else
-    takes the fish, and what the rig and `keep` raise.
+    takes the fish, and what the rig raises.
     """
     if not SHORTEST <= seconds < math.inf:
         raise ParameterError(f"an experiment of {seconds:g} s: {SHORTEST:g} s or more are needed")
     ticks = rig.rest(REST)
     ticks += rig.swim("excitation", {}, seconds - REST)
-    if keep:
-        keep(ticks)
     return frame(ticks)

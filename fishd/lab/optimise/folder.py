@@ -1,16 +1,17 @@
 """The folder of a search: a table of its candidates, a recording of all, and a picture."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 
-from fishd.config import Config
 from fishd.core.errors import ConfigError
 from fishd.lab.drawing import BLUE, ORANGE, drawn, save
 from fishd.lab.optimise.search import Proposal, Search
 from fishd.lab.optimise.trials import Trial
+from fishd.lab.rig import Rig
+from fishd.lab.rig_recording import recorded
 from fishd.lab.tables import Table
 from fishd.recording.writer import RunWriter
 
@@ -20,16 +21,13 @@ _COLUMNS = ("thrust", "error", "swum", "passed")
 
 
 class SearchFolder:
-    """A new folder in which candidates are kept as they are measured; a context manager."""
+    """A new folder in which candidates are kept as they are measured."""
 
-    def __init__(
-        self, path: Path, source: str, config: Config | Mapping[str, Any], names: Sequence[str]
-    ) -> None:
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
         """
-        source: what swims, config: with which configuration
         names: the parameters that are searched
 
-        Raises `ConfigError` where there is something in the folder, and `RecordingError`.
+        Raises `ConfigError` where there is something in the folder.
         """
         self.path = path
         try:
@@ -39,20 +37,13 @@ class SearchFolder:
             self._table = Table(path / TRIALS, (*names, *_COLUMNS))
         except OSError as error:
             raise ConfigError(f"{path}: cannot be made: {error.strerror}") from None
-        self._writer = RunWriter(path / RECORDING, source=source, note="a search")
-        self._writer.describe(config)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *what: Any) -> None:
-        self._writer.__exit__(*what)
+    def recorded(self, rig: Rig) -> AbstractContextManager[RunWriter]:
+        """While this lasts, all that the rig does is recorded: `fishd.lab.rig_recording`."""
+        return recorded(rig, self.path / RECORDING, "a search")
 
     def keep(self, trial: Trial) -> None:
-        """Keep a candidate and its ticks; raises `ConfigError` and `RecordingError`."""
-        for tick in trial.ticks:
-            self._writer.tick(tick)
-        self._writer.flush()
+        """Keep a candidate; raises `ConfigError`."""
         values = {name: getattr(trial, name) for name in _COLUMNS}
         try:
             self._table.add({**trial.parameters, **values})

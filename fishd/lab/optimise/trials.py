@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core.schema import Field
-from fishd.core.signals import Tick
 from fishd.lab.measurement import REST, evaluate, samples_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig, refuse_lost
@@ -36,8 +35,6 @@ class Trial(NamedTuple):
     """Ticks of swimming so far."""
     passed: float
     """Time since the beginning, rest included [s]."""
-    ticks: list[Tick]
-    """Those that are new: the swim and the rest after, and before the first, the rest before."""
 
 
 def trials(
@@ -53,7 +50,6 @@ def trials(
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
     rest = rig.rest(REST)
-    fresh = rest
     swum, passed = 0, REST
     while True:
         candidate = whole_ticks(search.suggest(), search.ranges, rig.tick)
@@ -69,8 +65,8 @@ def trials(
         swum += len(swim)
         passed += length + REST
         search.observe(candidate, found.thrust, found.error)
-        yield Trial(candidate, found.thrust, found.error, swum, passed, [*fresh, *swim, *after])
-        rest, fresh = after, []
+        yield Trial(candidate, found.thrust, found.error, swum, passed)
+        rest = after
 
 
 def whole_ticks(

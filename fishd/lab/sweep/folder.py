@@ -67,10 +67,10 @@ class SweepFolder:
         values = point.columns()
         return tuple(str(values.get(name, "")) for name in self._columns)
 
-    def keep(self, point: Point, result: Result, recording: bytes | Path | None) -> None:
+    def keep(self, point: Point, result: Result, recording: bytes | Path) -> None:
         """Keep what was measured, its recording first; raises `ConfigError` when it cannot be.
 
-        recording: its content, or a file in `RECORDINGS`, or None where there is none
+        recording: its content, or a file in `RECORDINGS`
         """
         try:
             if isinstance(recording, bytes):
@@ -80,8 +80,7 @@ class SweepFolder:
             key = self.key(point)
             values = msgspec.structs.asdict(result)
             row = dict(zip(self._columns, key, strict=True)) | values
-            name = f"{RECORDINGS}/{recording.name}" if recording else ""
-            self._table.add(row | {RECORDING: name})
+            self._table.add(row | {RECORDING: f"{RECORDINGS}/{recording.name}"})
         except OSError as error:
             raise self._unwritable(error) from None
         self.results[key] = result

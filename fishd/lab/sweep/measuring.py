@@ -14,7 +14,6 @@ from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import amplitude_of
 from fishd.core.errors import FishdError
-from fishd.core.signals import Tick
 from fishd.lab.measurement import measure
 from fishd.lab.parallel import Stop
 from fishd.lab.rig import Rig, is_of_one
@@ -72,18 +71,30 @@ def simulated(task: Task) -> tuple[Result, bytes] | None:
         extra = {name: str(value) for name, value in task.point.columns().items()}
         path = Path(folder) / "point.mcap"
         with RunWriter(path, source="simulation", note=task.point.label(), extra=extra) as writer:
-            writer.describe(task.config)
-            result = swim(task.point, task.config, task.lengths, writer)
+            result = swim(
+                task.point,
+                task.config,
+                task.lengths,
+                writer,
+                lambda run: writer.describe(run.config, run.about()),
+            )
         return result, path.read_bytes()
 
 
-def swim(point: Point, config: Config, lengths: Lengths, publisher: Publisher) -> Result:
+def swim(
+    point: Point,
+    config: Config,
+    lengths: Lengths,
+    publisher: Publisher,
+    begun: Callable[[VirtualRun], None] = lambda run: None,
+) -> Result:
     """The true thrust of a simulated fish at a point.
 
     The error is that of the mean over the beats, as they differ from one another: by noise that
     the controller answers, and by half beats that are no whole number of ticks.
 
-    publisher: gets every tick
+    publisher: gets every tick, and every event
+    begun: called before the first of them
     Raises `ParameterError` and `UnknownController`.
     """
     config = replace(config, start=Start())
@@ -95,6 +106,7 @@ def swim(point: Point, config: Config, lengths: Lengths, publisher: Publisher) -
     most = settle + math.ceil((lengths.periods + 2) / slowest / config.tick)
     beats = Beats()
     with VirtualRun(config, publisher) as run:
+        begun(run)
         run.loop.set_controller(point.controller, controller)
         for index in range(most):
             angle = run.loop.applied
@@ -119,12 +131,10 @@ def swim(point: Point, config: Config, lengths: Lengths, publisher: Publisher) -
     )
 
 
-def on_rig(
-    point: Point, rig: Rig, seconds: float, progress: Callable[[float], None]
-) -> tuple[Result, list[Tick]]:
-    """The thrust that a rig measures at a point, freed of its drift, and the ticks.
+def on_rig(point: Point, rig: Rig, seconds: float, progress: Callable[[float], None]) -> Result:
+    """The thrust that a rig measures at a point, freed of its drift.
 
-    There is trouble, and no tick, where fishd refuses this controller, or it gives up.
+    There is trouble, and no thrust, where fishd refuses this controller, or it gives up.
 
     progress: called with the time that has passed [s]
     Raises as `fishd.lab.measurement.measure` what concerns the other points, too.
@@ -134,14 +144,13 @@ def on_rig(
     except FishdError as error:
         if not is_of_one(error):
             raise
-        return Result(trouble=str(error)), []
-    result = Result(
+        return Result(trouble=str(error))
+    return Result(
         thrust=found.thrust,
         error=found.error,
         beat_frequency=found.frequency,
         seconds=len(found.ticks) * rig.tick,
     )
-    return result, list(found.ticks)
 
 
 def _half_width(deviation: float, count: int) -> float | None:

@@ -1,17 +1,15 @@
 """Runs a sweep: measures every point that its folder does not have yet."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from fishd.config import Config
 from fishd.core.interruption import interrupted_once, on_signal
-from fishd.core.signals import Tick
 from fishd.lab.parallel import workers
 from fishd.lab.rig import Rig
+from fishd.lab.rig_recording import recorded
 from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, Result, Task, on_rig, simulated
-from fishd.recording.writer import RunWriter
 
 STOP = "stop"
 """A file of this name in the folder ends a sweep in simulation."""
@@ -71,20 +69,12 @@ def on_robot(
             for point in found:
                 if folder.key(point) in folder.results:
                     continue
-                result, ticks = on_rig(point, rig, seconds, progress)
-                path = _recorded(point, folder, rig.name, ticks) if ticks else None
+                extra = {name: str(value) for name, value in point.columns().items()}
+                path = folder.recording_of(point)
+                with recorded(rig, path, point.label(), extra):
+                    result = on_rig(point, rig, seconds, progress)
                 folder.keep(point, result, path)
                 done(point, result)
     except KeyboardInterrupt:
         return False
     return True
-
-
-def _recorded(point: Point, folder: SweepFolder, source: str, ticks: Sequence[Tick]) -> Path:
-    extra = {name: str(value) for name, value in point.columns().items()}
-    path = folder.recording_of(point)
-    with RunWriter(path, source=source, note=point.label(), extra=extra) as writer:
-        writer.describe(folder.begun.config)
-        for tick in ticks:
-            writer.tick(tick)
-    return path

@@ -1,0 +1,49 @@
+"""An experiment on a running fishd, recorded while the fish swims."""
+
+import signal
+import time
+from pathlib import Path
+
+from rigs.processes import FISHCTL, Daemon, Process, wait_until
+
+from fishd.client import Fish
+from fishd.lab.rig import LiveRig
+from fishd.lab.rig_recording import recorded
+from fishd.recording import open_run
+from fishd.recording.rerun import rerun
+
+
+def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Fish(daemon.endpoint) as fish, LiveRig(fish) as rig, recorded(rig, path, "live"):
+        rig.rest(0.5)
+        rig.swim("swing", {"C": 0.4}, 1.5)
+        rig.rest(0.5)
+        rig.swim("square", {"frequency": 1.3}, 1.5)
+    run = open_run(path)
+    assert run.about["source"] == "fishd"
+    assert run.daemons[0]["robot"] == "simulated"
+    assert run.gaps == []
+    found = rerun(run).stretches
+    assert [each.recorded for each in found] == ["swing", "square"]
+    assert all(each.from_start and each.equal == each.ticks >= 30 for each in found)
+
+
+def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    words = ("identify", "--experiment", "--on", "robot", "--for", "40", "--record", str(path))
+    swims = Process(FISHCTL, "--endpoint", daemon.endpoint, *words)
+    wait_until(lambda: daemon.status().mode == "running")
+    time.sleep(1.0)
+    status, out, err = swims.end(signal.SIGTERM)
+    assert (status, out) == (130, "")
+    assert err.endswith(
+        f"fishctl: stopped before its end, so nothing is fitted; what it swam is in {path}\n"
+    )
+    assert daemon.status().mode == "idle"
+    run = open_run(path)
+    assert run.reason == "ended by Interrupted"
+    assert run.summary.swimming["excitation"] >= 15
+    assert "excitation" in [event.data.get("controller") for event in run.events]

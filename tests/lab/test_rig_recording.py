@@ -1,0 +1,96 @@
+"""What a rig does is recorded while it does it, with all that a rerun and a reader need."""
+
+import re
+from pathlib import Path
+
+import pytest
+from rigs.processes import fishctl, sets
+
+from fishd.config import Config, load
+from fishd.core.errors import RecordingError
+from fishd.core.signals import Event, Tick
+from fishd.lab.identification import Unidentifiable, identify
+from fishd.lab.rig import VirtualRig
+from fishd.lab.rig_recording import recorded
+from fishd.lab.run_traces import traces
+from fishd.recording import open_run
+from fishd.recording.rerun import rerun
+
+
+def test_every_swim_of_a_rig_is_rerun_to_the_last_bit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with VirtualRig(load("config/simulated.yaml")) as rig, recorded(rig, path, "two swims"):
+        rig.rest(2.0)
+        for controller, parameters in (("swing", {"C": 0.4}), ("square", {"frequency": 1.3})):
+            rig.swim(controller, parameters, 5.0)
+            rig.rest(3.0)
+    run = open_run(path)
+    assert [run.about[key] for key in ("source", "note")] == ["simulation", "two swims"]
+    assert [event.kind for event in run.events].count("controller") == 2
+    found = rerun(run)
+    assert [each.recorded for each in found.stretches] == ["swing", "square"]
+    assert [each.parameters.get("C") for each in found.stretches] == [0.4, None]
+    assert all(each.from_start and each.equal == each.ticks for each in found.stretches)
+    assert found.estimates.equal == found.estimates.ticks == len(run.ticks) == 360
+
+
+class Full:
+    """A disk that is full after some ticks."""
+
+    def __init__(self, room: int) -> None:
+        self._room = room
+
+    def tick(self, _: Tick) -> None:
+        self._room -= 1
+        if not self._room:
+            raise RecordingError("no room")
+
+    def event(self, _: Event) -> None:
+        """There is room for it."""
+
+
+def test_a_recording_that_fails_ends_a_swim_and_is_no_fault_of_the_fish() -> None:
+    with VirtualRig(Config()) as rig:
+        rig.listener = Full(50)
+        with pytest.raises(RecordingError, match="no room"):
+            rig.swim("swing", {}, 10.0)
+
+
+def test_what_swam_before_an_interruption_or_a_kill_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    monkeypatch.setattr("fishd.lab.rig_recording.FLUSH", 0.0)
+
+    def swim() -> None:
+        with VirtualRig(Config()) as rig, recorded(rig, path, "") as writer:
+            rig.swim("swing", {}, 5.0)
+            assert open_run(writer.part).summary.swimming == {"swing": 100}
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        swim()
+    run = open_run(path)
+    assert run.reason == "ended by KeyboardInterrupt"
+    assert run.summary.swimming == {"swing": 100}
+
+
+def test_forces_in_volts_are_never_called_newtons(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    config = load("config/virtual-pi.yaml", [f"state_folder={tmp_path}"])
+    with VirtualRig(config) as rig, recorded(rig, path, ""):
+        rig.swim("swing", {}, 10.0)
+    run = open_run(path)
+    assert (rig.unit, run.summary.force_unit, traces(run).unit) == ("V", "V", "mV")
+    listed = fishctl("runs", "--folder", str(tmp_path)).stdout
+    assert re.search(r"^run .* -?\d+\.\d\d ± \S+ mV ", listed, re.MULTILINE)
+    with pytest.raises(Unidentifiable, match=r"run.mcap: its forces are in V, not in newtons"):
+        identify(path)
+
+
+def test_a_simulated_run_says_what_its_forces_are_in(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    words = ("--config", "config/virtual-pi.yaml", *sets(f"state_folder={tmp_path}"))
+    done = fishctl("simulate", "swing", "--seconds", "11", *words, "--record", str(path))
+    assert done.returncode == 0, done.stderr
+    assert open_run(path).summary.force_unit == "V"
