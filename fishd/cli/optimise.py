@@ -209,7 +209,7 @@ def _fields() -> dict[str, Field]:
 def _range(text: str, controller: str, given: dict[str, Any], rig: "Rig") -> "Range":
     """`frequency`, or `frequency=1:3`; raises `UsageError`."""
     from fishd.lab.optimise.search import Range
-    from fishd.lab.optimise.trials import default_range
+    from fishd.lab.optimise.trials import default_range, whole_ticks
 
     name, equals, ends = text.partition("=")
     known = _fields()
@@ -225,14 +225,16 @@ def _range(text: str, controller: str, given: dict[str, Any], rig: "Rig") -> "Ra
             raise click.UsageError(
                 f"--over {name}: it has no bounds on both sides: write --over {name}=LOW:HIGH"
             )
-        return found
+        return whole_ticks(found, rig.tick) if name == "frequency" else found
     try:
         low, high = (float(end) for end in ends.split(":"))
     except ValueError:
         raise click.UsageError(
             f"--over {text}: write NAME=LOW:HIGH, such as frequency=0.5:4"
         ) from None
-    return Range(name, low, high)
+    found = Range(name, low, high)
+    found.check()
+    return whole_ticks(found, rig.tick) if name == "frequency" else found
 
 
 def _told(number: int, trial: "Trial", best: "Proposal | None", unit: str) -> str:

@@ -33,17 +33,28 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
     assert best.thrust == pytest.approx(0.02, abs=2.0 * best.error)
 
 
-def test_candidates_have_half_beats_of_whole_ticks_within_their_range() -> None:
-    ranges = [Range("frequency", 0.4, 4.0)]
-    assert whole_ticks({"frequency": 1.7}, ranges, 0.05) == {"frequency": pytest.approx(10 / 6)}
-    assert whole_ticks({"frequency": 3.99}, ranges, 0.05) == {"frequency": pytest.approx(10 / 3)}
-    assert whole_ticks({"C": 0.61}, [Range("C", 0.0, 1.0)], 0.05) == {"C": 0.61}
+def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> None:
+    search = Search([whole_ticks(Range("frequency", 1.2, 2.6), 0.05)])
+    possible = (1.25, 10 / 7, 10 / 6, 2.0, 2.5)
+    assert search.ranges[0].values == pytest.approx(possible)
+    tried = set()
+    for _ in range(8):
+        found = search.suggest()["frequency"]
+        tried.add(found)
+        thrust = 0.0257 - 0.02 * (found - 1.74) ** 2  # whose top is at none of them
+        search.observe({"frequency": found}, thrust, 0.8e-3)
+        best = search.proposal()
+        for each in (best.parameters, best.low, best.high):
+            assert each["frequency"] in search.ranges[0].values
+    assert best.parameters["frequency"] in tried
+    assert best.parameters["frequency"] == pytest.approx(10 / 6)
+    assert len(tried) > 3
 
 
 @pytest.mark.slow
 def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     config = load("config/simulated.yaml")
-    search = Search([Range("frequency", 0.4, 5.0)], seed=1)
+    search = Search([whole_ticks(Range("frequency", 0.4, 5.0), config.tick)], seed=1)
     swum = 0
     with VirtualRig(config) as rig:
         for trial in trials(rig, "square", {}, search, 300.0):
@@ -79,6 +90,7 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
         (["--over", "frequency=3:1"], "is no range"),
         (["--over", "frequency=1"], "LOW:HIGH"),
         (["--over", "frequency=1:30"], "frequency"),
+        (["--over", "frequency=1.5:1.9"], "there: 1.667; around: 1.429, 1.667, 2"),
         (["--over", "frequency", "--frequency", "2"], "is given, too"),
         (["--over", "frequency", "--budget", "5"], "too short"),
     ],

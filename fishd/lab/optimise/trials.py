@@ -1,9 +1,10 @@
 """Measures the candidates of a search on a rig: the fish swims with each, and rests in between."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.measurement import REST, SWIM_SETTLES, evaluate, samples_of
@@ -18,6 +19,10 @@ WAVE_SETTLES = 0.75
 """A given wave is steady after so long [s]: there is no estimator in it, and the fin follows."""
 FREQUENCIES = 0.4
 """The lowest frequency that is searched unless another is asked for [Hz]."""
+LONGEST = 200
+"""The longest half beat that is searched where the frequencies begin at 0 [ticks]."""
+FEWEST_VALUES = 3
+"""A search of fewer frequencies is none: `compare` or `sweep` measures them all."""
 SHORTEST = 2
 """The shortest half beat that is searched unless another is asked for [ticks]."""
 
@@ -55,7 +60,7 @@ def trials(
     fresh = rest
     swum, passed = 0, REST
     while True:
-        candidate = whole_ticks(search.suggest(), search.ranges, rig.tick)
+        candidate = search.suggest()
         parameters = {**fixed, **candidate}
         settles, length = lengths(parameters)
         if passed + length + REST > budget:
@@ -70,23 +75,28 @@ def trials(
         rest, fresh = after, []
 
 
-def whole_ticks(
-    candidate: dict[str, float], ranges: Sequence[Range], tick: float
-) -> dict[str, float]:
-    """The nearest candidate in these ranges whose half beats are whole ticks, if there is one.
+def whole_ticks(frequencies: Range, tick: float) -> Range:
+    """The same range, of the frequencies alone whose half beats are whole ticks.
 
-    A few beats of that are like all others. Other half beats are dithered, over more beats than a
-    candidate swims.
+    A few beats of one of those are like all others. Other half beats are dithered, over more beats
+    than a candidate swims.
+
+    tick: period of the loop [s]
+    Raises `ParameterError` where there are fewer than `FEWEST_VALUES`.
     """
-    found = [each for each in ranges if each.name == "frequency" and each.low > 0.0]
-    if not found:
-        return candidate
-    fewest = max(1, math.ceil(0.5 / found[0].high / tick - 1e-9))
-    most = math.floor(0.5 / found[0].low / tick + 1e-9)
-    if most < fewest:
-        return candidate
-    ticks = min(most, max(fewest, round(0.5 / candidate["frequency"] / tick)))
-    return candidate | {"frequency": 0.5 / (ticks * tick)}
+    name, low, high, _ = frequencies
+    longest = math.floor(0.5 / low / tick + 1e-9) if low > 0.0 else LONGEST
+    shortest = max(1, math.ceil(0.5 / high / tick - 1e-9))
+    values = [0.5 / (ticks * tick) for ticks in range(longest, shortest - 1, -1)]
+    if len(values) < FEWEST_VALUES:
+        around = range(longest + 1, max(0, shortest - 2), -1)
+        near = ", ".join(f"{0.5 / (ticks * tick):.4g}" for ticks in around)
+        there = ", ".join(f"{value:.4g}" for value in values) or "none"
+        raise ParameterError(
+            f"{name}: too few values from {low:g} to {high:g}: only half beats of whole ticks are "
+            f"compared, {FEWEST_VALUES} at least; there: {there}; around: {near}"
+        )
+    return Range(name, low, high, tuple(values))
 
 
 def lengths(parameters: Mapping[str, Any]) -> tuple[float, float]:
