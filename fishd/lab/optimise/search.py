@@ -128,7 +128,7 @@ class Search:
         """The next candidate: first some that fill the ranges, then what promises most."""
         if self.trials < len(self._first):
             return self._parameters(self._untried(self._first[self.trials]))
-        if self._is_finite:
+        if any(each.values for each in self.ranges):
             gain, _ = self._gain(self._possible)
             return self._parameters(self._possible[int(np.argmax(gain))])
         self._fit_noise()
@@ -208,7 +208,8 @@ class Search:
             return np.array([[only.share(value)] for value in only.values])
         filling = np.linspace(0.0, 1.0, _GRID)[:, None]
         if len(self.ranges) > 1:
-            filling = qmc.Halton(len(self.ranges), rng=self._seed).random(2 * _GRID)
+            within = qmc.Halton(len(self.ranges), rng=self._seed).random(2 * _GRID)
+            filling = np.clip(1.05 * within - 0.025, 0.0, 1.0)  # with the edges
         for index, each in enumerate(self.ranges):
             if each.values:
                 filling[:, index] = [each.share(each.value(share)) for share in filling[:, index]]
