@@ -225,10 +225,11 @@ def _on_robot(
 
 @contextmanager
 def _opened(path: Path, begun: "Begun", found: "list[Point]") -> "Iterator[SweepFolder]":
-    from fishd.lab.sweep.folder import SweepFolder, owned
+    from fishd.lab.begun import owned
+    from fishd.lab.sweep.folder import SweepFolder
 
     columns = dict.fromkeys(name for point in found for name in point.columns())
-    with owned(path):
+    with owned(path, "sweep"):
         folder = SweepFolder(path, begun, list(columns))
         yield folder
         folder.sort(found)

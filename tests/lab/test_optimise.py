@@ -1,5 +1,8 @@
 """The search of the best parameters: few ticks of swimming, honest about what it does not know."""
 
+import os
+import signal
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +10,13 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
+from fishd.lab.optimise.folder import Begun, SearchFolder
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials, whole_ticks
 from fishd.lab.rig import VirtualRig
 from fishd.recording import read
-from fishd.simulation import simulate
+from fishd.simulation import VirtualRun, simulate
+from fishd.virtual.plant.tethered import TrueWindow
 
 BEST = 25.736e-3
 """Of the default fish, by a square wave of whole ticks, at 1.667 Hz [N]."""
@@ -80,7 +85,66 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     passed = float(rows[-1].rpartition(",")[2])
     assert len(read(folder / "search.mcap")) == round(passed / 0.05)
     assert (folder / "thrust.svg").stat().st_size > 10_000
-    assert "exists already" in one_line(fishctl(*words))
+    assert "a larger --budget goes on" in done.stderr
+    there = (folder / "trials.csv").read_text()
+    more = fishctl(*words, "--budget", "40")
+    assert f"{folder}: 3 candidates there already" in more.stdout
+    assert (folder / "trials.csv").read_text().startswith(there)
+    assert len(read(folder / "search-2.mcap")) > 100
+    refused = one_line(fishctl(*words, "--amplitude", "0.3"))
+    assert "begun with parameters.amplitude = None, now it is 0.3" in refused
+
+
+@pytest.mark.slow
+def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(5)
+    tick = VirtualRun.tick
+    left = 0
+
+    def interrupted(run: VirtualRun) -> TrueWindow:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+        return tick(run)
+
+    monkeypatch.setattr(VirtualRun, "tick", interrupted)
+    folder = tmp_path / "run"
+    table = folder / "trials.csv"
+    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    kept, stops = "", 0
+    while True:
+        left = int(generator.integers(1, 300)) if stops < 8 else 0
+        done = fishctl(*words)
+        now = table.read_text()
+        assert now.startswith(kept)
+        kept = now
+        if done.returncode == 0:
+            break
+        stops += 1
+        assert done.returncode == 130
+        again = f"to go on: fishctl {' '.join(words)}\n"
+        assert done.stderr.startswith("fishctl: stopped before")
+        assert done.stderr.endswith(again)
+    assert stops == 8
+    assert "best frequency of square: 1.667 Hz" in done.stdout
+    rows = [row.split(",") for row in kept.splitlines()[1:]]
+    seconds = sum(len(read(each)) for each in folder.glob("search*.mcap")) * 0.05
+    swims = sum(float(b[3]) - float(a[3]) for a, b in pairwise([[0.0] * 5, *rows])) * 0.05
+    assert seconds > swims + 2.75 * len(rows)
+
+
+def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
+    begun = Begun("simulation", "square", {}, {"frequency": (1.0, 3.0)}, 0, {})
+    folder = SearchFolder(tmp_path, "simulation", begun)
+    table = tmp_path / "trials.csv"
+    whole = table.read_text() + "1.25,0.02,0.001,40,12.5\n"
+    table.write_text(whole + "2.0,0.023,0.001,80,24.7")  # of 24.75
+    folder = SearchFolder(tmp_path, "simulation", begun)
+    assert [each.parameters for each in folder.done] == [{"frequency": 1.25}]
+    assert table.read_text() == whole
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ from rigs.processes import fishctl, one_line
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Event, Tick
+from fishd.lab.begun import owned
 from fishd.lab.rig import Disturbed, VirtualRig
-from fishd.lab.sweep.folder import Begun, SweepFolder, owned
+from fishd.lab.sweep.folder import Begun, SweepFolder
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, Result, swim
 from fishd.lab.sweep.running import on_robot
@@ -147,7 +148,11 @@ def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
 
 
 def test_two_sweeps_do_not_share_a_folder(tmp_path: Path) -> None:
-    with owned(tmp_path), pytest.raises(ConfigError, match="a sweep runs in it"), owned(tmp_path):
+    with (
+        owned(tmp_path, "sweep"),
+        pytest.raises(ConfigError, match="a sweep runs in it"),
+        owned(tmp_path, "sweep"),
+    ):
         pass
 
 

@@ -1,66 +1,133 @@
 """The folder of a search: a table of its candidates, a recording of all, and a picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from msgspec import Struct
 
-from fishd.config import Config
+from fishd import __version__
 from fishd.core.errors import ConfigError
+from fishd.core.files import FileProblem, write_atomically
+from fishd.lab import tables
+from fishd.lab.begun import begin
 from fishd.lab.drawing import BLUE, ORANGE, drawn, save
 from fishd.lab.optimise.search import Proposal, Search
 from fishd.lab.optimise.trials import Trial
 from fishd.lab.tables import Table
+from fishd.recording.part_file import PART
 from fishd.recording.writer import RunWriter
 
-TRIALS, RECORDING = "trials.csv", "search.mcap"
+BEGUN, TRIALS, RECORDING = "search.json", "trials.csv", "search.mcap"
 _TICKS = [base * 10.0**k for k in range(-4, 4) for base in (1, 2, 3, 5)]
 _COLUMNS = ("thrust", "error", "swum", "passed")
 
 
+class Begun(Struct, frozen=True):
+    """With what a search began; a folder is gone on with only by the same."""
+
+    on: str
+    controller: str
+    parameters: dict[str, Any]
+    """Those that are not searched."""
+    over: dict[str, tuple[float, float]]
+    """From where to where each other one is."""
+    seed: int
+    config: dict[str, Any]
+    """The fish, as plain data."""
+    force_unit: str = "N"
+    version: str = __version__
+
+
 class SearchFolder:
-    """A new folder in which candidates are kept as they are measured; a context manager."""
+    """A folder in which candidates are kept as they are measured; a context manager.
 
-    def __init__(
-        self, path: Path, source: str, config: Config | Mapping[str, Any], names: Sequence[str]
-    ) -> None:
-        """
-        source: what swims, config: with which configuration
-        names: the parameters that are searched
+    `done` has those that were there when it was opened, without their ticks.
+    """
 
-        Raises `ConfigError` where there is something in the folder, and `RecordingError`.
+    def __init__(self, path: Path, source: str, begun: Begun) -> None:
+        """Makes the folder, or goes on with one.
+
+        source: what swims
+        Raises `ConfigError` where it is of something else.
         """
         self.path = path
+        self._source = source
+        self._begun = begun
+        self._writer: RunWriter | None = None
         try:
-            if path.exists() and (not path.is_dir() or any(path.iterdir())):
-                raise ConfigError(f"{path} exists already; give another --folder")
             path.mkdir(parents=True, exist_ok=True)
-            self._table = Table(path / TRIALS, (*names, *_COLUMNS))
+            begin(path / BEGUN, begun, "search")
+            head = (*begun.over, *_COLUMNS)
+            self.done = _read(path / TRIALS, head)
+            self._table = Table(path / TRIALS, head)
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be made: {error.strerror}") from None
-        self._writer = RunWriter(path / RECORDING, source=source, note="a search")
-        self._writer.describe(config)
+            raise self._unwritable(error) from None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *what: Any) -> None:
-        self._writer.__exit__(*what)
+        if self._writer:
+            self._writer.__exit__(*what)
 
     def keep(self, trial: Trial) -> None:
         """Keep a candidate and its ticks; raises `ConfigError` and `RecordingError`."""
+        writer = self._writer = self._writer or self._recording()
         for tick in trial.ticks:
-            self._writer.tick(tick)
-        self._writer.flush()
+            writer.tick(tick)
+        writer.flush()
         values = {name: getattr(trial, name) for name in _COLUMNS}
         try:
             self._table.add({**trial.parameters, **values})
         except OSError as error:
-            raise ConfigError(
-                f"{self.path / TRIALS}: cannot be written: {error.strerror}; what was measured "
-                "before is in it"
-            ) from None
+            raise self._unwritable(error) from None
+
+    def _recording(self) -> RunWriter:
+        """A new one, of this time that the search goes on."""
+        first, number = self.path / RECORDING, 1
+        path = first
+        while path.exists() or path.with_name(path.name + PART).exists():
+            number += 1
+            path = first.with_stem(f"{first.stem}-{number}")
+        writer = RunWriter(path, source=self._source, note="a search")
+        writer.describe(self._begun.config)
+        return writer
+
+    def _unwritable(self, error: OSError) -> ConfigError:
+        where = error.filename or self.path
+        return ConfigError(
+            f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
+        )
+
+
+def _read(path: Path, head: tuple[str, ...]) -> list[Trial]:
+    """The candidates of a table; a last row that a kill has cut off is dropped."""
+    if not path.exists():
+        return []
+    try:
+        before, *rows = tables.read(path)
+        if tuple(before) != head:
+            raise ValueError
+        if rows and not path.read_bytes().endswith(b"\n"):
+            write_atomically(path, tables.lines([head, *rows[:-1]]))
+            rows = rows[:-1]
+        found = [dict(zip(head, map(float, row), strict=True)) for row in rows]
+    except (ValueError, FileProblem):
+        raise ConfigError(f"{path}: not the table of this search; give another --folder") from None
+    names = head[: -len(_COLUMNS)]
+    return [
+        Trial(
+            {name: row[name] for name in names},
+            row["thrust"],
+            row["error"],
+            int(row["swum"]),
+            row["passed"],
+            [],
+        )
+        for row in found
+    ]
 
 
 def draw(

@@ -45,7 +45,12 @@ class Trial(NamedTuple):
 
 
 def trials(
-    rig: Rig, controller: str, fixed: Mapping[str, Any], search: Search, budget: float
+    rig: Rig,
+    controller: str,
+    fixed: Mapping[str, Any],
+    search: Search,
+    budget: float,
+    before: Trial | None = None,
 ) -> Iterator[Trial]:
     """Measure candidates on a rig for as long as the budget lasts; `search` knows of each.
 
@@ -54,17 +59,21 @@ def trials(
 
     fixed: parameters that are not searched
     budget: time in the tank [s]
+    before: the last one of a search that is gone on with, which `search` knows already
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
-    rest = rig.rest(REST)
+    swum, passed = (before.swum, before.passed) if before else (0, 0.0)
+    passed += REST
+    rest: list[Tick] = []
     fresh = rest
-    swum, passed = 0, REST
     while True:
         candidate = search.suggest()
         parameters = {**fixed, **candidate}
         settles, length = lengths(parameters)
         if passed + length + REST > budget:
             return
+        if not rest:
+            fresh = rest = rig.rest(REST)
         swim = rig.swim(controller, parameters, length)
         after = rig.rest(REST)
         found = evaluate(samples_of([*rest, *swim, *after]), rig.tick, settles)
@@ -113,12 +122,11 @@ def default_range(field: Field, rig: Rig) -> Range | None:
     A frequency from `FREQUENCIES` to half beats of `SHORTEST` ticks, an amplitude up to that of
     the rig; an end that is no value itself is moved in by a twentieth.
     """
-    parts = field.interval.strip("()[]").split(", ")
+    low, high = _ends(field)
     if field.name == "amplitude":
         return Range(field.name, rig.amplitude / 20.0, rig.amplitude)
-    if len(parts) != 2 or "inf" in field.interval:
+    if math.isinf(low) or math.isinf(high):
         return None
-    low, high = map(float, parts)
     if field.name == "frequency":
         return Range(field.name, max(low, FREQUENCIES), min(high, 0.5 / (SHORTEST * rig.tick)))
     margin = (high - low) / 20.0
@@ -127,3 +135,25 @@ def default_range(field: Field, rig: Rig) -> Range | None:
         low + margin * field.interval.startswith("("),
         high - margin * field.interval.endswith(")"),
     )
+
+
+def check_bounds(asked: Range, field: Field, rig: Rig) -> None:
+    """Raises `ParameterError` where a parameter cannot be searched between these."""
+    low, high = _ends(field)
+    if field.name == "amplitude":
+        high = min(high, rig.amplitude)
+    is_open = field.interval.startswith("(") and asked.low == low
+    is_open |= field.interval.endswith(")") and asked.high == high
+    if asked.low < low or asked.high > high or is_open:
+        reach = f"{field.interval[:1] or '['}{low:g}, {high:g}{field.interval[-1:] or ']'}"
+        raise ParameterError(
+            f"{asked.name}: from {asked.low:g} to {asked.high:g} is not within {reach}"
+        )
+
+
+def _ends(field: Field) -> tuple[float, float]:
+    """Between what its values are; infinite where nothing bounds them."""
+    parts = field.interval.strip("()[]").split(", ")
+    if len(parts) != 2:
+        return -math.inf, math.inf
+    return float(parts[0]), float(parts[1])
