@@ -12,6 +12,8 @@ from fishd.cli.options import ControllerGroup, endpoint_option, json_option
 from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
 from fishd.config import load
+from fishd.core import text
+from fishd.core.console import INTERRUPTED
 from fishd.core.interruption import interrupted_once
 
 if TYPE_CHECKING:
@@ -80,7 +82,7 @@ def _measure(
     overrides: tuple[str, ...],
     endpoint: str | None,
     as_json: bool,
-) -> None:
+) -> int:
     from fishd.lab.measurement import measure as run
     from fishd.lab.measurement import summary
     from fishd.lab.rig import LiveRig, Rig, VirtualRig
@@ -98,8 +100,12 @@ def _measure(
         else:
             fish = stack.enter_context(Fish(endpoint))
             rig = stack.enter_context(LiveRig(fish))
-            with showing(seconds, "s") as bar:
-                found = run(rig, name, parameters, seconds, bar.at, settle)
+            try:
+                with showing(seconds, "s") as bar:
+                    found = run(rig, name, parameters, seconds, bar.at, settle)
+            except KeyboardInterrupt:
+                echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
+                return INTERRUPTED
             if found.thrust > found.error and not found.remark:
                 fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
         if picture:
@@ -112,9 +118,10 @@ def _measure(
         echo(_line(found))
     if found.remark:
         echo(f"fishctl: {found.remark}; measure again with a longer --settle", err=True)
+    return 0
 
 
 def _line(found: "Measured") -> str:
     what = f"{found.controller} {spelled(dict(found.parameters))}".rstrip()
-    thrust = f"{found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} mN"
+    thrust = f"{found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} m{text.quoted(found.unit)}"
     return f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"

@@ -114,6 +114,7 @@ class ControlLoop:
         measurement = self._read(slot)
         read = self._now()
         self.observation = observation = self._estimate(measurement, slot, dt)
+        self._follow_thrust(observation)
         return Turn(slot, measurement, observation, (started, read, self._now()))
 
     def act(self, turn: Turn) -> None:
@@ -221,15 +222,22 @@ class ControlLoop:
 
     def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
         try:
-            seen = self._estimator.update(measurement, self.applied, slot.deadline, dt)
-            if not self.supervisor.sensor_lost:
-                running = self.supervisor.mode is Mode.RUNNING
-                self.thrust.update(seen, running, self.active.wave)
-            return seen
+            return self._estimator.update(measurement, self.applied, slot.deadline, dt)
         except Exception as error:
             self._fail("estimate-error", "the estimator failed", error)
             fx, fy, angle = measurement.fx, measurement.fy, self.applied
             return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
+
+    def _follow_thrust(self, observation: Observation) -> None:
+        """Only a display hangs on this: where it fails, it begins anew."""
+        if self.supervisor.sensor_lost:
+            return
+        try:
+            running = self.supervisor.mode is Mode.RUNNING
+            self.thrust.update(observation, running, self.active.wave)
+        except ArithmeticError as error:
+            self.reporter.problem("the thrust cannot be told, and is found anew", error)
+            self.thrust.forget()
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

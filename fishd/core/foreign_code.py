@@ -12,6 +12,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 from fishd.core import text
 from fishd.core.errors import Escaped
+from fishd.core.interruption import Interrupted
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -30,7 +31,9 @@ def contained(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     except Exception:
         raise
     except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) and _ctrl_c_is_raised():
+        if isinstance(error, Interrupted) or (
+            isinstance(error, KeyboardInterrupt) and _ctrl_c_is_raised()
+        ):
             raise
         raise Escaped(text.named(error)) from error
 

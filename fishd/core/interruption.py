@@ -9,6 +9,10 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+class Interrupted(KeyboardInterrupt):
+    """One of these signals came; no code of others may catch it."""
+
+
 @contextmanager
 def on_signal(ask: Callable[[], object]) -> Iterator[None]:
     """While this lasts, SIGINT, SIGTERM and SIGHUP call `ask`; the second of a kind acts as before.
@@ -26,7 +30,7 @@ def on_signal(ask: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def interrupted_once() -> Iterator[None]:
-    """While this lasts, the first of the three raises KeyboardInterrupt, and the others nothing.
+    """While this lasts, the first of the three raises `Interrupted`, and the others nothing.
 
     So what is done then, such as stopping a fish, is done to its end. Main thread only.
     """
@@ -34,7 +38,7 @@ def interrupted_once() -> Iterator[None]:
     def heard(number: int, _: object) -> None:
         for each in SIGNALS:
             signal.signal(each, signal.SIG_IGN)
-        raise KeyboardInterrupt
+        raise Interrupted
 
     with handled(SIGNALS, heard):
         yield
@@ -42,10 +46,14 @@ def interrupted_once() -> Iterator[None]:
 
 @contextmanager
 def handled(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
-    """While this lasts, these go to `handler`, in the main thread; yields who had them before."""
+    """While this lasts, these go to `handler`, in the main thread; yields who had them before.
+
+    One that is ignored, as `nohup` has it, stays so.
+    """
     former: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        former = {number: signal.signal(number, handler) for number in signals}
+        heard = [each for each in signals if signal.getsignal(each) is not signal.SIG_IGN]
+        former = {number: signal.signal(number, handler) for number in heard}
     try:
         yield former
     finally:

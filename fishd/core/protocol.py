@@ -149,8 +149,8 @@ class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
 class CalibrateThrust(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of calibrate-thrust: thrust [N] over the mean square of `fin_velocity`."""
 
-    factor: Annotated[float, Meta(gt=0)]
-    error: Annotated[float, Meta(gt=0)]
+    factor: Annotated[float, Meta(ge=1e-9, le=1e9)]
+    error: Annotated[float, Meta(ge=1e-12, le=1e9)]
     """Half of its 95 % interval."""
 
 

@@ -88,7 +88,11 @@ def fit(blocks: Blocks) -> Fit:
 
 
 def _covariances(seconds: Array) -> Iterator[Array]:
-    """Of each drift that is tried, at these times; over the variance of a block."""
+    """Of each drift that is tried, at these times; over the variance of a block.
+
+    Each counts as much as any other before the forces are seen: a kind that is added here with n
+    strengths counts n times.
+    """
     walk = np.minimum.outer(seconds, seconds)
     gap = np.subtract.outer(seconds, seconds)
     for time in TIMES:

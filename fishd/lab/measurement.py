@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import Struct
 
+from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
@@ -15,14 +16,12 @@ from fishd.lab.rig import Rig
 
 SWIM, REST = 6.0, 2.75
 """How long the fish swims and rests in turn [s]."""
-SWIM_SETTLES = 1.5
-"""A swim is steady after so long [s]; what the force was before is left out."""
-REST_SETTLES = 1.0
-"""The water and the fin are still after so long, fading included [s]."""
-BLOCK = 0.5
-"""Rest is cut in pieces of this length [s]."""
 UNSTEADY, RESTLESS = 0.05, 0.01
 """The power of the fin may change by this share in a swim, and be this share of it at rest."""
+LONGEST = 3600.0
+"""The longest measurement [s]."""
+MOST_BLOCKS = 200
+"""Beats and pieces of a rest are taken together until there are no more blocks than this."""
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
 
@@ -62,6 +61,8 @@ class Measured(NamedTuple):
     """The force without swimming, block by block [N]."""
     ticks: Sequence[Tick]
     """Every tick, in order."""
+    unit: str
+    """Of all forces: `N`; that of the sensor where it is not calibrated."""
     remark: str
     """Why the thrust may be wrong by more than its error; empty where nothing speaks for that."""
 
@@ -87,7 +88,9 @@ def measure(
         ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
         progress(len(ticks) * rig.tick)
     found = evaluate(samples_of(ticks), rig.tick, settle, _still(settle))
-    return found._replace(controller=controller, parameters=dict(parameters), ticks=ticks)
+    return found._replace(
+        controller=controller, parameters=dict(parameters), ticks=ticks, unit=rig.unit
+    )
 
 
 def samples_of(ticks: Iterable[Tick]) -> list[Sample]:
@@ -114,6 +117,8 @@ class Summary(Struct, frozen=True):
     swims: int
     seconds: float
     """How long it took, rests included [s]."""
+    force_unit: str
+    remark: str
 
 
 def summary(found: Measured, tick: float) -> Summary:
@@ -127,6 +132,8 @@ def summary(found: Measured, tick: float) -> Summary:
         found.thrust / found.power if found.power else 0.0,
         found.swims,
         len(found.ticks) * tick,
+        found.unit,
+        found.remark,
     )
 
 
@@ -143,12 +150,13 @@ def plan(
     if isinstance(frequency, int | float) and frequency > 0.0:
         swim = max(swim, settle + 3.0 / frequency)
     rest = _still(settle) + REST - REST_SETTLES
-    count = math.floor((seconds - rest) / (swim + rest)) if math.isfinite(seconds) else 0
-    if count < 2:
+    if not 2 * swim + 3 * rest <= seconds <= LONGEST:  # NaN is not
         raise ParameterError(
-            f"a measurement of {seconds:g} s is too short: two swims of {swim:.3g} s between three "
-            f"rests of {rest:.3g} s need {2 * swim + 3 * rest:.4g} s"
+            f"a measurement of {seconds:g} s is not possible: two swims of {swim:.3g} s between "
+            f"three rests of {rest:.3g} s need {2 * swim + 3 * rest:.4g} s, and {LONGEST:g} s are "
+            "the most"
         )
+    count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
     stretched = seconds / (rest + count * (swim + rest))
     cycle = [(True, swim * stretched), (False, rest * stretched)]
     return [(False, rest * stretched), *cycle * count]
@@ -176,7 +184,7 @@ def evaluate(
     kept = [
         list(_blocks(phase, tick, first, settles if phase[0].swims else stills)) for phase in phases
     ]
-    found = [block for blocks in kept for block in blocks]
+    found = [block for blocks in _together(kept) for block in blocks]
     swimming = [block for block in found if block.swims]
     if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
         raise ParameterError(
@@ -186,7 +194,8 @@ def evaluate(
     time, force = np.array([(block.time, block.force) for block in found]).T
     swims = np.array([block.swims for block in found])
     lasts = np.array([block.lasts for block in found])
-    spread = np.where(swims, _spread(found, True), _spread(found, False))
+    apart = [block for blocks in kept for block in blocks]
+    spread = np.where(swims, _spread(apart, True), _spread(apart, False))
     blocks = Blocks(time, force, spread / lasts, swims)
     result = fit(blocks)
     lasting = sum(block.lasts for block in swimming)
@@ -201,8 +210,29 @@ def evaluate(
         blocks=blocks,
         drift=result.drift,
         ticks=[],
+        unit="N",
         remark=_remark(kept),
     )
+
+
+def _together(kept: Sequence[list["_Block"]]) -> list[list["_Block"]]:
+    """The same in longer blocks, each within its swim or rest, where there are too many."""
+    each = math.ceil(sum(map(len, kept)) / MOST_BLOCKS)
+    return [
+        [_joined(blocks[begin : begin + each]) for begin in range(0, len(blocks), each)]
+        for blocks in kept
+    ]
+
+
+def _joined(blocks: Sequence["_Block"]) -> "_Block":
+    if len(blocks) == 1:
+        return blocks[0]
+    lasts = np.array([block.lasts for block in blocks])
+    time, force, power = np.average(
+        [(block.time, block.force, block.power) for block in blocks], axis=0, weights=lasts
+    )
+    beats = sum(block.beats for block in blocks)
+    return _Block(time, lasts.sum(), force, power, beats, blocks[0].swims)
 
 
 def _remark(kept: Sequence[Sequence["_Block"]]) -> str:
@@ -246,8 +276,13 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
     ups = _reversals(phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1
+    if swims and not beating and len({sample.phi_c for sample in phase[begin:]}) > 1:
+        raise ParameterError(
+            f"no whole beat is left of a swim of {len(phase) * tick:.3g} s; a longer --settle "
+            "lengthens swims"
+        )
     if not beating:
-        cuts = list(range(begin, len(phase), max(1, round(BLOCK / tick))))
+        cuts = list(range(begin, len(phase), max(1, round(PIECE / tick))))
     begun, beats = 0, 0
     for index in range(1, len(cuts)):
         beats += 1

@@ -33,7 +33,7 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
                     label=what if axes is above else None,
                 )
         above.plot(blocks.time, 1e3 * found.drift, color=BLACK, label="drift as fitted")
-        above.set_ylabel("F$_x$ as measured [mN]")
+        above.set_ylabel(f"F$_x$ as measured [m{found.unit}]")
         outer = 1e3 * np.concatenate((blocks.force, found.drift))
         room = 0.35 * (outer.max() - outer.min()) + 1.0
         above.set_ylim(outer.min() - room, outer.max() + room)
@@ -42,6 +42,6 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
         below.axhspan(level - error, level + error, color=BLUE, alpha=0.2, linewidth=0)
         below.axhline(level, color=BLUE, linewidth=0.8)
         below.axhline(0.0, color=GREY, linewidth=0.6)
-        below.set_ylabel("without drift [mN]")
+        below.set_ylabel(f"without drift [m{found.unit}]")
         below.set_xlabel("time [s]")
-        below.set_title(f"{found.controller}: {level:.2f} ± {error:.2f} mN")
+        below.set_title(f"{found.controller}: {level:.2f} ± {error:.2f} m{found.unit}")

@@ -55,6 +55,7 @@ class VirtualRig:
 
     def __init__(self, config: Config) -> None:
         self.name = "simulation"
+        self.unit = "N"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
         self._kept = KeepingPublisher()
@@ -93,6 +94,7 @@ class LiveRig:
         """Raises `NoDaemon`."""
         status = fish.status()
         self.name = status.robot
+        self.unit = status.force_unit
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self._fish = fish

@@ -126,4 +126,36 @@ def test_the_first_whole_beats_are_known_as_well_as_the_zero() -> None:
     with rig() as fish:
         fish.rest(3.0)
         thrust, error = known(fish.swim("swing", {}, 1.5))
-        assert abs(thrust - 22e-3) < error < 8e-3
+        assert abs(thrust - TRUTH) < error < 8e-3
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-2])
+def test_at_rest_the_interval_knows_of_the_noise(noise: float) -> None:
+    outside = 0
+    for seed in range(8):
+        config = replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed, noise=noise))
+        with VirtualRig(config) as fish:
+            ticks = fish.rest(20.0)[100:]
+            outside += sum(abs(tick.thrust) > tick.thrust_error for tick in ticks)  # type: ignore[operator]
+    assert outside < 0.1 * 8 * len(ticks)
+
+
+def test_a_rest_that_shows_a_larger_drift_widens_what_comes_after() -> None:
+    errors = []
+    for drift in (0.0, 2e-3):
+        config = replace(CONFIG, simulation=replace(CONFIG.simulation, drift_walk=drift))
+        with VirtualRig(config) as fish:
+            for _ in range(4):
+                fish.rest(3.0)
+                ticks = fish.swim("swing", {}, 12.0)
+        errors.append(known(ticks)[1])
+    assert errors[1] > 1.5 * errors[0]
+
+
+def test_a_factor_that_overflows_stops_no_fish() -> None:
+    with rig() as fish:
+        fish.rest(3.0)
+        fish.swim("swing", {}, 6.0)
+        fish._run.loop.thrust.calibrate(1e150, 1e150)
+        ticks = fish.swim("swing", {}, 10.0)
+        assert {tick.mode for tick in ticks} == {"running"}

@@ -7,6 +7,9 @@ import msgspec
 import pytest
 from rigs.processes import FISHCTL, Daemon, Process, running, wait_until
 
+from fishd.client import Fish
+from fishd.core.errors import Refused
+
 
 @pytest.fixture(scope="module")
 def drifting(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-def]
@@ -52,7 +55,9 @@ def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_whoever_ends_it_leaves_the_fish_at_rest(daemon: Daemon, how: signal.Signals) -> None:
-    assert begun(daemon).end(how)[0] == 130
+    status, out, err = begun(daemon).end(how)
+    assert (status, out) == (130, "")
+    assert err == "fishctl: interrupted: the fish rests, nothing is measured\n"
     assert daemon.status().mode == "idle"
 
 
@@ -63,3 +68,11 @@ def test_an_emergency_stop_ends_it_and_says_so(daemon: Daemon) -> None:
     assert status == 1
     assert "in mode estop (requested with fishctl)" in err
     assert daemon.status().mode == "estop"
+
+
+def test_what_is_no_factor_is_refused_and_stops_no_fish(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        for factor, error in ((1e308, 1.0), (0.0, 1.0), (1.0, 1e308), (-1.0, 1.0)):
+            with pytest.raises(Refused, match="calibrate-thrust: "):
+                fish.calibrate_thrust(factor, error)
+        assert fish.status().mode == "idle"

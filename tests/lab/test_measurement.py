@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from fishd.config import Config, load
 from fishd.core.errors import ParameterError
 from fishd.lab import drift
-from fishd.lab.measurement import Measured, measure, plan
+from fishd.lab.measurement import MOST_BLOCKS, Measured, measure, plan
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.simulation import simulate
 
@@ -66,9 +66,9 @@ def test_a_plan_takes_its_time_and_begins_and_ends_at_rest(
     assert min(length for swims, length in phases if swims) > 3.0 / frequency + 1.0
 
 
-@pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0])
-def test_what_is_too_short_is_told_with_what_is_needed(seconds: float) -> None:
-    with pytest.raises(ParameterError, match=r"two swims of 6 s .* need 20\.2 s"):
+@pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0, 1e9])
+def test_a_length_that_is_not_possible_is_told_with_what_is_needed(seconds: float) -> None:
+    with pytest.raises(ParameterError, match=r"two swims of 6 s .* need 20\.25 s, and 3600 s"):
         plan(seconds, {})
 
 
@@ -95,3 +95,17 @@ def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() 
     truth = simulate(slow, "swing", {}, 200.0, 60.0).mean_thrust * np.cos(0.05)
     assert found.remark == ""
     assert abs(found.thrust - truth) < found.error < 0.02 * truth
+
+
+def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
+    slow = {"smaller": 1.0, "lowest": 0.15, "highest": 0.15}
+    with VirtualRig(RIG) as rig, pytest.raises(ParameterError, match="no whole beat is left"):
+        measure(rig, "excitation", slow, 30.0)
+
+
+@pytest.mark.slow
+def test_a_long_measurement_is_the_same_and_no_slower_to_judge() -> None:
+    found = measured(replace(RIG, simulation=replace(RIG.simulation, drift=5e-3)), 1200.0)
+    assert len(found.blocks.time) <= MOST_BLOCKS + 2 * 270
+    truth = simulate(RIG, "swing", {}).mean_thrust * np.cos(RIG.simulation.rotation)
+    assert abs(found.thrust - truth) < 2.0 * found.error < 0.2e-3

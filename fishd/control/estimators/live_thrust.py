@@ -41,10 +41,10 @@ UNKNOWN = 1.0
 """Standard deviation of a zero that nothing is known of, and of a thrust [N]."""
 MOST_KNOWN = 0.1
 """A thrust that is known no better than this is not known [N]."""
-_NOISE = 2e-3
+_NOISE = 1e-3
 """What blocks are thought to vary by until there are two to compare [N]."""
-_FORGETS = 0.1
-"""Share of the newest comparison in the variance of blocks."""
+_COMPARISONS = 10
+"""How many comparisons of blocks the variance of blocks remembers."""
 
 
 Wave = tuple[str, dict[str, Any]]
@@ -55,7 +55,10 @@ class LiveThrust:
     """Thrust over the latest whole beats, and half of its 95 % interval."""
 
     def __init__(self, zero_drift: float) -> None:
-        """zero_drift: how fast the zero wanders, standard deviation after a second [N/√s]"""
+        """zero_drift: how fast the zero wanders, standard deviation after a second [N/√s].
+
+        Where rests show that it wanders faster, that is taken instead.
+        """
         self.thrust: float | None = None
         """Of the latest beats; at rest, of the latest piece of it [N]. None while not known."""
         self.error = 0.0
@@ -66,7 +69,7 @@ class LiveThrust:
         self._factor_variance: float | None = None
         self._anchored = False
         """Is the zero known, or a factor from when it was?"""
-        self._time = -math.inf
+        self._time = self._rested = -math.inf
         self._at_rest = 0.0
         self._noises = {True: _Noise(), False: _Noise()}
         self._swims = False
@@ -114,6 +117,7 @@ class LiveThrust:
             self._block = None
             self._beats.clear()
             self._at_rest = 0.0
+            self._noises[swims].forget()  # there was drift since
             if swims:
                 self._take_up(wave)
         self._phase += seen.dt
@@ -165,6 +169,8 @@ class LiveThrust:
         else:
             noise.forget()
         self._at_rest = block.force - self._zero
+        if not self._swims:
+            self._rested = time
 
     def _wait(self, time: float) -> None:
         """What is known becomes less certain with time."""
@@ -183,9 +189,13 @@ class LiveThrust:
         surprise = force - self._zero - self._factor * power
         along, across = a + b * power, b + c * power
         total = along + across * power + variance
-        if power == 0.0 and surprise**2 > BROKEN**2 * total:
-            self._zero, self._zero_variance, self._covariance = force, variance, 0.0
-            return False
+        if power == 0.0 and surprise**2 > INTERVAL**2 * total:
+            if surprise**2 > BROKEN**2 * total:
+                self._zero, self._zero_variance, self._covariance = force, variance, 0.0
+                return False
+            gap = self._time - self._rested
+            if 2.0 * PIECE < gap < math.inf:  # a swim was between: no jump, but drift
+                self._wander += (surprise**2 - total) / gap
         self._zero += along / total * surprise
         self._factor += across / total * surprise
         self._zero_variance = max(0.0, a - along * along / total)
@@ -203,7 +213,8 @@ class LiveThrust:
             error = math.hypot(INTERVAL * self._power * math.sqrt(spread), SHAPE * thrust)
         elif not self._swims:
             thrust = self._at_rest
-            error = INTERVAL * math.sqrt(self._zero_variance + self._wander * passed)
+            spread = self._zero_variance + self._wander * passed + self._noises[False].variance
+            error = INTERVAL * math.sqrt(spread)
         elif seen.frequency:  # the first beats, or the first of another wave
             thrust = seen.thrust - self._zero
             spread = self._zero_variance + self._wander * passed + self._noises[True].variance
@@ -242,13 +253,15 @@ class _Noise:
 
     def __init__(self) -> None:
         self.variance = _NOISE**2
+        self._count = 1
         self._before: float | None = None
 
     def compare(self, force: float) -> None:
         """Take in the force of another block."""
         if self._before is not None:
             found = 0.5 * (force - self._before) ** 2
-            self.variance += _FORGETS * (found - self.variance)
+            self._count = min(self._count + 1, _COMPARISONS)
+            self.variance += (found - self.variance) / self._count
         self._before = force
 
     def forget(self) -> None:

@@ -4,10 +4,11 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
-from fishd.lab.measurement import REST, SWIM_SETTLES, evaluate, samples_of
+from fishd.lab.measurement import REST, evaluate, samples_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig
 
