@@ -15,7 +15,7 @@ from fishd.cli.config import set_option
 from fishd.cli.lab_progress import showing
 from fishd.cli.optimise_output import optimum_of, say, told
 from fishd.cli.options import ControllerGroup, ParameterType, endpoint_option, json_option
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.output import counted, echo, print_json, warn_of_fin
 from fishd.cli.sweep import ON, refuse_other
 from fishd.cli.sweep_output import again
 from fishd.client import Fish
@@ -142,6 +142,7 @@ def _optimise(
                 swum = simulate(load(file, overrides), name, {**parameters, **found.parameters})
                 truth = {"true_thrust": swum.mean_thrust, "efficiency": swum.efficiency}
                 optimum = replace(optimum, **truth)
+                warn_of_fin(swum.fin_amplitude)
             else:
                 optimum = replace(optimum, thinking=thinking)
             units = {each: field.unit for each, field in _fields().items()}

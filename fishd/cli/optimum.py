@@ -7,7 +7,7 @@ import click
 
 from fishd.cli.config import fish_options
 from fishd.cli.options import json_option
-from fishd.cli.output import echo, echo_rows, print_json
+from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
 from fishd.config import load
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -84,6 +84,8 @@ def optimum(
 
         found = lab.optimal_control(plant, chosen[0])
         draw(found, figure)
+    for k, amplitude in enumerate(chosen):
+        warn_of_fin(best.fin_amplitude[k], f" at ±{amplitude:g} rad")
     if as_json:
         sets = {"best_square": best, "fast_servo": fast, "slow_servo": slow}
         print_json(

@@ -47,6 +47,10 @@ class Range(NamedTuple):
         """What a number from 0 to 1 stands for: the nearest that it can have."""
         if self.values:
             return min(self.values, key=lambda each: abs(self.share(each) - share))
+        return self.between(share)
+
+    def between(self, share: float) -> float:
+        """What that number stands for where any value is possible."""
         if self.is_logarithmic:
             return float(self.low * (self.high / self.low) ** share)
         return float(self.low + share * (self.high - self.low))
@@ -144,7 +148,7 @@ class Search:
 
     def proposal(self) -> Proposal:
         """What seems best now; there must have been a trial."""
-        shares = np.vstack((self._possible, self._library.space.params))
+        shares: Array = np.vstack((self._possible, self._library.space.params))
         gain, (mean, covariance) = self._gain(shares)
         best = int(np.argmax(mean))
         generator = np.random.default_rng(self._seed)
@@ -152,10 +156,8 @@ class Search:
             mean, covariance, _SAMPLES, method="eigh", check_valid="ignore"
         )
         tops = shares[np.argmax(curves, axis=1)]
-        low, high = (
-            np.quantile(tops, at, axis=0, method=end)
-            for at, end in ((0.025, "lower"), (0.975, "higher"))
-        )
+        low = np.quantile(tops, 0.025, axis=0, method="lower")
+        high = np.quantile(tops, 0.975, axis=0, method="higher")
         return Proposal(
             self._parameters(shares[best]),
             self._parameters(np.minimum(low, shares[best])),
@@ -177,7 +179,7 @@ class Search:
         """Of one parameter: its values, the thrust, and half of its 95 % interval [N]."""
         shares = np.linspace(0.0, 1.0, points)
         mean, covariance = self._expected(shares[:, None])
-        values = np.array([self.ranges[0].value(share) for share in shares])
+        values = np.array([self.ranges[0].between(float(share)) for share in shares])
         return values, mean, 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
     def _expected(self, shares: Array) -> tuple[Array, Array]:
@@ -188,12 +190,12 @@ class Search:
 
     def _gain(self, shares: Array) -> tuple[Array, tuple[Array, Array]]:
         """The improvement expected at these places [N]; the thrust there, and its covariance."""
-        places = np.vstack((shares, self._library.space.params))
+        places: Array = np.vstack((shares, self._library.space.params))
         mean, covariance = self._expected(places)
-        deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-18))
+        deviation: Array = np.sqrt(np.maximum(np.diag(covariance), 1e-18))
         self._acquisition.y_max = mean[-self.trials :].max()
         n = len(shares)
-        gain = self._acquisition.base_acq(mean[:n], deviation[:n])
+        gain = cast(Array, self._acquisition.base_acq(mean[:n], deviation[:n]))
         return gain, (mean[:n], covariance[:n, :n])
 
     @property
