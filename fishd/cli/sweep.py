@@ -68,7 +68,7 @@ def sweep_options(function: Any) -> Any:
             multiple=True,
             metavar="KEY=VALUES",
             help="In simulation: a key of the configuration with several values, such as "
-            "plant.xi=0.05,0.6,1.2 or plant.omega0=8:14:2. Repeatable.",
+            "plant.xi=0.6,1.2,2.4 or plant.omega0=8:14:2. Repeatable.",
         ),
         click.option(
             "--config",
@@ -150,7 +150,7 @@ def _varied(text: str) -> tuple[str, list[str]]:
 
     key, equals, values = text.partition("=")
     if not (equals and key.strip()):
-        raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.05,0.6,1.2")
+        raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.6,1.2,2.4")
     return key.strip(), spread(values)
 
 
