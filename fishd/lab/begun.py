@@ -25,6 +25,9 @@ def owned(path: Path, what: str) -> Iterator[None]:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
+    try:
         with locked(path / what, remove=True):
             yield
     except Taken as taken:

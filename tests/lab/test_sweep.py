@@ -183,6 +183,13 @@ def test_a_fin_that_swings_further_than_the_equations_hold_is_told(
     assert "beyond 1 rad the equations of the fish do not hold" in done.stderr
 
 
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder, named in (("file", "File exists"), ("file/run", "Not a directory")):
+        with pytest.raises(ConfigError, match=f"cannot be made a folder: {named}"):
+            owned(tmp_path / folder, "search").__enter__()
+
+
 def test_two_sweeps_do_not_share_a_folder(tmp_path: Path) -> None:
     with (
         owned(tmp_path, "sweep"),
@@ -252,7 +259,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         (["--vary", "plant.xi"], "write KEY=VALUES"),
         (["--for", "30"], "is for --on robot"),
         (["--on", "robot", "--vary", "plant.xi=1,2"], "keeps its configuration"),
-        (["--on", "robot", "--for", "5"], "too short"),
+        (["--on", "robot", "--for", "5"], "need 20.25 s"),
     ],
 )
 def test_what_cannot_be_swept_is_one_line_before_anything_is_made(
