@@ -1,7 +1,7 @@
 """The verb that compares policies and controllers on the same fish, simulated or live."""
 
-import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,9 +14,10 @@ from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.sweep import ON, refuse_other
 from fishd.client import Fish
-from fishd.config import adopt, load
+from fishd.config import Config, adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
+from fishd.core.interruption import interrupted_once
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -95,10 +96,11 @@ def compare(
 
     In simulation thrust is the true one, and efficiency that over the thrust of the best square
     wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
-    rest, and shows what was measured. ± is the 95 % interval: of a measurement, or of the mean of
-    several runs. |φ_c|/Φ is the mean size of the command, square its mean size over its rms:
-    square wave 1, sine 0.900, triangle 0.866. Exit status 1 when one is refused on this fish, such
-    as a policy for another amplitude, or ends in mode fault; the others swim all the same.
+    rest, and shows what was measured. ± is the 95 % interval of the mean thrust of all runs, from
+    how they differ and, on a robot, from the error of each measurement. |φ_c|/Φ is the mean size
+    of the command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866.
+    Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
+    in mode fault; the others swim all the same.
     """
     of_simulation = {
         "--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides,
@@ -114,11 +116,12 @@ def compare(
     else:
         lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
         outcome = _in_simulation(contestants, file, overrides, *lengths, runs)
+    status = _report(outcome, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
 
         draw(picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
-    return _report(outcome, as_json)
+    return status
 
 
 def _in_simulation(
@@ -130,10 +133,10 @@ def _in_simulation(
     runs: int,
 ) -> _Outcome:
     from fishd.lab.compare import comparison
-    from fishd.lab.compare.contestants import default_contestants, parse, refusal
+    from fishd.lab.compare.contestants import parse, refusal
 
     config = load(file, overrides)
-    chosen = [parse(text) for text in texts] or default_contestants(config)
+    chosen = [parse(text) for text in texts] or _all(config)
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
     able = [one for one in chosen if one not in (out for out, _ in left_out)]
     swum = able or chosen
@@ -143,15 +146,14 @@ def _in_simulation(
 
 
 def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str | None) -> _Outcome:
-    from fishd.lab.compare.contestants import absolute, default_contestants, parse
+    from fishd.lab.compare.contestants import absolute, parse
     from fishd.lab.compare.live import LiveComparison
     from fishd.lab.rig import LiveRig
 
     ended, status = "", 0
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too lets the fish rest
     chosen = [absolute(parse(text)) for text in texts]
-    with Fish(endpoint) as fish:
-        chosen = chosen or default_contestants(adopt(fish.config()))
+    with interrupted_once(), Fish(endpoint) as fish:  # whatever ends it leaves the fish at rest
+        chosen = chosen or _all(adopt(fish.config()))
         unit = fish.status().force_unit
         with LiveRig(fish) as rig, showing(len(chosen) * runs * seconds, "s") as bar:
             live = LiveComparison(rig, chosen)
@@ -168,6 +170,22 @@ def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str |
     )
 
 
+def _all(config: Config) -> "list[Contestant]":
+    """Those that swim where none is named; says which cannot, for want of a package."""
+    from fishd.controllers.policy import library
+    from fishd.lab.compare.contestants import default_contestants
+
+    named = library.names()
+    if named and not (find_spec("onnx") and find_spec("onnxruntime")):
+        echo(
+            f"fishctl: left out, as the extra 'policy' is missing: {', '.join(named)}; where the "
+            "sources of fishd are: pip install --constraint tools/constraints.txt --editable "
+            "'.[policy]'",
+            err=True,
+        )
+    return default_contestants(config)
+
+
 def _report(outcome: _Outcome, as_json: bool) -> int:
     """Print it; gives the exit status."""
     standings = outcome.standings
@@ -177,6 +195,8 @@ def _report(outcome: _Outcome, as_json: bool) -> int:
         from rich.console import Console
 
         Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings, outcome.unit))
+        if said := _of_simulated(standings):
+            echo(said)
     for one, why in outcome.left_out:
         echo(f"fishctl: {one.label}: left out: {why}", err=True)
     for standing in standings:
@@ -195,8 +215,7 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
 
     simulated = all(standing.runs for standing in standings)
     several = simulated and len(standings[0].runs) > 1
-    caption = _of_simulated(standings) if simulated else None
-    table = Table(caption=caption, caption_justify="left", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
     table.add_column("contestant", overflow="fold")
     heads = ["efficiency"] if simulated else []
     heads += ["lowest – highest"] if several else []
@@ -220,7 +239,7 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
 
 
 def _of_simulated(standings: "list[Standing]") -> str | None:
-    """What efficiency is of, where it is the same for all."""
+    """What efficiency is of, where it is the same for all; None on a robot."""
     best = {
         (run.best_square_thrust, run.best_square_frequency)
         for standing in standings

@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import set_option
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
+from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.config import Config, adopt, load
 from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.core.interruption import interrupted_once
 from fishd.core.signals import Tick
+from fishd.recording import RunWriter
+from fishd.recording.folder import find, named
 
 if TYPE_CHECKING:
     from fishd.lab.identification import Estimate, Identification
@@ -40,7 +43,7 @@ _SYMBOLS = {
 
 
 @click.command()
-@click.argument("runs", nargs=-1, type=click.Path(path_type=Path), metavar="[RUN]...")
+@click.argument("runs", nargs=-1, metavar="[RUN]...")
 @click.option("--experiment", is_flag=True, help="Let a fish swim what tells most about it, first.")
 @click.option(
     "--on",
@@ -51,27 +54,28 @@ _SYMBOLS = {
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(min=30.0, max=3600.0),
+    type=FiniteRange(min=30.0, max=3600.0),
     help="With --experiment: how long it takes. [default: 180]",
 )
 @click.option(
     "--record",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="With --experiment: keep its ticks, as a recording.",
+    metavar="RUN",
+    help="With --experiment: keep its ticks, as a recording: a path, or a name in the folder of "
+    "recordings.",
 )
+@folder_option
 @click.option(
     "--config",
     "file",
     type=click.Path(path_type=Path, readable=False),
-    help="Configuration whose plant a fit begins with, and of the simulated fish. [default: that "
-    "of the running fishd for --on robot, else the defaults]",
+    help="Configuration that a fit begins with, and of the simulated fish. [default: that of "
+    "the running fishd for --on robot, else the defaults]",
 )
 @set_option
 @click.option(
     "--fit",
     metavar="NAME,...",
-    help="What to fit; the rest is as in the plant of the configuration. [default: omega0, xi, "
+    help="What to fit; the rest is as in the configuration. [default: omega0, xi, "
     "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_drag, servo_delay, backlash, "
     "rotation; also: cable_slack, servo_dead_zone]",
 )
@@ -91,11 +95,12 @@ _SYMBOLS = {
 @endpoint_option
 @json_option
 def identify(
-    runs: tuple[Path, ...],
+    runs: tuple[str, ...],
     experiment: bool,
     on: str | None,
     seconds: float | None,
-    record: Path | None,
+    record: str | None,
+    folder: Path | None,
     file: Path | None,
     overrides: tuple[str, ...],
     fit: str | None,
@@ -107,7 +112,8 @@ def identify(
 ) -> None:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
 
-    RUN is a recording. Several are fitted together, as one fish. Or let --experiment swim one now.
+    RUN is a path, a name in the folder of recordings, or 'latest'. Several are fitted together, as
+    one fish. Or let --experiment swim one now.
 
     --to writes what `fishd --config` and `fishctl simulate --config` read.
     """
@@ -118,10 +124,9 @@ def identify(
             raise click.UsageError(f"{option} goes with --experiment")
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
-    if record:
-        record = record.with_name(f"{record.name.removesuffix('.mcap')}.mcap")
-        if record.exists():
-            raise FishdError(f"{record}: exists already; --record names another")
+    kept = named(record, folder) if record else None
+    if kept and kept.exists():
+        raise FishdError(f"{kept}: exists already; --record names another")
     if plot:
         from fishd.lab.drawing import check
 
@@ -133,24 +138,34 @@ def identify(
     lab.check(names)  # before minutes of swimming
     if experiment:
         config, fish = _config(on, file, overrides, endpoint)
-        tables: list[Any] = [_swum(config, fish, seconds or 180.0, record)]
-        origin = "an experiment"
+        tables: list[Any] = [_swum(config, fish, seconds or 180.0, kept)]
+        origin = f"an experiment with {_swimmer(on, file, overrides)}"
     else:
-        config, tables = load(file, overrides), list(runs)
-        origin = ", ".join(run.name for run in runs)
-    found = lab.identify(tables, start=config.plant, fit=names)
-    if plot:
-        from fishd.lab.identification.figure import draw
-
-        draw(found, plot)
+        config, tables = load(file, overrides), [find(run, folder) for run in runs]
+        origin = ", ".join(path.name for path in tables)
+    found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names)
     if as_json:
-        print_json(found.to_builtins())
+        print_json(found.to_builtins() | {"origin": origin})
     else:
         _print(found)
+        defaults = experiment and on != "robot" and not file
+        echo(f"from {origin}" + ("; --config names another" if defaults else ""))
     for remark in found.remarks:
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
         _write(target, found.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
+    if plot:
+        from fishd.lab.identification.figure import draw
+
+        draw(found, plot)
+
+
+def _swimmer(on: str | None, file: Path | None, overrides: tuple[str, ...]) -> str:
+    """Which fish swims an experiment, in words."""
+    if on == "robot":
+        return "the fish of fishd"
+    fish = f"the simulated fish of {file}" if file else "the default fish"
+    return f"{fish}, changed by --set" if overrides else fish
 
 
 def _config(
@@ -177,8 +192,6 @@ def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None
     from fishd.lab.rig import LiveRig, Rig, VirtualRig
 
     def keep(ticks: list[Tick]) -> None:
-        from fishd.recording import RunWriter
-
         if record:
             note = "fishctl identify --experiment"
             with RunWriter(record, source=config.robot, note=note) as writer:
@@ -214,7 +227,7 @@ def _print(found: "Identification") -> None:
         echo(line.rstrip())
     echo()
     for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
-        rest = f"noise {channel.noise * 1e3:.2f} mN, drift {channel.drift * 1e3:.1f} mN"
+        rest = f"noise {channel.noise * 1e3:.2f} mN, drift ±{0.5 * channel.drift * 1e3:.1f} mN"
         echo(f"{symbol}: {channel.explained:.3%} of it explained; {rest}")
     parts = "" if found.passages == 1 else f", in {found.passages} parts without a gap"
     echo(f"fitted to {found.seconds:.0f} s of swimming{parts}")

@@ -1,4 +1,7 @@
-"""What a person sees of an experiment: a bar with the time left on a terminal, else lines."""
+"""What a person sees of an experiment: lines of what is done, and a bar with the time left.
+
+The bar goes to standard error, so that the output is clean for a program.
+"""
 
 import sys
 from collections.abc import Iterator
@@ -6,13 +9,14 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from fishd.cli.output import echo
+from fishd.core import text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 
 class Lines:
-    """A line for each thing that is done, for logs and pipes."""
+    """A line for each thing that is done."""
 
     def __init__(self, err: bool) -> None:
         """err: on standard error"""
@@ -27,17 +31,20 @@ class Lines:
 
 
 class Bar(Lines):
-    """The same above a bar."""
+    """The same, above a bar where they are on a terminal, too."""
 
-    def __init__(self, progress: "Progress", task: "TaskID") -> None:
-        super().__init__(err=False)
+    def __init__(self, progress: "Progress", task: "TaskID", err: bool) -> None:
+        super().__init__(err)
         self._progress = progress
         self._task = task
 
     def done(self, line: str, amount: float) -> None:
         """Print the line, move the bar."""
-        echo_above = self._progress.console.print
-        echo_above(line, markup=False, highlight=False, soft_wrap=True)
+        if self._err or sys.stdout.isatty():
+            echo_above = self._progress.console.print
+            echo_above(text.block(line), markup=False, highlight=False, soft_wrap=True)
+        else:
+            super().done(line, amount)
         self.at(amount)
 
     def at(self, amount: float) -> None:
@@ -47,12 +54,11 @@ class Bar(Lines):
 
 @contextmanager
 def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
-    """A bar where it can be seen, else lines.
+    """Lines, and a bar where it can be seen.
 
-    total: in `unit`; err: on standard error, since the output is for a program
+    total: in `unit`; err: the lines are on standard error, since the output is for a program
     """
-    stream = sys.stderr if err else sys.stdout
-    if not stream.isatty():
+    if not sys.stderr.isatty():
         yield Lines(err)
         return
     from rich.console import Console
@@ -72,5 +78,7 @@ def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=Console(file=stream)) as progress:
-        yield Bar(progress, progress.add_task("", total=total))
+    # What is printed elsewhere meanwhile is not the bar's to redirect.
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, redirect_stdout=False) as progress:
+        yield Bar(progress, progress.add_task("", total=total), err)

@@ -83,6 +83,7 @@ def _measure(
     endpoint: str | None,
     as_json: bool,
 ) -> int:
+    from fishd.lab import drawing
     from fishd.lab.measurement import measure as run
     from fishd.lab.measurement import summary
     from fishd.lab.rig import LiveRig, Rig, VirtualRig
@@ -91,6 +92,8 @@ def _measure(
         raise click.UsageError(
             "--config and --set describe a fish in virtual time: --on simulation"
         )
+    if picture:
+        drawing.check(picture)
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())  # whatever ends it leaves the fish at rest
         rig: Rig
@@ -108,16 +111,16 @@ def _measure(
                 return INTERRUPTED
             if found.thrust > found.error and not found.remark:
                 fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
-        if picture:
-            from fishd.lab.measurement_figure import draw
-
-            draw(found, rig.tick, picture)
     if as_json:
         print_json(summary(found, rig.tick))
     else:
         echo(_line(found))
     if found.remark:
         echo(f"fishctl: {found.remark}; measure again with a longer --settle", err=True)
+    if picture:
+        from fishd.lab.measurement_figure import draw
+
+        draw(found, rig.tick, picture)
     return 0
 
 

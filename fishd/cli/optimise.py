@@ -104,12 +104,14 @@ def _optimise(
     endpoint: str | None,
     as_json: bool,
 ) -> int:
+    from fishd.lab import drawing
     from fishd.lab.begun import owned
     from fishd.lab.measurement import REST
     from fishd.lab.optimise.folder import Begun, SearchFolder, draw
     from fishd.lab.optimise.search import Search
     from fishd.lab.optimise.trials import lengths
 
+    drawing.check_installed()
     refuse_other(on, {"--config": file, "--set": overrides}, {})
     path = folder or Path("runs") / f"optimise-{datetime.now():%Y%m%d-%H%M%S}"
     with _fish(on, file, overrides, endpoint) as (rig, config, unit):
@@ -146,14 +148,20 @@ def _optimise(
             else:
                 optimum = replace(optimum, thinking=thinking)
             units = {each: field.unit for each, field in _fields().items()}
-            picture = draw(path, search, found, units, unit)
     except KeyboardInterrupt:
         echo(f"fishctl: stopped before the best was told; to go on: {again(path)}", err=True)
         return INTERRUPTED
-    if as_json:
-        print_json(optimum)
-    else:
-        say(optimum, unit, units, path, picture)
+    try:
+        with interrupted_once():
+            if as_json:
+                print_json(optimum)
+            else:
+                say(optimum, unit, units, path)
+            pictures = draw(path, search, found, units, unit)
+            if not as_json:
+                echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
+    except KeyboardInterrupt:
+        whole = False
     if not whole:
         echo(
             f"fishctl: stopped before its end: this is the best so far; to go on: {again(path)}",

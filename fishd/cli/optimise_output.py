@@ -73,7 +73,7 @@ def optimum_of(name: str, trials: int, last: "Trial", found: "Proposal") -> Opti
     )
 
 
-def say(found: Optimum, unit: str, units: dict[str, str], path: Path, pictures: list[Path]) -> None:
+def say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
     """Show what was found; units: of the parameters, unit: of the force."""
     for name, value in found.parameters.items():
         symbol = "" if units[name] in ("", "1") else f" {units[name]}"
@@ -91,4 +91,3 @@ def say(found: Optimum, unit: str, units: dict[str, str], path: Path, pictures: 
         f"{found.seconds:.0f} s with the rests{thinking}"
     )
     echo(f"table: {path / 'trials.csv'}")
-    echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")

@@ -42,18 +42,17 @@ def _checked(
 )
 @click.option("--control", is_flag=True, help="Find the best command of any shape, too.")
 @click.option(
-    "--figure",
+    "--plot",
+    "picture",
     type=click.Path(path_type=Path, dir_okay=False),
-    default="optimal-control.png",
-    show_default=True,
-    help="File that --control draws into.",
+    help="With --control: draw command, costate and thrust into this file (.png, .svg).",
 )
 @json_option
 @fish_options
 def optimum(
     amplitudes: tuple[float, ...],
     control: bool,
-    figure: Path,
+    picture: Path | None,
     file: Path | None,
     overrides: tuple[str, ...],
     as_json: bool,
@@ -63,7 +62,7 @@ def optimum(
     Shown are the square wave of the best frequency, and the limits of a servo that is fast (the
     wheel follows at once) and slow (it always turns at full speed); Φ_s separates the two. With
     --control, optimal control finds the best periodic command within ±Φ without being told its
-    shape, and draws it with its costate: some seconds.
+    shape: some seconds.
     """
     from fishd.lab import drawing
     from fishd.lab import optimum as lab
@@ -73,17 +72,14 @@ def optimum(
     chosen = amplitudes or (config.amplitude_limit,)
     if control and len(chosen) > 1:
         raise click.UsageError("--control takes one --amplitude at a time")
-    if control:
-        drawing.check(figure)
+    if picture and not control:
+        raise click.UsageError("--plot draws what --control finds: give both")
+    if picture:
+        drawing.check(picture)
     best = lab.best_square_waves(plant, chosen)
     fast, slow = lab.fast_servo(plant, chosen), lab.slow_servo(plant, chosen)
     limit = lab.saturation_amplitude(plant)
-    found = None
-    if control:
-        from fishd.lab.optimum.figure import draw
-
-        found = lab.optimal_control(plant, chosen[0])
-        draw(found, figure)
+    found = lab.optimal_control(plant, chosen[0]) if control else None
     for k, amplitude in enumerate(chosen):
         warn_of_fin(best.fin_amplitude[k], f" at ±{amplitude:g} rad")
     if as_json:
@@ -93,19 +89,23 @@ def optimum(
             | {"saturation_amplitude": limit}
             | ({"optimal_control": _plain(vars(found))} if found else {})
         )
-        return
-    for k, amplitude in enumerate(chosen):
-        echo_rows(
-            [
-                ("amplitude", f"±{amplitude:g} rad, {amplitude / limit:.2f} of Φ_s = Ω/ω₀"),
-                ("best square", _row(best, k)),
-                ("fast servo", _row(fast, k)),
-                ("slow servo", _row(slow, k)),
-            ]
-        )
-    if found:
-        echo_rows(_control_rows(found, figure))
-    _say_what_is_left_out(plant, control)
+    else:
+        for k, amplitude in enumerate(chosen):
+            echo_rows(
+                [
+                    ("amplitude", f"±{amplitude:g} rad, {amplitude / limit:.2f} of Φ_s = Ω/ω₀"),
+                    ("best square", _row(best, k)),
+                    ("fast servo", _row(fast, k)),
+                    ("slow servo", _row(slow, k)),
+                ]
+            )
+        if found:
+            echo_rows(_control_rows(found))
+        _say_what_is_left_out(plant, control)
+    if found and picture:
+        from fishd.lab.optimum.figure import draw
+
+        draw(found, picture)
 
 
 def _row(optima: "Optima", k: int) -> str:
@@ -115,13 +115,12 @@ def _row(optima: "Optima", k: int) -> str:
     )
 
 
-def _control_rows(found: "OptimalControl", figure: Path) -> list[tuple[str, str]]:
+def _control_rows(found: "OptimalControl") -> list[tuple[str, str]]:
     return [
         ("control", f"{1e3 * found.thrust:.3f} mN at {found.frequency:.3f} Hz"),
         ("", f"{found.ratio:.2%} of the best square wave"),
         ("", f"|φ_c| = Φ in {found.full:.1%} of the time"),
         ("", f"on the side of the costate in {found.agreement:.1%} of the time"),
-        ("figure", str(figure)),
     ]
 
 

@@ -38,6 +38,19 @@ def daemon_options(function: F) -> F:
     return endpoint_option(json_option(function))
 
 
+class FiniteRange(click.FloatRange):
+    """A number within bounds, and neither `nan` nor `inf`, which click's own range lets through."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Text to number."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"'{value}' is not valid: a finite number is needed", param, ctx)
+        return number
+
+
 class ParameterType(click.ParamType[Any]):
     """A value for one parameter of a controller; whether it is in range the daemon decides."""
 

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
+from msgspec.structs import replace
 
 from fishd.cli.config import set_option
 from fishd.cli.options import ControllerGroup, endpoint_option, json_option
 from fishd.cli.sweep_output import again, conclude, telling
 from fishd.client import Fish
 from fishd.config import Config, load
+from fishd.controllers.base import Limits
 from fishd.core.errors import ConfigError, FishdError, NoDaemon
 from fishd.core.signals import ControllerInfo
 
@@ -110,8 +112,10 @@ def _sweep(
     endpoint: str | None,
     as_json: bool,
 ) -> int:
+    from fishd.lab import drawing
     from fishd.lab.sweep import grid
 
+    drawing.check_installed()
     of_simulation = {
         "--config": file, "--set": overrides, "--vary": vary, "--settle": settle,
         "--periods": periods, "--jobs": jobs, "--cluster": cluster,
@@ -145,13 +149,13 @@ def refuse_other(on: str, of_simulation: dict[str, Any], of_robot: dict[str, Any
             raise click.UsageError(f"{name} {where}")
 
 
-def _varied(text: str) -> tuple[str, list[str]]:
-    from fishd.lab.sweep.grid import spread
+def _varied(text: str) -> tuple[str, list[Any]]:
+    from fishd.lab.sweep.grid import spread, typed
 
     key, equals, values = text.partition("=")
     if not (equals and key.strip()):
         raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.6,1.2,2.4")
-    return key.strip(), spread(values)
+    return key.strip(), list(dict.fromkeys(map(typed, spread(values))))
 
 
 def _in_simulation(
@@ -174,7 +178,7 @@ def _in_simulation(
         changed = tuple(point.keys.items())
         if changed not in fish:
             fish[changed] = _fish_of(point, file, overrides)
-        grid.check(point, fish[changed])
+        grid.check(point, replace(fish[changed].limits, virtual=True))
         pairs.append((point, fish[changed]))
     config = msgspec.to_builtins(load(file, overrides))
     begun = Begun("simulation", config, msgspec.to_builtins(lengths))
@@ -202,14 +206,15 @@ def _on_robot(
 ) -> "tuple[bool, SweepFolder]":
     from fishd.lab.measurement import plan
     from fishd.lab.rig import Disturbed, LiveRig
-    from fishd.lab.sweep import running
+    from fishd.lab.sweep import grid, running
     from fishd.lab.sweep.folder import Begun
 
     for point in found:
         plan(seconds, point.parameters)  # which says that it is too short, before anything moves
     with Fish(endpoint) as fish:
-        unit = fish.status().force_unit
-        begun = Begun("robot", fish.config(), {"seconds": seconds}, unit)
+        status = fish.status()
+        grid.check_remote(found, Limits(status.amplitude_limit, status.tick))
+        begun = Begun("robot", fish.config(), {"seconds": seconds}, status.force_unit)
         with (
             _opened(path, begun, found) as folder,
             telling(folder, found, "s", seconds, err) as count,

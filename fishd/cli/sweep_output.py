@@ -70,7 +70,7 @@ def conclude(
     whole: bool,
     as_json: bool,
 ) -> int:
-    """Draw what there is, and say what is best; the exit status."""
+    """Say what is best, and draw what there is; the exit status."""
     from fishd.lab.sweep import curves, figure
 
     drawn = curves.curves(folder, found)
@@ -80,10 +80,6 @@ def conclude(
         for curve in drawn
         if (best := curves.best(curve))
     ]
-    pictures = []
-    if bests:
-        stem = folder.path / "thrust"
-        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
     if as_json:
         print_json([best for _, best in bests])
     else:
@@ -92,7 +88,10 @@ def conclude(
             if best.whole_ticks:
                 echo(f"{curve.label}, of whole ticks: {_measured(best.whole_ticks, unit)}")
         echo(f"table: {folder.path / 'points.csv'}")
-        if pictures:
+    if any(curve.peak for curve in drawn):
+        stem = folder.path / "thrust"
+        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
+        if not as_json:
             echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
     fins = [
         (result.fin_amplitude or 0.0, point.label())
@@ -118,6 +117,8 @@ def _proposal(best: "Best", unit: str, force_unit: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
     error = "" if best.error is None else f" ± {best.error * 1e3:.2f}"
     thrust = f"{best.thrust * 1e3:.2f}{error} m{force_unit}"
+    if best.x is None:
+        return thrust
     if best.at_edge:
         return (
             f"best measured at {best.over} {best.x:g}{symbol}, {thrust}: at the edge of the grid, "

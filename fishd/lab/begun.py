@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
+from fishd import __version__
 from fishd.core import files
 from fishd.core.errors import ConfigError
 from fishd.core.files import FileProblem, write_atomically
@@ -59,16 +60,34 @@ def _check_same(file: Path, begun: Struct, what: str) -> None:
     except FileProblem as problem:
         raise ConfigError(f"{file}: {problem}") from None
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"{file}: no {what} began so: {error}") from None
-    before, now = (_leaves(msgspec.to_builtins(each)) for each in (data, begun))
+        raise ConfigError(
+            f"{file}: not as this fishd ({__version__}) writes it: {error}; give another --folder"
+        ) from None
+    before, now = (_relevant(each) for each in (data, begun))
     for key in dict.fromkeys([*before, *now]):
-        if key == "version" or key.removeprefix("config.").partition(".")[0] in OTHERS:
-            continue
-        if before.get(key) != now.get(key):
+        known = (key in before and key in now) or not key.startswith("config.")
+        if known and before.get(key) != now.get(key):
             raise ConfigError(
                 f"{file}: this {what} was begun with {key} = {before.get(key)}, now it is "
                 f"{now.get(key)}; give the same, or another --folder"
             )
+    if others := [key for key in (*before, *now) if not (key in before and key in now)]:
+        version = getattr(data, "version", __version__)
+        who = f"fishd {version}" if version != __version__ else "another fishd"
+        has = "has" if others[0] in before else "has no"
+        raise ConfigError(
+            f"{file}: this {what} was begun with {who}, whose configuration {has} {others[0]}, "
+            "unlike that of now; give another --folder"
+        )
+
+
+def _relevant(begun: Struct) -> dict[str, Any]:
+    """What thrust depends on, by dotted keys."""
+    return {
+        key: value
+        for key, value in _leaves(msgspec.to_builtins(begun)).items()
+        if key != "version" and key.removeprefix("config.").partition(".")[0] not in OTHERS
+    }
 
 
 def _leaves(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -37,13 +37,18 @@ _STYLE: dict[Any, Any] = {
 }
 
 
+def check_installed() -> None:
+    """Raise `MissingPackage` without matplotlib (extra: lab)."""
+    if find_spec("matplotlib") is None:
+        raise MissingPackage(_MISSING)
+
+
 def check(path: str | os.PathLike[str]) -> None:
     """Raise `FishdError` where no figure can be written there, before anything is computed.
 
     Raises `MissingPackage` without matplotlib (extra: lab).
     """
-    if find_spec("matplotlib") is None:
-        raise MissingPackage(_MISSING)
+    check_installed()
     file = Path(path)
     if file.suffix.lower() not in FORMATS:
         kind = file.suffix or "without a suffix"

@@ -12,7 +12,7 @@ from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTL
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
-from fishd.lab.rig import Rig
+from fishd.lab.rig import Rig, refuse_lost
 
 SWIM, REST = 6.0, 2.75
 """How long the fish swims and rests in turn [s]."""
@@ -81,12 +81,15 @@ def measure(
     progress: called with the time that has passed [s]
     settle: how long the fin takes until it swims steadily, or hangs still as before [s]
 
-    Raises `ParameterError` for a time that is too short, `Disturbed`, and what `Rig.swim` raises.
+    Raises `ParameterError` for a time that is too short, `Disturbed` (also where many ticks were
+    lost on their way), and what `Rig.swim` raises.
     """
     ticks: list[Tick] = []
-    for swims, length in plan(seconds, parameters, settle):
+    phases = plan(seconds, parameters, settle)
+    for swims, length in phases:
         ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
         progress(len(ticks) * rig.tick)
+    refuse_lost(ticks, (length for _, length in phases), rig.tick)
     found = evaluate(samples_of(ticks), rig.tick, settle, _still(settle))
     return found._replace(
         controller=controller, parameters=dict(parameters), ticks=ticks, unit=rig.unit
@@ -291,15 +294,17 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
             continue
         # A force is that of the window before its tick, an angle that of the one after it.
         window = phase[start + 1 : end + 1]
+        counted, beats, begun = beats, 0, index
+        if phase[end].seq - phase[start].seq != len(window):  # a tick was lost: no whole beats
+            continue
         yield _Block(
             time=(0.5 * (phase[start].seq + phase[end].seq) - first) * tick,
             lasts=len(window) * tick,
             force=sum(each.fx for each in window) / len(window),
             power=sum(each.fin_velocity**2 for each in window) / len(window),
-            beats=beats if beating else 0,
+            beats=counted if beating else 0,
             swims=swims,
         )
-        begun, beats = index, 0
 
 
 def _reversals(phase: list[Sample]) -> list[int]:

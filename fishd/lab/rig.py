@@ -1,14 +1,24 @@
 """A fish that an experiment tells to swim and to rest: of a running fishd, or in virtual time."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
 from fishd.client import Fish
 from fishd.config import Config
-from fishd.core.errors import FishdError, FishError
+from fishd.core.errors import (
+    FishdError,
+    FishError,
+    ParameterError,
+    PolicyError,
+    Refused,
+    UnknownController,
+)
 from fishd.core.signals import Reason, Tick
 from fishd.simulation import KeepingPublisher, VirtualRun
+
+LOST = 0.02
+"""A measurement may miss this share of its ticks."""
 
 
 class Disturbed(FishdError):
@@ -17,6 +27,34 @@ class Disturbed(FishdError):
 
 class Replaced(Disturbed):
     """The controller gave up and another one took over, which the experiment did not ask for."""
+
+
+_OF_ONE = ("bad-parameter", "controller-error", "too-slow", "unknown-controller")
+
+
+def is_of_one(error: FishdError) -> bool:
+    """Does it concern one controller with its parameters only, so that the next one may swim?"""
+    if isinstance(error, Refused):
+        return error.code in _OF_ONE
+    return isinstance(error, Replaced | ParameterError | PolicyError | UnknownController)
+
+
+def refuse_lost(ticks: Sequence[Tick], lengths: Iterable[float], tick: float) -> None:
+    """Raise `Disturbed` where too many of the ticks of a measurement did not arrive.
+
+    lengths: of its swims and rests [s]; tick: period of the loop [s]
+    """
+    expected = sum(_count(length, tick) for length in lengths)
+    lost = expected - len(ticks)
+    if lost > LOST * expected:
+        raise Disturbed(
+            f"{lost} of {expected} ticks were lost on their way from fishd, more than {LOST:.0%}: "
+            "this measurement is lost"
+        )
+
+
+def _count(seconds: float, tick: float) -> int:
+    return max(1, round(seconds / tick))
 
 
 class Rig(Protocol):
@@ -80,7 +118,7 @@ class VirtualRig:
     def _pass(self, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
         self._kept.ticks = ticks
-        for _ in range(max(1, round(seconds / self.tick))):
+        for _ in range(_count(seconds, self.tick)):
             self._run.tick()
             loop = self._run.loop
             _check(ticks[-1], controller, loop.supervisor.reason, loop.active.fallback)
@@ -88,7 +126,10 @@ class VirtualRig:
 
 
 class LiveRig:
-    """The fish of a running fishd; its controller is ours until somebody else takes it."""
+    """The fish of a running fishd; its controller is ours until somebody else takes it.
+
+    A few ticks that are lost on their way are missing in what it returns.
+    """
 
     def __init__(self, fish: Fish) -> None:
         """Raises `NoDaemon`."""
@@ -99,25 +140,36 @@ class LiveRig:
         self.amplitude = status.amplitude_limit
         self._fish = fish
         self._ticks = fish.ticks()
+        self._pid = status.pid
+        self._latest = 0
+        """Number of the latest tick that came."""
         self._controller: str | None = None
+        self._asked = False
+        """Was a controller asked for, and nothing heard of it since?"""
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop what was begun here; what somebody else has begun since swims on."""
-        if self._controller is None:
-            return
         with suppress(FishError):
-            status = self._fish.status()
-            ours = status.controller == self._controller or status.fallback
-            if status.mode == "running" and ours:
+            if self._asked:  # it may be loading still, and swim later
                 self._fish.stop()
+            elif self._controller is not None:
+                status = self._fish.status()
+                ours = status.controller == self._controller or status.fallback
+                if status.mode == "running" and ours:
+                    self._fish.stop()
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         """As `Rig.swim`; raises `NoDaemon` where fishd goes away."""
-        state = self._fish.set_controller(controller, **parameters)
-        self._controller = controller
+        self._asked = True
+        try:
+            state = self._fish.set_controller(controller, **parameters)
+        except Refused:
+            self._asked = False
+            raise
+        self._controller, self._asked = controller, False
         return self._pass(state.seq, seconds, controller)
 
     def rest(self, seconds: float) -> list[Tick]:
@@ -128,17 +180,36 @@ class LiveRig:
 
     def _pass(self, first: int, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
-        count = max(1, round(seconds / self.tick))
+        end = first + _count(seconds, self.tick)
+        if first <= self._latest:
+            raise _restarted()
         for tick in self._ticks:
-            if not first <= tick.seq < first + 2 * count:  # of before, or of another fishd
+            self._check_same_fishd(tick)
+            if tick.seq < first:
                 continue
             if not _as_told(tick, controller):
                 status = self._fish.status()
                 _check(tick, controller, status.reason, status.fallback)
-            ticks.append(tick)
-            if tick.seq >= first + count - 1:
+            if tick.seq < end:
+                ticks.append(tick)
+            if tick.seq >= end - 1:
                 break
+        if not ticks:
+            refuse_lost(ticks, (seconds,), self.tick)
         return ticks
+
+    def _check_same_fishd(self, tick: Tick) -> None:
+        """Raise `Disturbed` where this tick is of another fishd than the first one."""
+        before, self._latest = self._latest, tick.seq
+        if tick.seq <= before:
+            raise _restarted()
+        # One that was restarted soon after its start may have got further meanwhile.
+        if before and tick.seq > before + 1 and self._fish.status().pid != self._pid:
+            raise _restarted()
+
+
+def _restarted() -> Disturbed:
+    return Disturbed("fishd was restarted: this measurement is lost")
 
 
 def _as_told(tick: Tick, controller: str | None) -> bool:

@@ -11,7 +11,14 @@ from fishd.core import text
 from fishd.core.errors import RecordingError
 from fishd.core.files import write_atomically
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
-from fishd.lab.run_traces import PORTRAIT, Traces
+from fishd.lab.run_traces import (
+    LEAST_ANGLE,
+    LEAST_FORCE,
+    LEAST_QUANTITY,
+    PORTRAIT,
+    Traces,
+    limits,
+)
 
 _PORTRAIT_HEIGHT = 2
 """Of the phase portrait, in rows of the others."""
@@ -20,29 +27,39 @@ _PORTRAIT_HEIGHT = 2
 def page(traces: Traces, path: str | os.PathLike[str]) -> None:
     """Write the page; raises `RecordingError` where it cannot be."""
     titles = ["forces", "command", "thrust", *map(text.quoted, traces.quantities)]
-    rows = len(titles) + 1
+    heights = [1] * len(titles)
+    if traces.portrait:
+        titles.append(f"phase portrait, last {PORTRAIT:g} s of swimming")
+        heights.append(_PORTRAIT_HEIGHT)
+    rows = len(titles)
     figure = make_subplots(
         rows=rows,
         cols=1,
-        row_heights=[1] * (rows - 1) + [_PORTRAIT_HEIGHT],
+        row_heights=heights,
         vertical_spacing=0.3 / rows,
-        subplot_titles=[*titles, f"phase portrait, last {PORTRAIT:g} s of swimming"],
+        subplot_titles=titles,
     )
     _lines(figure, traces)
-    _portrait(figure, traces, rows)
-    for row in range(1, rows):
+    over_time = len(heights) - bool(traces.portrait)
+    if traces.portrait:
+        _portrait(figure, traces, traces.portrait, rows)
+    for row in range(1, over_time + 1):
         figure.update_xaxes(matches="x", row=row, col=1)
-    figure.update_xaxes(title_text="time (s)", row=rows - 1, col=1)
-    for time, event in traces.events:
-        said = text.line(event.message, 60) if event.kind == "mark" else event.kind
+    figure.update_xaxes(title_text="time (s)", row=over_time, col=1)
+    for event in traces.events:
         colour = PURPLE if event.kind == "mark" else "grey"
-        figure.add_vline(time, line={"color": colour, "width": 1, "dash": "dot"}, row="all")
+        figure.add_vline(event.time, line={"color": colour, "width": 1, "dash": "dot"}, row="all")
         figure.add_annotation(
-            x=time, y=1, yref="y domain", text=_escaped(said), showarrow=False, xanchor="left"
+            x=event.time,
+            y=1,
+            yref="y domain",
+            text=_escaped(event.text),
+            showarrow=False,
+            xanchor="left",
         )
     figure.update_layout(
         title=_escaped(text.line(traces.title)),
-        height=190 * (rows + _PORTRAIT_HEIGHT),
+        height=190 * (1 + sum(heights)),
         template="plotly_white",
         hovermode="x unified",
     )
@@ -77,19 +94,25 @@ def _lines(figure: Figure, traces: Traces) -> None:
         add(3, f"{'−+'[sign > 0]} 95 %", edge, BLUE, dash="dot")
     for row, (name, values) in enumerate(traces.quantities.items(), start=4):
         add(row, _escaped(text.quoted(name)), values, GREEN)
-    figure.update_yaxes(title_text=traces.unit, row=1, col=1)
-    figure.update_yaxes(title_text="rad", row=2, col=1)
-    figure.update_yaxes(title_text=traces.unit, row=3, col=1)
+        figure.update_yaxes(range=limits(LEAST_QUANTITY, values), row=row, col=1)
+    error = traces.thrust_error
+    angles = [traces.phi_c] if traces.alpha is None else [traces.phi_c, traces.alpha]
+    ends = (
+        (traces.unit, limits(LEAST_FORCE, traces.fx, traces.fy)),
+        ("rad", limits(LEAST_ANGLE, *angles)),
+        (traces.unit, limits(LEAST_FORCE, *(traces.thrust + k * error for k in (-1, 0, 1)))),
+    )
+    for row, (unit, span) in enumerate(ends, start=1):
+        figure.update_yaxes(title_text=unit, range=span, row=row, col=1)
 
 
-def _portrait(figure: Figure, traces: Traces, row: int) -> None:
+def _portrait(figure: Figure, traces: Traces, chosen: slice, row: int) -> None:
     if traces.alpha is not None and traces.alpha_rate is not None:
         across, up = traces.alpha, traces.alpha_rate
         names = "true fin angle α (rad)", "its rate (rad/s)"
     else:
         across, up = traces.fin_velocity, traces.fy
         names = "fin velocity, as estimated", f"F_y ({traces.unit})"
-    chosen = traces.portrait
     line = Scattergl(
         x=across[chosen],
         y=up[chosen],

@@ -1,23 +1,41 @@
 """What the figures of a recording are drawn from: arrays against time, with a break at each gap."""
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from fishd.core.errors import RecordingError
+from fishd.controllers import registry
+from fishd.core import text
+from fishd.core.errors import RecordingError, UnknownController
 from fishd.core.signals import Event, Tick
 from fishd.recording import Run
 
 PORTRAIT = 20.0
 """The phase portrait is of so much swimming, the latest [s]."""
+LEAST_FORCE, LEAST_ANGLE, LEAST_QUANTITY = 1.0, 0.1, 1e-3
+"""No axis spans less, so that numerical dust does not look like a signal [mN or mV, rad, any]."""
 SHOWN = ("mark", "controller", "parameters", "fallback", "fault", "calibration")
 """Kinds of event that a figure shows."""
 
+LONGEST_TEXT = 48
+"""Of an event [characters]."""
+
 Array = NDArray[np.float64]
+
+
+class Shown(NamedTuple):
+    """An event in a figure."""
+
+    time: float
+    """As `Traces.time` [s]."""
+    kind: str
+    text: str
+    """Which controller, which parameters changed to what, or what a mark says."""
 
 
 class Traces(NamedTuple):
@@ -45,11 +63,10 @@ class Traces(NamedTuple):
     alpha_rate: Array | None
     """True fin angle and its rate, of a simulated fish [rad, rad/s]."""
     quantities: dict[str, Array]
-    """The controller's own."""
-    portrait: slice
-    """The samples of the phase portrait."""
-    events: list[tuple[float, Event]]
-    """Events, and when they were, as `time`."""
+    """The controller's own, by name and unit, as in `since_reversal (s)`."""
+    portrait: slice | None
+    """The samples of the phase portrait; None where no controller swam."""
+    events: list[Shown]
 
 
 def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
@@ -65,10 +82,13 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         found = (value(row) if isinstance(row, Tick) else math.nan for row in rows)
         return np.array([math.nan if v is UNSET else v for v in found], dtype=float)
 
+    def quantity(name: str) -> Array:
+        return column(lambda tick: _quantities(tick).get(name, math.nan))
+
     simulated = chosen[0].alpha is not UNSET
     time = np.array([(row.t if isinstance(row, Tick) else row) - first for row in rows])
     swims = [index for index, row in enumerate(rows) if isinstance(row, Tick) and _swims(row)]
-    last = swims[-1] if swims else len(rows) - 1
+    units = _units({tick.controller for tick in chosen})
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
     return Traces(
         title=_title(run),
@@ -83,17 +103,60 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         fin_velocity=column(lambda tick: tick.fin_velocity),
         alpha=column(lambda tick: tick.alpha) if simulated else None,
         alpha_rate=column(lambda tick: tick.alpha_rate) if simulated else None,
-        quantities={
-            name: column(lambda tick, name=name: _quantities(tick).get(name, math.nan))  # type: ignore[misc]
-            for name in names
-        },
-        portrait=slice(int(np.searchsorted(time, time[last] - PORTRAIT)), last + 1),
-        events=[
-            (event.t - first, event)
-            for event in run.events
-            if event.kind in SHOWN and begin <= event.t - first <= end
-        ],
+        quantities={f"{name} ({units.get(name, '1')})": quantity(name) for name in names},
+        portrait=_portrait(time, swims),
+        events=[each for each in _shown(run.events, first) if begin <= each.time <= end],
     )
+
+
+def limits(least: float, *curves: Array) -> tuple[float, float]:
+    """Ends of an axis with room for these curves, and of a span that is not less than `least`."""
+    values = np.concatenate(curves)
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    room = max(0.05 * (high - low), (least - (high - low)) / 2)
+    return low - room, high + room
+
+
+def _portrait(time: Array, swims: list[int]) -> slice | None:
+    if not swims:
+        return None
+    last = swims[-1]
+    return slice(int(np.searchsorted(time, time[last] - PORTRAIT)), last + 1)
+
+
+def _units(controllers: Iterable[str]) -> dict[str, str]:
+    """Units of the quantities of these controllers, as far as they are installed here."""
+    units: dict[str, str] = {}
+    for name in sorted(controllers):
+        with suppress(UnknownController):
+            units |= {each.name: each.unit for each in registry.describe(name).quantities}
+    return units
+
+
+def _shown(events: Iterable[Event], first: float) -> Iterator[Shown]:
+    before: dict[str, Any] = {}
+    for event in events:
+        if event.kind not in SHOWN:
+            continue
+        words, parameters = event.kind, event.data.get("parameters")
+        if isinstance(parameters, dict):
+            takes_over = event.kind != "parameters"
+            changed = {
+                name: value
+                for name, value in parameters.items()
+                if (value is not None if takes_over else value != before.get(name))
+            }
+            who = [str(event.data.get("controller", event.kind))] if takes_over else []
+            settings = (
+                f"{name}={'default' if value is None else value}" for name, value in changed.items()
+            )
+            words, before = " ".join((*who, *settings)) or event.kind, parameters
+        elif event.kind == "mark":
+            words = event.message
+        elif event.kind == "fault":
+            words = f"fault {event.data.get('code', '')}".strip()
+        yield Shown(event.t - first, event.kind, text.line(words, LONGEST_TEXT))
 
 
 def _with_breaks(ticks: list[Tick]) -> list[Tick | float]:

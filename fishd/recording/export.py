@@ -10,6 +10,7 @@ import pyarrow.parquet
 
 from fishd.core.errors import RecordingError
 from fishd.core.files import write_atomically
+from fishd.recording.folder import check_new
 from fishd.recording.reader import Run
 
 Format = Literal["csv", "parquet"]
@@ -26,9 +27,7 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
     """
     tables = {folder / f"{run.name}.{form}": run.frame()}
     tables[folder / f"{run.name}-events.{form}"] = _events(run)
-    for path in tables:
-        if path.exists() and not replace:
-            raise RecordingError(f"{path} is there already; --force replaces it")
+    check_new(tables, replace=replace)
     about = msgspec.json.encode({"about": run.about, "configs": run.configs})
     for path, table in tables.items():
         try:

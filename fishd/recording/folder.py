@@ -1,17 +1,14 @@
 """The folder of recordings: where it is, what is in it, and which recording a name means."""
 
 import os
-import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-
 from fishd.core.errors import RecordingError
 from fishd.core.schema import nearest
+from fishd.recording.mcap_file import metadata
 from fishd.recording.part_file import PART, SUFFIX, is_being_written
 from fishd.recording.reader import open_run
 from fishd.recording.summary import Summary, from_metadata
@@ -32,6 +29,8 @@ class Glance(NamedTuple):
     finished: bool
     writing: bool
     """True while some process still writes it."""
+    damaged: int | None = None
+    """How many ticks cannot be read; None where nothing is damaged."""
 
 
 def runs_folder() -> Path:
@@ -58,6 +57,13 @@ def made(folder: Path) -> Path:
     return folder
 
 
+def check_new(paths: Iterable[Path], *, replace: bool) -> None:
+    """Raise `RecordingError` where one of these is there already, unless it may be replaced."""
+    for path in paths:
+        if path.exists() and not replace:
+            raise RecordingError(f"{path} is there already; --force replaces it")
+
+
 def new_path(folder: Path, prefix: str = "") -> Path:
     """A path for a recording that begins now, named after the date and time of this place."""
     name = f"{prefix}{datetime.now():%Y-%m-%d-%H%M%S}"
@@ -66,6 +72,17 @@ def new_path(folder: Path, prefix: str = "") -> Path:
         number += 1
         path = folder / f"{name}-{number}{SUFFIX}"
     return path
+
+
+def named(run: str, folder: Path | None = None) -> Path:
+    """The path of a new recording: as given where it has a `/`, else in the folder of recordings.
+
+    `.mcap` is added where it is missing, and that folder is made; raises `RecordingError`.
+    """
+    if Path(run).name in ("", ".."):  # "/", "." and their like
+        raise RecordingError(f"'{run}' is no name of a recording")
+    path = Path(run).expanduser() if "/" in run else made(folder or runs_folder()) / run
+    return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 
 
 def paths(folder: Path) -> list[Path]:
@@ -116,28 +133,15 @@ def glances(folder: Path) -> Iterator[Glance | RecordingError]:
 
 
 def glance(path: Path) -> Glance:
-    """A recording in short; at once where it is finished. Raises `RecordingError`."""
-    found = _from_index(path)
-    if found is not None:
-        return found
+    """A recording in short; soon where it is finished and whole. Raises `RecordingError`."""
+    said = metadata(path) or {}
+    summary = from_metadata(said.get("fishd.end", {}))
+    if summary is not None and "fishd.run" in said:
+        return Glance(name_of(path), path, said["fishd.run"], summary, True, False)
     run = open_run(path)
     writing = is_being_written(path)
-    return Glance(run.name, path, run.about, run.summary, run.finished, writing)
-
-
-def _from_index(path: Path) -> Glance | None:
-    """What the index at the end of a finished recording leads to; None without one."""
-    try:
-        with path.open("rb") as file:
-            metadata = {each.name: each.metadata for each in make_reader(file).iter_metadata()}
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-    except (McapError, ValueError, struct.error):  # no end, or a damaged one
-        return None
-    summary = from_metadata(metadata.get("fishd.end", {}))
-    if summary is None or "fishd.run" not in metadata:
-        return None
-    return Glance(name_of(path), path, metadata["fishd.run"], summary, True, False)
+    damaged = run.damaged if run.is_damaged else None
+    return Glance(run.name, path, run.about, run.summary, run.finished, writing, damaged)
 
 
 def _modified(path: Path) -> float:

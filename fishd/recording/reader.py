@@ -1,7 +1,6 @@
 """Reads recordings, also one that was never finished: a kill leaves whole chunks."""
 
 import os
-import struct
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -9,19 +8,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
 import yaml
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader
-from zstandard import ZstdError
+from mcap.records import Attachment, Channel, Footer, Message, Metadata
 
 from fishd.config import Config, adopt
 from fishd.core.errors import ConfigError, RecordingError
 from fishd.core.frames import frame
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording.mcap_file import Damaged, records
 from fishd.recording.part_file import PART, SUFFIX
 from fishd.recording.schemas import CHANNELS
-from fishd.recording.summary import Gap, Summary, Tally
+from fishd.recording.summary import Gap, Summary, Tally, from_metadata
 from fishd.recording.writer import CALIBRATIONS, CONFIG
 
 if TYPE_CHECKING:
@@ -29,8 +26,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-LONGEST_RECORD = 2**28
-"""No record of a recording is longer; what says so is damaged [bytes]."""
+TOPICS = dict(enumerate(CHANNELS, start=1))
+"""Topics of channels as `RunWriter` numbers them, for a file in which that part is damaged."""
 
 
 class Entry(NamedTuple):
@@ -61,6 +58,10 @@ class Run:
         """False where the recording was not ended, or is still being written."""
         self.reason = ""
         """Why it ended; empty unless it is finished."""
+        self._ended: Summary | None = None
+        """As it was when the recording ended."""
+        self._damages: list[int] = []
+        """How many ticks come before each damaged part that was skipped."""
         self.entries: list[Entry] = []
         """All messages in the order in which they came."""
         self._scan()
@@ -123,6 +124,24 @@ class Run:
         """The recording in numbers."""
         return self._tally.summary
 
+    @property
+    def is_damaged(self) -> bool:
+        """Are there parts that cannot be read?"""
+        return bool(self._damages)
+
+    @cached_property
+    def damaged(self) -> int:
+        """How many ticks were in them, as far as anything tells; raises `RecordingError`.
+
+        Between two ticks they are in `gaps`, too.
+        """
+        if not self._damages:
+            return 0
+        if self._ended is not None:
+            return max(0, self._ended.ticks - len(self.ticks))
+        around = [self.ticks[at - 1 : at + 1] for at in set(self._damages) if at]
+        return sum(max(0, pair[1].seq - pair[0].seq - 1) for pair in around if len(pair) == 2)
+
     @cached_property
     def _tally(self) -> Tally:
         tally = Tally()
@@ -135,19 +154,26 @@ class Run:
         return frame(self.ticks)
 
     def _scan(self) -> None:
-        topics: dict[int, str] = {}
+        topics = dict(TOPICS)
+        ticks = 0
         for record in records(self.path):
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
-                if (topic := topics.get(record.channel_id)) in CHANNELS:
+                if (topic := topics.get(record.channel_id, "")) in CHANNELS:
                     self.entries.append(Entry(topic, record.data))
+                    ticks += topic == "tick"
+            elif isinstance(record, Damaged):
+                self._damages.append(ticks)
             elif isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Metadata):
                 self._take_metadata(record.name, record.metadata)
             elif isinstance(record, Attachment):
-                self._take_attachment(record.name, record.data)
-        if not self.about:
+                try:
+                    self._take_attachment(record.name, record.data)
+                except (yaml.YAMLError, msgspec.DecodeError, ValueError, LookupError):
+                    self._damages.append(ticks)
+        if not self.about and not (self.is_damaged and self.entries):
             raise RecordingError(f"{self.path} is an MCAP file, but no recording of fishd")
 
     def _take_metadata(self, name: str, data: dict[str, str]) -> None:
@@ -156,7 +182,7 @@ class Run:
         elif name == "fishd.daemon":
             self.daemons.append(data)
         elif name == "fishd.end":
-            self.reason = data.get("reason", "")
+            self.reason, self._ended = data.get("reason", ""), from_metadata(data)
 
     def _take_attachment(self, name: str, data: bytes) -> None:
         if name == CONFIG:
@@ -186,24 +212,3 @@ def read(path: str | os.PathLike[str]) -> "DataFrame":
 def open_run(path: str | os.PathLike[str]) -> Run:
     """A recording, finished or not; raises `RecordingError`."""
     return Run(Path(path))
-
-
-def records(path: Path) -> Iterator[McapRecord]:
-    """All records of an MCAP file; one that was cut off ends with its last whole chunk.
-
-    Raises `RecordingError`.
-    """
-    begun = False
-    try:
-        with path.open("rb") as file:
-            try:
-                reader = StreamReader(file, validate_crcs=True, record_size_limit=LONGEST_RECORD)
-                for record in reader.records:
-                    begun = True
-                    yield record
-            except (McapError, ZstdError, struct.error, ValueError):
-                pass  # it was not finished, or is damaged from here on
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-    if not begun:
-        raise RecordingError(f"{path} is no MCAP file")

@@ -71,6 +71,8 @@ class Recorder:
         self._described: Description | None = None
         self._seq = 0
         self._gone = False
+        self._refused = 0
+        """Messages that are none of fishd's."""
         self.reason = "stopped"
         """Why the recording ended, as the file says."""
 
@@ -88,12 +90,20 @@ class Recorder:
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         """Finish the file, also after an error; raises `RecordingError`."""
         self._telemetry.close()
+        if self._refused > 1:
+            self._tell(f"messages that are none of fishd's, left out: {self._refused}")
         self.writer.close(self.reason if error is None else text.named(error))
 
     @property
     def began(self) -> bool:
         """Was a file opened?"""
         return self._writer is not None
+
+    @property
+    def status(self) -> Status:
+        """What fishd said of itself when it was asked last."""
+        assert self._described
+        return self._described.status
 
     @property
     def writer(self) -> RunWriter:
@@ -139,7 +149,9 @@ class Recorder:
         try:
             message = self.writer.message(topic, payload)
         except msgspec.DecodeError:
-            self._tell(f"a message of topic {topic} is none of fishd's: left out")
+            self._refused += 1
+            if self._refused == 1:  # a flood of them is told when all is over
+                self._tell(f"a message of topic {topic} is none of fishd's: left out")
             return
         if isinstance(message, TickHead):
             if message.seq <= self._seq:
@@ -151,9 +163,8 @@ class Recorder:
             for gap in self.writer.gaps[known:]:
                 self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
         elif isinstance(message, Status):
-            assert self._described
             # Once its ticks come, so that the file says whose they are.
-            if message.pid != self._described.status.pid and self._seq <= message.seq:
+            if message.pid != self.status.pid and self._seq <= message.seq:
                 self._ask_again()
         elif message.kind == "calibration":
             self._ask_again()

@@ -6,12 +6,15 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
+from fishd.recording.mcap_file import records
 from fishd.recording.part_file import PART, SUFFIX, PartFile, is_being_written
-from fishd.recording.reader import Run, open_run, records
+from fishd.recording.reader import TOPICS, Run, open_run
+from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import to_metadata
 from fishd.recording.writer import CHUNK
 
-RECOVERED = "recovered: the recording was not finished"
+UNFINISHED = "recovered: the recording was not finished"
+DAMAGED = "recovered: the recording was damaged, ticks that could not be read: {}"
 
 
 def recover(path: Path) -> Run:
@@ -24,7 +27,7 @@ def recover(path: Path) -> Run:
     if is_part and is_being_written(path):
         raise RecordingError(f"{path} is being recorded now; end that first")
     run = open_run(path)
-    if run.finished:
+    if run.finished and not run.is_damaged:
         raise RecordingError(f"{path} is finished and whole: there is nothing to recover")
     final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
     file = PartFile(final, final.with_name(final.name + ".recovering"))
@@ -44,30 +47,45 @@ def recover(path: Path) -> Run:
 def _copy(run: Run, file: PartFile) -> None:
     writer = Writer(file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
     writer.start(profile="", library="fishd")
+    if not run.about:  # that part is damaged
+        writer.add_metadata("fishd.run", {"run": run.name})
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
+
+    def channel_of(number: int) -> int:
+        if number not in channels:  # where its record is damaged
+            topic = TOPICS[number]
+            name, schema = schema_name(CHANNELS[topic]), json_schema(CHANNELS[topic])
+            found = writer.register_schema(name, "jsonschema", schema)
+            channels[number] = writer.register_channel(topic, "json", found)
+        return channels[number]
+
     for record in records(run.path):
-        if isinstance(record, Message):
+        if isinstance(record, Message) and (record.channel_id in {*channels, *TOPICS}):
             writer.add_message(
-                channels[record.channel_id],
+                channel_of(record.channel_id),
                 record.log_time,
                 record.data,
                 record.publish_time,
                 record.sequence,
             )
-        elif isinstance(record, Schema):
+        elif isinstance(record, Schema) and record.id not in schemas:
             schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel):
+        elif isinstance(record, Channel) and record.id not in channels:
             channels[record.id] = writer.register_channel(
-                record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                record.topic,
+                record.message_encoding,
+                schemas.get(record.schema_id, 0),
+                record.metadata,
             )
-        elif isinstance(record, Metadata):
+        elif isinstance(record, Metadata) and record.name != "fishd.end":
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
-    writer.add_metadata("fishd.end", to_metadata(run.summary) | {"reason": RECOVERED})
+    reason = DAMAGED.format(run.damaged) if run.is_damaged else UNFINISHED
+    writer.add_metadata("fishd.end", to_metadata(run.summary) | {"reason": reason})
     writer.flush()  # type: ignore[no-untyped-call]
     writer.finish()  # type: ignore[no-untyped-call]
     file.flush()

@@ -23,6 +23,7 @@ LONGEST_PAUSE = 5.0
 """A longer silence in the recording is cut short to this [s]."""
 JOINING = 0.3
 """Subscribers that try again all the time are given so long to connect [s]."""
+RIVAL = "a fishd or another replay"
 ADVICE = "end it, or give this replay addresses of its own with --control and --address"
 NOT_LIVE = "this is a replay of {}: it can be watched, not steered"
 
@@ -47,8 +48,10 @@ class Replay:
         with ExitStack() as stack:
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.destroy, linger=200)
-            own = addresses.claimed(control, "a fishd or another replay", ADVICE)
-            stack.enter_context(own)
+            for address, option in ((control, "--control"), (telemetry, "--address")):
+                if why := addresses.why_not_served(address):
+                    raise StartupError(f"{option}: '{address}' is no address to serve: {why}")
+                stack.enter_context(addresses.claimed(address, RIVAL, ADVICE))
             self._publisher = context.socket(zmq.PUB)
             self.telemetry = _bound(self._publisher, telemetry, "--address")
             self._router = context.socket(zmq.ROUTER)
@@ -171,9 +174,7 @@ class Replay:
 
 
 def _bound(socket: "zmq.Socket[bytes]", address: str, option: str) -> str:
-    """Bind; the address that clients connect to. Raises `StartupError`."""
-    if why := addresses.why_not_served(address):
-        raise StartupError(f"{option}: '{address}' is no address to serve: {why}")
+    """Bind what is `claimed`; the address that clients connect to. Raises `StartupError`."""
     path = addresses.socket_path(address)
     before = os.umask(0o117) if path else None
     try:

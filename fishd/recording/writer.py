@@ -22,6 +22,8 @@ from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
 
 CHUNK = 32 * 2**10
 """A chunk is closed when it is longer; to close one stalls the writer for 0.5 ms [bytes]."""
+LATEST = 1e10
+"""No message is later than this: MCAP counts nanoseconds, in 64 bits [s, unix]."""
 CONFIG, CALIBRATIONS = "config.yaml", "calibrations.json"
 """Names of attachments."""
 
@@ -130,27 +132,29 @@ class RunWriter:
 
     def tick(self, tick: Tick) -> None:
         """Record a tick."""
-        self.tally.tick(tick)
         self._add("tick", tick.t, tick.seq, self._encode(tick))
+        self.tally.tick(tick)
 
     def event(self, event: Event) -> None:
         """Record an event."""
-        self.tally.event(event)
         self._add("event", event.t, 0, self._encode(event))
+        self.tally.event(event)
 
     def status(self, status: Status) -> None:
         """Record a status."""
-        self.tally.status(status)
         self._add("status", status.t, status.seq, self._encode(status))
+        self.tally.status(status)
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
         """Record a message of telemetry to the byte, and return what it says.
 
-        Raises `msgspec.DecodeError` for what is none.
+        Raises `msgspec.DecodeError` for what is none, such as one whose `t` is not in 0…`LATEST`.
         """
         head = _DECODERS[topic](payload)
-        self.tally.add(head)
+        if not 0.0 <= head.t <= LATEST:
+            raise msgspec.ValidationError(f"t = {head.t:g} is no time")
         self._add(topic, head.t, 0 if isinstance(head, Event) else head.seq, payload)
+        self.tally.add(head)
         return head
 
     def flush(self, *, sync: bool = False) -> None:
@@ -202,6 +206,8 @@ class RunWriter:
     def _add(self, topic: str, t: float, seq: int, payload: bytes) -> None:
         if self._closed:
             raise RecordingError(f"{self.path}: the recording has ended")
+        if not t <= LATEST:
+            raise RecordingError(f"{self.path}: t = {t:g} is no time")
         nanoseconds = max(0, round(t * 1e9))
         channel = self._channels[topic]
         try:

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,17 @@ def test_a_wrong_command_is_one_line(arguments: list[str], message: str, status:
     done = run(*arguments)
     assert message in done.stderr
     assert (done.stdout, done.returncode, done.stderr.count("\n")) == ("", status, 1)
+
+
+@pytest.mark.slow
+def test_policies_without_the_packages_that_they_need_are_said_to_be_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    done = run("--seconds", "15", "--settle", "5")
+    assert (done.returncode, done.stderr.count("\n")) == (0, 1)
+    assert "left out, as the extra 'policy' is missing: default-fish" in done.stderr
+    assert all(line == line.rstrip() for line in done.stdout.splitlines())
 
 
 def test_it_is_said_that_another_controller_took_over_from_a_policy() -> None:

@@ -1,6 +1,7 @@
 """`fishctl identify`: from an experiment to a configuration, a recording and a picture."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -28,13 +29,55 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
 
     again = invoke(str(record), "--fit", "omega0, xi", "--set", "plant.omega0=11", "--json")
     assert again.exit_code == 0
-    estimates = json.loads(again.stdout)["estimates"]
+    told = json.loads(again.stdout)
+    assert told["origin"] == "run.mcap"
+    estimates = told["estimates"]
     assert estimates["omega0"]["low"] < 11.0 < estimates["omega0"]["high"]
     assert not estimates["coupling"]["fitted"]
 
     refused = invoke(str(record), "--to", str(fish))
     assert isinstance(refused.exception, FishdError)
     assert "exists already; --force overwrites it, --to names another" in str(refused.exception)
+
+
+def test_a_run_is_a_name_in_the_folder_of_recordings_or_the_latest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FISHD_RUNS", str(tmp_path / "runs"))
+    known = ("--fit", "omega0", "--set", "simulation.rotation=0.1")
+    swim = ("--experiment", "--for", "30", "--record", "first", *known)
+    assert invoke(*swim).exit_code == 0
+    assert (tmp_path / "runs" / "first.mcap").is_file()
+    told = [invoke(run, *known) for run in ("first", "first.mcap", "latest")]
+    assert told[0].stdout.endswith("\nfrom first.mcap\n")
+    assert {each.stdout for each in told} == {told[0].stdout}
+    assert {each.stderr for each in told} == {""}  # the fish is explained, as its sensor is turned
+    again = invoke(*swim)
+    assert str(again.exception).endswith("first.mcap: exists already; --record names another")
+
+
+@pytest.mark.parametrize(
+    ("words", "fish"),
+    [
+        ((), "the default fish; --config names another"),
+        (("--set", "plant.xi=1"), "the default fish, changed by --set; --config names another"),
+        (("--config", "fish.yaml"), "the simulated fish of fish.yaml"),
+    ],
+)
+def test_it_says_which_fish_swam(
+    words: tuple[str, ...], fish: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("fish.yaml").write_text("plant:\n  omega0: 11\n", encoding="utf-8")
+    done = invoke("--experiment", "--for", "30", "--fit", "omega0", *words)
+    assert done.stdout.endswith(f"\nfrom an experiment with {fish}\n")
+
+
+def test_a_drift_is_told_to_either_side() -> None:
+    drifting = ("--set", "simulation.drift=0.01")
+    done = invoke("--experiment", "--for", "70", "--fit", "omega0", *drifting)
+    shown = [float(each) for each in re.findall(r"drift ±(\S+) mN", done.stdout)]
+    assert shown == [pytest.approx(10.0, abs=0.5)] * 2
 
 
 @pytest.mark.parametrize(
@@ -44,6 +87,8 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
         (("run.mcap", "--experiment"), "one of the two"),
         (("run.mcap", "--for", "60"), "--for goes with --experiment"),
         (("--experiment", "--for", "5"), "5.0 is not in the range"),
+        (("--experiment", "--for", "nan"), "'nan' is not valid: a finite number is needed"),
+        (("--experiment", "--for", "inf"), "inf is not in the range"),
     ],
 )
 def test_a_command_line_that_makes_no_sense_is_refused(
@@ -58,6 +103,7 @@ def test_a_command_line_that_makes_no_sense_is_refused(
     ("words", "complaint"),
     [
         (("nowhere.mcap",), "nowhere.mcap"),
+        (("--experiment", "--record", "/"), "'/' is no name of a recording"),
         (("--experiment", "--fit", "omega"), "did you mean 'omega0'?"),
     ],
 )

@@ -30,7 +30,7 @@ def test_it_shows_the_best_square_wave_and_the_limits_of_the_configured_fish() -
 
 def test_optimal_control_is_told_and_drawn(tmp_path: Path) -> None:
     picture = tmp_path / "best.svg"
-    done = invoke("--control", "--figure", str(picture), *QUICK)
+    done = invoke("--control", "--plot", str(picture), *QUICK)
     assert done.exit_code == 0
     assert "|φ_c| = Φ in 100.0% of the time" in done.output
     assert picture.read_text(encoding="utf-8").startswith("<?xml")
@@ -47,9 +47,15 @@ def test_a_figure_that_cannot_be_written_is_refused_before_anything_is_computed(
     file: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fishd.lab.optimum.optimal_control", lambda *_: pytest.fail("computed"))
-    done = invoke("--control", "--figure", str(tmp_path / file))
+    done = invoke("--control", "--plot", str(tmp_path / file))
     assert isinstance(done.exception, FishdError)
     assert complaint in str(done.exception)
+
+
+def test_without_control_there_is_nothing_to_draw(tmp_path: Path) -> None:
+    done = invoke("--plot", str(tmp_path / "best.png"))
+    assert done.exit_code == 2
+    assert "give both" in done.output
 
 
 def test_what_the_limits_leave_out_is_said() -> None:

@@ -15,7 +15,7 @@ def comparing(daemon: Daemon, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_lets_the_fish_rest(daemon: Daemon, number: int) -> None:
     process = comparing(daemon, "swing", "sine")
     wait_until(lambda: daemon.status().mode == "running")

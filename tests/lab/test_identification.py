@@ -1,6 +1,7 @@
 """Identification: a fish from its forces, with what can and cannot be told of it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from rigs.harness import Rig
 from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.frames import frame
-from fishd.lab.identification import Identification, Unidentifiable, experiment, identify
+from fishd.lab.identification import Estimate, Identification, Unidentifiable, experiment, identify
 from fishd.lab.identification.response import Drive, response
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.plant.parameters import PlantParameters
@@ -76,8 +77,36 @@ def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path
     file = tmp_path / "fish.yaml"
     file.write_text(found.to_yaml("a test"), encoding="utf-8")
     config = load(file)
-    assert asdict(config.plant) == pytest.approx(found.plant | {"servo_reaction": 0.0}, rel=1e-5)
-    assert config.simulation.rotation == pytest.approx(found["rotation"].value, rel=1e-5)
+    written = asdict(config.plant) | asdict(config.simulation)
+    assert set(found.plant) == set(asdict(config.plant))
+    for each in found.estimates:
+        assert abs(written[each.name] - each.value) <= 0.01 * (each.high - each.low), each.name
+
+
+@pytest.mark.parametrize("seconds", [135.0, 180.0])
+def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(seconds: float) -> None:
+    for seed in range(2):
+        table = swum(*REAL, f"simulation.seed={seed}", seconds=seconds)
+        found = identify(table, start=FISH, rig=load(None, REAL).simulation, fit=["coupling"])
+        for name in ("offset_x", "offset_y"):
+            assert found[name].low < 0.02 < found[name].high, (seed, name)
+
+
+@pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])
+def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> None:
+    with VirtualRig(load()) as rig, pytest.raises(ParameterError, match="30 s or more are needed"):
+        experiment(rig, seconds)
+
+
+def test_the_configuration_has_no_digits_that_the_interval_does_not_know(
+    table: pd.DataFrame, tmp_path: Path
+) -> None:
+    found = identify(table, start=FISH, fit=["coupling"])
+    others = tuple(each for each in found.estimates if each.name != "servo_delay")
+    found = replace(found, estimates=(Estimate("servo_delay", 3.9e-14, 0.0, 4e-5), *others))
+    file = tmp_path / "fish.yaml"
+    file.write_text(found.to_yaml(), encoding="utf-8")
+    assert "servo_delay: 0  # 0 to 4e-05 s" in file.read_text(encoding="utf-8")
 
 
 def test_gaps_and_skipped_slots_cost_only_what_is_missing(table: pd.DataFrame) -> None:
@@ -100,6 +129,17 @@ def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
     assert found.seconds == pytest.approx(30 * 33 * TICK, abs=0.2)
     assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
     assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
+
+
+def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) -> None:
+    config = load(None, (*REAL, "plant.servo_reaction=1e-4"))
+    found = identify(table, start=config.plant, rig=config.simulation, fit=["omega0", "xi"])
+    assert found["rotation"].value == config.simulation.rotation
+    assert not found["rotation"].fitted
+    assert found["omega0"].low < 11.0 < found["omega0"].high
+    assert all(channel.white for channel in found.channels)
+    assert found.plant["servo_reaction"] == 1e-4
+    assert "servo_reaction is as in the configuration" in found.remarks[0]
 
 
 def width(found: Identification) -> float:

@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import msgspec
@@ -12,12 +13,12 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import Config, load
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Event, Tick
 from fishd.lab.begun import owned
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
-from fishd.lab.sweep.folder import Begun, SweepFolder
+from fishd.lab.sweep.folder import MEASURED, Begun, SweepFolder
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, Result, swim
 from fishd.lab.sweep.running import on_robot
@@ -125,6 +126,60 @@ def test_a_fish_that_somebody_else_takes_loses_one_point_only(tmp_path: Path) ->
     assert len(opened(tmp_path).results) == 2
 
 
+def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
+    config = load(None, ["plant.cable_slack=0.2"])
+    found = [
+        Point("square", {"frequency": 50.0}),
+        Point("ppo", {"policy": "default-fish"}),
+        Point("hold", {}),
+        Point("square", {"frequency": 1.5}),
+    ]
+    begun = Begun("robot", msgspec.to_builtins(config), {"seconds": 21.0})
+    columns = ["controller", "parameters.frequency", "parameters.policy"]
+    folder = SweepFolder(tmp_path, begun, columns)
+    assert on_robot(folder, found, VirtualRig(config), 21.0, nothing)
+    kept = SweepFolder(tmp_path, begun, columns).results
+    troubles = [kept[folder.key(point)].trouble for point in found]
+    assert "frequency" in troubles[0]
+    assert "ppo gave up" in troubles[1]
+    assert troubles[2:] == ["", ""]
+    assert len(list((tmp_path / "ticks").iterdir())) == 2
+
+
+@pytest.mark.parametrize("key", ["estimator.zero_drift", "a_key_of_then"])
+def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path, key: str) -> None:
+    opened(tmp_path)
+    begun = tmp_path / "sweep.json"
+    data = msgspec.json.decode(begun.read_bytes())
+    if key == "a_key_of_then":
+        data["config"][key] = 1
+    else:
+        del data["config"]["estimator"]["zero_drift"]
+    begun.write_bytes(msgspec.json.encode(data | {"version": "0.0.1"}))
+    has = "has" if key == "a_key_of_then" else "has no"
+    with pytest.raises(ConfigError, match=f"fishd 0.0.1, whose configuration {has} config.{key}"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("head", "named"),
+    [
+        ("controller,parameters.frequency,thrust,error,recording", "it has no column beat_freq"),
+        (f"controller,parameters.C,{','.join(MEASURED)},recording", "of controller, parameters.C;"),
+    ],
+)
+def test_a_table_with_other_columns_is_refused_with_what_differs(
+    tmp_path: Path, head: str, named: str
+) -> None:
+    opened(tmp_path)
+    (tmp_path / "points.csv").write_text(head + "\n")
+    with pytest.raises(ConfigError, match=named):
+        opened(tmp_path)
+
+
 def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     for point in SQUARES:
@@ -221,7 +276,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert "20 points, 16 of them there already" in second.stderr
     best = msgspec.json.decode(second.stdout)
     assert [(each["controller"], each["keys"]) for each in best] == [
-        (name, {"plant.xi": xi}) for xi in ("0.9", "1.2") for name in ("square", "sine")
+        (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")
     ]
     assert all(each["x_low"] < each["x"] < each["x_high"] for each in best)
     with (folder / "points.csv").open(newline="") as file:
@@ -230,6 +285,69 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert all((folder / row["recording"]).is_file() for row in rows)
     assert (folder / "thrust.png").stat().st_size > 10_000
     assert (folder / "thrust.svg").stat().st_size > 10_000
+
+
+def swept(folder: Path, *words: str) -> CompletedProcess[str]:
+    brief = ("--periods", "3", "--settle", "1", "--jobs", "1", "--folder", str(folder))
+    return fishctl("sweep", words[0], *brief, *words[1:])
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_points_without_an_axis_are_a_line_each(tmp_path: Path) -> None:
+    one = swept(tmp_path / "one", "swing")
+    assert (one.returncode, one.stderr) == (0, "")
+    assert "\nswing: 25.7" in one.stdout
+    assert not (tmp_path / "one" / "thrust.png").exists()
+    two = swept(tmp_path / "two", "square,sine", "--frequency", "1.7", "--json")
+    best = msgspec.json.decode(two.stdout)
+    assert [(each["controller"], each["over"], each["x"]) for each in best] == [
+        ("square", "", None),
+        ("sine", "", None),
+    ]
+    assert best[0]["thrust"] > best[1]["thrust"] > 16e-3
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> None:
+    vary = ("--vary", "plant.servo_speed=8,10,12", "--amplitude", "0.3")
+    done = swept(tmp_path / "run", "square", "--frequency", "1.7", *vary)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\nsquare: best measured at plant.servo_speed 12, " in done.stdout
+    assert (tmp_path / "run" / "thrust.png").stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
+    slack = ("--set", "plant.cable_slack=0.2", "--settle", "15")
+    done = swept(tmp_path / "run", "ppo", "--policy", "default-fish", *slack)
+    assert done.returncode == 1
+    assert "no thrust: ppo gave up" in done.stdout
+    assert done.stdout.endswith("points.csv\n")
+
+
+@pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--over=frequency")])
+def test_what_cannot_be_drawn_here_is_told_before_anything_swims(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Sequence[str]
+) -> None:
+    monkeypatch.setattr("fishd.lab.drawing.find_spec", lambda _: None)
+    folder = tmp_path / "run"
+    assert "pip install 'fishd[lab]'" in one_line(fishctl(*verb, "--folder", str(folder)))
+    assert not folder.exists()
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_what_is_best_is_printed_though_its_picture_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise FishdError("thrust.png: the figure cannot be written: No space left on device")
+
+    monkeypatch.setattr("fishd.lab.sweep.figure.draw", full)
+    done = swept(tmp_path / "run", "square", "--frequency", "1.5,1.7,1.9")
+    assert "\nsquare: best frequency 1.7" in done.stdout
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "No space left" in done.stderr
 
 
 @pytest.mark.slow
@@ -259,7 +377,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         (["--vary", "plant.xi"], "write KEY=VALUES"),
         (["--for", "30"], "is for --on robot"),
         (["--on", "robot", "--vary", "plant.xi=1,2"], "keeps its configuration"),
-        (["--on", "robot", "--for", "5"], "need 20.25 s"),
+        (["--on", "robot", "--for", "5"], "not possible"),
     ],
 )
 def test_what_cannot_be_swept_is_one_line_before_anything_is_made(

@@ -7,13 +7,20 @@ import pytest
 from rigs.documents import ROOT
 
 from fishd.core.errors import ParameterError
-from fishd.lab.sweep.grid import Point, axis, points, spread
+from fishd.lab.sweep.grid import Point, axis, points, spread, typed
 from fishd.lab.sweep.peak import peak
 
 
 def test_a_range_has_both_ends_and_decimals_that_are_exact() -> None:
     assert list(map(float, spread("0.4:1.2:0.2"))) == [0.4, 0.6, 0.8, 1.0, 1.2]
     assert list(map(float, spread("100:300:100,0.05, 1e-3"))) == [100.0, 200.0, 300.0, 0.05, 0.001]
+
+
+def test_a_value_is_a_number_where_it_is_one() -> None:
+    texts = ["0.6", "1.0", "1E+1", "3", "on", "nan", "inf", "pi/servo", "1e400"]
+    assert [*map(typed, texts)] == [0.6, 1, 10, 3, "on", "nan", "inf", "pi/servo", "1e400"]
+    assert isinstance(typed("3"), int)  # as a seed must be
+    assert axis([Point("swing", {}, {"plant.xi": typed(x)}) for x in ("0.9", "1")]) == "plant.xi"
 
 
 @pytest.mark.parametrize(

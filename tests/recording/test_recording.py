@@ -3,15 +3,19 @@
 import errno
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import msgspec
 import pytest
+from msgspec.structs import replace
 from rigs.harness import Rig
 from rigs.recordings import recorded, swum, write
 
 from fishd.core.errors import RecordingError
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording.folder import find, glance, glances
+from fishd.recording.recorder import Recorder
 from fishd.recording.recover import recover
 from fishd.simulation import simulate
 
@@ -79,14 +83,52 @@ def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
             recover(writer.part)
 
 
-def test_a_damaged_byte_costs_nothing_before_its_chunk(tmp_path: Path) -> None:
+def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> None:
+    rig = swum()
+    path = recorded(rig, tmp_path / "run", flush_every=10)
+    whole, ticks = path.read_bytes(), rig.recorder.ticks
+    worst = 0
+    for offset in range(30, len(whole) - 40, 397):
+        content = bytearray(whole)
+        content[offset] ^= 0x55
+        path.write_bytes(content)
+        run = open_run(path)
+        read = {tick.seq for tick in run.ticks}
+        worst = max(worst, lost := len(ticks) - len(read))
+        assert run.ticks == [tick for tick in ticks if tick.seq in read]
+        assert run.damaged == lost, offset
+        assert glance(path).damaged == (lost if run.is_damaged else None)
+        assert run.finished
+    assert worst == 10
+
+
+def test_what_names_a_recording_and_its_channels_may_be_damaged_too(tmp_path: Path) -> None:
+    path = recorded(swum(), tmp_path / "run", flush_every=10)
+    whole, ticks = path.read_bytes(), open_run(path).ticks
+    first_chunk = whole.index(b"\x04\0\0\0zstd")
+    for offset in (whole.index(b"fishd.run") - 4, first_chunk + 60, len(whole) // 2):
+        content = bytearray(path.read_bytes())
+        content[offset] ^= 0x55
+        path.write_bytes(content)
+    run, recovered = open_run(path), recover(path)
+    assert run.about == {}
+    assert 0 < len(run.ticks) < len(ticks)
+    assert recovered.ticks == run.ticks
+    assert not recovered.is_damaged
+
+
+def test_what_is_recovered_of_a_damaged_recording_is_whole(tmp_path: Path) -> None:
     path = recorded(swum(), tmp_path / "run", flush_every=10)
     content = bytearray(path.read_bytes())
-    content[int(0.6 * len(content))] ^= 0xFF
+    content[int(0.4 * len(content))] ^= 0x55
     path.write_bytes(content)
-    run = open_run(path)
-    assert not run.finished
-    assert 0 < len(run.ticks) < 60
+    damaged, run = open_run(path), recover(path)
+    assert run.path == tmp_path / "run-recovered.mcap"
+    assert (damaged.damaged, run.is_damaged, run.summary.lost) == (10, False, 10)
+    assert run.ticks == damaged.ticks
+    assert run.reason == "recovered: the recording was damaged, ticks that could not be read: 10"
+    with pytest.raises(RecordingError, match="there is nothing to recover"):
+        recover(run.path)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
@@ -119,6 +161,36 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
     run = recover(writer.part)
     assert 0 < len(run.ticks) < 600
     assert run.ticks == (ticks * 10)[: len(run.ticks)]
+
+
+@pytest.mark.parametrize("t", [1e300, -1.0, 1.1e10])
+def test_a_message_from_no_time_is_left_out_and_the_recording_goes_on(
+    tmp_path: Path, t: float
+) -> None:
+    ticks = swum(0.4).recorder.ticks
+    with RunWriter(tmp_path / "run") as writer:
+        writer.message("tick", msgspec.json.encode(ticks[0]))
+        with pytest.raises(msgspec.DecodeError, match="is no time"):
+            writer.message("tick", msgspec.json.encode(replace(ticks[1], t=t)))
+        writer.message("tick", msgspec.json.encode(ticks[2]))
+    run = open_run(writer.path)
+    assert run.ticks == [ticks[0], ticks[2]]
+    assert run.summary == glance(writer.path).summary
+
+
+def test_a_flood_of_what_is_none_of_fishds_is_counted_and_told_twice(tmp_path: Path) -> None:
+    said: list[str] = []
+    tick = swum(0.2).recorder.ticks[0]
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
+    recorder._writer = recorder._open_writer()
+    for t in (tick.t, 1e300, 1e301, -1.0):
+        recorder._take("tick", msgspec.json.encode(replace(tick, t=t)))
+    recorder.__exit__(None, None, None)
+    assert said == [
+        "a message of topic tick is none of fishd's: left out",
+        "messages that are none of fishd's, left out: 3",
+    ]
+    assert len(open_run(tmp_path / "run.mcap").ticks) == 1
 
 
 def test_a_run_that_never_began_leaves_no_file(tmp_path: Path) -> None:

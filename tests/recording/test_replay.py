@@ -1,14 +1,18 @@
 """A replay is what a subscriber and a client of fishd expect, and cannot be steered."""
 
+import re
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rigs.processes import Subscriber
+import zmq
+from rigs.processes import FISHCTL, Process, Subscriber, fishctl, one_line, wait_until
 from rigs.recordings import recorded, swum
 
 from fishd.client import Fish, Refused
+from fishd.core import addresses, unix_sockets
 from fishd.core.errors import StartupError
 from fishd.recording import open_run
 from fishd.recording.replay import Replay
@@ -35,6 +39,17 @@ def test_a_replay_is_the_recorded_bytes_at_the_recorded_speed(replay: Replay) ->
     assert heard == recorded
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_replay_ends_by_a_signal_and_leaves_no_socket(tmp_path: Path, number: int) -> None:
+    run = recorded(swum(), tmp_path / "run", source="simulation")
+    socket = tmp_path / "control"
+    words = ("--speed", "0.01", "--address", "tcp://127.0.0.1:0", "--control", f"ipc://{socket}")
+    process = Process(FISHCTL, "replay", str(run), *words)
+    wait_until(socket.exists)
+    assert process.end(number)[::2] == (0, "")
+    assert not socket.exists()
+
+
 def test_a_client_sees_the_replay_and_cannot_steer_it(replay: Replay) -> None:
     player = threading.Thread(target=replay.play, args=(3.0,))
     player.start()
@@ -57,5 +72,31 @@ def test_an_address_in_use_is_said_in_one_line(replay: Replay, tmp_path: Path) -
         Replay(replay._run, replay.telemetry, f"ipc://{tmp_path}/other")
     with pytest.raises(StartupError, match="a fishd or another replay"):
         Replay(replay._run, "tcp://127.0.0.1:0", replay.control)
+    with pytest.raises(StartupError, match="a fishd or another replay"):
+        Replay(replay._run, replay.control, f"ipc://{tmp_path}/other")
     with pytest.raises(StartupError, match="is no address to serve"):
         Replay(replay._run, "nonsense", f"ipc://{tmp_path}/other")
+
+
+def test_a_replay_leaves_the_telemetry_of_a_fishd_alone(tmp_path: Path) -> None:
+    run = recorded(swum(0.2), tmp_path / "run")
+    address = f"ipc://{tmp_path}/telemetry"
+    with addresses.claimed(address), zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        publisher.bind(address)
+        words = ("--address", address, "--control", f"ipc://{tmp_path}/control")
+        refused = fishctl("replay", str(run), *words)
+        assert f"already serves {address}" in one_line(refused)
+        assert unix_sockets.listener(tmp_path / "telemetry")
+
+
+def test_a_replay_names_the_command_that_shows_it_and_not_the_live_fish(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = recorded(swum(0.2), tmp_path / "run")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    words = ("replay", str(run), "--address", f"ipc://{tmp_path}/telemetry", "--speed", "9")
+    assert fishctl(*words).stdout.endswith("watch it with: fishctl watch\n")
+    monkeypatch.setenv("FISHD_ENDPOINT", f"ipc://{tmp_path}/live")
+    said = re.search(r"fishctl --endpoint (\S+) watch", fishctl(*words).stdout)
+    assert said
+    assert said[1] == f"ipc://{tmp_path}/fishd/control"

@@ -7,10 +7,11 @@ from pathlib import Path
 import pandas
 import pyarrow.parquet
 import pytest
+from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
 from rigs.recordings import recorded, swum, write
 
-from fishd.lab.run_traces import traces
+from fishd.lab.run_traces import LEAST_FORCE, limits, traces
 from fishd.recording import open_run
 
 
@@ -48,6 +49,12 @@ def test_a_recording_is_drawn_as_a_picture_and_as_a_page_that_loads_nothing(
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", html)
     assert "Plotly.newPlot" in html
     assert "<b>stiff</b>" not in html
+    resting = Rig()
+    resting.run_for(0.5)
+    rest = fishctl("plot", str(recorded(resting, tmp_path / "rest")), "--to", str(tmp_path))
+    assert "phase portrait" not in Path(rest.stdout.split()[1]).read_text()
+    again = fishctl("plot", str(path), "--to", str(tmp_path), "--png", "--force")
+    assert again.stdout == f"{picture}\n"
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
     assert "there is no tick between these times; it is 3.0 s long" in one_line(nothing)
 
@@ -57,6 +64,31 @@ def test_where_ticks_are_missing_a_curve_has_a_break(tmp_path: Path) -> None:
     drawn = traces(open_run(write(tmp_path / "run", ticks[:20] + ticks[30:])))
     assert len(drawn.time) == 51
     assert [index for index, value in enumerate(drawn.fx) if value != value] == [20]
+
+
+def test_a_figure_says_which_controller_and_parameters_and_the_units(path: Path) -> None:
+    drawn = traces(open_run(path))
+    said = ["swing C=0.6 longest_half_period=1.0", "C=0.3"]
+    assert [event.text for event in drawn.events] == said
+    assert list(drawn.quantities) == ["top_speed (1)", "reversal_speed (1)", "since_reversal (s)"]
+
+
+def test_a_resting_fish_has_no_phase_portrait_and_dust_is_not_blown_up(tmp_path: Path) -> None:
+    rig = Rig("simulation.noise=0")
+    rig.run_for(1)
+    drawn = traces(open_run(recorded(rig, tmp_path / "run")))
+    assert drawn.portrait is None
+    low, high = limits(LEAST_FORCE, drawn.fx, drawn.fy)
+    assert high - low == pytest.approx(1.0)
+    low, high = limits(LEAST_FORCE, drawn.fx + 500.0, drawn.fy)
+    assert low < 0 < 500 < high
+
+
+def test_a_picture_replaces_none_unless_it_is_told_to(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.html").write_text("mine")
+    refused = fishctl("plot", str(path), "--to", str(tmp_path))
+    assert "run.html is there already; --force replaces it" in one_line(refused)
+    assert [each.name for each in tmp_path.iterdir()] == ["run.html"]
 
 
 def test_recordings_are_listed_with_what_is_missing(path: Path, tmp_path: Path) -> None:

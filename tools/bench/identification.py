@@ -60,7 +60,7 @@ def one(run: tuple[str, int]) -> dict[str, tuple[float, float, float, float]]:
     with VirtualRig(Config(plant=plant, simulation=rig)) as swum:
         found = identify(experiment(swum, SECONDS))
     truth: dict[str, Any] = msgspec.structs.asdict(plant) | msgspec.structs.asdict(rig)
-    # Three whole periods of the drift: its mean is zero.
+    # Nearly three whole periods of the drift: its mean is as good as zero.
     return {
         each.name: (truth[each.name], each.value, each.low, each.high)
         for each in found.estimates

@@ -5,11 +5,9 @@ from pathlib import Path
 import click
 
 from fishd.cli.output import echo
-from fishd.cli.recording.record import folder_option
-from fishd.recording import open_run
+from fishd.cli.recording.choice import folder_option, opened
 from fishd.recording.export import Format
 from fishd.recording.export import export as write
-from fishd.recording.folder import find
 
 
 @click.command()
@@ -32,5 +30,5 @@ def export(run: str, form: Format | None, target: Path, force: bool, folder: Pat
     """
     if form is None:
         raise click.UsageError("--csv or --parquet is needed")
-    for path in write(open_run(find(run, folder)), target, form, replace=force):
+    for path in write(opened(run, folder), target, form, replace=force):
         echo(path)

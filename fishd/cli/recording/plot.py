@@ -6,11 +6,10 @@ from pathlib import Path
 import click
 
 from fishd.cli.output import echo
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import folder_option, opened
 from fishd.lab.run_figure import picture
 from fishd.lab.run_traces import traces
-from fishd.recording import open_run
-from fishd.recording.folder import find
+from fishd.recording.folder import check_new
 
 
 @click.command()
@@ -28,24 +27,32 @@ from fishd.recording.folder import find
 )
 @click.option("--png", "only", flag_value="png", help="The picture alone.")
 @click.option("--html", "only", flag_value="html", help="The interactive page alone.")
+@click.option("--force", is_flag=True, help="Replace files that are there already.")
 @folder_option
 def plot(
-    run: str, begin: float, end: float, target: Path, only: str | None, folder: Path | None
+    run: str,
+    begin: float,
+    end: float,
+    target: Path,
+    only: str | None,
+    force: bool,
+    folder: Path | None,
 ) -> None:
     """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. NAME.png is a picture; NAME.html
-    is a page to zoom into, which needs no network. Either replaces an older one.
+    is a page to zoom into, which needs no network.
     """
-    recorded = open_run(find(run, folder))
+    recorded = opened(run, folder)
     drawn = traces(recorded, begin, end)
-    if only != "html":
-        path = target / f"{recorded.name}.png"
-        picture(drawn, path)
-        echo(path)
-    if only != "png":
+    forms = [only] if only else ["png", "html"]
+    paths = {form: target / f"{recorded.name}.{form}" for form in forms}
+    check_new(paths.values(), replace=force)
+    if "png" in paths:
+        picture(drawn, paths["png"])
+        echo(paths["png"])
+    if "html" in paths:
         from fishd.lab.run_page import page
 
-        path = target / f"{recorded.name}.html"
-        page(drawn, path)
-        echo(path)
+        page(drawn, paths["html"])
+        echo(paths["html"])

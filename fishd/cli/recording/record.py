@@ -10,23 +10,16 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.options import endpoint_option
+from fishd.cli.options import FiniteRange, endpoint_option
 from fishd.cli.output import counted, echo
+from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import FOLDER_VARIABLE, made, new_path, runs_folder
+from fishd.recording.folder import made, named, new_path, runs_folder
 from fishd.recording.recorder import Recorder
-
-folder_option = click.option(
-    "--folder",
-    type=click.Path(path_type=Path, file_okay=False),
-    help=f"Where recordings are; default: ${FOLDER_VARIABLE}, else fishd/runs in "
-    "$XDG_DATA_HOME or ~/.local/share.",
-)
-
 
 UNITS = {"MB": 10**6, "GB": 10**9}
 LEAST = 10**7
@@ -61,7 +54,7 @@ class Size(click.ParamType[int]):
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     metavar="SECONDS",
     help="End by itself after this time; by default Ctrl-C ends it.",
 )
@@ -104,11 +97,13 @@ def record(
         _record_for_ever(partial(recorder_of, box.open, due=box.due), stopping, seconds)
         return
     progress = _draw if sys.stdout.isatty() else lambda writer: None
-    path = _path(run, place)
+    path = named(run, place) if run else new_path(place)
     recorder = recorder_of(partial(begin, path), progress=progress)
     try:
         with recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it")
+            if (mode := recorder.status.mode) != "running":
+                _tell(f"the fish is at rest (mode {mode}); it swims with: fishctl set-controller")
             recorder.run(stopping, seconds)
     except RecordingError as error:
         if recorder.began:
@@ -136,12 +131,6 @@ def _record_for_ever(
                 _tell(f"waiting: {error}")
             waiting = True
             stopping.wait(1.0)
-
-
-def _path(run: str | None, folder: Path) -> Path:
-    if run is None:
-        return new_path(folder)
-    return Path(run).expanduser() if "/" in run else folder / run
 
 
 class _Signals:

@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from fishd.cli.output import counted, echo
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import damage, folder_option
+from fishd.recording import open_run
 from fishd.recording.folder import find
 from fishd.recording.recover import recover as finish
 
@@ -14,14 +15,17 @@ from fishd.recording.recover import recover as finish
 @click.argument("file")
 @folder_option
 def recover(file: str, folder: Path | None) -> None:
-    """Finish a recording that was cut off, by a kill, a full disk or a power cut.
+    """Finish a recording that was cut off, by a kill, a full disk or a power cut, or is damaged.
 
     FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
     NAME.mcap; a file of another name stays as it is, and NAME-recovered.mcap is written beside it.
     """
-    run = finish(find(file, folder))
+    path = find(file, folder)
+    damaged = open_run(path)
+    run = finish(path)
     summary = run.summary
+    what = f"; {damage(damaged.damaged)}" if damaged.is_damaged else ""
     echo(
         f"{run.path}: {summary.duration:.1f} s, {counted(summary.ticks, 'tick')}, "
-        f"{summary.lost} lost, {counted(summary.events, 'event')}"
+        f"{summary.lost} lost, {counted(summary.events, 'event')}{what}"
     )

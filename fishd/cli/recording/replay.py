@@ -1,16 +1,16 @@
 """The verb that publishes a recording as if it were live."""
 
-import signal
+import shlex
 from contextlib import suppress
 from pathlib import Path
 
 import click
 
+from fishd.cli.options import FiniteRange
 from fishd.cli.output import echo
-from fishd.cli.recording.record import folder_option
-from fishd.core.addresses import control_address
-from fishd.recording import open_run
-from fishd.recording.folder import find
+from fishd.cli.recording.choice import folder_option, opened
+from fishd.core.addresses import control_address, find_control
+from fishd.core.interruption import interrupted_once
 from fishd.recording.replay import Replay
 
 TELEMETRY = "tcp://127.0.0.1:9872"
@@ -20,7 +20,7 @@ TELEMETRY = "tcp://127.0.0.1:9872"
 @click.argument("run")
 @click.option(
     "--speed",
-    type=click.FloatRange(0.01, 1000),
+    type=FiniteRange(0.01, 1000),
     default=1.0,
     show_default=True,
     help="How much faster than it was recorded.",
@@ -44,14 +44,15 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
     RUN is a path, a name in the folder of recordings, or 'latest'. It ends with the recording, or
     with Ctrl-C. A silence of more than 5 s is cut short.
     """
-    recorded = open_run(find(run, folder))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with Replay(recorded, address, control or control_address()) as player:
+    recorded = opened(run, folder)
+    with (
+        suppress(KeyboardInterrupt),
+        interrupted_once(),
+        Replay(recorded, address, control or control_address()) as player,
+    ):
         seconds = recorded.summary.duration / speed
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
-        if control:
-            echo(f"watch it with: fishctl --endpoint {control} watch")
-        else:
-            echo("watch it with: fishctl watch")
-        with suppress(KeyboardInterrupt):
-            player.play(speed)
+        found = find_control() == player.control
+        endpoint = "" if found else f"--endpoint {shlex.quote(player.control)} "
+        echo(f"watch it with: fishctl {endpoint}watch")
+        player.play(speed)

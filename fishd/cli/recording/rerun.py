@@ -8,10 +8,8 @@ import click
 from fishd.cli.config import set_option
 from fishd.cli.options import ParameterType, json_option
 from fishd.cli.output import counted, echo, print_json, spelled
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import folder_option, opened
 from fishd.controllers import registry
-from fishd.recording import open_run
-from fishd.recording.folder import find
 from fishd.recording.rerun import Estimates, Stretch
 from fishd.recording.rerun import rerun as choose_again
 
@@ -35,21 +33,22 @@ def rerun(
 
     RUN is a path, a name in the folder of recordings, or 'latest'. The controller sees the recorded
     forces and angles. The one that swam gives the same commands to the last bit, from each of its
-    starts that is in the recording; exit status 1 where it does not. One that swam already when the
-    recording began is compared, too, but not judged.
+    starts that is in the recording; exit status 1 where it does not, or where none swam. One that
+    swam already when the recording began is compared, too, but not judged.
 
     fishctl rerun latest --controller swing C=0.4
     """
     given = _parameters(controller, parameters)
-    result = choose_again(open_run(find(run, folder)), controller, given, overrides)
+    result = choose_again(opened(run, folder), controller, given, overrides)
     if as_json:
         print_json(result)
     else:
         for stretch in result.stretches:
             _print(stretch)
-        if not result.stretches:
-            echo("no controller swam")
         _print_estimates(result.estimates)
+    if not result.stretches:
+        echo("fishctl: no controller swam: there is nothing to choose again", err=True)
+        return 1
     same = controller is None and not given and not overrides
     wrong = [s for s in result.stretches if s.from_start and s.equal < s.ticks]
     return 1 if same and wrong else 0

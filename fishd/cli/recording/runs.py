@@ -10,13 +10,15 @@ import msgspec
 
 from fishd.cli.options import json_option
 from fishd.cli.output import counted, echo, print_json
-from fishd.cli.recording.record import folder_option
+from fishd.cli.recording.choice import damage, folder_option
 from fishd.core import text
 from fishd.core.errors import RecordingError
 from fishd.recording.folder import Glance, glances, runs_folder
 from fishd.recording.summary import Summary
 
 WIDE = 1000
+LONGEST = 1e9
+"""No recording is longer than these thirty years [s]."""
 
 
 @click.command()
@@ -49,6 +51,7 @@ def _as_json(glance: Glance) -> dict[str, Any]:
         "name": glance.name,
         "path": str(glance.path),
         "state": _state(glance),
+        "damaged": glance.damaged,
         "duration": glance.summary.duration,
         **msgspec.structs.asdict(glance.summary),
         "about": glance.about,
@@ -87,8 +90,13 @@ def _thrust(summary: Summary) -> str:
     if summary.thrust is None:
         return "–"
     if summary.thrust_error is None:
-        return f"{summary.thrust * 1e3:.2f} ± ?"
-    return f"{summary.thrust * 1e3:.2f} ± {summary.thrust_error * 1e3:.2f}"
+        return f"{_thousandths(summary.thrust)} ± ?"
+    return f"{_thousandths(summary.thrust)} ± {_thousandths(summary.thrust_error)}"
+
+
+def _thousandths(value: float) -> str:
+    shown = value * 1e3
+    return f"{shown:.2f}" if abs(shown) < 1e6 else f"{shown:.3g}"
 
 
 def _remarks(glance: Glance) -> list[str]:
@@ -96,6 +104,7 @@ def _remarks(glance: Glance) -> list[str]:
     restarts = glance.summary.restarts
     return [
         *([state] if state != "finished" else []),
+        *([damage(glance.damaged)] if glance.damaged is not None else []),
         *([counted(restarts, "restart")] if restarts else []),
         *(glance.about[key] for key in ("subject", "note") if glance.about.get(key)),
     ]
@@ -115,6 +124,8 @@ def _began(iso: str) -> str:
 
 
 def _length(seconds: float) -> str:
+    if not 0.0 <= seconds <= LONGEST:  # of a file in which no times stand
+        return f"{seconds:.3g} s"
     minutes, rest = divmod(seconds, 60.0)
     hours, minutes = divmod(int(minutes), 60)
     if hours:

@@ -114,7 +114,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         controller=reports[0].controller,
         parameters=reports[0].parameters,
         thrust=fmean(thrusts),
-        error=_error_of_mean(thrusts),
+        error=error_of_mean(thrusts),
         thrusts=thrusts,
         efficiency=fmean(report.efficiency for report in reports),
         frequency=fmean(report.frequency for report in reports),
@@ -126,7 +126,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
     )
 
 
-def _error_of_mean(values: Sequence[float]) -> float | None:
+def error_of_mean(values: Sequence[float]) -> float | None:
     """Half of the 95 % interval of the mean, by Student's t; None for a single value."""
     if len(values) < 2:
         return None

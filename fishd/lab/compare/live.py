@@ -6,15 +6,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from msgspec.structs import replace
 
-from fishd.core.errors import FishdError, ParameterError, Refused, UnknownController
+from fishd.core.errors import FishdError
 from fishd.core.signals import Tick
-from fishd.lab.compare.comparison import Standing, Trace, trace
+from fishd.lab.compare.comparison import Standing, Trace, error_of_mean, trace
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.measurement import Measured, measure, plan
-from fishd.lab.rig import Replaced, Rig
-
-OF_A_CONTESTANT = ("bad-parameter", "controller-error", "too-slow", "unknown-controller")
-"""Refusals that say nothing of the next contestant."""
+from fishd.lab.rig import Rig, is_of_one
 
 
 class LiveComparison:
@@ -59,8 +56,8 @@ class LiveComparison:
                     seconds,
                     lambda passed, begun=begun: progress(begun + passed),  # type: ignore[misc]
                 )
-            except (Replaced, ParameterError, UnknownController, Refused) as error:
-                if isinstance(error, Refused) and error.code not in OF_A_CONTESTANT:
+            except FishdError as error:
+                if not is_of_one(error):
                     raise
                 self.left_out.append((contestant, error))
                 out.add(index)
@@ -78,9 +75,13 @@ class LiveComparison:
 
 
 def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
-    """Runs count by the inverse squares of their errors."""
+    """Runs count by the inverse squares of their errors.
+
+    Where they differ by more than these say, the error is that of their mean by Student's t.
+    """
     weights = [1.0 / run.error**2 for run in runs]
     total = sum(weights)
+    thrusts = [run.thrust for run in runs]
     angles = [abs(tick.phi_c) for run in runs for tick in run.ticks if tick.mode == "running"]
     mean = sum(angles) / len(angles)
     rms = math.sqrt(sum(angle**2 for angle in angles) / len(angles))
@@ -89,8 +90,8 @@ def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
         controller=runs[0].controller,
         parameters=dict(runs[0].parameters),
         thrust=sum(w * run.thrust for w, run in zip(weights, runs, strict=True)) / total,
-        error=1.0 / math.sqrt(total),
-        thrusts=[run.thrust for run in runs],
+        error=max(1.0 / math.sqrt(total), error_of_mean(thrusts) or 0.0),
+        thrusts=thrusts,
         frequency=sum(w * run.frequency for w, run in zip(weights, runs, strict=True)) / total,
         fullness=mean / rig.amplitude,
         squareness=mean / rms if rms else 0.0,

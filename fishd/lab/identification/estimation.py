@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import chi2
+from scipy.stats import chi2, t
 
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
@@ -16,6 +16,7 @@ from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Pro
 from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
 from fishd.lab.identification.response import Array
 from fishd.lab.identification.result import UNITS, Channel, Estimate, Fit, Identification
+from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ _SMOOTH = 5.0
 _SINGULAR = 1e-10
 """Information below this share of the largest is none."""
 OFFSETS = ("offset_x", "offset_y")
+_STRETCHES = (4, 5)
+"""Into how many stretches runs are cut, whose means tell how well the mean of a drift is known."""
 _LAGS = 20
 """Ticks that what is left over may be correlated for."""
 
@@ -50,12 +53,14 @@ def identify(
     runs: "DataFrame | str | os.PathLike[str] | Sequence[DataFrame | str | os.PathLike[str]]",
     *,
     start: PlantParameters | None = None,
+    rig: SimulationSettings | None = None,
     fit: Sequence[str] = DEFAULT,
 ) -> Identification:
     """Fit a fish and its rig to what some runs of it have measured.
 
     runs: tables of ticks (`fishd.recording.read`, `experiment`), or paths of recordings
     start: where to begin, and the value of what is not fitted; by default the fish of Fu et al.
+    rig: the same for `rotation`; by default the sensor is not turned
     fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`
 
     Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
@@ -65,8 +70,8 @@ def identify(
     parts = passages([_table(run) for run in _several(runs)])
     if not any(one.commands.any() for one in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
-    first = start or PlantParameters()
-    known = msgspec.structs.asdict(first) | {"rotation": 0.0}
+    known = msgspec.structs.asdict(start or PlantParameters())
+    known["rotation"] = (rig or SimulationSettings()).rotation
     values = {name: float(known[name]) for name in POSSIBLE}
     problem, values = _solved(parts, names, values)
     settle = _settling(values)
@@ -74,7 +79,7 @@ def identify(
         longer = [one for one in parts if one.duration > settle + SHORTEST]
         problem = Problem(longer or parts, names, settle if longer else _SETTLE)
         values = solve(problem, values)
-    return _summary(parts, problem, values)
+    return _summary(parts, problem, values, known)
 
 
 def _several(runs: object) -> list[object]:
@@ -144,21 +149,27 @@ def _settling(values: dict[str, float]) -> float:
 
 
 def _summary(
-    parts: Sequence[Passage], problem: Problem, values: dict[str, float]
+    parts: Sequence[Passage],
+    problem: Problem,
+    values: dict[str, float],
+    known: dict[str, float],
 ) -> Identification:
+    """What is found; `known` holds what the model does not use, too."""
+    all_values = {**known, **values}
     residuals = problem.residuals(values)
     innovations = problem.whitened(residuals)
     jacobian = problem.jacobian(values)
     covariance, untold = _covariance(jacobian, innovations)
     deviations = np.sqrt(np.diag(covariance))
     spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
-    estimates = [_estimate(name, values[name], spread) for name in UNITS if name in values]
-    means = np.concatenate(residuals, axis=1).mean(axis=1)
+    estimates = [_estimate(name, all_values[name], spread) for name in UNITS if name in all_values]
+    left = np.concatenate(residuals, axis=1)
     slopes = problem.slopes_of_means(values)
-    count = innovations.shape[1]
-    for name, mean, slope, noise in zip(OFFSETS, means, slopes, problem.noise, strict=True):
-        error = _Z * float(np.sqrt(slope @ covariance @ slope + noise.white**2 / count))
-        estimates.append(Estimate(name, float(mean), float(mean) - error, float(mean) + error))
+    for name, of, slope, noise in zip(OFFSETS, left, slopes, problem.noise, strict=True):
+        told = _Z * np.sqrt(slope @ covariance @ slope + noise.white**2 / of.size)
+        error = float(np.hypot(told, _wandering(of)))
+        mean = float(of.mean())
+        estimates.append(Estimate(name, mean, mean - error, mean + error))
     drifts = [_smoothed(each, parts[0].tick) for each in residuals]
     channels = tuple(
         Channel(
@@ -207,6 +218,20 @@ def _covariance(jacobian: Array, innovations: Array) -> tuple[Array, Array | Non
     wider = np.sqrt(np.maximum(np.diag(robust) / np.diag(inverse), 1.0))
     unscaled = wider / size
     return inverse * np.outer(unscaled, unscaled), vectors[:, 0] if weak[0] else None
+
+
+def _wandering(residual: Array) -> float:
+    """Half of the 95 % interval of a mean, by how much the means of stretches differ [N].
+
+    Whatever the drift is, as long as a stretch is as good as another (Ibragimov and Müller,
+    "t-statistic based correlation and heterogeneity robust inference").
+    """
+    halves = []
+    for count in _STRETCHES:  # a drift whose period is one stretch is seen by the other cut
+        means = [stretch.mean() for stretch in np.array_split(residual, count)]
+        deviation = np.std(means, ddof=1) / np.sqrt(count)
+        halves.append(float(t.ppf(0.975, count - 1) * deviation))
+    return max(halves)
 
 
 def _estimate(name: str, value: float, spread: dict[str, float]) -> Estimate:
@@ -262,6 +287,10 @@ def _remarks(
     untold: Array | None,
 ) -> tuple[str, ...]:
     remarks = []
+    if any(e.name == "servo_reaction" and e.value for e in estimates):
+        remarks.append(
+            "servo_reaction is as in the configuration, but no fit takes it into account"
+        )
     if untold is not None:
         involved = [name for name, part in zip(names, untold, strict=True) if abs(part) > 0.3]
         remarks.append(

@@ -1,8 +1,10 @@
 """Lets a fish swim what tells most about it."""
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from fishd.core.errors import ParameterError
 from fishd.core.frames import frame
 from fishd.core.signals import Tick
 from fishd.lab.rig import Rig
@@ -23,11 +25,11 @@ def experiment(
 
     seconds: how long all of it takes [s]
     keep: is given all ticks, once it has swum
-    Raises ValueError for less than `SHORTEST`, `Disturbed` where somebody else takes the fish, and
-    what the rig and `keep` raise.
+    Raises `ParameterError` for less than `SHORTEST` or for ever, `Disturbed` where somebody else
+    takes the fish, and what the rig and `keep` raise.
     """
-    if not seconds >= SHORTEST:
-        raise ValueError(f"an experiment of {seconds:g} s is too short; {SHORTEST:g} s are needed")
+    if not SHORTEST <= seconds < math.inf:
+        raise ParameterError(f"an experiment of {seconds:g} s: {SHORTEST:g} s or more are needed")
     ticks = rig.rest(REST)
     ticks += rig.swim("excitation", {}, seconds - REST)
     if keep:

@@ -1,5 +1,6 @@
 """What an identification has found: values with intervals, and how well they explain the forces."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ UNITS = {
     "backlash": "rad",
     "cable_slack": "rad",
     "servo_dead_zone": "rad",
+    "servo_reaction": "N s^2/rad",
     "rotation": "rad",
     "offset_x": "N",
     "offset_y": "N",
@@ -146,14 +148,24 @@ class Identification:
         }
 
     def _line(self, name: str, value: float) -> str:
-        text = f"  {name}: {_number(value)}"
         if name not in UNITS:
-            return text
+            return f"  {name}: {_number(value)}"
         found = self[name]
+        text = f"  {name}: {_number(_rounded(found))}"
         unit = "" if found.unit == "1" else f" {found.unit}"
         if not found.fitted:
             return f"{text}{unit and '  #' + unit}"
         return f"{text}  # {found.low:.5g} to {found.high:.5g}{unit}"
+
+
+def _rounded(found: Estimate) -> float:
+    """To a hundredth of the interval or better: more digits tell nothing."""
+    width = found.high - found.low
+    if not found.fitted or not 0.0 < width < math.inf:
+        return found.value
+    rounded = round(found.value, 2 - math.floor(math.log10(width)))
+    # A fish that hardly answers is no fish without it: what must be positive stays so.
+    return rounded if rounded or found.low <= 0.0 else found.value
 
 
 def _number(value: float) -> str:

@@ -10,7 +10,7 @@ from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.measurement import REST, evaluate, samples_of
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.rig import Rig
+from fishd.lab.rig import Rig, refuse_lost
 
 STEADY = 1.5
 """How long the fish swims with each candidate once it has settled, at least [s]."""
@@ -77,7 +77,9 @@ def trials(
             fresh = rest = rig.rest(REST)
         swim = rig.swim(controller, parameters, length)
         after = rig.rest(REST)
-        found = evaluate(samples_of([*rest, *swim, *after]), rig.tick, settles)
+        ticks = [*rest, *swim, *after]
+        refuse_lost(ticks, (REST, length, REST), rig.tick)
+        found = evaluate(samples_of(ticks), rig.tick, settles)
         swum += len(swim)
         passed += length + REST
         search.observe(candidate, found.thrust, found.error)

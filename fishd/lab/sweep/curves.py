@@ -50,9 +50,9 @@ class Best(Struct, frozen=True):
     """Those of the highest point that was measured."""
     keys: dict[str, Any]
     over: str
-    """What was varied along the curve, such as `frequency` or `plant.xi`."""
-    x: float
-    """The best value of that."""
+    """What was varied along the curve, such as `frequency` or `plant.xi`; empty for one point."""
+    x: float | None
+    """The best value of that; None where nothing was varied."""
     x_low: float | None
     """Its 95 % interval; None where there is none to tell."""
     x_high: float | None
@@ -85,26 +85,27 @@ def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
 
 
 def best(curve: Curve) -> Best | None:
-    """The best of a curve; None where there is none."""
-    if curve.peak is None:
+    """The best of a curve; None where no point has a thrust."""
+    swum = [
+        (result.thrust, index)
+        for index, result in enumerate(curve.results)
+        if result.thrust is not None
+    ]
+    if not swum:
         return None
-    found = curve.peak
-    index = max(
-        (index for index, result in enumerate(curve.results) if result.thrust is not None),
-        key=lambda index: curve.results[index].thrust or 0.0,
-    )
-    point = curve.points[index]
+    thrust, index = max(swum)
+    point, found = curve.points[index], curve.peak
     return Best(
         controller=point.controller,
         parameters=point.parameters,
         keys=point.keys,
         over=curve.over,
-        x=found.x,
-        x_low=found.x_low,
-        x_high=found.x_high,
-        thrust=found.y,
-        error=found.y_error,
-        at_edge=found.at_edge,
+        x=found.x if found else None,
+        x_low=found.x_low if found else None,
+        x_high=found.x_high if found else None,
+        thrust=found.y if found else thrust,
+        error=found.y_error if found else curve.results[index].error,
+        at_edge=found.at_edge if found else False,
     )
 
 
@@ -136,19 +137,23 @@ def _is_whole(ticks: float) -> bool:
 def _curve(folder: SweepFolder, group: list[Point], over: str, all_of: Sequence[Point]) -> Curve:
     results = [folder.results[folder.key(point)] for point in group]
     x = [float(point.columns()[over]) for point in group] if over else []
-    swum = [index for index, result in enumerate(results) if result.thrust is not None]
-    top = None
-    if over and swum:
-        thrusts = [result.thrust or 0.0 for result in results]
-        top = peak(
-            [x[index] for index in swum],
-            [thrusts[index] for index in swum],
-            [results[index].error for index in swum],
-        )
-        same = {
-            name
-            for name, value in group[0].columns().items()
-            if all(other.columns().get(name, value) == value for other in all_of)
-        }
-    label = group[0].label(without={*same, over})
+    swum = [
+        (at, result.thrust, result.error)
+        for at, result in zip(x, results, strict=False)
+        if result.thrust is not None
+    ]
+    top = peak(*map(list, zip(*swum, strict=True))) if swum else None
+    label = group[0].label(without={*_shared(all_of), over})
     return Curve(label, over.removeprefix(PARAMETER), group, x, results, top)
+
+
+def _shared(found: Sequence[Point]) -> set[str]:
+    """The columns that tell nothing apart; none where there is one point only."""
+    columns = [point.columns() for point in found]
+    if len(columns) < 2:
+        return set()
+    return {
+        name
+        for name in dict.fromkeys(name for each in columns for name in each)
+        if len({str(each[name]) for each in columns if name in each}) == 1
+    }

@@ -24,14 +24,15 @@ def draw(
     """Write the picture as PNG and as SVG; returns both paths.
 
     stem: path without a suffix
-    found: curves; those over one quantity share a panel, the others are left out
+    found: curves, one with a peak at least; those over one quantity share a panel, and those that
+        are over nothing, or without a thrust, are left out
     units: of what they are drawn over
     error_of: what the bars are, such as `the mean over beats`
     Raises `FishdError` where a file cannot be written, and `MissingPackage`.
     """
     panels: dict[str, list[Curve]] = {}
     for curve in found:
-        if curve.over:
+        if curve.peak:
             panels.setdefault(curve.over, []).append(curve)
     paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
     with drawn(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:

@@ -63,10 +63,10 @@ class SweepFolder:
         values = point.columns()
         return tuple(str(values.get(name, "")) for name in self._columns)
 
-    def keep(self, point: Point, result: Result, recording: bytes | Path) -> None:
+    def keep(self, point: Point, result: Result, recording: bytes | Path | None) -> None:
         """Keep what was measured, its recording first; raises `ConfigError` when it cannot be.
 
-        recording: its content, or a file in `RECORDINGS`
+        recording: its content, or a file in `RECORDINGS`, or None where there is none
         """
         try:
             if isinstance(recording, bytes):
@@ -76,7 +76,8 @@ class SweepFolder:
             key = self.key(point)
             values = msgspec.structs.asdict(result)
             row = dict(zip(self._columns, key, strict=True)) | values
-            self._table.add(row | {RECORDING: f"{RECORDINGS}/{recording.name}"})
+            name = f"{RECORDINGS}/{recording.name}" if recording else ""
+            self._table.add(row | {RECORDING: name})
         except OSError as error:
             raise self._unwritable(error) from None
         self.results[key] = result
@@ -110,10 +111,7 @@ class SweepFolder:
         try:
             before, *rows = tables.read(path)
             if tuple(before) != head:
-                raise ConfigError(
-                    f"{path}: this sweep has other parameters or keys: it was of "
-                    f"{', '.join(before[: -len(MEASURED) - 1])}; give another --folder"
-                )
+                raise ConfigError(f"{path}: {_other(before)}; give another --folder")
             complete = [row for row in rows if len(row) == len(head)]
             for row in complete:
                 measured = dict(zip(head, row, strict=True))
@@ -134,3 +132,16 @@ class SweepFolder:
     def _unwritable(self, error: OSError) -> ConfigError:
         where = error.filename or self.path
         return ConfigError(f"{where}: cannot be written: {error.strerror}; nothing is lost")
+
+
+def _other(head: Sequence[str]) -> str:
+    """Why a table with another head is not gone on with."""
+    measured = (*MEASURED, RECORDING)
+    if tuple(head[-len(measured) :]) == measured:
+        return (
+            "this sweep has other parameters or keys: it was of "
+            f"{', '.join(head[: -len(measured)])}"
+        )
+    missing = [name for name in measured if name not in head]
+    why = f"it has no column {', '.join(missing)}" if missing else "it has other columns"
+    return f"not a table as this fishd ({__version__}) writes it: {why}"

@@ -1,19 +1,21 @@
 """The points of a sweep: every combination of controllers, parameter values and configured keys."""
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from typing import Any
 
 from msgspec import Struct
-from msgspec.structs import replace
 
-from fishd.config import Config
 from fishd.controllers import registry
+from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError
 
 MOST = 100_000
 """A grid has no more points."""
+_WHOLE = 2.0**53
+"""Below this, a number that is whole is exact."""
 PARAMETER = "parameters."
 """What the column of a controller's parameter begins with; that of a configured key is its name."""
 
@@ -57,6 +59,17 @@ def spread(text: str) -> list[str]:
     if "" in found:
         raise ParameterError(f"'{text}' is not valid: a value is missing in it")
     return list(dict.fromkeys(found))
+
+
+def typed(text: str) -> int | float | str:
+    """A number where it is one: a whole one without a fraction; else the text itself."""
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    if not math.isfinite(number):
+        return text
+    return int(number) if number.is_integer() and abs(number) < _WHOLE else number
 
 
 def _range(piece: str) -> list[str]:
@@ -114,14 +127,27 @@ def _combinations(values: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def check(point: Point, config: Config) -> None:
-    """Raises `ParameterError` and `UnknownController` where it cannot swim a fish of `config`."""
-    limits = replace(config.limits, virtual=True)
+def check(point: Point, limits: Limits) -> None:
+    """Raises `ParameterError` and `UnknownController` where it cannot swim within these limits."""
     try:
         registry.check(point.controller, point.parameters, limits)
     except ParameterError as error:
         where = " ".join(f"{key}={_short(value)}" for key, value in point.keys.items())
         raise ParameterError(f"{error}{f' (with {where})' if where else ''}", error.path) from None
+
+
+def check_remote(found: Sequence[Point], limits: Limits) -> None:
+    """The same for a fishd that may run on another machine.
+
+    What only that can tell is left to it: a controller that is not installed here, a file.
+    """
+    names = registry.names()
+    for point in found:
+        if point.controller not in names:
+            continue
+        fields = registry.describe(point.controller).parameters
+        if not any(field.file and field.name in point.parameters for field in fields):
+            check(point, limits)
 
 
 def axis(found: Sequence[Point]) -> str:

@@ -13,10 +13,11 @@ from fishd.config import Config, Start
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import amplitude_of
+from fishd.core.errors import FishdError
 from fishd.core.signals import Tick
 from fishd.lab.measurement import measure
 from fishd.lab.parallel import Stop
-from fishd.lab.rig import Rig
+from fishd.lab.rig import Rig, is_of_one
 from fishd.lab.sweep.grid import Point
 from fishd.recording.writer import RunWriter
 from fishd.simulation import Beats, VirtualRun
@@ -123,10 +124,17 @@ def on_rig(
 ) -> tuple[Result, list[Tick]]:
     """The thrust that a rig measures at a point, freed of its drift, and the ticks.
 
+    There is trouble, and no tick, where fishd refuses this controller, or it gives up.
+
     progress: called with the time that has passed [s]
-    Raises as `fishd.lab.measurement.measure`.
+    Raises as `fishd.lab.measurement.measure` what concerns the other points, too.
     """
-    found = measure(rig, point.controller, point.parameters, seconds, progress)
+    try:
+        found = measure(rig, point.controller, point.parameters, seconds, progress)
+    except FishdError as error:
+        if not is_of_one(error):
+            raise
+        return Result(trouble=str(error)), []
     result = Result(
         thrust=found.thrust,
         error=found.error,

@@ -1,9 +1,11 @@
 """Runs a sweep: measures every point that its folder does not have yet."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from fishd.config import Config
 from fishd.core.interruption import interrupted_once, on_signal
+from fishd.core.signals import Tick
 from fishd.lab.parallel import workers
 from fishd.lab.rig import Rig
 from fishd.lab.sweep.folder import SweepFolder
@@ -57,6 +59,7 @@ def on_robot(
 ) -> bool:
     """Measure on a rig what is missing; False where a signal ended that before.
 
+    A point whose controller is refused, or gives up, has trouble, and the next one is measured.
     The fish rests afterwards, whatever ends it.
 
     seconds: for each point [s]
@@ -69,14 +72,19 @@ def on_robot(
                 if folder.key(point) in folder.results:
                     continue
                 result, ticks = on_rig(point, rig, seconds, progress)
-                extra = {name: str(value) for name, value in point.columns().items()}
-                path = folder.recording_of(point)
-                with RunWriter(path, source=rig.name, note=point.label(), extra=extra) as writer:
-                    writer.describe(folder.begun.config)
-                    for tick in ticks:
-                        writer.tick(tick)
+                path = _recorded(point, folder, rig.name, ticks) if ticks else None
                 folder.keep(point, result, path)
                 done(point, result)
     except KeyboardInterrupt:
         return False
     return True
+
+
+def _recorded(point: Point, folder: SweepFolder, source: str, ticks: Sequence[Tick]) -> Path:
+    extra = {name: str(value) for name, value in point.columns().items()}
+    path = folder.recording_of(point)
+    with RunWriter(path, source=source, note=point.label(), extra=extra) as writer:
+        writer.describe(folder.begun.config)
+        for tick in ticks:
+            writer.tick(tick)
+    return path

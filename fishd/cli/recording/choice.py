@@ -1,0 +1,32 @@
+"""Which recording a verb is about, and what its reader must know of it first."""
+
+from pathlib import Path
+
+import click
+
+from fishd.cli.output import counted, echo
+from fishd.recording import Run, open_run
+from fishd.recording.folder import FOLDER_VARIABLE, find
+
+folder_option = click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    help=f"Where recordings are; default: ${FOLDER_VARIABLE}, else fishd/runs in "
+    "$XDG_DATA_HOME or ~/.local/share.",
+)
+
+
+def opened(name: str, folder: Path | None) -> Run:
+    """The recording that a name means; says on standard error where it is damaged.
+
+    Raises `RecordingError`.
+    """
+    run = open_run(find(name, folder))
+    if run.is_damaged:
+        echo(f"fishctl: {run.path}: {damage(run.damaged)}", err=True)
+    return run
+
+
+def damage(ticks: int) -> str:
+    """What a damaged file has cost: `damaged: 10 ticks lost`."""
+    return f"damaged: {counted(ticks, 'tick')} lost"

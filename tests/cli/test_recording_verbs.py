@@ -1,0 +1,82 @@
+"""What the verbs about recordings refuse and say."""
+
+import json
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+from rigs.harness import Rig
+from rigs.processes import fishctl, one_line
+from rigs.recordings import recorded, swum
+
+from fishd.recording import RunWriter
+
+
+@pytest.mark.parametrize("length", ["nan", "inf", "-inf", "0"])
+def test_a_recording_has_a_length_that_ends(tmp_path: Path, length: str) -> None:
+    refused = fishctl("record", "--for", length, "--folder", str(tmp_path))
+    assert refused.returncode == 2
+    assert "'--for'" in one_line(refused)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_times_and_forces_that_cannot_be_are_listed_in_few_digits(tmp_path: Path) -> None:
+    (tick, *_) = swum(0.2).recorder.ticks
+    with RunWriter(tmp_path / "run") as writer:
+        writer.tick(tick)
+        writer.tally.tick(replace(tick, seq=tick.seq + 1, t=1e300, thrust=-1e300))
+    listed = fishctl("runs", "--folder", str(tmp_path)).stdout
+    assert "1e+300 s" in listed
+    assert max(map(len, listed.splitlines())) < 120
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of which one chunk, of ten ticks, cannot be read."""
+    path = recorded(swum(), tmp_path_factory.mktemp("runs") / "run", flush_every=10)
+    content = bytearray(path.read_bytes())
+    content[int(0.4 * len(content))] ^= 0x55
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("verb", "more"),
+    [
+        ("export", ["--csv", "--to"]),
+        ("rerun", ["--folder"]),
+        pytest.param("plot", ["--to"], marks=pytest.mark.slow),
+    ],
+)
+def test_every_verb_says_what_a_damaged_recording_lacks(
+    damaged: Path, tmp_path: Path, verb: str, more: list[str]
+) -> None:
+    done = fishctl(verb, str(damaged), *more, str(tmp_path))
+    assert done.returncode == 0
+    assert done.stderr == f"fishctl: {damaged}: damaged: 10 ticks lost\n"
+
+
+def test_a_damaged_recording_is_listed_as_one_and_recovered(damaged: Path) -> None:
+    folder = str(damaged.parent)
+    assert "damaged: 10 ticks lost" in fishctl("runs", "--folder", folder).stdout
+    (listed,) = json.loads(fishctl("runs", "--json", "--folder", folder).stdout)
+    assert (listed["damaged"], listed["lost"]) == (10, 10)
+    done = fishctl("recover", "run", "--folder", folder)
+    assert done.stdout.startswith(f"{folder}/run-recovered.mcap: ")
+    assert done.stdout.endswith("; damaged: 10 ticks lost\n")
+
+
+def test_where_no_controller_swam_nothing_is_chosen_again(tmp_path: Path) -> None:
+    rig = Rig()
+    rig.run_for(0.5)
+    done = fishctl("rerun", str(recorded(rig, tmp_path / "run")))
+    assert done.returncode == 1
+    assert done.stderr == "fishctl: no controller swam: there is nothing to choose again\n"
+
+
+@pytest.mark.parametrize("verb", ["export --csv", "plot", "replay", "rerun", "recover"])
+def test_a_file_that_is_no_recording_is_one_line_of_every_verb(tmp_path: Path, verb: str) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)) * 9)
+    done = fishctl(*verb.split(), "run", "--folder", str(tmp_path))
+    assert done.returncode == 1
+    assert "run.mcap is an MCAP file, but no recording of fishd" in one_line(done)

@@ -1,0 +1,27 @@
+"""`fishctl sweep --on robot` and a running fishd: what it refuses, and how it ends."""
+
+import signal
+from pathlib import Path
+
+from rigs.processes import FISHCTL, Daemon, Process, one_line, wait_until
+
+
+def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    words = ("sweep", "square", "--on", "robot", "--folder", str(tmp_path / "run"))
+    before = daemon.status().seq
+    complaint = one_line(daemon.fishctl(*words, "--amplitude", "0.3,0.41,0.6"))
+    assert "amplitude_limit" in complaint
+    assert daemon.status().seq < before + 60  # a point takes 600
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_closed_terminal_lets_the_fish_rest(daemon: Daemon, tmp_path: Path) -> None:
+    words = ("sweep", "square", "--on", "robot", "--folder", str(tmp_path / "run"))
+    sweep = Process(FISHCTL, "--endpoint", daemon.endpoint, *words, "--frequency", "1,2")
+    wait_until(lambda: daemon.status().mode == "running")
+    status, _, err = sweep.end(signal.SIGHUP)
+    assert status == 130
+    assert "stopped after 0 of 2 points; to go on: fishctl" in err
+    assert daemon.status().mode == "idle"

@@ -1,0 +1,125 @@
+"""The fish of a running fishd, here one in virtual time: who stops it, and what may be lost."""
+
+from typing import Any, cast
+
+import pytest
+from rigs.virtual_daemon import VirtualDaemon
+
+from fishd.client import Fish
+from fishd.core.errors import NoDaemon, Refused
+from fishd.core.protocol import State
+from fishd.lab.measurement import measure
+from fishd.lab.optimise.search import Range, Search
+from fishd.lab.optimise.trials import trials
+from fishd.lab.rig import Disturbed, LiveRig
+
+
+def rig_of(daemon: VirtualDaemon) -> LiveRig:
+    return LiveRig(cast(Fish, daemon))
+
+
+class Late(VirtualDaemon):
+    """Its answers to `set_controller` are not heard: it swims at once, or once it has loaded."""
+
+    def __init__(self, ended_by: type[BaseException], loads: bool) -> None:
+        super().__init__()
+        self._ended_by = ended_by
+        self._loads = loads
+        self.loading: str | None = None
+
+    def set_controller(self, name: str, /, **parameters: Any) -> State:
+        if self._loads:
+            self.loading = name
+        else:
+            super().set_controller(name, **parameters)
+        raise self._ended_by
+
+    def stop(self) -> State:
+        self.loading = None  # as fishd's `superseded`
+        return super().stop()
+
+
+@pytest.mark.parametrize("ended_by", [KeyboardInterrupt, NoDaemon])
+@pytest.mark.parametrize("loads", [False, True])
+def test_a_controller_whose_start_was_not_heard_of_is_stopped(
+    ended_by: type[BaseException], loads: bool
+) -> None:
+    daemon = Late(ended_by, loads)
+    with pytest.raises(ended_by), rig_of(daemon) as rig:
+        rig.swim("swing", {}, 1.0)
+    assert daemon.loading is None
+    assert daemon.status().mode == "idle"
+
+
+def test_what_somebody_else_has_begun_swims_on_after_a_refusal() -> None:
+    daemon = VirtualDaemon()
+    with rig_of(daemon) as rig:
+        rig.rest(1.0)
+        daemon.set_controller("sine")
+        with pytest.raises(Refused):
+            rig.swim("swing", {"C": 7.0}, 1.0)
+    assert daemon.status().controller == "sine"
+
+
+def test_a_restart_of_fishd_is_told_at_once_whenever_it_happens() -> None:
+    daemon = VirtualDaemon()
+    with rig_of(daemon) as rig:
+        rig.rest(5.0)
+        daemon.restart()
+        with pytest.raises(Disturbed, match="fishd was restarted"):
+            rig.swim("swing", {}, 1.0)
+    assert daemon.run.loop.seq < 5
+
+    daemon = Restarting(at=40, then_ahead=0)
+    with rig_of(daemon) as rig, pytest.raises(Disturbed, match="fishd was restarted"):
+        rig.rest(5.0)
+    assert daemon.run.loop.seq < 5
+
+    daemon = Restarting(at=3, then_ahead=20)
+    with rig_of(daemon) as rig, pytest.raises(Disturbed, match="fishd was restarted"):
+        rig.rest(5.0)
+
+
+class Restarting(VirtualDaemon):
+    """It is restarted after a tick; the new one is ahead by some ticks when it is heard."""
+
+    def __init__(self, at: int, then_ahead: int) -> None:
+        super().__init__()
+        self._at = at
+        self._then_ahead = then_ahead
+
+    def ticks(self):  # type: ignore[no-untyped-def]
+        for tick in super().ticks():
+            yield tick
+            if self.pid == 1 and tick.seq == self._at:
+                self.restart()
+                self.lost = set(range(self._then_ahead))
+
+
+def test_a_few_ticks_may_be_lost_but_not_many() -> None:
+    daemon = VirtualDaemon()
+    daemon.lost = {100, 101, 200, 399}
+    with rig_of(daemon) as rig:
+        found = measure(rig, "swing", {}, 21.0)
+        assert len(found.ticks) == pytest.approx(420 - 4, abs=2)
+        assert found.thrust == pytest.approx(25.7e-3, abs=0.05e-3)
+
+    daemon = VirtualDaemon()
+    daemon.lost = set(range(100, 110))
+    with (
+        rig_of(daemon) as rig,
+        pytest.raises(Disturbed, match=r"10 of 4\d\d ticks were lost on their way .* than 2%"),
+    ):
+        measure(rig, "swing", {}, 21.0)
+    assert daemon.status().mode == "idle"
+
+    daemon.lost = set(range(500, 600, 10))
+    with rig_of(daemon) as rig, pytest.raises(Disturbed, match="ticks were lost"):
+        list(trials(rig, "square", {}, Search([Range("frequency", 1.0, 2.0)]), 30.0))
+
+
+def test_a_swim_of_which_nothing_came_is_told() -> None:
+    daemon = VirtualDaemon()
+    daemon.lost = set(range(1, 30))
+    with rig_of(daemon) as rig, pytest.raises(Disturbed, match="20 of 20 ticks were lost"):
+        rig.swim("swing", {}, 1.0)

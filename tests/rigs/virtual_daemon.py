@@ -1,0 +1,64 @@
+"""A fishd in virtual time behind the methods of a client, for a test to disturb."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from fishd.config import Config
+from fishd.core.errors import ParameterError, Refused
+from fishd.core.protocol import State
+from fishd.core.signals import Tick
+from fishd.simulation import KeepingPublisher, VirtualRun
+
+
+class VirtualStatus:
+    """What a `LiveRig` asks of a status."""
+
+    def __init__(self, run: VirtualRun, pid: int) -> None:
+        loop = run.loop
+        self.pid, self.robot, self.tick = pid, "simulated", run.config.tick
+        self.force_unit = "N"
+        self.amplitude_limit = run.config.amplitude_limit
+        self.mode, self.controller = loop.supervisor.mode.value, loop.active.name
+        self.reason, self.fallback = loop.supervisor.reason, loop.active.fallback
+
+
+class VirtualDaemon:
+    """It ticks as its ticks are read; stands in for a `Fish`."""
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.config_of_run = config or Config()
+        self.lost: set[int] = set()
+        """Numbers of ticks that nobody hears."""
+        self.pid = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """As a service manager would."""
+        self.pid += 1
+        self._kept = KeepingPublisher()
+        self.run = VirtualRun(self.config_of_run, self._kept)
+
+    def status(self) -> VirtualStatus:
+        return VirtualStatus(self.run, self.pid)
+
+    def set_controller(self, name: str, /, **parameters: Any) -> State:
+        try:
+            self.run.set_controller(name, parameters)
+        except ParameterError as error:
+            raise Refused("bad-parameter", str(error)) from None
+        return self._state()
+
+    def stop(self) -> State:
+        self.run.loop.stop()
+        return self._state()
+
+    def ticks(self) -> Iterator[Tick]:
+        while True:
+            self.run.tick()
+            if self._kept.ticks[-1].seq not in self.lost:
+                yield self._kept.ticks[-1]
+
+    def _state(self) -> State:
+        loop = self.run.loop
+        mode = loop.supervisor.mode.value
+        return State(loop.seq + 1, mode, None, loop.active.name, loop.active.parameters)
