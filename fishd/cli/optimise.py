@@ -1,57 +1,37 @@
 """The verb that searches the best parameters of a controller."""
 
 import contextlib
+import time
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
-from msgspec import Struct
+import msgspec
 from msgspec.structs import replace
 
 from fishd.cli.config import set_option
 from fishd.cli.lab_progress import showing
+from fishd.cli.optimise_output import optimum_of, say, told
 from fishd.cli.options import ControllerGroup, ParameterType, endpoint_option, json_option
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.output import counted, echo, print_json, warn_of_fin
 from fishd.cli.sweep import ON, refuse_other
+from fishd.cli.sweep_output import again
 from fishd.client import Fish
 from fishd.config import Start, load
 from fishd.controllers import registry
 from fishd.core.console import INTERRUPTED
-from fishd.core.errors import ParameterError
+from fishd.core.errors import FishdError, NoDaemon, ParameterError
 from fishd.core.interruption import interrupted_once
 from fishd.core.schema import Field, nearest
 from fishd.simulation import simulate
 
 if TYPE_CHECKING:
-    from fishd.lab.optimise.search import Proposal, Range
+    from fishd.lab.optimise.folder import SearchFolder
+    from fishd.lab.optimise.search import Proposal, Range, Search
     from fishd.lab.optimise.trials import Trial
     from fishd.lab.rig import Rig
-
-
-class Optimum(Struct, frozen=True):
-    """What a search found, as a program reads it."""
-
-    controller: str
-    parameters: dict[str, float]
-    low: dict[str, float]
-    """The 95 % interval of each."""
-    high: dict[str, float]
-    thrust: float
-    """[N]"""
-    error: float
-    """Half of its 95 % interval [N]."""
-    improvement: float
-    """Expected of another trial, as a share of the thrust."""
-    trials: int
-    ticks_swum: int
-    seconds: float
-    """In the tank, rest included [s]."""
-    true_thrust: float | None = None
-    """There, of a simulated fish [N]."""
-    efficiency: float | None = None
-    """That over the thrust of the best square wave."""
 
 
 def optimise_options(function: Any) -> Any:
@@ -62,8 +42,8 @@ def optimise_options(function: Any) -> Any:
         click.option(
             "--folder",
             type=click.Path(path_type=Path),
-            help="Where table, recording and picture go; must be new. "
-            "[default: runs/optimise-DATE-TIME]",
+            help="Where table, recordings and picture go; a search that began in it is gone on "
+            "with. [default: runs/optimise-DATE-TIME]",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the search."),
         click.option(
@@ -125,15 +105,16 @@ def _optimise(
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
+    from fishd.lab.begun import owned
     from fishd.lab.measurement import REST
-    from fishd.lab.optimise.folder import SearchFolder, draw
+    from fishd.lab.optimise.folder import Begun, SearchFolder, draw
     from fishd.lab.optimise.search import Search
-    from fishd.lab.optimise.trials import lengths, trials
+    from fishd.lab.optimise.trials import lengths
 
     drawing.check_installed()
     refuse_other(on, {"--config": file, "--set": overrides}, {})
     path = folder or Path("runs") / f"optimise-{datetime.now():%Y%m%d-%H%M%S}"
-    with _fish(on, file, overrides, endpoint) as rig:
+    with _fish(on, file, overrides, endpoint) as (rig, config):
         ranges = [_range(text, name, parameters, rig) for text in over]
         search = Search(ranges, seed)
         if on == "simulation":
@@ -144,69 +125,133 @@ def _optimise(
             raise ParameterError(
                 f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"
             )
+        searched = {each.name: (each.low, each.high) for each in ranges}
         unit = rig.unit
-        run = SearchFolder(path, [each.name for each in ranges])
-        found, whole = None, True
-        last: Trial | None = None
-        try:
-            with (
-                interrupted_once(),
-                rig,
-                run.recorded(rig),
-                showing(budget, "s", err=as_json) as show,
-            ):
-                show.at(REST)
-                for last in trials(rig, name, parameters, search, budget):
-                    run.keep(last)
-                    found = search.proposal()
-                    shown = found if search.is_warm else None
-                    show.done(_told(search.trials, last, shown, unit), last.passed)
-                    if search.is_warm and found.improvement <= until:
-                        break
-        except KeyboardInterrupt:
-            whole = False
-    if last is None or found is None:
+        begun = Begun(on, name, parameters, searched, seed, config, unit)
+        with owned(path, "search"):
+            run = SearchFolder(path, begun)
+            task = _Task(name, parameters, search, budget, until)
+            whole, last, thinking = _measured(task, rig, run, unit, as_json)
+    if last is None:
         if whole:
             raise ParameterError(f"a budget of {budget:g} s is too short for the first candidate")
-        echo("fishctl: stopped before the first candidate was measured", err=True)
+        echo(f"fishctl: stopped before the first candidate; to go on: {again(path)}", err=True)
         return INTERRUPTED
-    optimum = _optimum(name, search.trials, last, found)
-    if on == "simulation":
-        report = simulate(load(file, overrides), name, {**parameters, **found.parameters})
-        optimum = replace(optimum, true_thrust=report.mean_thrust, efficiency=report.efficiency)
-    units = {each: field.unit for each, field in _fields().items()}
-    if as_json:
-        print_json(optimum)
-    else:
-        _say(optimum, unit, units, path)
-    pictures = draw(path, search, found, units, unit)
-    if not as_json:
-        echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
+    try:
+        with interrupted_once():
+            found = search.proposal()
+            optimum = optimum_of(name, search.trials, last, found)
+            if on == "simulation":
+                swum = simulate(load(file, overrides), name, {**parameters, **found.parameters})
+                truth = {"true_thrust": swum.mean_thrust, "efficiency": swum.efficiency}
+                optimum = replace(optimum, **truth)
+                warn_of_fin(swum.fin_amplitude)
+            else:
+                optimum = replace(optimum, thinking=thinking)
+            units = {each: field.unit for each, field in _fields().items()}
+    except KeyboardInterrupt:
+        echo(f"fishctl: stopped before the best was told; to go on: {again(path)}", err=True)
+        return INTERRUPTED
+    try:
+        with interrupted_once():
+            if as_json:
+                print_json(optimum)
+            else:
+                say(optimum, unit, units, path)
+            pictures = draw(path, search, found, units, unit)
+            if not as_json:
+                echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
+    except KeyboardInterrupt:
+        whole = False
     if not whole:
-        echo("fishctl: stopped before its end: this is the best so far", err=True)
+        echo(
+            f"fishctl: stopped before its end: this is the best so far; to go on: {again(path)}",
+            err=True,
+        )
         return INTERRUPTED
-    if found.improvement > until or not search.is_warm:
+    if not task.is_done(found):
         echo(
             f"fishctl: the budget of {budget:g} s is used: another candidate is expected to give "
-            f"{found.improvement:.1%} more, not {until:.1%} as asked for",
+            f"{found.improvement:.1%} more, not {until:.1%} as asked for; a larger --budget goes "
+            f"on with --folder {path}",
             err=True,
         )
         return 1
     return 0
 
 
+class _Task(NamedTuple):
+    """What is to be searched, and when it ends."""
+
+    controller: str
+    fixed: dict[str, Any]
+    search: "Search"
+    budget: float
+    until: float
+
+    def is_done(self, found: "Proposal") -> bool:
+        return self.search.is_warm and found.improvement <= self.until
+
+
+def _measured(
+    task: _Task, rig: "Rig", run: "SearchFolder", unit: str, err: bool
+) -> "tuple[bool, Trial | None, float]":
+    """Measure candidates until it is done, after those that are there.
+
+    Returns False where a signal ended it before, the last candidate, and how long the fish of a
+    robot waited for the next one [s].
+    """
+    from fishd.lab.optimise.trials import trials
+    from fishd.lab.rig import Disturbed
+
+    search = task.search
+    for each in run.done:
+        search.observe(each.parameters, each.thrust, each.error)
+    last = run.done[-1] if run.done else None
+    before = last.passed if last else 0.0
+    whole = True
+    begin = time.monotonic()
+    if last:
+        echo(f"{run.path}: {counted(len(run.done), 'candidate')} there already", err=err)
+    if last and task.is_done(search.proposal()):
+        return whole, last, 0.0
+    try:
+        with (
+            interrupted_once(),
+            rig,
+            run.recorded(rig),
+            showing(task.budget, "s", err=err) as show,
+        ):
+            show.at(before)
+            for each in trials(rig, task.controller, task.fixed, search, task.budget, last):
+                run.keep(each)
+                last = each
+                found = search.proposal()
+                shown = found if search.is_warm else None
+                show.done(told(search.trials, last, shown, unit), last.passed)
+                if task.is_done(found):
+                    break
+    except KeyboardInterrupt:
+        whole = False
+    except (Disturbed, NoDaemon) as error:
+        raise FishdError(f"{error}; to go on: {again(run.path)}") from None
+    waited = time.monotonic() - begin - ((last.passed if last else 0.0) - before)
+    return whole, last, max(0.0, waited)
+
+
 @contextlib.contextmanager
 def _fish(
     on: str, file: Path | None, overrides: tuple[str, ...], endpoint: str | None
-) -> "Iterator[Rig]":
-    """What swims."""
+) -> "Iterator[tuple[Rig, dict[str, Any]]]":
+    """What swims, and its configuration."""
     from fishd.lab.rig import LiveRig, VirtualRig
 
     if on == "simulation":
-        yield VirtualRig(replace(load(file, overrides), start=Start()))
+        config = replace(load(file, overrides), start=Start())
+        yield VirtualRig(config), msgspec.to_builtins(config)
         return
     with Fish(endpoint) as fish:
-        yield LiveRig(fish)
+        yield LiveRig(fish), fish.config()
 
 
 def _fields() -> dict[str, Field]:
@@ -218,7 +263,7 @@ def _fields() -> dict[str, Field]:
 def _range(text: str, controller: str, given: dict[str, Any], rig: "Rig") -> "Range":
     """`frequency`, or `frequency=1:3`; raises `UsageError`."""
     from fishd.lab.optimise.search import Range
-    from fishd.lab.optimise.trials import default_range
+    from fishd.lab.optimise.trials import check_bounds, default_range, whole_ticks
 
     name, equals, ends = text.partition("=")
     known = _fields()
@@ -234,60 +279,14 @@ def _range(text: str, controller: str, given: dict[str, Any], rig: "Rig") -> "Ra
             raise click.UsageError(
                 f"--over {name}: it has no bounds on both sides: write --over {name}=LOW:HIGH"
             )
-        return found
+        return whole_ticks(found, rig.tick) if name == "frequency" else found
     try:
         low, high = (float(end) for end in ends.split(":"))
     except ValueError:
         raise click.UsageError(
             f"--over {text}: write NAME=LOW:HIGH, such as frequency=0.5:4"
         ) from None
-    return Range(name, low, high)
-
-
-def _told(number: int, trial: "Trial", best: "Proposal | None", unit: str) -> str:
-    """best: what seems so, once there is enough to say it"""
-    measured = (
-        f"{number}: {_spelled(trial.parameters)}: {trial.thrust * 1e3:.2f} ± "
-        f"{trial.error * 1e3:.2f} m{unit}"
-    )
-    if best is None:
-        return measured
-    more = f"another may give {best.improvement:.1%} more"
-    return f"{measured}; best so far {_spelled(best.parameters)}, {more}"
-
-
-def _spelled(parameters: dict[str, float]) -> str:
-    return " ".join(f"{name}={value:.4g}" for name, value in parameters.items())
-
-
-def _optimum(name: str, trials: int, last: "Trial", found: "Proposal") -> Optimum:
-    return Optimum(
-        controller=name,
-        parameters=found.parameters,
-        low=found.low,
-        high=found.high,
-        thrust=found.thrust,
-        error=found.error,
-        improvement=found.improvement,
-        trials=trials,
-        ticks_swum=last.swum,
-        seconds=last.passed,
-    )
-
-
-def _say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
-    for name, value in found.parameters.items():
-        symbol = "" if units[name] in ("", "1") else f" {units[name]}"
-        interval = f"[{found.low[name]:.4g}, {found.high[name]:.4g}]"
-        echo(f"best {name} of {found.controller}: {value:.4g}{symbol} {interval}")
-    echo(f"thrust there: {found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} m{unit}")
-    if found.true_thrust is not None:
-        echo(
-            f"true thrust there: {found.true_thrust * 1e3:.2f} mN, {found.efficiency:.1%} of the "
-            "best square wave"
-        )
-    echo(
-        f"{counted(found.trials, 'candidate')}, {found.ticks_swum} ticks of swimming, "
-        f"{found.seconds:.0f} s with the rests"
-    )
-    echo(f"table: {path / 'trials.csv'}")
+    found = Range(name, low, high)
+    found.check()
+    check_bounds(found, known[name], rig)
+    return whole_ticks(found, rig.tick) if name == "frequency" else found

@@ -7,7 +7,7 @@ import click
 
 from fishd.cli.config import fish_options
 from fishd.cli.options import json_option
-from fishd.cli.output import echo, echo_rows, print_json
+from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
 from fishd.config import load
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -80,6 +80,8 @@ def optimum(
     fast, slow = lab.fast_servo(plant, chosen), lab.slow_servo(plant, chosen)
     limit = lab.saturation_amplitude(plant)
     found = lab.optimal_control(plant, chosen[0]) if control else None
+    for k, amplitude in enumerate(chosen):
+        warn_of_fin(best.fin_amplitude[k], f" at ±{amplitude:g} rad")
     if as_json:
         sets = {"best_square": best, "fast_servo": fast, "slow_servo": slow}
         print_json(

@@ -61,6 +61,21 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
+def warn_of_fin(amplitude: float, where: str = "") -> None:
+    """Say so where a simulated fin swings further than its equations hold.
+
+    amplitude: largest fin angle [rad]; where: that it does
+    """
+    from fishd.virtual.plant.parameters import LARGEST_FIN
+
+    if amplitude > LARGEST_FIN:
+        echo(
+            f"fishctl: the fin swings by ±{amplitude:.2f} rad{where}: beyond {LARGEST_FIN:g} rad "
+            "the equations of the fish do not hold, nor does this thrust",
+            err=True,
+        )
+
+
 def time_of_day(t: float) -> str:
     """Of unix time [s], here: `13:05:59`."""
     return f"{datetime.fromtimestamp(t):%H:%M:%S}"

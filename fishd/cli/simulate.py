@@ -7,7 +7,7 @@ import click
 
 from fishd.cli.config import fish_options
 from fishd.cli.options import ControllerGroup, json_option
-from fishd.cli.output import echo, echo_rows, print_json, spelled
+from fishd.cli.output import echo, echo_rows, print_json, spelled, warn_of_fin
 from fishd.config import Config, load
 from fishd.core.errors import MissingPackage
 
@@ -85,6 +85,7 @@ def _simulate(
         print_json(report)
     else:
         echo_rows(_rows(report, config, settle))
+    warn_of_fin(report.fin_amplitude)
     if report.fallback:
         echo(f"fishctl: another controller took over: {report.fallback.message}", err=True)
     if report.reason:

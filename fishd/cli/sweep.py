@@ -70,7 +70,7 @@ def sweep_options(function: Any) -> Any:
             multiple=True,
             metavar="KEY=VALUES",
             help="In simulation: a key of the configuration with several values, such as "
-            "plant.xi=0.05,0.6,1.2 or plant.omega0=8:14:2. Repeatable.",
+            "plant.xi=0.6,1.2,2.4 or plant.omega0=8:14:2. Repeatable.",
         ),
         click.option(
             "--config",
@@ -154,7 +154,7 @@ def _varied(text: str) -> tuple[str, list[Any]]:
 
     key, equals, values = text.partition("=")
     if not (equals and key.strip()):
-        raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.05,0.6,1.2")
+        raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.6,1.2,2.4")
     return key.strip(), list(dict.fromkeys(map(typed, spread(values))))
 
 
@@ -230,10 +230,11 @@ def _on_robot(
 
 @contextmanager
 def _opened(path: Path, begun: "Begun", found: "list[Point]") -> "Iterator[SweepFolder]":
-    from fishd.lab.sweep.folder import SweepFolder, owned
+    from fishd.lab.begun import owned
+    from fishd.lab.sweep.folder import SweepFolder
 
     columns = dict.fromkeys(name for point in found for name in point.columns())
-    with owned(path):
+    with owned(path, "sweep"):
         folder = SweepFolder(path, begun, list(columns))
         yield folder
         folder.sort(found)

@@ -7,12 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from fishd.cli.lab_progress import Lines, showing
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.output import counted, echo, print_json, warn_of_fin
 from fishd.core.console import INTERRUPTED
 
 if TYPE_CHECKING:
-    from fishd.lab.sweep.curves import Best
+    from fishd.lab.sweep.curves import Best, WholeTicks
     from fishd.lab.sweep.folder import SweepFolder
     from fishd.lab.sweep.grid import Point
     from fishd.lab.sweep.measuring import Result
@@ -73,18 +75,32 @@ def conclude(
 
     drawn = curves.curves(folder, found)
     unit = folder.begun.force_unit
-    bests = [(curve, best) for curve in drawn if (best := curves.best(curve))]
+    bests = [
+        (curve, msgspec.structs.replace(best, whole_ticks=curves.whole_ticks(folder, curve)))
+        for curve in drawn
+        if (best := curves.best(curve))
+    ]
     if as_json:
         print_json([best for _, best in bests])
     else:
         for curve, best in bests:
             echo(f"{curve.label}: {_proposal(best, units.get(best.over, ''), unit)}")
+            if best.whole_ticks:
+                echo(f"{curve.label}, of whole ticks: {_measured(best.whole_ticks, unit)}")
         echo(f"table: {folder.path / 'points.csv'}")
     if any(curve.peak for curve in drawn):
         stem = folder.path / "thrust"
         pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
         if not as_json:
             echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
+    fins = [
+        (result.fin_amplitude or 0.0, point.label())
+        for point in found
+        if (result := folder.results.get(folder.key(point)))
+    ]
+    if fins:
+        widest, where = max(fins)
+        warn_of_fin(widest, f" at {where}")
     if not whole:
         done = sum(folder.key(point) in folder.results for point in found)
         echo(
@@ -112,6 +128,14 @@ def _proposal(best: "Best", unit: str, force_unit: str) -> str:
         return f"best measured at {best.over} {best.x:.4g}{symbol}: {thrust}"
     interval = f"[{best.x_low:.4g}, {best.x_high:.4g}]"
     return f"best {best.over} {best.x:.4g}{symbol} {interval}: {thrust}"
+
+
+def _measured(found: "WholeTicks", force_unit: str) -> str:
+    error = "" if found.error is None else f" ± {found.error * 1e3:.2f}"
+    thrust = f"best measured at {found.frequency:.4g} Hz: {found.thrust * 1e3:.2f}{error}"
+    if found.nearer is None:
+        return f"{thrust} m{force_unit}"
+    return f"{thrust} m{force_unit}; {found.nearer:.6g} Hz is nearer the best, and not in the grid"
 
 
 def again(folder: Path) -> str:

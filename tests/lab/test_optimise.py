@@ -1,5 +1,8 @@
 """The search of the best parameters: few ticks of swimming, honest about what it does not know."""
 
+import os
+import signal
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +10,14 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
+from fishd.lab.optimise.folder import Begun, SearchFolder
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials, whole_ticks
 from fishd.lab.rig import VirtualRig
-from fishd.recording import open_run
+from fishd.recording import open_run, read
 from fishd.recording.rerun import rerun
-from fishd.simulation import simulate
+from fishd.simulation import VirtualRun, simulate
+from fishd.virtual.plant.tethered import TrueWindow
 
 BEST = 25.736e-3
 """Of the default fish, by a square wave of whole ticks, at 1.667 Hz [N]."""
@@ -34,17 +39,28 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
     assert best.thrust == pytest.approx(0.02, abs=2.0 * best.error)
 
 
-def test_candidates_have_half_beats_of_whole_ticks_within_their_range() -> None:
-    ranges = [Range("frequency", 0.4, 4.0)]
-    assert whole_ticks({"frequency": 1.7}, ranges, 0.05) == {"frequency": pytest.approx(10 / 6)}
-    assert whole_ticks({"frequency": 3.99}, ranges, 0.05) == {"frequency": pytest.approx(10 / 3)}
-    assert whole_ticks({"C": 0.61}, [Range("C", 0.0, 1.0)], 0.05) == {"C": 0.61}
+def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> None:
+    search = Search([whole_ticks(Range("frequency", 1.2, 2.6), 0.05)])
+    possible = (1.25, 10 / 7, 10 / 6, 2.0, 2.5)
+    assert search.ranges[0].values == pytest.approx(possible)
+    tried = set()
+    for _ in range(8):
+        found = search.suggest()["frequency"]
+        tried.add(found)
+        thrust = 0.0257 - 0.02 * (found - 1.74) ** 2  # whose top is at none of them
+        search.observe({"frequency": found}, thrust, 0.8e-3)
+        best = search.proposal()
+        for each in (best.parameters, best.low, best.high):
+            assert each["frequency"] in search.ranges[0].values
+    assert best.parameters["frequency"] in tried
+    assert best.parameters["frequency"] == pytest.approx(10 / 6)
+    assert len(tried) > 3
 
 
 @pytest.mark.slow
 def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     config = load("config/simulated.yaml")
-    search = Search([Range("frequency", 0.4, 5.0)], seed=1)
+    search = Search([whole_ticks(Range("frequency", 0.4, 5.0), config.tick)], seed=1)
     swum = 0
     with VirtualRig(config) as rig:
         for trial in trials(rig, "square", {}, search, 300.0):
@@ -74,7 +90,66 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert len(again) == len(rows) - 1
     assert all(each.from_start and each.equal == each.ticks for each in again)
     assert (folder / "thrust.svg").stat().st_size > 10_000
-    assert "exists already" in one_line(fishctl(*words))
+    assert "a larger --budget goes on" in done.stderr
+    there = (folder / "trials.csv").read_text()
+    more = fishctl(*words, "--budget", "40")
+    assert f"{folder}: 3 candidates there already" in more.stdout
+    assert (folder / "trials.csv").read_text().startswith(there)
+    assert len(read(folder / "search-2.mcap")) > 100
+    refused = one_line(fishctl(*words, "--amplitude", "0.3"))
+    assert "begun with parameters.amplitude = None, now it is 0.3" in refused
+
+
+@pytest.mark.slow
+def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(5)
+    tick = VirtualRun.tick
+    left = 0
+
+    def interrupted(run: VirtualRun) -> TrueWindow:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+        return tick(run)
+
+    monkeypatch.setattr(VirtualRun, "tick", interrupted)
+    folder = tmp_path / "run"
+    table = folder / "trials.csv"
+    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    kept, stops = "", 0
+    while True:
+        left = int(generator.integers(1, 300)) if stops < 8 else 0
+        done = fishctl(*words)
+        now = table.read_text()
+        assert now.startswith(kept)
+        kept = now
+        if done.returncode == 0:
+            break
+        stops += 1
+        assert done.returncode == 130
+        again = f"to go on: fishctl {' '.join(words)}\n"
+        assert done.stderr.startswith("fishctl: stopped before")
+        assert done.stderr.endswith(again)
+    assert stops == 8
+    assert "best frequency of square: 1.667 Hz" in done.stdout
+    rows = [row.split(",") for row in kept.splitlines()[1:]]
+    seconds = sum(len(read(each)) for each in folder.glob("search*.mcap")) * 0.05
+    swims = sum(float(b[3]) - float(a[3]) for a, b in pairwise([[0.0] * 5, *rows])) * 0.05
+    assert seconds > swims + 2.75 * len(rows)
+
+
+def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
+    begun = Begun("simulation", "square", {}, {"frequency": (1.0, 3.0)}, 0, {})
+    folder = SearchFolder(tmp_path, begun)
+    table = tmp_path / "trials.csv"
+    whole = table.read_text() + "1.25,0.02,0.001,40,12.5\n"
+    table.write_text(whole + "2.0,0.023,0.001,80,24.7")  # of 24.75
+    folder = SearchFolder(tmp_path, begun)
+    assert [each.parameters for each in folder.done] == [{"frequency": 1.25}]
+    assert table.read_text() == whole
 
 
 @pytest.mark.parametrize(
@@ -84,6 +159,7 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
         (["--over", "frequency=3:1"], "is no range"),
         (["--over", "frequency=1"], "LOW:HIGH"),
         (["--over", "frequency=1:30"], "frequency"),
+        (["--over", "frequency=1.5:1.9"], "there: 1.667; around: 1.429, 1.667, 2"),
         (["--over", "frequency", "--frequency", "2"], "is given, too"),
         (["--over", "frequency", "--budget", "5"], "too short"),
     ],

@@ -15,8 +15,10 @@ from rigs.processes import fishctl, one_line
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Event, Tick
+from fishd.lab.begun import owned
 from fishd.lab.rig import Disturbed, VirtualRig
-from fishd.lab.sweep.folder import MEASURED, Begun, SweepFolder, owned
+from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
+from fishd.lab.sweep.folder import MEASURED, Begun, SweepFolder
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, Result, swim
 from fishd.lab.sweep.running import on_robot
@@ -205,8 +207,54 @@ def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
         opened(tmp_path, load(None, settings), seconds)
 
 
+def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing(
+    tmp_path: Path,
+) -> None:
+    folder = opened(tmp_path)
+    thrusts = {1.4: 0.0227, 1.6: 0.0251, 1.8: 0.0252, 2.0: 0.0238, 2.2: 0.0216, 2.5: 0.0176}
+    found = [Point("square", {"frequency": value}) for value in thrusts]
+    for point, thrust in zip(found, thrusts.values(), strict=True):
+        folder.keep(point, Result(thrust=thrust, error=1e-4), b"a recording")
+    (curve,) = curves(folder, found)
+    told = whole_ticks(folder, curve)
+    assert told == WholeTicks(2.0, 0.0238, 1e-4, pytest.approx(10 / 6))
+    best = Point("square", {"frequency": 1.66667})
+    folder.keep(best, Result(thrust=0.02574, error=1e-4), b"a recording")
+    (curve,) = curves(folder, [*found, best])
+    assert whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["simulate", "swing", "--seconds", "20"],
+        ["optimum"],
+        ["sweep", "square", "--frequency", "1.8,2", "--periods", "3", "--jobs", "1"],
+    ],
+)
+def test_a_fin_that_swings_further_than_the_equations_hold_is_told(
+    words: Sequence[str], tmp_path: Path
+) -> None:
+    folder = ["--folder", str(tmp_path / "run")] if words[0] == "sweep" else []
+    done = fishctl(*words, "--set", "plant.xi=0.05", *folder)
+    assert done.returncode == 0
+    assert done.stderr.count("\n") == 1
+    assert "beyond 1 rad the equations of the fish do not hold" in done.stderr
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder, named in (("file", "File exists"), ("file/run", "Not a directory")):
+        with pytest.raises(ConfigError, match=f"cannot be made a folder: {named}"):
+            owned(tmp_path / folder, "search").__enter__()
+
+
 def test_two_sweeps_do_not_share_a_folder(tmp_path: Path) -> None:
-    with owned(tmp_path), pytest.raises(ConfigError, match="a sweep runs in it"), owned(tmp_path):
+    with (
+        owned(tmp_path, "sweep"),
+        pytest.raises(ConfigError, match="a sweep runs in it"),
+        owned(tmp_path, "sweep"),
+    ):
         pass
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from fishd.config import Config
 from fishd.core.errors import ParameterError, Refused
 from fishd.core.protocol import State
-from fishd.core.signals import Tick
+from fishd.core.signals import Event, Tick
 from fishd.simulation import KeepingPublisher, VirtualRun
 
 
@@ -51,6 +51,9 @@ class VirtualDaemon:
     def stop(self) -> State:
         self.run.loop.stop()
         return self._state()
+
+    def ticks_and_events(self) -> Iterator[Tick | Event]:
+        return iter(self.ticks())
 
     def ticks(self) -> Iterator[Tick]:
         while True:

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from common.report import DOCS, Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import trials
+from fishd.lab.optimise.trials import trials, whole_ticks
 from fishd.lab.rig import VirtualRig
 from fishd.simulation import simulate
 
@@ -62,7 +62,7 @@ def search(config: Config, seed: int) -> tuple[int, int, int, float, bool]:
     grid = [0.5 / (ticks * config.tick) for ticks in range(5, 8)]
     frequencies = [*np.arange(1.5, 2.0, 0.02).tolist(), *grid]
     best = max(frequencies, key=thrust)
-    found = Search([Range("frequency", *RANGE)], seed)
+    found = Search([whole_ticks(Range("frequency", *RANGE), config.tick)], seed)
     swum, shares = [], []
     with VirtualRig(config) as rig:
         for trial in trials(rig, "square", {}, found, BUDGET):

@@ -1,46 +1,74 @@
 """The folder of a search: a table of its candidates, a recording of all, and a picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
+from fishd import __version__
 from fishd.core.errors import ConfigError
+from fishd.core.files import FileProblem, write_atomically
+from fishd.lab import tables
+from fishd.lab.begun import begin
 from fishd.lab.drawing import BLUE, ORANGE, drawn, save
 from fishd.lab.optimise.search import Proposal, Search
 from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import Rig
 from fishd.lab.rig_recording import recorded
 from fishd.lab.tables import Table
+from fishd.recording.part_file import PART
 from fishd.recording.writer import RunWriter
 
-TRIALS, RECORDING = "trials.csv", "search.mcap"
+BEGUN, TRIALS, RECORDING = "search.json", "trials.csv", "search.mcap"
 _TICKS = [base * 10.0**k for k in range(-4, 4) for base in (1, 2, 3, 5)]
 _COLUMNS = ("thrust", "error", "swum", "passed")
 
 
+class Begun(Struct, frozen=True):
+    """With what a search began; a folder is gone on with only by the same."""
+
+    on: str
+    controller: str
+    parameters: dict[str, Any]
+    """Those that are not searched."""
+    over: dict[str, tuple[float, float]]
+    """From where to where each other one is."""
+    seed: int
+    config: dict[str, Any]
+    """The fish, as plain data."""
+    force_unit: str = "N"
+    version: str = __version__
+
+
 class SearchFolder:
-    """A new folder in which candidates are kept as they are measured."""
+    """A folder in which candidates are kept as they are measured.
 
-    def __init__(self, path: Path, names: Sequence[str]) -> None:
-        """
-        names: the parameters that are searched
+    `done` has those that were there when it was opened.
+    """
 
-        Raises `ConfigError` where there is something in the folder.
-        """
+    def __init__(self, path: Path, begun: Begun) -> None:
+        """Makes the folder, or goes on with one; raises `ConfigError` where that is of another."""
         self.path = path
         try:
-            if path.exists() and (not path.is_dir() or any(path.iterdir())):
-                raise ConfigError(f"{path} exists already; give another --folder")
             path.mkdir(parents=True, exist_ok=True)
-            self._table = Table(path / TRIALS, (*names, *_COLUMNS))
+            begin(path / BEGUN, begun, "search")
+            head = (*begun.over, *_COLUMNS)
+            self.done = _read(path / TRIALS, head)
+            self._table = Table(path / TRIALS, head)
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be made: {error.strerror}") from None
+            raise self._unwritable(error) from None
 
     def recorded(self, rig: Rig) -> AbstractContextManager[RunWriter]:
-        """While this lasts, all that the rig does is recorded: `fishd.lab.rig_recording`."""
-        return recorded(rig, self.path / RECORDING, "a search")
+        """While this lasts, all that the rig does goes into a recording of its own."""
+        first, number = self.path / RECORDING, 1
+        path = first
+        while path.exists() or path.with_name(path.name + PART).exists():
+            number += 1
+            path = first.with_stem(f"{first.stem}-{number}")
+        return recorded(rig, path, "a search")
 
     def keep(self, trial: Trial) -> None:
         """Keep a candidate; raises `ConfigError`."""
@@ -48,10 +76,40 @@ class SearchFolder:
         try:
             self._table.add({**trial.parameters, **values})
         except OSError as error:
-            raise ConfigError(
-                f"{self.path / TRIALS}: cannot be written: {error.strerror}; what was measured "
-                "before is in it"
-            ) from None
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> ConfigError:
+        where = error.filename or self.path
+        return ConfigError(
+            f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
+        )
+
+
+def _read(path: Path, head: tuple[str, ...]) -> list[Trial]:
+    """The candidates of a table; a last row that a kill has cut off is dropped."""
+    if not path.exists():
+        return []
+    try:
+        before, *rows = tables.read(path)
+        if tuple(before) != head:
+            raise ValueError
+        if rows and not path.read_bytes().endswith(b"\n"):
+            write_atomically(path, tables.lines([head, *rows[:-1]]))
+            rows = rows[:-1]
+        found = [dict(zip(head, map(float, row), strict=True)) for row in rows]
+    except (ValueError, FileProblem):
+        raise ConfigError(f"{path}: not the table of this search; give another --folder") from None
+    names = head[: -len(_COLUMNS)]
+    return [
+        Trial(
+            {name: row[name] for name in names},
+            row["thrust"],
+            row["error"],
+            int(row["swum"]),
+            row["passed"],
+        )
+        for row in found
+    ]
 
 
 def draw(

@@ -40,9 +40,17 @@ class Range(NamedTuple):
     name: str
     low: float
     high: float
+    values: tuple[float, ...] = ()
+    """Those that it can have, from low to high; empty where it can have any."""
 
     def value(self, share: float) -> float:
-        """What a number from 0 to 1 stands for."""
+        """What a number from 0 to 1 stands for: the nearest that it can have."""
+        if self.values:
+            return min(self.values, key=lambda each: abs(self.share(each) - share))
+        return self.between(share)
+
+    def between(self, share: float) -> float:
+        """What that number stands for where any value is possible."""
         if self.is_logarithmic:
             return float(self.low * (self.high / self.low) ** share)
         return float(self.low + share * (self.high - self.low))
@@ -55,6 +63,11 @@ class Range(NamedTuple):
             found = (value - self.low) / (self.high - self.low)
         return min(1.0, max(0.0, found))
 
+    def check(self) -> None:
+        """Raises `ParameterError` where it is empty."""
+        if not self.low < self.high or not math.isfinite(self.high - self.low):
+            raise ParameterError(f"{self.name}: from {self.low:g} to {self.high:g} is no range")
+
     @property
     def is_logarithmic(self) -> bool:
         """By ratio rather than by difference?"""
@@ -62,7 +75,7 @@ class Range(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """Where the Gaussian process expects the most thrust."""
+    """Where the Gaussian process expects the most thrust, among what can be measured."""
 
     parameters: dict[str, float]
     low: dict[str, float]
@@ -85,9 +98,9 @@ class Search:
         if not ranges:
             raise ParameterError("nothing to search: name a parameter")
         for each in ranges:
-            if not each.low < each.high or not math.isfinite(each.high - each.low):
-                raise ParameterError(f"{each.name}: from {each.low:g} to {each.high:g} is no range")
+            each.check()
         self.ranges = tuple(ranges)
+        self._seed = seed
         self._names = [each.name for each in ranges]
         self._acquisition = _NoisyImprovement(xi=0.0)
         with warnings.catch_warnings():
@@ -101,10 +114,9 @@ class Search:
                 allow_duplicate_points=True,
             )
         first = 2 * len(ranges) + 1
-        spread = qmc.LatinHypercube(len(ranges), scramble=False, rng=seed).random(first)
-        self._first = iter(spread)
+        self._first = qmc.LatinHypercube(len(ranges), scramble=False, rng=seed).random(first)
+        self._possible = self._fill()
         self._variances: list[float] = []
-        self._seed = seed
 
     @property
     def trials(self) -> int:
@@ -118,12 +130,14 @@ class Search:
 
     def suggest(self) -> dict[str, float]:
         """The next candidate: first some that fill the ranges, then what promises most."""
-        share = next(self._first, None)
-        if share is None:
-            self._fit_noise()
-            found = self._library.suggest()
-            share = np.array([found[name] for name in self._names])
-        return self._parameters(share)
+        if self.trials < len(self._first):
+            return self._parameters(self._untried(self._first[self.trials]))
+        if any(each.values for each in self.ranges):
+            gain, _ = self._gain(self._possible)
+            return self._parameters(self._possible[int(np.argmax(gain))])
+        self._fit_noise()
+        found = self._library.suggest()
+        return self._parameters(np.array([found[name] for name in self._names]))
 
     def observe(self, parameters: Mapping[str, float], thrust: float, error: float) -> None:
         """Take what a candidate gave [N], and half of its 95 % interval [N]."""
@@ -134,23 +148,22 @@ class Search:
 
     def proposal(self) -> Proposal:
         """What seems best now; there must have been a trial."""
-        shares = self._candidates()
-        mean, covariance = self._expected(shares)
+        shares: Array = np.vstack((self._possible, self._library.space.params))
+        gain, (mean, covariance) = self._gain(shares)
         best = int(np.argmax(mean))
         generator = np.random.default_rng(self._seed)
         curves = generator.multivariate_normal(
             mean, covariance, _SAMPLES, method="eigh", check_valid="ignore"
         )
-        low, high = np.quantile(shares[np.argmax(curves, axis=1)], (0.025, 0.975), axis=0)
-        deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-18))
-        self._acquisition.y_max = mean[-self.trials :].max()
-        gain = self._acquisition.base_acq(mean, deviation)
+        tops = shares[np.argmax(curves, axis=1)]
+        low = np.quantile(tops, 0.025, axis=0, method="lower")
+        high = np.quantile(tops, 0.975, axis=0, method="higher")
         return Proposal(
             self._parameters(shares[best]),
             self._parameters(np.minimum(low, shares[best])),
             self._parameters(np.maximum(high, shares[best])),
             float(mean[best]),
-            1.96 * float(deviation[best]),
+            1.96 * math.sqrt(max(float(covariance[best, best]), 1e-18)),
             float(gain.max() / abs(mean[best])),
         )
 
@@ -166,7 +179,7 @@ class Search:
         """Of one parameter: its values, the thrust, and half of its 95 % interval [N]."""
         shares = np.linspace(0.0, 1.0, points)
         mean, covariance = self._expected(shares[:, None])
-        values = np.array([self.ranges[0].value(share) for share in shares])
+        values = np.array([self.ranges[0].between(float(share)) for share in shares])
         return values, mean, 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
     def _expected(self, shares: Array) -> tuple[Array, Array]:
@@ -175,12 +188,42 @@ class Search:
         places = [dict(zip(self._names, map(float, place), strict=True)) for place in shares]
         return cast(tuple[Array, Array], self._library.predict(places, return_cov=True))
 
-    def _candidates(self) -> Array:
-        """Numbers from 0 to 1 that fill the space, and what was measured; (n, parameters)."""
+    def _gain(self, shares: Array) -> tuple[Array, tuple[Array, Array]]:
+        """The improvement expected at these places [N]; the thrust there, and its covariance."""
+        places: Array = np.vstack((shares, self._library.space.params))
+        mean, covariance = self._expected(places)
+        deviation: Array = np.sqrt(np.maximum(np.diag(covariance), 1e-18))
+        self._acquisition.y_max = mean[-self.trials :].max()
+        n = len(shares)
+        gain = cast(Array, self._acquisition.base_acq(mean[:n], deviation[:n]))
+        return gain, (mean[:n], covariance[:n, :n])
+
+    @property
+    def _is_finite(self) -> bool:
+        """Is there a single parameter, of few values?"""
+        return len(self.ranges) == 1 and bool(self.ranges[0].values)
+
+    def _fill(self) -> Array:
+        """Numbers from 0 to 1 that fill the space, all of them possible; (n, parameters)."""
+        if self._is_finite:
+            only = self.ranges[0]
+            return np.array([[only.share(value)] for value in only.values])
         filling = np.linspace(0.0, 1.0, _GRID)[:, None]
         if len(self.ranges) > 1:
-            filling = qmc.Halton(len(self.ranges), rng=self._seed).random(2 * _GRID)
-        return np.vstack((filling, self._library.space.params))
+            within = qmc.Halton(len(self.ranges), rng=self._seed).random(2 * _GRID)
+            filling = np.clip(1.05 * within - 0.025, 0.0, 1.0)  # with the edges
+        for index, each in enumerate(self.ranges):
+            if each.values:
+                filling[:, index] = [each.share(each.value(share)) for share in filling[:, index]]
+        return filling
+
+    def _untried(self, share: Array) -> Array:
+        """The nearest that is possible, and new where there are few."""
+        if not self._is_finite:
+            return share
+        tried = self._library.space.params[:, 0] if self.trials else np.empty(0)
+        new = [each for each in self._possible if not np.any(np.isclose(tried, each[0]))]
+        return min(new or self._possible, key=lambda each: abs(float(each[0] - share[0])))
 
     def _parameters(self, shares: Array) -> dict[str, float]:
         return {

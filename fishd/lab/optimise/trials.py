@@ -1,11 +1,13 @@
 """Measures the candidates of a search on a rig: the fish swims with each, and rests in between."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from fishd.control.estimators.live_thrust import SWIM_SETTLES
+from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
+from fishd.core.signals import Tick
 from fishd.lab.measurement import REST, evaluate, samples_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig, refuse_lost
@@ -18,6 +20,10 @@ WAVE_SETTLES = 0.75
 """A given wave is steady after so long [s]: there is no estimator in it, and the fin follows."""
 FREQUENCIES = 0.4
 """The lowest frequency that is searched unless another is asked for [Hz]."""
+LONGEST = 200
+"""The longest half beat that is searched where the frequencies begin at 0 [ticks]."""
+FEWEST_VALUES = 3
+"""A search of fewer frequencies is none: `compare` or `sweep` measures them all."""
 SHORTEST = 2
 """The shortest half beat that is searched unless another is asked for [ticks]."""
 
@@ -38,7 +44,12 @@ class Trial(NamedTuple):
 
 
 def trials(
-    rig: Rig, controller: str, fixed: Mapping[str, Any], search: Search, budget: float
+    rig: Rig,
+    controller: str,
+    fixed: Mapping[str, Any],
+    search: Search,
+    budget: float,
+    before: Trial | None = None,
 ) -> Iterator[Trial]:
     """Measure candidates on a rig for as long as the budget lasts; `search` knows of each.
 
@@ -47,16 +58,20 @@ def trials(
 
     fixed: parameters that are not searched
     budget: time in the tank [s]
+    before: the last one of a search that is gone on with, which `search` knows already
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
-    rest = rig.rest(REST)
-    swum, passed = 0, REST
+    rest: list[Tick] = []
+    swum, passed = (before.swum, before.passed) if before else (0, 0.0)
+    passed += REST
     while True:
-        candidate = whole_ticks(search.suggest(), search.ranges, rig.tick)
+        candidate = search.suggest()
         parameters = {**fixed, **candidate}
         settles, length = lengths(parameters)
         if passed + length + REST > budget:
             return
+        if not rest:
+            rest = rig.rest(REST)
         swim = rig.swim(controller, parameters, length)
         after = rig.rest(REST)
         ticks = [*rest, *swim, *after]
@@ -69,23 +84,28 @@ def trials(
         rest = after
 
 
-def whole_ticks(
-    candidate: dict[str, float], ranges: Sequence[Range], tick: float
-) -> dict[str, float]:
-    """The nearest candidate in these ranges whose half beats are whole ticks, if there is one.
+def whole_ticks(frequencies: Range, tick: float) -> Range:
+    """The same range, of the frequencies alone whose half beats are whole ticks.
 
-    A few beats of that are like all others. Other half beats are dithered, over more beats than a
-    candidate swims.
+    A few beats of one of those are like all others. Other half beats are dithered, over more beats
+    than a candidate swims.
+
+    tick: period of the loop [s]
+    Raises `ParameterError` where there are fewer than `FEWEST_VALUES`.
     """
-    found = [each for each in ranges if each.name == "frequency" and each.low > 0.0]
-    if not found:
-        return candidate
-    fewest = max(1, math.ceil(0.5 / found[0].high / tick - 1e-9))
-    most = math.floor(0.5 / found[0].low / tick + 1e-9)
-    if most < fewest:
-        return candidate
-    ticks = min(most, max(fewest, round(0.5 / candidate["frequency"] / tick)))
-    return candidate | {"frequency": 0.5 / (ticks * tick)}
+    name, low, high, _ = frequencies
+    longest = math.floor(0.5 / low / tick + 1e-9) if low > 0.0 else LONGEST
+    shortest = max(1, math.ceil(0.5 / high / tick - 1e-9))
+    values = [0.5 / (ticks * tick) for ticks in range(longest, shortest - 1, -1)]
+    if len(values) < FEWEST_VALUES:
+        around = range(longest + 1, max(0, shortest - 2), -1)
+        near = ", ".join(f"{0.5 / (ticks * tick):.4g}" for ticks in around)
+        there = ", ".join(f"{value:.4g}" for value in values) or "none"
+        raise ParameterError(
+            f"{name}: too few values from {low:g} to {high:g}: only half beats of whole ticks are "
+            f"compared, {FEWEST_VALUES} at least; there: {there}; around: {near}"
+        )
+    return Range(name, low, high, tuple(values))
 
 
 def lengths(parameters: Mapping[str, Any]) -> tuple[float, float]:
@@ -102,12 +122,11 @@ def default_range(field: Field, rig: Rig) -> Range | None:
     A frequency from `FREQUENCIES` to half beats of `SHORTEST` ticks, an amplitude up to that of
     the rig; an end that is no value itself is moved in by a twentieth.
     """
-    parts = field.interval.strip("()[]").split(", ")
+    low, high = _ends(field)
     if field.name == "amplitude":
         return Range(field.name, rig.amplitude / 20.0, rig.amplitude)
-    if len(parts) != 2 or "inf" in field.interval:
+    if math.isinf(low) or math.isinf(high):
         return None
-    low, high = map(float, parts)
     if field.name == "frequency":
         return Range(field.name, max(low, FREQUENCIES), min(high, 0.5 / (SHORTEST * rig.tick)))
     margin = (high - low) / 20.0
@@ -116,3 +135,25 @@ def default_range(field: Field, rig: Rig) -> Range | None:
         low + margin * field.interval.startswith("("),
         high - margin * field.interval.endswith(")"),
     )
+
+
+def check_bounds(asked: Range, field: Field, rig: Rig) -> None:
+    """Raises `ParameterError` where a parameter cannot be searched between these."""
+    low, high = _ends(field)
+    if field.name == "amplitude":
+        high = min(high, rig.amplitude)
+    is_open = field.interval.startswith("(") and asked.low == low
+    is_open |= field.interval.endswith(")") and asked.high == high
+    if asked.low < low or asked.high > high or is_open:
+        reach = f"{field.interval[:1] or '['}{low:g}, {high:g}{field.interval[-1:] or ']'}"
+        raise ParameterError(
+            f"{asked.name}: from {asked.low:g} to {asked.high:g} is not within {reach}"
+        )
+
+
+def _ends(field: Field) -> tuple[float, float]:
+    """Between what its values are; infinite where nothing bounds them."""
+    parts = field.interval.strip("()[]").split(", ")
+    if len(parts) != 2:
+        return -math.inf, math.inf
+    return float(parts[0]), float(parts[1])

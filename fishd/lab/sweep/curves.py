@@ -1,6 +1,7 @@
 """What a sweep shows: a curve of thrust for each controller and setting, and its best point."""
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +11,9 @@ from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import PARAMETER, Point, axis
 from fishd.lab.sweep.measuring import Result
 from fishd.lab.sweep.peak import Peak, peak
+
+_SLIP = 5e-3
+"""Half beats this near to whole ticks count as such [ticks]."""
 
 
 class Curve(NamedTuple):
@@ -23,6 +27,19 @@ class Curve(NamedTuple):
     results: list[Result]
     peak: Peak | None
     """None over nothing, or where no point has a thrust."""
+
+
+class WholeTicks(Struct, frozen=True):
+    """The best that was measured of the frequencies whose half beats are whole ticks."""
+
+    frequency: float
+    """[Hz]"""
+    thrust: float
+    """[N]"""
+    error: float | None
+    """Half of its 95 % interval [N]."""
+    nearer: float | None
+    """Another such frequency that is nearer the best of the curve, and was not measured [Hz]."""
 
 
 class Best(Struct, frozen=True):
@@ -45,6 +62,8 @@ class Best(Struct, frozen=True):
     """Half of its 95 % interval [N]."""
     at_edge: bool
     """The highest point is at the edge of the grid: the best may lie beyond."""
+    whole_ticks: WholeTicks | None = None
+    """Of a curve over frequencies that has some."""
 
 
 def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
@@ -88,6 +107,31 @@ def best(curve: Curve) -> Best | None:
         error=found.y_error if found else curve.results[index].error,
         at_edge=found.at_edge if found else False,
     )
+
+
+def whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | None:
+    """The best that was measured without dithered half beats; None where nothing was."""
+    if curve.over != "frequency" or curve.peak is None:
+        return None
+    tick = float(curve.points[0].keys.get("tick", folder.begun.config["tick"]))
+    whole = {
+        round(0.5 / x / tick): (thrust, x, result.error)
+        for x, result in zip(curve.x, curve.results, strict=True)
+        if (thrust := result.thrust) is not None and x > 0.0 and _is_whole(0.5 / x / tick)
+    }
+    if not whole:
+        return None
+    thrust, frequency, error = max(whole.values(), key=lambda each: each[0])
+    top = curve.peak.x
+    half = 0.5 / top / tick
+    around = [ticks for ticks in (math.floor(half), math.ceil(half)) if ticks > 0]
+    near = min(around, key=lambda ticks: abs(0.5 / (ticks * tick) - top))
+    return WholeTicks(frequency, thrust, error, None if near in whole else 0.5 / (near * tick))
+
+
+def _is_whole(ticks: float) -> bool:
+    """So nearly that no reversal of a short swim slips to another tick."""
+    return round(ticks) > 0 and abs(ticks - round(ticks)) < _SLIP
 
 
 def _curve(folder: SweepFolder, group: list[Point], over: str, all_of: Sequence[Point]) -> Curve:

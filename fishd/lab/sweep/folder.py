@@ -1,7 +1,6 @@
 """The folder of a sweep: what it was begun with, a table of its points, and their recordings."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,19 +9,16 @@ from msgspec import Struct
 from msgspec.structs import fields
 
 from fishd import __version__
-from fishd.core import files
 from fishd.core.errors import ConfigError
 from fishd.core.files import FileProblem, write_atomically
-from fishd.core.lockfile import NotALock, Taken, locked
 from fishd.lab import tables
+from fishd.lab.begun import begin
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Result
 
 BEGUN, POINTS, RECORDINGS = "sweep.json", "points.csv", "ticks"
 RECORDING = "recording"
 """The column that names the recording of a point."""
-OTHERS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
-"""Sections and keys of a configuration that have no part in the thrust."""
 MEASURED = tuple(field.name for field in fields(Result))
 
 On = Literal["simulation", "robot"]
@@ -54,7 +50,7 @@ class SweepFolder:
         self._columns = tuple(columns)
         self.results: dict[tuple[str, ...], Result] = {}
         try:
-            _make(path, begun)
+            begin(path / BEGUN, begun, "sweep")
             (path / RECORDINGS).mkdir(exist_ok=True)
             head = (*self._columns, *MEASURED, RECORDING)
             self._read(head)
@@ -137,19 +133,6 @@ class SweepFolder:
         return ConfigError(f"{where}: cannot be written: {error.strerror}; nothing is lost")
 
 
-@contextmanager
-def owned(path: Path) -> Iterator[None]:
-    """While this lasts, no other sweep uses the folder; raises `ConfigError`."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with locked(path / "sweep", remove=True):
-            yield
-    except Taken as taken:
-        raise ConfigError(f"{path}: a sweep runs in it, process {taken.pid}") from None
-    except NotALock as error:
-        raise ConfigError(f"{error.filename}: {error.strerror}") from None
-
-
 def _other(head: Sequence[str]) -> str:
     """Why a table with another head is not gone on with."""
     measured = (*MEASURED, RECORDING)
@@ -161,59 +144,3 @@ def _other(head: Sequence[str]) -> str:
     missing = [name for name in measured if name not in head]
     why = f"it has no column {', '.join(missing)}" if missing else "it has other columns"
     return f"not a table as this fishd ({__version__}) writes it: {why}"
-
-
-def _make(path: Path, begun: Begun) -> None:
-    file = path / BEGUN
-    if file.exists():
-        _check_same(file, begun)
-        return
-    others = [each for each in path.iterdir() if not each.name.endswith(".lock")]
-    if others:
-        raise ConfigError(f"{path}: not empty, and no sweep began in it; give another --folder")
-    write_atomically(file, msgspec.json.format(msgspec.json.encode(begun), indent=2))
-
-
-def _check_same(file: Path, begun: Begun) -> None:
-    """Refuse to go on with another fish, or for another length."""
-    try:
-        data = msgspec.json.decode(files.read(file, files.SETTINGS, "a sweep"), type=Begun)
-    except FileProblem as problem:
-        raise ConfigError(f"{file}: {problem}") from None
-    except msgspec.MsgspecError as error:
-        raise ConfigError(
-            f"{file}: not as this fishd ({__version__}) writes it: {error}; give another --folder"
-        ) from None
-    before, now = (_relevant(each) for each in (data, begun))
-    for key in (key for key in before if key in now):
-        if before[key] != now[key]:
-            raise ConfigError(
-                f"{file}: this sweep was begun with {key} = {before[key]}, now it is {now[key]}; "
-                "give the same, or another --folder"
-            )
-    if others := [key for key in (*before, *now) if not (key in before and key in now)]:
-        who = f"fishd {data.version}" if data.version != __version__ else "another fishd"
-        has = "has" if others[0] in before else "has no"
-        raise ConfigError(
-            f"{file}: this sweep was begun with {who}, whose configuration {has} {others[0]}, "
-            "unlike that of now; give another --folder"
-        )
-
-
-def _relevant(begun: Begun) -> dict[str, Any]:
-    """What thrust depends on, by dotted keys."""
-    return {
-        key: value
-        for key, value in _leaves(msgspec.to_builtins(begun)).items()
-        if key != "version" and key.removeprefix("config.").partition(".")[0] not in OTHERS
-    }
-
-
-def _leaves(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping) and value:
-            found |= _leaves(value, f"{prefix}{key}.")
-        else:
-            found[prefix + key] = value
-    return found

@@ -6,6 +6,9 @@ from msgspec import Struct
 
 from fishd.core.schema import unit
 
+LARGEST_FIN = 1.0
+"""The equations are of small fin angles, with α for sin α, which is 19 % more here [rad]."""
+
 
 class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Constants of the servo, the fin and the forces; the defaults are those of Fu et al."""

@@ -1,0 +1,40 @@
+"""`fishctl optimise --on robot` on a real fishd: what a signal leaves, and how it goes on."""
+
+import signal
+from pathlib import Path
+
+import pytest
+from rigs.processes import FISHCTL, Daemon, Process, wait_until
+
+
+@pytest.mark.slow
+def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    table = folder / "trials.csv"
+    words = ["--endpoint", daemon.endpoint, "optimise", "square", "--over", "frequency=1:3"]
+    words += ["--on", "robot", "--folder", str(folder)]
+    searching = Process(FISHCTL, *words)
+    wait_until(lambda: table.exists() and table.read_text().count("\n") == 2)
+    wait_until(lambda: daemon.status().mode == "running")
+    status, out, err = searching.end(signal.SIGINT)
+    assert status == 130
+    assert daemon.status().mode == "idle"
+    assert "1 candidate, " in out
+    assert "s of thinking besides" in out
+    assert err.endswith(f"to go on: fishctl {' '.join(words)}\n")
+    again = daemon.fishctl(*words[2:], "--budget", "12")
+    assert again.returncode == 1
+    assert f"{folder}: 1 candidate there already" in again.stdout
+    assert "the budget of 12 s is used" in again.stderr
+
+
+def test_what_the_fish_cannot_do_is_not_begun(daemon: Daemon, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["optimise", "square", "--on", "robot", "--folder", str(folder)]
+    for over, named in (("frequency=1:30", "(0, 10]"), ("amplitude=0.1:0.6", "(0, 0.42]")):
+        refused = daemon.fishctl(*words, "--over", over)
+        assert refused.returncode == 1
+        assert f"is not within {named}" in refused.stderr
+    assert not folder.exists()
