@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 from fishd.client import Fish
 from fishd.config import Config
 from fishd.control.reporting import Publisher
+from fishd.core import text
 from fishd.core.errors import (
     FishdError,
     FishError,
@@ -215,6 +216,11 @@ class LiveRig:
         for tick in self._messages:
             _hand_on(tick, self.listener)
             if not isinstance(tick, Tick):
+                if ticks and controller and tick.kind in ("parameters", "controller"):
+                    raise Disturbed(
+                        f"somebody else changed what swims: {text.line(tick.message)}: this "
+                        "measurement is lost"
+                    )
                 continue
             self._check_same_fishd(tick)
             if tick.seq < first:

@@ -53,6 +53,15 @@ def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -
     assert daemon.status().controller == "square"
 
 
+def test_another_parameter_in_the_middle_ends_it_too(daemon: Daemon) -> None:
+    measuring = begun(daemon)
+    time.sleep(0.3)
+    assert daemon.fishctl("set-parameter", "C=0.1").returncode == 0
+    status, _, err = measuring.finish()
+    assert status == 1
+    assert "somebody else changed what swims: swing goes on with C=0.1" in err
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_whoever_ends_it_leaves_the_fish_at_rest(daemon: Daemon, how: signal.Signals) -> None:
     status, out, err = begun(daemon).end(how)
