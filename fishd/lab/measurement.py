@@ -90,7 +90,10 @@ def measure(
         ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
         progress(len(ticks) * rig.tick)
     refuse_lost(ticks, (length for _, length in phases), rig.tick)
-    found = evaluate(samples_of(ticks), rig.tick, settle, _still(settle))
+    samples = samples_of(ticks)
+    found = evaluate(samples, rig.tick, settle, _still(settle))
+    if not found.frequency and len({each.phi_c for each in samples if each.swims}) > 1:
+        raise ParameterError("no whole beat is left of a swim; a longer --settle lengthens swims")
     return found._replace(
         controller=controller, parameters=dict(parameters), ticks=ticks, unit=rig.unit
     )
@@ -177,6 +180,8 @@ def evaluate(
     stills: float = REST_SETTLES,
 ) -> Measured:
     """The thrust of a fish that swam and rested in turn; names no controller, and has no ticks.
+
+    A tail that does not beat is judged by pieces of its swims, as of its rests.
 
     tick: period of the loop [s]
     settles, stills: when a swim is steady, and a rest is still [s]
@@ -279,11 +284,6 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
     ups = _reversals(phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1
-    if swims and not beating and len({sample.phi_c for sample in phase[begin:]}) > 1:
-        raise ParameterError(
-            f"no whole beat is left of a swim of {len(phase) * tick:.3g} s; a longer --settle "
-            "lengthens swims"
-        )
     if not beating:
         cuts = list(range(begin, len(phase), max(1, round(PIECE / tick))))
     begun, beats = 0, 0

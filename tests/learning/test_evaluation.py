@@ -169,3 +169,18 @@ def test_on_a_robot_whatever_the_sensor_drifts_is_told_apart(drift: str) -> None
     assert found.thrust == pytest.approx(square_wave(config.plant, 0.42, 1 / 0.6).thrust, abs=1e-3)
     assert abs(found.efficiency - 1.0) < 0.04
     assert found.frequency == pytest.approx(1 / 0.6, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "decide",
+    [lambda _: 0.42, lambda seen: 0.2 + 0.1 * square_of_six_ticks(seen), lambda _: 0.0],
+    ids=["holds still", "stays on one side", "at neutral"],
+)
+def test_on_a_robot_a_policy_that_does_not_beat_is_stalled_and_ends_no_training(
+    decide: Callable[[Observation], float],
+) -> None:
+    env = SwimEnv(SimulatedLink(CONFIG), CONFIG, EnvironmentSettings())
+    env.reset(seed=1)
+    found = on_link(env, decide, EvaluationSettings(), lambda: False)
+    assert found
+    assert found.stalled

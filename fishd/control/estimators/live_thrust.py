@@ -37,6 +37,8 @@ INTERVAL = 1.96
 """Half of a 95 % interval, over the standard deviation."""
 BROKEN = 8.0
 """A force at rest so many standard deviations off is no drift: the zero is found anew."""
+WANDER_FADES = 0.9
+"""What rests showed of a faster drift counts this much less with each further rest."""
 UNKNOWN = 1.0
 """Standard deviation of a zero that nothing is known of, and of a thrust [N]."""
 MOST_KNOWN = 0.1
@@ -63,7 +65,7 @@ class LiveThrust:
         """Of the latest beats; at rest, of the latest piece of it [N]. None while not known."""
         self.error = 0.0
         """Half of its 95 % interval [N]."""
-        self._wander = zero_drift**2
+        self._least_wander = self._wander = zero_drift**2
         self._zero = self._factor = 0.0
         self._zero_variance, self._covariance = UNKNOWN**2, 0.0
         self._factor_variance: float | None = None
@@ -189,13 +191,13 @@ class LiveThrust:
         surprise = force - self._zero - self._factor * power
         along, across = a + b * power, b + c * power
         total = along + across * power + variance
-        if power == 0.0 and surprise**2 > INTERVAL**2 * total:
-            if surprise**2 > BROKEN**2 * total:
-                self._zero, self._zero_variance, self._covariance = force, variance, 0.0
-                return False
-            gap = self._time - self._rested
-            if 2.0 * PIECE < gap < math.inf:  # a swim was between: no jump, but drift
-                self._wander += (surprise**2 - total) / gap
+        if power == 0.0 and surprise**2 > BROKEN**2 * total:
+            self._zero, self._zero_variance, self._covariance = force, variance, 0.0
+            return False
+        gap = self._time - self._rested
+        if power == 0.0 and 2.0 * PIECE < gap < math.inf:  # a swim was between
+            more = surprise**2 - total if surprise**2 > INTERVAL**2 * total else 0.0
+            self._wander = max(self._least_wander, WANDER_FADES * self._wander + more / gap)
         self._zero += along / total * surprise
         self._factor += across / total * surprise
         self._zero_variance = max(0.0, a - along * along / total)

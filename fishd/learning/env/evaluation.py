@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fishd import simulation
 from fishd.config import Config, Start
+from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.measurement import Sample, evaluate, plan
 from fishd.learning.env.environment import SwimEnv
@@ -106,7 +107,9 @@ def worst_of_others(config: Config, decide: Decide, settings: TrainingSettings) 
 def on_link(
     env: SwimEnv, decide: Decide, settings: EvaluationSettings, stop: Callable[[], bool]
 ) -> Evaluation | None:
-    """Evaluate on the fish that learns, by its measured thrust; None where `stop` says so.
+    """Evaluate on the fish that learns, by its measured thrust.
+
+    None where `stop` says so, and where too many observations were lost to tell.
 
     The fish swims and rests in turn, as in `fishd.lab.measurement`. It must not be in a pause.
     Raises `LinkLost`.
@@ -125,7 +128,10 @@ def on_link(
             env.advance(angle)
     shares = np.array([each.phi_c for each in samples if each.swims]) / amplitude
     frequency, fullness = beat_frequency(shares, tick), float(np.mean(np.abs(shares)))
-    found = evaluate(samples, tick)
+    try:
+        found = evaluate(samples, tick)
+    except ParameterError:
+        return None
     return Evaluation(
         thrust=found.thrust,
         error=found.error,
