@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from fishd.camera.frames import Stack
 from fishd.client import Fish
 from fishd.client.agent import Agent
 from fishd.config import Config
@@ -119,6 +120,10 @@ class FishdLink:
         # A tick of a pause is not counted as lost there, but no action was applied in it either.
         applied = found.answered == asked.seq
         return StepResult(found, max(self._agent.lost, 0 if applied else 1))
+
+    def look(self) -> Stack | None:
+        """Nothing yet."""
+        return None
 
     def pause(self, seconds: float) -> None:
         """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""

@@ -114,7 +114,9 @@ class RunRecorder:
             latest=self.latest,
             best=self.best,
         )
-        return checkpoints.save(self._job.folder, kind, self._model, self._card(), state)
+        return checkpoints.save(
+            self._job.folder, kind, self._model, self._card(), state, self._env.eye
+        )
 
     def _card(self) -> Card:
         job, seen = self._job, self._env.features
@@ -126,6 +128,7 @@ class RunRecorder:
         """Take over the networks of another run; raises `CheckpointError`."""
         past = self._checked_card(parent).provenance
         checkpoints.load_parameters(self._model, parent, optimiser=False)
+        self._load_eye(parent)
         name = f"{parent.resolve().parent.name}/{parent.name}"
         self._note = f"began with {name}, {past.steps} steps in {past.on}"
 
@@ -151,6 +154,10 @@ class RunRecorder:
                 )
         return card
 
+    def _load_eye(self, checkpoint: Path) -> None:
+        if self._env.eye:
+            checkpoints.load_eye(self._env.eye, checkpoint)
+
     def _resume(self) -> None:
         """Go on from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
         job, model = self._job, self._model
@@ -168,6 +175,7 @@ class RunRecorder:
                 f"a larger total, such as --steps {state.steps + job.settings.steps}"
             )
         checkpoints.load_parameters(model, self.checkpoint)
+        self._load_eye(self.checkpoint)
         self._note = card.provenance.note
         self.steps = model.num_timesteps = state.steps
         self.rollouts, model._n_updates = state.rollouts, state.updates

@@ -24,6 +24,9 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.eyes import making as eyes
+from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes.making import babble
 from fishd.learning.ppo import DeterministicPolicy, is_finite, learning_rate, make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
@@ -51,7 +54,7 @@ def train(
     if job.on == "robot":
         link = FishdLink(job.endpoint, address=job.agent)
     else:
-        link = SimulatedLink(job.config, job.settings.randomisation)
+        link = SimulatedLink(job.config, job.settings.randomisation, job.simulated_camera)
     try:
         return Training(job, link, display or Display(), stop).run()
     except OSError as error:
@@ -71,9 +74,10 @@ class Training:
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Makes or opens the run folder; nothing moves yet. Raises as `train` does."""
         self._job, self._display, self._stop = job, display, stop
-        self._env = SwimEnv(link, job.config, job.settings.environment)
+        self._eye = eyes.make(job.settings)
+        self._env = SwimEnv(link, job.config, job.settings.seen, self._eye)
         self._vec_env = DummyVecEnv([lambda: self._env])
-        self._model = make_learner(job.settings, self._vec_env)
+        self._model = make_learner(job.settings, self._vec_env, self._eye)
         self._callback = RolloutCallback(self._env, display, stop)
         self._recorder = RunRecorder(job, self._env, self._model)
         self._paused = False
@@ -90,6 +94,8 @@ class Training:
         message = ""
         try:
             self._reset()
+            if self._eye and not self._eye.is_fitted:
+                ended, message = self._babble(self._eye)
             while recorder.steps < job.settings.steps and ended == "finished":
                 ended, message = self._update()
         except LinkLost as error:
@@ -133,6 +139,24 @@ class Training:
         self._model._last_obs = observations
         self._model._last_episode_starts = np.ones(1, dtype=bool)
 
+    def _babble(self, eye: Eye) -> tuple[Ended, str]:
+        """Move at random for a while, and let the eye find out what it sees of that."""
+        env, ticks = self._env, self._job.settings.camera.babble
+        frames, angles = [], []
+        for angle in babble(self._job.settings.seed, ticks, env.link.amplitude):
+            if self._stop():
+                return "interrupted", ""
+            env.advance(angle)
+            assert env.stack is not None
+            frames.append(env.stack[0])
+            angles.append(angle)
+            self._display.step(env.tank_time)
+        env.pause()
+        self._paused = True
+        eye.fit(np.stack(frames), np.array(angles))
+        self._recorder.steps = self._model.num_timesteps = ticks
+        return "finished", ""
+
     def _update(self) -> tuple[Ended, str]:
         """One rollout, its update and evaluation; how it ended, and why."""
         model, settings, recorder = self._model, self._job.settings, self._recorder
@@ -171,11 +195,12 @@ class Training:
     def _evaluate(self) -> None:
         """Evaluate the policy without exploration."""
         job, env = self._job, self._env
-        policy = DeterministicPolicy(self._model.policy, env.features, env.link.amplitude)
+        policy = DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
         if job.on == "simulation":
-            found = evaluation.in_simulation(job.config, policy, job.settings.evaluation)
+            camera = job.simulated_camera
+            found = evaluation.in_simulation(job.config, policy, job.settings.evaluation, camera)
             if job.settings.evaluation.others:
-                others = evaluation.worst_of_others(job.config, policy, job.settings)
+                others = evaluation.worst_of_others(job.config, policy, job.settings, camera)
                 found = replace(found, worst=min(others, found.efficiency))
         else:
             env.resume()
