@@ -17,7 +17,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.making import babble, make
-from fishd.learning.settings import CameraSettings, EnvironmentSettings, TrainingSettings
+from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
 
 CONFIG = Config()
 EYES = ["modes", "cnn", "nature"]
@@ -25,7 +25,7 @@ TICKS = 256
 
 
 def eye_of(kind: str, **settings: object) -> Eye:
-    camera = CameraSettings(eye=kind, **settings)
+    camera = VisionSettings(eye=kind, **settings)
     eye = make(TrainingSettings(see="camera", camera=camera))
     assert eye
     return eye
