@@ -42,7 +42,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     ] = 10
 
 
-class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How pictures become numbers, where the agent sees any."""
 
     eye: Annotated[
@@ -160,7 +160,7 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         "force"
     )
     environment: EnvironmentSettings = EnvironmentSettings()
-    camera: CameraSettings = CameraSettings()
+    camera: VisionSettings = VisionSettings()
     randomisation: Randomisation = Randomisation()
     ppo: PpoSettings = PpoSettings()
     evaluation: EvaluationSettings = EvaluationSettings()

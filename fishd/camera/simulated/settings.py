@@ -3,7 +3,7 @@
 import math
 from typing import Annotated
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.core.schema import note, unit
 
@@ -12,8 +12,8 @@ class SimulatedCameraSettings(Struct, frozen=True, forbid_unknown_fields=True, k
     """Timing, optics and light of a simulated camera; the defaults are the rig `default`."""
 
     rate: Annotated[
-        float | None,
-        unit("1/s", "Frames per second; null: one for each tick, in phase with it.", gt=0, le=1000),
+        Annotated[float, Meta(gt=0, le=1000)] | None,
+        unit("1/s", "Frames per second; null: one for each tick, in phase with it."),
     ] = None
     latency: Annotated[
         float, unit("s", "From the middle of the exposure until the frame is there.", ge=0, le=1)

@@ -43,6 +43,12 @@ IMPLAUSIBLE = 1.03
     help="YAML file of the training, such as config/learning.yaml; without it, the defaults.",
 )
 @click.option(
+    "--see",
+    type=click.Choice(["force", "camera", "both"]),
+    help="What the agent sees of the fish; settings such as config/learning-cnn.yaml say how "
+    "pictures become numbers. [default: that of the settings, force]",
+)
+@click.option(
     "--steps",
     type=click.IntRange(min=1),
     help="Control steps to learn from, in all; rounded up to whole rollouts of ppo.n_steps.",
@@ -87,6 +93,7 @@ def ppo(
     file: Path | None,
     overrides: tuple[str, ...],
     settings_file: Path | None,
+    see: Literal["force", "camera", "both"] | None,
     steps: int | None,
     seed: int | None,
     folder: Path | None,
@@ -102,7 +109,8 @@ def ppo(
 
     Ctrl-C leaves the fish at neutral and a checkpoint from which --resume goes on.
     """
-    own = {"--config": file, "--set": overrides, "--settings": settings_file, "--seed": seed}
+    own: dict[str, Any] = {"--config": file, "--set": overrides, "--settings": settings_file}
+    own |= {"--see": see, "--seed": seed}
     new = {"--folder": folder, "--from": parent}
     if resume:
         _refuse("goes on as the run began", {**own, **new, "--seeds": seeds})
@@ -113,7 +121,7 @@ def ppo(
     job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
-    given = {"steps": steps, "seed": seed}
+    given = {"steps": steps, "seed": seed, "see": see}
     changed = {name: value for name, value in given.items() if value is not None}
     job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     if seeds is not None:

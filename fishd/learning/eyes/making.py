@@ -1,13 +1,17 @@
 """Makes the eye that a training asks for, and the babble that it is fitted to."""
 
-from collections.abc import Iterator
+import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.modes import ModesEye
 from fishd.learning.eyes.pictures import CnnEye, NatureEye
 from fishd.learning.settings import TrainingSettings
+
+_LONGEST = 6
+"""An angle of the babble is held for up to so many ticks."""
 
 
 def make(settings: TrainingSettings) -> Eye | None:
@@ -22,17 +26,16 @@ def make(settings: TrainingSettings) -> Eye | None:
     return NatureEye(camera.stack)
 
 
-def babble(seed: int, ticks: int, amplitude: float) -> Iterator[float]:
-    """Instruction angles that have nothing to do with what is seen [rad].
+def babble(seed: int, ticks: int, amplitude: float) -> NDArray[np.float64]:
+    """Instruction angles that have nothing to do with what is seen, shape (ticks,) [rad].
+
+    The second half is the first one mirrored, so that the mean picture favours no side.
 
     ticks: how many
     amplitude: the largest [rad]
     """
     random = np.random.default_rng([seed, 1])
-    angle = 0.0
-    hold = 0
-    for _ in range(ticks):
-        if not hold:
-            angle, hold = float(random.uniform(-amplitude, amplitude)), int(random.integers(1, 7))
-        hold -= 1
-        yield angle
+    half = math.ceil(ticks / 2)
+    levels = random.uniform(-amplitude, amplitude, half)
+    angles = np.repeat(levels, random.integers(1, _LONGEST + 1, half))[:half]
+    return np.concatenate((angles, -angles))[:ticks]

@@ -2,7 +2,7 @@
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -138,19 +138,19 @@ class RunRecorder:
         Raises `CheckpointError`.
         """
         card, own = checkpoints.read_card(checkpoint), self._card()
+        theirs = _architecture(card.provenance.settings)
+        ours = _architecture(own.provenance.settings)
+        for key, here in ours.items():
+            if theirs.get(key) != here:
+                raise CheckpointError(
+                    f"{checkpoint}: its {key} is {theirs.get(key)}, that of this training is "
+                    f"{here}; eye and networks must be alike"
+                )
         for what in ("observation", "tick", "amplitude"):
             if getattr(card, what) != getattr(own, what):
                 raise CheckpointError(
                     f"{checkpoint}: its {what}, with scales, differs from that of this training; "
                     "use the configuration and the environment settings that it was trained with"
-                )
-        theirs = card.provenance.settings.get("ppo", {})
-        ours = msgspec.json.decode(msgspec.json.encode(self._job.settings.ppo))  # lists, as theirs
-        for key in ("hidden", "activation", "symmetric"):
-            if theirs.get(key) != ours.get(key):
-                raise CheckpointError(
-                    f"{checkpoint}: its ppo.{key} is {theirs.get(key)}, that of this training is "
-                    f"{ours.get(key)}; the networks must be alike"
                 )
         return card
 
@@ -189,3 +189,15 @@ class RunRecorder:
         if self._job.resume:
             table.keep_until(self.steps)
         return table
+
+
+def _architecture(settings: dict[str, Any]) -> dict[str, Any]:
+    """What makes two networks alike, of a training's settings, by key."""
+    settings = msgspec.json.decode(msgspec.json.encode(settings))  # lists, as in a file
+    see, ppo = settings.get("see", "force"), settings.get("ppo", {})
+    camera = {} if see == "force" else settings.get("camera", {})
+    return {
+        "see": see,
+        **{f"ppo.{key}": ppo.get(key) for key in ("hidden", "activation", "symmetric")},
+        **{f"camera.{key}": value for key, value in camera.items()},
+    }

@@ -119,9 +119,15 @@ class Training:
 
     def _introduce(self) -> None:
         recorder, job = self._recorder, self._job
-        last, rollout = job.last_step(recorder.steps), job.settings.ppo.n_steps
+        done, rollout = recorder.steps, job.settings.ppo.n_steps
+        if self._eye and not self._eye.is_fitted:
+            done = job.settings.camera.babble
+        last = job.last_step(done)
         whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
         text = f"{job.folder}: {last} steps{whole} on {job.on}"
+        if self._eye:
+            also = " and forces" if job.settings.see == "both" else ""
+            text += f", from pictures{also} with the eye {job.settings.camera.eye}"
         if job.resume:
             tank = minutes(self._env.tank_time)
             text += f", resumed from {recorder.checkpoint}, {tank} in the tank"
@@ -142,18 +148,18 @@ class Training:
     def _babble(self, eye: Eye) -> tuple[Ended, str]:
         """Move at random for a while, and let the eye find out what it sees of that."""
         env, ticks = self._env, self._job.settings.camera.babble
-        frames, angles = [], []
-        for angle in babble(self._job.settings.seed, ticks, env.link.amplitude):
+        frames = []
+        angles = babble(self._job.settings.seed, ticks, env.link.amplitude)
+        for angle in angles.tolist():
             if self._stop():
                 return "interrupted", ""
             env.advance(angle)
             assert env.stack is not None
             frames.append(env.stack[0])
-            angles.append(angle)
             self._display.step(env.tank_time)
         env.pause()
         self._paused = True
-        eye.fit(np.stack(frames), np.array(angles))
+        eye.fit(np.stack(frames), angles)
         self._recorder.steps = self._model.num_timesteps = ticks
         return "finished", ""
 
