@@ -222,7 +222,7 @@ def _stacks(card: Card) -> list[Stack]:
     config = replace(Config(), tick=card.tick, amplitude_limit=card.amplitude)
     link = SimulatedLink(config, camera=Camera(SimulatedCameraSettings(), card.pictures))
     link.reset()
-    for angle in babble(0, _STACKS, card.amplitude):
+    for angle in babble(0, _STACKS, card.amplitude).tolist():
         link.step(angle)
         if (stack := link.look()) is not None:
             found.append(stack)

@@ -60,8 +60,8 @@ class CnnEye(Eye):
         constants |= {**self.constants, "channel": np.array([1])}
         constants |= {f"at_{k}": np.array([k]) for k in {0, 1, last, last + 1}}
         nodes += [
-            helper.make_node("MatMul", ["rows", "lit"], ["low"]),
-            helper.make_node("MatMul", ["low", "columns"], ["small"]),
+            helper.make_node("MatMul", ["rows", "lit"], ["wide"]),
+            helper.make_node("MatMul", ["wide", "columns"], ["small"]),
             helper.make_node("Sub", ["small", "mean"], ["deviation"]),
             helper.make_node("Mul", ["deviation", "scale"], ["glimpses" if last else out]),
         ]
