@@ -80,7 +80,7 @@ _FARTHEST = 1e6
 SHORTEST_PAUSE, LONGEST_PAUSE = 10.0, 120.0
 """Bounds of a pause whose length is not given; the first one is the longest [s]."""
 FIRST_FRAMES = 5.0
-"""How long a camera may take to show a whole stack [s]."""
+"""How long a camera may take to show a whole stack, in real and in virtual time [s]."""
 _ALLOWANCE = 4.0
 """Such a pause may last so many times the longest one so far."""
 
@@ -233,7 +233,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         """Stay at neutral until the camera shows a whole stack; raises `LinkLost`."""
         if self.eye is None or self._look():
             return
-        for _ in range(round(FIRST_FRAMES / self.link.tick)):
+        begun, began = self.latest.time, time.monotonic()
+        while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
             self.latest, _ = self.link.step(0.0)
             if self._look():
                 return

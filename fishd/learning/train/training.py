@@ -52,7 +52,8 @@ def train(
     torch.set_num_threads(1)
     link: Link
     if job.on == "robot":
-        link = FishdLink(job.endpoint, address=job.agent)
+        stack = job.settings.camera.stack if job.settings.see != "force" else None
+        link = FishdLink(job.endpoint, address=job.agent, stack=stack, camera=job.camera_endpoint)
     else:
         link = SimulatedLink(job.config, job.settings.randomisation, job.simulated_camera)
     try:
