@@ -11,6 +11,7 @@ An episode is truncated after `episode` steps, and never terminates: a fish has 
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -26,6 +27,7 @@ from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes.making import babble
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -189,6 +191,26 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.tank_time += self.latest.time - before
         self.lost += lost
         return lost
+
+    def babble(self, seed: int, ticks: int, stop: Callable[[], bool] = lambda: False) -> bool:
+        """Move at random, outside of any episode, and let the eye find out what it sees of that.
+
+        ticks: for how long
+        stop: called after each of them; True ends it
+
+        False where it was stopped. Raises `LinkLost`, and `NoMotion` where the tail is not to be
+        seen.
+        """
+        assert self.eye
+        frames = []
+        angles = babble(seed, ticks, self.link.amplitude)
+        for angle in angles.tolist():
+            if self.stack is None or stop():
+                return False
+            self.advance(angle)
+            frames.append(self.stack[0])
+        self.eye.fit(np.stack(frames), angles)
+        return True
 
     def pause(self, seconds: float | None = None) -> None:
         """Let the fish wait at neutral while the agent learns.
