@@ -17,6 +17,8 @@ from fishd.core.signals import Observation
 HOLD = 0.25
 """So long the last angle is held where frames are missing; then neutral, until they are back [s].
 
+Before the first of them it is neutral, too.
+
 Half a beat of the default fish lasts 0.3 s: what a policy held for longer would not be swimming.
 """
 
@@ -38,8 +40,8 @@ class Pilot:
         self._limit = DwellLimit(limits.chatter.dwell, limits, self.card.amplitude)
         self._angle = 0.0
         self._begun = False
-        self.blind = math.inf if self.card.pictures else 0.0
-        """How long frames have been missing [s]; infinite before the first stack."""
+        self.blind = 0.0
+        """How long frames have been missing [s]."""
 
     @property
     def waits(self) -> bool:
@@ -51,8 +53,8 @@ class Pilot:
 
         stack: None where the camera has not shown all of it
 
-        Raises `ControllerFault` with the code `chatter`, see `DwellLimit`, and `PolicyError` for an
-        output that is not finite.
+        Raises `ControllerFault` with the code `chatter`, see `DwellLimit`, and `PolicyError` for
+        frames of another size and for an output that is not finite.
         """
         if not self._begun:
             self._begun = True
@@ -69,9 +71,20 @@ class Pilot:
     def _chosen(self, observation: Observation, stack: Stack | None) -> float:
         network = self._network
         self._write(observation, network.row)
-        for place, frame in zip(network.frames, stack or (), strict=True):
-            place[:] = frame
+        if self.card.pictures and stack is not None:
+            self._show(stack)
         action = network.run()
         if not math.isfinite(action):
             raise PolicyError(f"what the policy puts out is not finite: {action}")
         return self.card.amplitude * max(-1.0, min(1.0, action))
+
+    def _show(self, stack: Stack) -> None:
+        places = self._network.frames
+        sizes = [frame.shape for frame in stack]
+        if sizes != [place.shape for place in places]:
+            count, height, width = places.shape
+            raise PolicyError(
+                f"it sees {count} frames of {height} x {width} pixels; frames of {sizes} came"
+            )
+        for place, frame in zip(places, stack, strict=True):
+            place[:] = frame

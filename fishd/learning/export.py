@@ -4,6 +4,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import torch
 from msgspec import Struct
 from msgspec.structs import replace
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -34,6 +35,8 @@ from fishd.virtual.plant.parameters import PlantParameters
 
 TOLERANCE = 1e-5
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ."""
+TOLERANCE_OF_PICTURES = 1e-4
+"""The same where thousands of pixels are summed, which each library does in an order of its own."""
 _PROBES = 1000
 _STACKS = 100
 """Of noise, and of a tail."""
@@ -59,6 +62,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would give other
     outputs than the policy.
     """
+    torch.set_num_threads(1)  # for single pictures, more only get in each other's way
     card = checkpoints.read_card(checkpoint)
     policy, perception = checkpoints.load_policy(checkpoint)
     found = _evaluated(checkpoint, card, policy, perception)
@@ -90,6 +94,11 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
             f"{path}: the environment of this model, {type(vec_env).__name__}, is not a SwimEnv "
             "alone, so the inputs of the network are not known"
         )
+    if env.eye:
+        raise PolicyError(
+            f"{path}: a model that sees pictures is not exported from Python; train it with "
+            "'fishctl learn ppo --see camera'"
+        )
     if not isinstance(policy, ActorCriticPolicy) or not isinstance(
         policy.features_extractor, FlattenExtractor
     ):
@@ -104,7 +113,8 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     )
     card = replace(card, provenance=past)
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
-    _write(path, _completed(card, in_simulation(env.config, decide, EvaluationSettings())), policy)
+    found = in_simulation(env.config, decide, EvaluationSettings())
+    _write(path, _completed(card, found), policy, env.perception)
     return path
 
 
@@ -174,7 +184,19 @@ def _evaluated(
     config = replace(config, tick=card.tick, amplitude_limit=card.amplitude, plant=plant)
     decide = DeterministicPolicy(policy, perception, card.amplitude)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
-    return in_simulation(config, decide, settings.evaluation)
+    camera = _camera(checkpoint.parent, card)
+    return in_simulation(config, decide, settings.evaluation, camera)
+
+
+def _camera(run: Path, card: Card) -> Camera | None:
+    """That of a run, where it has one, else a good one; None for a policy that sees no pictures."""
+    if card.pictures is None:
+        return None
+    try:
+        seen = runs.read_camera(run)
+    except FishdError:
+        seen = SimulatedCameraSettings()
+    return Camera(seen, card.pictures)
 
 
 def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
@@ -204,7 +226,7 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
             seen = np.concatenate((perception.eye.see(stacks[index]), row))
         wanted, _ = policy.predict(seen, deterministic=True)
         worst = max(worst, abs(network.run() - float(wanted[0])))
-    if not worst <= TOLERANCE:
+    if not worst <= (TOLERANCE_OF_PICTURES if perception.eye else TOLERANCE):
         raise PolicyError(
             f"with this onnxruntime, the outputs of the file differ from those of the policy, by "
             f"up to {worst:.2g} of Φ; install another version of it"
@@ -212,8 +234,7 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
 
 
 def _stacks(card: Card) -> list[Stack]:
-    """Stacks of noise, and those of a simulated fish that moves at random; none without pictures.
-    """
+    """Stacks of noise, and of a simulated fish that moves at random; none without pictures."""
     if card.pictures is None:
         return []
     random = np.random.default_rng(1)

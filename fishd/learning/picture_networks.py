@@ -72,7 +72,9 @@ def network_nodes(network: nn.Sequential, picture: str, out: str) -> Nodes:
         elif isinstance(part, nn.Linear):
             node = helper.make_node("Gemm", given, [after], transB=1)
         else:
-            node = helper.make_node("Relu" if isinstance(part, nn.ReLU) else "Flatten", given, [after])
+            node = helper.make_node(
+                "Relu" if isinstance(part, nn.ReLU) else "Flatten", given, [after]
+            )
         nodes.append(node)
         value = after
     return nodes, constants

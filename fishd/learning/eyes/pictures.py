@@ -1,6 +1,7 @@
 """The eyes that leave seeing to a network: `cnn` prepares the picture, `nature` does not."""
 
 from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
