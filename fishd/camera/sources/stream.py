@@ -5,17 +5,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import urlsplit
 
-# Before OpenCV is loaded: no waiting for lost packets, and no lines of ffmpeg's on standard error.
-os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp|fflags;nobuffer")
+# Before OpenCV is loaded: no lines of ffmpeg's on standard error.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
 import numpy as np
 
 from fishd.camera.frames import Pixels
-from fishd.camera.settings import StreamSettings
+from fishd.camera.settings import StreamSettings, public
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.core.clock import boot_id
 
@@ -37,7 +35,11 @@ class StreamSource:
         self._settings = settings
         self._url = settings.url
         self._live = "://" in settings.url
-        self.device = _without_password(settings.url)
+        if self._live:  # a file would lose its first frame
+            os.environ.setdefault(
+                "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp|fflags;nobuffer"
+            )
+        self.device = public(settings.url)
 
     def run(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
         """Take frames until told to stop."""
@@ -136,11 +138,3 @@ def _grey(picture: Pixels) -> Pixels:
     if picture.ndim == 2:
         return picture
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def _without_password(url: str) -> str:
-    """For people, and for whoever reads the log."""
-    if "://" not in url:
-        return url
-    parts = urlsplit(url)
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
