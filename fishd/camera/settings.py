@@ -21,7 +21,7 @@ _Delay = Annotated[
     unit(
         "s",
         "So much earlier than its time stamp says was the middle of a frame's exposure, beyond "
-        "what the exposure explains; `fishctl camera latency` measures it.",
+        "what the exposure explains.",
         ge=-1,
         le=5,
     ),
