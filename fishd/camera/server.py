@@ -15,7 +15,7 @@ from fishd.camera import messages, picture
 from fishd.camera.frames import Pixels
 from fishd.camera.messages import FrameHeader, Until, ViewHeader
 from fishd.camera.monitor import Monitor
-from fishd.camera.settings import CameraSettings
+from fishd.camera.settings import CameraSettings, without_password
 from fishd.camera.sockets import Publisher, Requests
 from fishd.camera.sources.base import Shot, Source, Timeline, Trouble
 from fishd.core import text
@@ -67,7 +67,7 @@ class Server:
             self._monitor.session = self._new_session()
             self._requests.operations = {
                 "status": self._monitor.state,
-                "config": lambda: self._settings,
+                "config": lambda: without_password(self._settings),
             }
             self._stack = stack.pop_all()
         return self
