@@ -113,9 +113,9 @@ def compare(
     wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
     rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
     simulated camera, on a robot by a running fishd-camera. ± is the 95 % interval of the mean
-    thrust of all runs, from
-    how they differ and, on a robot, from the error of each measurement. |φ_c|/Φ is the mean size
-    of the command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866.
+    thrust of all runs, from how they differ and, on a robot, from the error of each measurement.
+    |φ_c|/Φ is the mean size of the command, square its mean size over its rms: square wave 1, sine
+    0.900, triangle 0.866.
     Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
     in mode fault; the others swim all the same.
     """
