@@ -108,7 +108,7 @@ def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
         if policy.card.pictures:
             raise PolicyError(
                 f"{policy.path}: it sees pictures, which this loop does not have; let it swim with "
-                f"'fishctl agent {parameters.policy}'"
+                f"'fishctl agent {parameters.policy}', or in simulation with 'fishctl compare'"
             )
         return policy.card, Network(policy)
     except PolicyError as error:

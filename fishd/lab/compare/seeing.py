@@ -45,11 +45,7 @@ class SeeingController(Controller[PpoParameters]):
     def watch(self, run: VirtualRun) -> None:
         """Put the camera above the fish of a run, before its first tick."""
         truth, pictures = run.loop.robot.truth, self._pilot.card.pictures
-        if truth is None:
-            raise ParameterError(
-                f"{run.loop.robot.name} does not tell where the tail is, so no camera can show it; "
-                "robot: simulated is needed"
-            )
+        assert truth
         assert pictures
         self._sight = SimulatedSight(self._camera, pictures, self.limits.tick, truth)
 
