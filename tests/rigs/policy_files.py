@@ -79,7 +79,7 @@ def seeing_card(
     """By default it sees two frames of 32 x 32 pixels, and nothing else."""
     return Card(
         observation=tuple(Feature(*f) for f in features),
-        pictures=pictures or StackSettings(size=32, frames=2),
+        pictures=pictures or StackSettings(size=32, frames=2, delay=0.02),
         tick=tick,
         amplitude=0.42,
         provenance=PROVENANCE,
