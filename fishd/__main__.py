@@ -22,6 +22,13 @@ def fishctl() -> None:
     main()
 
 
+def fishd_camera() -> None:
+    """The `fishd-camera` command."""
+    with _quiet():
+        from fishd.camera.main import main
+    main()
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Let a Ctrl-C meanwhile be the end of the process, unless it is ignored as below `nohup`."""

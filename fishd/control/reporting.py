@@ -120,6 +120,7 @@ class Reporter:
                 alpha_rate=truth.alpha_rate if truth else UNSET,
                 phi=truth.phi if truth else UNSET,
                 quantities=loop.active.quantities or UNSET,
+                time=observation.time,
             )
         )
 

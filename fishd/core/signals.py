@@ -137,6 +137,10 @@ class Tick(Struct, frozen=True, gc=False):
         dict[str, float] | UnsetType,
         note("The controller's own quantities, by name; absent where it has none to show."),
     ] = UNSET
+    time: Annotated[
+        float,
+        unit("s", "Time of the tick, on fishd's monotonic clock; in lockstep it is virtual."),
+    ] = 0.0
 
 
 Level = Literal["info", "warning", "error"]
@@ -325,3 +329,9 @@ class Status(Struct, frozen=True):
     quantity_units: Annotated[
         dict[str, str], note("Unit of each quantity that this controller has; `1` for none.")
     ] = {}
+    clock: Annotated[
+        float, unit("s", "When the snapshot was taken, on fishd's monotonic clock.")
+    ] = 0.0
+    boot: Annotated[
+        str, note("Names this start of fishd's machine, from which its monotonic clock counts.")
+    ] = ""

@@ -17,7 +17,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller
 from fishd.controllers.policy import library
 from fishd.core import protocol, text
-from fishd.core.clock import Clock
+from fishd.core.clock import Clock, boot_id
 from fishd.core.errors import ParameterError, Refused, UnknownController
 from fishd.core.foreign_code import contained
 from fishd.core.protocol import PolicyInfo, State
@@ -59,6 +59,7 @@ class Operations:
         self._config = config
         self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
         self._started = clock.monotonic()
+        self._boot = boot_id()
         self._decisions = 0
         self._calls = BackgroundCalls(protocol.LOADING)
         self._controllers = controllers
@@ -130,6 +131,8 @@ class Operations:
             force_unit=loop.robot.force_unit,
             quantities=loop.active.quantities,
             quantity_units=loop.active.quantity_units,
+            clock=self._clock.monotonic(),
+            boot=self._boot,
         )
 
     async def _status(self, _: protocol.NoArguments) -> Status:

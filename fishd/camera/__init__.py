@@ -1,0 +1,1 @@
+"""The camera above the tail: frames with their times, real or simulated (extra: camera)."""

@@ -1,0 +1,98 @@
+"""The fish's axis of motion, found from pictures of a tail that moves."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from fishd.core.errors import FishdError
+
+Floats = NDArray[np.float64]
+
+_STEEPEST = 0.2
+"""Largest tilt that is looked for [rad]."""
+_SHARE = 0.3
+"""The axis lies within this share of the height about the middle row."""
+_MOTION = 1.5
+"""A pixel that moves with the tail varies more than so many times as much as a typical one."""
+_FINE = 8
+"""The self-convolution of a column is interpolated to so many points per pixel."""
+
+
+class NoMotion(FishdError, ValueError):
+    """Nothing moves in the pictures that the axis is to be found in."""
+
+
+class Axis(Struct, frozen=True, kw_only=True):
+    """A straight line through the picture about which the tail swings evenly."""
+
+    offset: float
+    """How far below the middle row it crosses the middle column [px]."""
+    tilt: float = 0.0
+    """Its slope, positive where it goes down to the right [rad]."""
+
+    def rows(self, height: int, width: int) -> Floats:
+        """Its row in each column, shape (width,) [px]."""
+        columns = np.arange(width, dtype=np.float64) - 0.5 * (width - 1)
+        found: Floats = columns * math.tan(self.tilt) + (0.5 * (height - 1) + self.offset)
+        return found
+
+
+class Motion(NamedTuple):
+    """What moves in a set of pictures."""
+
+    energy: Floats
+    """Variance of each pixel beyond that of a typical one, shape (height, width)."""
+    axis: Axis
+    centre: float
+    """Column about which the motion is centred [px]."""
+
+
+def find_motion(pictures: NDArray[np.uint8]) -> Motion:
+    """The motion and its axis, in pictures of shape (number, height, width), ten or more.
+
+    Light that changes as a whole is taken off. A tail that swings evenly leaves a picture of motion
+    that is its own mirror image: the axis is where that, convolved with its mirror image in each
+    column, adds up to most. Raises `NoMotion`.
+    """
+    if len(pictures) < 10:
+        raise NoMotion(f"{len(pictures)} pictures are too few to see a motion in; 10 are needed")
+    values = pictures.astype(np.float64)
+    values /= np.maximum(values.mean(axis=(1, 2), keepdims=True), 1.0)
+    variance = values.var(axis=0)
+    typical = float(np.median(variance))
+    energy = np.where(variance > _MOTION * typical, variance - typical, 0.0)
+    if not np.count_nonzero(energy) >= 0.002 * energy.size:
+        raise NoMotion(
+            "nothing moves in these pictures but noise; let the fish swim, and see that the camera "
+            "looks at its tail"
+        )
+    axis = _axis(energy)
+    centre = float(energy.sum(axis=0) @ np.arange(energy.shape[1]) / energy.sum())
+    return Motion(energy, axis, centre)
+
+
+def _axis(energy: Floats) -> Axis:
+    height, width = energy.shape
+    spectrum = np.fft.rfft(energy, 2 * height, axis=0).T
+    folded = np.fft.irfft(spectrum**2, 2 * height * _FINE, axis=1)
+    offsets = np.arange(-_SHARE * height, _SHARE * height + 0.1, 0.5)
+    best, step = Axis(offset=0.0), (0.5, 0.02)
+    tilts = np.arange(-_STEEPEST, _STEEPEST + 1e-9, step[1])
+    for _ in range(3):
+        best = max(
+            (Axis(offset=float(offset), tilt=float(tilt)) for offset in offsets for tilt in tilts),
+            key=lambda axis: _folded_at(folded, 2.0 * axis.rows(height, width)),
+        )
+        step = (step[0] / 5, step[1] / 5)
+        offsets = best.offset + step[0] * np.arange(-5, 6)
+        tilts = best.tilt + step[1] * np.arange(-5, 6)
+    return best
+
+
+def _folded_at(folded: Floats, rows: Floats) -> float:
+    """Sum over all columns of the self-convolution about a line; rows: twice its row in each."""
+    points = np.clip(np.rint(rows * _FINE).astype(int), 0, folded.shape[1] - 1)
+    return float(folded[np.arange(len(rows)), points].sum())

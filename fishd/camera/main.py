@@ -1,0 +1,92 @@
+"""The command `fishd-camera`: from settings to a camera that publishes until a signal ends it."""
+
+import logging
+import threading
+from pathlib import Path
+
+import click
+
+from fishd import __version__
+from fishd.camera.settings import CameraSettings, load
+from fishd.camera.sources.base import Source
+from fishd.core import text
+from fishd.core.console import complain, run
+from fishd.core.errors import FishdError
+from fishd.core.interruption import on_signal
+from fishd.daemon.logs import LogWriter
+from fishd.daemon.shutdown import leave
+
+log = logging.getLogger(__name__)
+NAME = "fishd-camera"
+
+
+def open_source(settings: CameraSettings) -> Source:
+    """What the settings name; nothing is opened yet."""
+    if settings.source == "v4l2":
+        from fishd.camera.sources.v4l2 import V4l2Source
+
+        return V4l2Source(settings.v4l2)
+    if settings.source == "stream":
+        from fishd.camera.sources.stream import StreamSource
+
+        return StreamSource(settings.stream)
+    from fishd.camera.sources.simulated import SimulatedSource
+
+    return SimulatedSource(settings.simulated, settings.picture.size)
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--config",
+    "path",
+    type=click.Path(path_type=Path, readable=False),
+    help="YAML file; without it, a simulated camera above the fish of this machine.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Override one key of the settings, such as source=v4l2. Repeatable.",
+)
+@click.option(
+    "--log-format",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="How logs on standard error look.",
+)
+@click.version_option(__version__, prog_name=NAME)
+def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> int:
+    """Publish the frames of a camera above the tail until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
+
+    Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 78 when the
+    settings are wrong.
+    """
+    settings = load(path, overrides)
+    try:
+        from fishd.camera.server import Server
+
+        source = open_source(settings)
+    except ImportError as error:
+        complain(NAME, f"{text.said(error)}; install the extra: pip install 'fishd[camera]'", 1)
+    logs = LogWriter(log_format)
+    logging.getLogger("linuxpy").setLevel(logging.WARNING)
+    stopping = threading.Event()
+    try:
+        with on_signal(stopping.set), Server(settings, source) as server:
+            server.run(stopping.is_set)
+    except FishdError as error:
+        log.critical("%s", error)
+        return 1
+    except Exception:
+        log.critical("fishd-camera failed", exc_info=True)
+        return 1
+    finally:
+        logs.close()
+    return 0
+
+
+def main() -> None:
+    """The `fishd-camera` command."""
+    leave(run(camera, NAME))

@@ -1,0 +1,54 @@
+"""From a camera's picture to the frame for learners and the view for people."""
+
+import cv2
+import numpy as np
+import simplejpeg
+
+from fishd.camera.frames import Pixels
+from fishd.camera.messages import Crop
+from fishd.camera.settings import PictureSettings, PublishSettings
+
+_TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+
+def turned(picture: Pixels, settings: PictureSettings) -> Pixels:
+    """The picture as frames show it, the fish's head to the left."""
+    turn = _TURNS.get(settings.rotate)
+    return picture if turn is None else np.asarray(cv2.rotate(picture, turn), np.uint8)
+
+
+def cropped(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
+    """The square of a turned picture that frames show, and where it is."""
+    height, width = picture.shape
+    side = max(1, round(settings.crop.side * min(height, width)))
+    left = min(max(0, round(settings.crop.x * width - 0.5 * side)), width - side)
+    top = min(max(0, round(settings.crop.y * height - 0.5 * side)), height - side)
+    place = Crop(left=left / width, top=top / height, width=side / width, height=side / height)
+    return picture[top : top + side, left : left + side], place
+
+
+def frame(picture: Pixels, settings: PictureSettings) -> Pixels:
+    """What learners are shown of a turned picture, shape (size, size)."""
+    part, _ = cropped(picture, settings)
+    return scaled(part, settings.size, settings.size)
+
+
+def scaled(picture: Pixels, width: int, height: int) -> Pixels:
+    """The picture in another size [px]: averaged over areas, or with larger pixels."""
+    if picture.shape == (height, width):
+        return picture
+    smaller = width <= picture.shape[1] and height <= picture.shape[0]
+    way = cv2.INTER_AREA if smaller else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=way), np.uint8)
+
+
+def jpeg(picture: Pixels, settings: PublishSettings) -> tuple[bytes, int, int]:
+    """A turned picture for people as JPEG, and its width and height [px]."""
+    height, width = picture.shape
+    scale = settings.view_width / width
+    if scale > 1.0:  # larger pixels, in whole steps
+        scale = float(int(scale))
+    shown = scaled(picture, max(1, round(width * scale)), max(1, round(height * scale)))
+    grey = np.ascontiguousarray(shown)[:, :, np.newaxis]
+    data: bytes = simplejpeg.encode_jpeg(grey, settings.view_quality, colorspace="GRAY")
+    return data, shown.shape[1], shown.shape[0]

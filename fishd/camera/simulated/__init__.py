@@ -1,0 +1,1 @@
+"""A simulated camera: draws the tail as fin angle and light say."""
