@@ -15,7 +15,7 @@ from rigs.camera_process import CameraProcess, running_camera
 from rigs.processes import Daemon, Subscriber, running, wait_until
 from rigs.virtual_pi_process import virtual_pi
 
-from fishd.camera.client import CameraClient
+from fishd.camera.client import CameraClient, CameraLost
 from fishd.camera.frames import Frame, StackSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
@@ -131,7 +131,7 @@ class Lockstep:
     def __init__(self, daemon: Daemon, camera: CameraProcess, stack: StackSettings) -> None:
         self.fish = Fish(daemon.endpoint)
         self.agent = Agent(f"{daemon.endpoint}-agent")
-        self.client = camera.client(fish=self.fish, stack=stack)
+        self.client = camera.client(fish=self.fish, stack=stack, timeout=4.0)
         self.fish.set_controller("remote", agent=self.agent.address)
 
     def __enter__(self) -> "Lockstep":
@@ -190,8 +190,6 @@ def test_in_lockstep_a_frame_is_the_same_as_beside_the_simulation(tmp_path: Path
 
 
 def test_in_lockstep_a_camera_that_dies_is_noticed(tmp_path: Path) -> None:
-    from fishd.camera.client import CameraLost
-
     with (
         running(tmp_path, "--set", "lockstep=true") as daemon,
         running_camera(tmp_path, *settings(daemon)) as camera,
@@ -199,7 +197,6 @@ def test_in_lockstep_a_camera_that_dies_is_noticed(tmp_path: Path) -> None:
         camera.is_in("streaming")
         with Lockstep(daemon, camera, StackSettings(frames=2)) as run:
             run.swim(20)
-            run.client.timeout = 1.0
             camera.process.kill()
             with pytest.raises(CameraLost, match="no camera at"):
                 run.swim(20)
