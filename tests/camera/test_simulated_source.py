@@ -88,6 +88,25 @@ def test_times_of_frames_and_ticks_are_on_one_clock(tmp_path: Path, daemon: Daem
     assert all(frame.available - frame.time >= 0.03 for frame in frames)
 
 
+def test_from_another_machine_the_offset_is_estimated(
+    tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fishd.camera.clock_offset.boot_id", lambda: "of another machine")
+    with (
+        running_camera(tmp_path, *settings(daemon)) as camera,
+        Fish(daemon.endpoint) as fish,
+    ):
+        camera.is_in("streaming")
+        with camera.client(fish=fish) as client:
+            frames = collect(client, 5)
+            offset = client.offset()
+            here = {each.header.seq: each for each in [client.latest] if each}
+    assert 0.0 < offset.uncertainty < 1.0
+    assert abs(offset.seconds) <= offset.uncertainty  # it is one clock in truth
+    (sent,) = here.values()
+    assert frames[-1].time == pytest.approx(sent.header.time, abs=offset.uncertainty)
+
+
 def test_a_stack_has_the_frames_before_the_tick(tmp_path: Path, daemon: Daemon) -> None:
     with running_camera(tmp_path, *settings(daemon, "simulated.rate=100")) as camera:
         camera.is_in("streaming")

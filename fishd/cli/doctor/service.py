@@ -85,8 +85,8 @@ def camera(context: Context) -> Result | None:
             return None
     zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
-        camera = requests.CameraRequests(address, zmq_context, PATIENCE)
-        state = camera.status()
+        asking = requests.CameraRequests(address, zmq_context, PATIENCE)
+        state = asking.status()
     except (FishError, msgspec.MsgspecError) as error:
         return warning(str(error), "see what listens there, or restart fishd-camera")
     finally:
