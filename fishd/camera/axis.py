@@ -36,7 +36,7 @@ class Axis(Struct, frozen=True, kw_only=True):
     def rows(self, height: int, width: int) -> Floats:
         """Its row in each column, shape (width,) [px]."""
         columns = np.arange(width, dtype=np.float64) - 0.5 * (width - 1)
-        found: Floats = 0.5 * (height - 1) + self.offset + math.tan(self.tilt) * columns
+        found: Floats = columns * math.tan(self.tilt) + (0.5 * (height - 1) + self.offset)
         return found
 
 

@@ -8,7 +8,7 @@ import zmq
 
 from fishd.camera import messages
 from fishd.camera.clock_offset import ClockOffset, Offset, Reading
-from fishd.camera.frames import Frame, FrameHistory, Pixels, StackSettings
+from fishd.camera.frames import Frame, FrameHistory, Stack, StackSettings
 from fishd.camera.messages import (
     BadMessage,
     CameraState,
@@ -153,10 +153,10 @@ class CameraClient:
                 yield seen
             self.check()
 
-    def stack_at(self, tick: float, patience: float = PATIENCE) -> Pixels | None:
+    def stack_at(self, tick: float, patience: float = PATIENCE) -> Stack | None:
         """What a policy is shown in the tick at `tick` [s, clock of fishd].
 
-        Shape (frames, height, width), newest first; None where a frame is missing. In lockstep it
+        None where a frame is missing. In lockstep it
         waits until the camera has shown all of the time before the tick. In real time it takes
         what has come.
 

@@ -13,6 +13,10 @@ Pixels = NDArray[np.uint8]
 """Grey levels, shape (height, width)."""
 
 
+Stack = tuple[Pixels, ...]
+"""Frames of one size, newest first."""
+
+
 class Frame(NamedTuple):
     """One picture of the tail."""
 
@@ -66,8 +70,8 @@ class FrameHistory:
         """Forget all frames."""
         self._frames.clear()
 
-    def stack(self, tick: float) -> Pixels | None:
-        """What a policy is shown at `tick` [s]: shape (frames, size, size), newest first.
+    def stack(self, tick: float) -> Stack | None:
+        """What a policy is shown at `tick` [s].
 
         The k-th frame is the newest that was exposed at or before tick - delay - k·interval and had
         arrived by the tick. None where one of them is missing, or older than permitted.
@@ -83,7 +87,7 @@ class FrameHistory:
                     return None
                 chosen.append(frame.pixels)
                 if len(chosen) == settings.frames:
-                    return np.stack(chosen)
+                    return tuple(chosen)
                 wanted -= settings.interval
         return None
 

@@ -20,6 +20,7 @@ from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation, in_simulation
+from fishd.learning.env.perception import Perception
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
@@ -52,8 +53,8 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     outputs than the policy.
     """
     card = checkpoints.read_card(checkpoint)
-    policy = checkpoints.load_policy(checkpoint)
-    found = _evaluated(checkpoint, card, policy)
+    policy, perception = checkpoints.load_policy(checkpoint)
+    found = _evaluated(checkpoint, card, policy, perception)
     if found.stalled and not force:
         raise PolicyError(
             f"{checkpoint}: this policy stalls when it swims without exploration: "
@@ -95,7 +96,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
         settings={"environment": msgspec.to_builtins(env.settings)},
     )
     card = replace(card, provenance=past)
-    decide = DeterministicPolicy(policy, card.observation, card.amplitude)
+    decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     _write(path, _completed(card, in_simulation(env.config, decide, EvaluationSettings())), policy)
     return path
 
@@ -114,7 +115,9 @@ def _write(target: Path, card: Card, policy: ActorCriticPolicy) -> int:
     return len(content)
 
 
-def _evaluated(checkpoint: Path, card: Card, policy: ActorCriticPolicy) -> Evaluation:
+def _evaluated(
+    checkpoint: Path, card: Card, policy: ActorCriticPolicy, perception: Perception
+) -> Evaluation:
     """The latest evaluation on the robot, else one on the simulated fish of its training."""
     state = checkpoints.read_state(checkpoint)
     if state.on == "robot" and state.latest and state.latest.steps == state.steps:
@@ -125,7 +128,7 @@ def _evaluated(checkpoint: Path, card: Card, policy: ActorCriticPolicy) -> Evalu
         config = Config()
     plant = msgspec.convert(card.provenance.plant, PlantParameters)
     config = replace(config, tick=card.tick, amplitude_limit=card.amplitude, plant=plant)
-    decide = DeterministicPolicy(policy, card.observation, card.amplitude)
+    decide = DeterministicPolicy(policy, perception, card.amplitude)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
     return in_simulation(config, decide, settings.evaluation)
 

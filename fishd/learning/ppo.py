@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
-from fishd.controllers.policy.card import Feature, Layout
+from fishd.camera.frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.learning.env.environment import spaces
+from fishd.learning.env.perception import Perception
+from fishd.learning.eyes.base import Eye
+from fishd.learning.picture_networks import PictureExtractor, SymmetricPicturePolicy
 from fishd.learning.settings import PpoSettings, TrainingSettings
 
 _HALF = math.sqrt(0.5)
@@ -113,11 +116,11 @@ class Rollout(RolloutBuffer):
         return super()._get_samples(batch_inds[~self.void[batch_inds]], env)
 
 
-def make_learner(settings: TrainingSettings, env: VecEnv) -> PPO:
+def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None) -> PPO:
     """A new PPO with an untrained policy; seeds torch, numpy and the environment."""
     ppo = settings.ppo
     return PPO(
-        SymmetricPolicy if ppo.symmetric else ActorCriticPolicy,
+        _kind(ppo, eye),
         env,
         learning_rate=ppo.learning_rate,
         n_steps=ppo.n_steps,
@@ -131,25 +134,41 @@ def make_learner(settings: TrainingSettings, env: VecEnv) -> PPO:
         max_grad_norm=ppo.max_grad_norm,
         target_kl=ppo.target_kl,
         rollout_buffer_class=Rollout,
-        policy_kwargs=_shape(ppo),
+        policy_kwargs=_shape(ppo, eye),
         seed=settings.seed,
         device="cpu",
     )
 
 
-def make_policy(ppo: PpoSettings, features: int) -> ActorCriticPolicy:
-    """The networks alone, as `make_learner` makes them; features: number of inputs"""
-    observation, action = spaces(features)
-    kind = SymmetricPolicy if ppo.symmetric else ActorCriticPolicy
-    return kind(observation, action, lambda _: ppo.learning_rate, **_shape(ppo))
+def make_policy(ppo: PpoSettings, features: int, eye: Eye | None = None) -> ActorCriticPolicy:
+    """The networks alone, as `make_learner` makes them.
+
+    features: number of inputs beside what the eye gives
+    """
+    observation, action = spaces(features + (eye.outputs if eye else 0))
+    return _kind(ppo, eye)(observation, action, lambda _: ppo.learning_rate, **_shape(ppo, eye))
 
 
-def _shape(ppo: PpoSettings) -> dict[str, Any]:
-    return {
+def _kind(ppo: PpoSettings, eye: Eye | None) -> type[ActorCriticPolicy]:
+    if not ppo.symmetric:
+        return ActorCriticPolicy
+    return SymmetricPicturePolicy if eye and eye.shape else SymmetricPolicy
+
+
+def _shape(ppo: PpoSettings, eye: Eye | None) -> dict[str, Any]:
+    found = {
         "net_arch": {"pi": list(ppo.hidden), "vf": list(ppo.hidden)},
         "activation_fn": _ACTIVATIONS[ppo.activation],
         "log_std_init": ppo.log_std_init,
     }
+    if eye and eye.shape:
+        found["features_extractor_class"] = PictureExtractor
+        found["features_extractor_kwargs"] = {
+            "shape": eye.shape,
+            "kind": eye.network,
+            "mirrored": ppo.symmetric,
+        }
+    return found
 
 
 def learning_rate(ppo: PpoSettings, steps: int) -> float:
@@ -188,26 +207,40 @@ def is_finite(model: PPO) -> bool:
 
 
 class DeterministicPolicy:
-    """A copy of a policy, without exploration: observation in, instruction angle out [rad].
+    """A policy without exploration: what is observed in, instruction angle out [rad].
 
-    In numpy, which for a single input is several times as fast as torch.
+    Plain layers are copied and run in numpy, which for a single input is several times as fast as
+    torch; a network for pictures runs as it is.
     """
 
-    def __init__(
-        self, policy: ActorCriticPolicy, features: tuple[Feature, ...], amplitude: float
-    ) -> None:
+    def __init__(self, policy: ActorCriticPolicy, perception: Perception, amplitude: float) -> None:
         """amplitude: Φ [rad]"""
-        self._layers = [(weight.copy(), bias.copy()) for weight, bias in layers_of(policy)]
-        self._tanh = policy.activation_fn is torch.nn.Tanh
-        self._layout = Layout(features)
+        self._perception = perception
         self._amplitude = amplitude
+        self._latest = 0.0
+        self._policy = policy
+        self._layers: Layers = []
+        if isinstance(policy.features_extractor, FlattenExtractor):
+            self._layers = [(weight.copy(), bias.copy()) for weight, bias in layers_of(policy)]
+        self._tanh = policy.activation_fn is torch.nn.Tanh
 
-    def __call__(self, observation: Observation) -> float:
-        """The instruction angle that answers an observation [rad]."""
-        values = self._layout.vector(observation)
+    def __call__(self, observation: Observation, stack: Stack | None = None) -> float:
+        """The angle that answers an observation [rad]; without the frames it needs, as before."""
+        if stack is None and self._perception.eye:
+            return self._latest
+        values = self._perception.vector(observation, stack)
+        action = self._plain(values) if self._layers else self._torch(values)
+        self._latest = max(-1.0, min(1.0, action)) * self._amplitude
+        return self._latest
+
+    def _plain(self, values: NDArray[np.float32]) -> float:
         *hidden, (weight, bias) = self._layers
         for inner, offset in hidden:
             values = inner @ values + offset
             values = np.tanh(values) if self._tanh else np.maximum(values, 0.0)
-        action = float((weight @ values + bias)[0])
-        return max(-1.0, min(1.0, action)) * self._amplitude
+        return float((weight @ values + bias)[0])
+
+    def _torch(self, values: NDArray[np.float32]) -> float:
+        with torch.no_grad():
+            action = self._policy.get_distribution(torch.from_numpy(values[None])).mode()
+        return float(action[0, 0])

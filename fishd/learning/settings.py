@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 import msgspec
 import yaml
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
+from fishd.camera.frames import StackSettings
 from fishd.controllers.policy.card import FeatureName
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
@@ -19,7 +21,8 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """What the agent sees, and what it is rewarded for."""
 
     observation: Annotated[
-        tuple[FeatureName, ...], note("What the agent sees, in order.", min_length=1)
+        tuple[FeatureName, ...],
+        note("What the agent sees, in order; forces only where `see` permits them."),
     ] = ("fy", "fy_rate", "instruction_angle", "previous_angle", "fin_velocity")
     force_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
@@ -37,6 +40,36 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             "ticks", "An episode begins after up to so many ticks at a random angle.", ge=0, le=1000
         ),
     ] = 10
+
+
+class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How pictures become numbers, where the agent sees any."""
+
+    eye: Annotated[
+        Literal["modes", "cnn", "nature"],
+        note(
+            "`modes`: patterns that follow the command; `cnn`: a small network that is shown "
+            "differences of frames about the axis; `nature`: a large one with the frames as they "
+            "are, as in the paper."
+        ),
+    ] = "modes"
+    stack: StackSettings = StackSettings()
+    babble: Annotated[
+        int,
+        unit(
+            "ticks",
+            "Before it learns, the fish moves at random: `modes` and `cnn` need that.",
+            ge=64,
+            le=10_000,
+        ),
+    ] = 256
+    align: Annotated[
+        bool, note("Look for the axis of motion in the babble; false: the middle row.")
+    ] = True
+    modes: Annotated[int, note("Patterns that the eye `modes` keeps.", ge=1, le=16)] = 4
+    memory: Annotated[
+        int, unit("ticks", "Commands that `modes` explains a frame by.", ge=2, le=64)
+    ] = 8
 
 
 class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -123,10 +156,26 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     steps: Annotated[int, note("Control steps to learn from.", ge=1)] = 8000
     seed: Annotated[int, note("Of networks, exploration and start.", ge=0, le=2**32 - 1)] = 0
     checkpoint_every: Annotated[int, note("Steps between checkpoints.", ge=1)] = 5000
+    see: Annotated[Literal["force", "camera", "both"], note("What the agent sees of the fish.")] = (
+        "force"
+    )
     environment: EnvironmentSettings = EnvironmentSettings()
+    camera: VisionSettings = VisionSettings()
     randomisation: Randomisation = Randomisation()
     ppo: PpoSettings = PpoSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
+
+    @property
+    def seen(self) -> EnvironmentSettings:
+        """What the environment shows beside pictures: with `see: camera`, no forces."""
+        names = self.environment.observation
+        if self.see == "camera":
+            names = tuple(name for name in names if name in _COMMANDS)
+        return replace(self.environment, observation=names)
+
+
+_COMMANDS = ("instruction_angle", "previous_angle")
+"""What the agent knows without any sensor."""
 
 
 def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
@@ -142,6 +191,14 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
         raise ConfigError(problem.located(sources)) from None
 
 
+def check(settings: TrainingSettings) -> None:
+    """Refuse settings that were changed since they were loaded; raises `ConfigError`."""
+    try:
+        _check(settings)
+    except Problem as problem:
+        raise ConfigError(problem.located({})) from None
+
+
 def to_yaml(settings: TrainingSettings) -> str:
     """All settings, defaults included, as YAML that `load` reads back."""
     return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False)
@@ -155,7 +212,7 @@ def _check(settings: TrainingSettings) -> None:
             ("ppo", "batch_size"),
             f"{ppo.batch_size} is not valid: n_steps, {ppo.n_steps}, must be a multiple of it",
         )
-    if ppo.symmetric and "fx" in settings.environment.observation:
+    if ppo.symmetric and "fx" in settings.seen.observation:
         raise Problem(
             ("ppo", "symmetric"),
             "true is not valid where environment.observation has fx, which is the same for a "
@@ -165,6 +222,17 @@ def _check(settings: TrainingSettings) -> None:
     if len(set(seen)) < len(seen):
         raise Problem(
             ("environment", "observation"), f"{list(seen)} is not valid: each may be in it once"
+        )
+    if not seen and settings.see == "force":
+        raise Problem(
+            ("environment", "observation"),
+            "an empty list is not valid with see: force; the agent would see nothing",
+        )
+    if settings.camera.memory >= settings.camera.babble // 4:
+        raise Problem(
+            ("camera", "memory"),
+            f"{settings.camera.memory} ticks is not valid: less than a quarter of babble, "
+            f"{settings.camera.babble} ticks, is needed",
         )
     if evaluation.settle >= evaluation.seconds:
         raise Problem(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fishd.camera.frames import Stack
 from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
@@ -28,7 +29,7 @@ from fishd.virtual.plant.optimum import best_square_wave, square_wave
 CONFIG = load(None, ["simulation.offset_y=0.005"])
 
 
-def square_of_six_ticks(observation: Observation) -> float:
+def square_of_six_ticks(observation: Observation, stack: Stack | None = None) -> float:
     return 0.42 if round(observation.time / 0.05) // 6 % 2 else -0.42
 
 
@@ -44,7 +45,7 @@ def test_a_function_gets_the_report_that_a_controller_gets() -> None:
 def test_it_sees_what_the_sensor_sees() -> None:
     seen: list[Observation] = []
 
-    def rest(observation: Observation) -> float:
+    def rest(observation: Observation, stack: Stack | None) -> float:
         seen.append(observation)
         return 0.0
 
@@ -55,18 +56,18 @@ def test_it_sees_what_the_sensor_sees() -> None:
 
 
 def test_half_the_amplitude_is_half_full() -> None:
-    report = judge(CONFIG, lambda seen: 0.5 * square_of_six_ticks(seen), 30.0, 10.0)
+    report = judge(CONFIG, lambda seen, _: 0.5 * square_of_six_ticks(seen), 30.0, 10.0)
     assert report.fullness == pytest.approx(0.5)
     assert report.squareness == pytest.approx(1.0)
 
 
 def test_what_the_configuration_starts_with_is_not_asked() -> None:
     config = load(None, ["robot=virtual-pi", "start.controller=swing"])
-    assert judge(config, lambda _: 0.0, 5.0, 1.0).fullness == 0.0
+    assert judge(config, lambda *_: 0.0, 5.0, 1.0).fullness == 0.0
 
 
 def test_an_answer_that_is_no_number_ends_in_a_fault_with_its_reason() -> None:
-    report = judge(CONFIG, lambda _: math.nan, 5.0, 1.0)
+    report = judge(CONFIG, lambda *_: math.nan, 5.0, 1.0)
     assert report.mode == "fault"
     assert report.reason
     assert report.reason.code == "controller-error"
@@ -74,7 +75,7 @@ def test_an_answer_that_is_no_number_ends_in_a_fault_with_its_reason() -> None:
 
 def test_lengths_that_leave_nothing_to_judge_are_refused() -> None:
     with pytest.raises(ParameterError, match="nothing is left to judge"):
-        judge(CONFIG, lambda _: 0.0, 5.0, 5.0)
+        judge(CONFIG, lambda *_: 0.0, 5.0, 5.0)
 
 
 @pytest.mark.parametrize("amplitude", [0.2, 0.42, 0.8])
@@ -100,7 +101,7 @@ def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
 
 
 def test_a_policy_that_stays_in_rapid_reversals_once_it_is_there_is_worth_nothing() -> None:
-    def stuck(observation: Observation) -> float:
+    def stuck(observation: Observation, stack: Stack | None) -> float:
         """Goes on with what it finds when it is first asked."""
         found.append(observation.previous_angle * observation.instruction_angle < 0.0)
         return -observation.instruction_angle if found[0] else square_of_six_ticks(observation)
@@ -144,9 +145,9 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     ("decide", "stalls"),
     [
         (square_of_six_ticks, False),
-        (lambda _: 0.42, True),
-        (lambda seen: 0.01 * square_of_six_ticks(seen), True),
-        (lambda seen: -0.42 if seen.instruction_angle > 0.0 else 0.42, True),
+        (lambda *_: 0.42, True),
+        (lambda seen, _: 0.01 * square_of_six_ticks(seen), True),
+        (lambda seen, _: -0.42 if seen.instruction_angle > 0.0 else 0.42, True),
     ],
     ids=["swims", "holds still", "hardly moves", "reverses in every tick"],
 )
@@ -173,7 +174,7 @@ def test_on_a_robot_whatever_the_sensor_drifts_is_told_apart(drift: str) -> None
 
 @pytest.mark.parametrize(
     "decide",
-    [lambda _: 0.42, lambda seen: 0.2 + 0.1 * square_of_six_ticks(seen), lambda _: 0.0],
+    [lambda *_: 0.42, lambda seen, _: 0.2 + 0.1 * square_of_six_ticks(seen), lambda *_: 0.0],
     ids=["holds still", "stays on one side", "at neutral"],
 )
 def test_on_a_robot_a_policy_that_does_not_beat_is_stalled_and_ends_no_training(

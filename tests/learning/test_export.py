@@ -50,8 +50,8 @@ def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
     controller = registry.create(
         "ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, chatter=ChatterSettings(dwell=0.0))
     )
-    policy = checkpoints.load_policy(trained.best)
-    decide = DeterministicPolicy(policy, found.card.observation, 0.42)
+    policy, perception = checkpoints.load_policy(trained.best)
+    decide = DeterministicPolicy(policy, perception, 0.42)
     draw = np.random.default_rng(1)
     for _ in range(200):
         fy, rate, velocity, angle = draw.normal(0.0, (0.4, 5.0, 0.03, 0.42)).tolist()

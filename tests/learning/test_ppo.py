@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from fishd.controllers.policy.card import Feature, Layout
 from fishd.learning.env.environment import spaces
+from fishd.learning.env.perception import Perception
 from fishd.learning.ppo import (
     DeterministicPolicy,
     Rollout,
@@ -74,7 +75,7 @@ def test_the_policy_in_numpy_is_that_of_stable_baselines(
     policy = make_policy(ppo, 2)
     with torch.no_grad():
         policy.action_net.weight *= 100.0  # so that some actions are clipped
-    decide = DeterministicPolicy(policy, FEATURES, 0.42)
+    decide = DeterministicPolicy(policy, Perception(FEATURES), 0.42)
     layout = Layout(FEATURES)
     found = []
     for angle in np.linspace(-0.42, 0.42, 21):

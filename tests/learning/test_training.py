@@ -43,7 +43,7 @@ class Witness(Display):
 
 
 def parameters(checkpoint: Path) -> dict[str, Any]:
-    return checkpoints.load_policy(checkpoint).state_dict()
+    return checkpoints.load_policy(checkpoint)[0].state_dict()
 
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> bool:

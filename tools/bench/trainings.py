@@ -11,7 +11,6 @@ from msgspec.structs import replace
 from common.report import DOCS, progress
 from fishd.config import Config, load
 from fishd.learning import settings as training
-from fishd.learning.env.environment import features
 from fishd.learning.env.evaluation import Evaluation, judge
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder.checkpoints import load_policy
@@ -63,13 +62,12 @@ def trained(config: Config, settings: TrainingSettings, seed: int, others: bool)
             return Trained(points, so_far, [], [])
         assert outcome.best
         assert outcome.checkpoint
-        best, last = (swum(path, config, settings) for path in (outcome.best, outcome.checkpoint))
+        best, last = (swum(path, config) for path in (outcome.best, outcome.checkpoint))
         return Trained(points, so_far, best, last)
 
 
-def swum(checkpoint: Path, config: Config, settings: TrainingSettings) -> list[float]:
+def swum(checkpoint: Path, config: Config) -> list[float]:
     """Efficiency of a policy on each fish that is off, over that fish's own best square wave."""
-    seen = features(config, settings.environment)
     found = []
     for signs in itertools.product((-1.0, 1.0), repeat=4):
         plant = config.plant
@@ -78,7 +76,7 @@ def swum(checkpoint: Path, config: Config, settings: TrainingSettings) -> list[f
             value * (1.0 + OFF * sign) for value, sign in zip(values, signs, strict=True)
         )
         off = replace(plant, omega0=omega0, xi=xi, servo_speed=speed, coupling=coupling)
-        decide = DeterministicPolicy(load_policy(checkpoint), seen, config.amplitude_limit)
+        decide = DeterministicPolicy(*load_policy(checkpoint), config.amplitude_limit)
         fish = replace(config, plant=off, simulation=replace(config.simulation, seed=1000))
         found.append(judge(fish, decide, 60.0, 10.0).efficiency)
     return found

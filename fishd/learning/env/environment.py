@@ -11,6 +11,7 @@ An episode is truncated after `episode` steps, and never terminates: a fish has 
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -18,11 +19,15 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from fishd.camera.frames import Stack
 from fishd.config import Config
-from fishd.controllers.policy.card import Feature, FeatureName, Layout
+from fishd.controllers.policy.card import Feature, FeatureName
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
-from fishd.learning.env.link import Link
+from fishd.learning.env.link import Link, LinkLost
+from fishd.learning.env.perception import Perception
+from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes.making import babble
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -76,6 +81,8 @@ _FARTHEST = 1e6
 """Bound of the observation space: finite, as tools expect, and never reached."""
 SHORTEST_PAUSE, LONGEST_PAUSE = 10.0, 120.0
 """Bounds of a pause whose length is not given; the first one is the longest [s]."""
+FIRST_FRAMES = 5.0
+"""How long a camera may take to show a whole stack, in real and in virtual time [s]."""
 _ALLOWANCE = 4.0
 """Such a pause may last so many times the longest one so far."""
 
@@ -97,10 +104,13 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
 
-    def __init__(self, link: Link, config: Config, settings: EnvironmentSettings) -> None:
+    def __init__(
+        self, link: Link, config: Config, settings: EnvironmentSettings, eye: Eye | None = None
+    ) -> None:
         """
         link: to the fish
         config: the fish that the scales are made for
+        eye: what makes numbers of pictures, where the agent sees any; fit it before the first step
 
         Raises `ConfigError` where the fish has another tick or Φ than `config`.
         """
@@ -109,19 +119,22 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.config = config
         self.features = features(config, settings)
         self.settings = settings
-        self._layout = Layout(self.features)
+        self.eye = eye
+        self.perception = Perception(self.features, eye)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
-        self.observation_space, self.action_space = spaces(len(self.features))
+        self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
         """Mean thrust of the best square wave of the configured fish [N]."""
         self._steps = 0
         self._begun = self._closed = False
         self.latest: Observation
         """The latest observation, once an episode has begun."""
+        self.stack: Stack | None = None
+        """The latest stack of frames, once there is one."""
         self.tank_time = 0.0
         """How long the agent has controlled a fish, pauses included [s]."""
         self.lost = 0
-        """Ticks in which another angle than the agent's was applied."""
+        """Ticks in which another angle than the agent's was applied, or no frame came."""
         self._paused = 0.0
         self._pause_began = 0.0
         self._longest_pause: float | None = None
@@ -142,11 +155,12 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
         self._begun = True
         self._steps = 0
+        self._await_frames()
         angle = self.link.amplitude * float(draw.uniform(-1.0, 1.0))
         lost = sum(
             self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
         )
-        return self._layout.vector(self.latest), self._info(lost)
+        return self._seen(), self._info(lost)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Apply an instruction angle for one tick.
@@ -163,18 +177,40 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         truncated = self._steps >= self.settings.episode or lost > 0
         info = self._info(lost)
         self._paused = 0.0
-        return self._layout.vector(self.latest), reward, False, truncated, info
+        return self._seen(), reward, False, truncated, info
 
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
 
-        Raises `LinkLost`.
+        A tick without a frame counts as one. Raises `LinkLost`.
         """
         before = self.latest.time
         self.latest, lost = self.link.step(angle)
+        if self.eye and not self._look():
+            lost = max(lost, 1)
         self.tank_time += self.latest.time - before
         self.lost += lost
         return lost
+
+    def babble(self, seed: int, ticks: int, stop: Callable[[], bool] = lambda: False) -> bool:
+        """Move at random, outside of any episode, and let the eye find out what it sees of that.
+
+        ticks: for how long
+        stop: called after each of them; True ends it
+
+        False where it was stopped. Raises `LinkLost`, and `NoMotion` where the tail is not to be
+        seen.
+        """
+        assert self.eye
+        frames = []
+        angles = babble(seed, ticks, self.link.amplitude)
+        for angle in angles.tolist():
+            if self.stack is None or stop():
+                return False
+            self.advance(angle)
+            frames.append(self.stack[0])
+        self.eye.fit(np.stack(frames), angles)
+        return True
 
     def pause(self, seconds: float | None = None) -> None:
         """Let the fish wait at neutral while the agent learns.
@@ -197,15 +233,37 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         took = time.monotonic() - self._pause_began
         self._longest_pause = max(took, self._longest_pause or 0.0)
         self.latest = self.link.resume()
+        self._await_frames()
         waited = self.latest.time - before
         self._paused += waited
         self.tank_time += waited
-        return self._layout.vector(self.latest)
+        return self._seen()
 
     def close(self) -> None:
         """Leave the fish at neutral."""
         self._closed = True
         self.link.close()
+
+    def _look(self) -> bool:
+        """Take the stack of this tick; False, and the one before is kept, where there is none."""
+        stack = self.link.look()
+        if stack is not None:
+            self.stack = stack
+        return stack is not None
+
+    def _await_frames(self) -> None:
+        """Stay at neutral until the camera shows a whole stack; raises `LinkLost`."""
+        if self.eye is None or self._look():
+            return
+        begun, began = self.latest.time, time.monotonic()
+        while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
+            self.latest, _ = self.link.step(0.0)
+            if self._look():
+                return
+        raise LinkLost(f"the camera has shown nothing for {FIRST_FRAMES:g} s")
+
+    def _seen(self) -> Vector:
+        return self.perception.vector(self.latest, self.stack)
 
     def _check_open(self) -> None:
         if self._closed:

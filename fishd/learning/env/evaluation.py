@@ -9,14 +9,16 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd import simulation
+from fishd.camera.frames import Stack
+from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.measurement import Sample, evaluate, plan
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.simulated_link import FunctionController, NullPublisher, at_edge
+from fishd.learning.env.simulated_link import Camera, FunctionController, NullPublisher, at_edge
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
-from fishd.simulation import Report
+from fishd.simulation import Report, VirtualRun
 
 STALLED = 0.05
 """A policy whose mean |φ_c| is below this share of Φ does not swim."""
@@ -26,8 +28,8 @@ CHATTER = 0.9
 SHAKE = 1.0
 """How long a fish is shaken [s]."""
 
-Decide = Callable[[Observation], float]
-"""A policy: observation in, instruction angle out [rad]."""
+Decide = Callable[[Observation, Stack | None], float]
+"""A policy: observation, and frames where it sees any, in; instruction angle out [rad]."""
 
 
 class Evaluation(Struct, frozen=True, kw_only=True):
@@ -61,23 +63,44 @@ class Evaluation(Struct, frozen=True, kw_only=True):
 
 
 def judge(
-    config: Config, decide: Decide, seconds: float, settle: float, name: str = "policy"
+    config: Config,
+    decide: Decide,
+    seconds: float,
+    settle: float,
+    camera: Camera | None = None,
 ) -> Report:
     """Let a policy swim the simulated fish of `config`, from rest, as a controller does.
 
     seconds, settle: as for `fishd.simulation.simulate` [s]
+    camera: what it sees the fish with, if it sees any
 
     Raises `ParameterError` where the lengths do not fit one another.
     """
     config = replace(config, robot="simulated", start=Start())
-    controller = FunctionController(config, decide)
-    return simulation.judge(config, name, controller, seconds, settle, NullPublisher())
+    sights: list[SimulatedSight] = []
+
+    def begun(run: VirtualRun) -> None:
+        if camera and run.loop.robot.truth:
+            sights.append(camera.on(run.loop.robot.truth, config.tick))
+
+    def decided(seen: Observation) -> float:
+        return decide(seen, sights[0].look(seen.time) if sights else None)
+
+    controller = FunctionController(config, decided)
+    return simulation.judge(config, "policy", controller, seconds, settle, NullPublisher(), begun)
 
 
-def in_simulation(config: Config, decide: Decide, settings: EvaluationSettings) -> Evaluation:
+def in_simulation(
+    config: Config, decide: Decide, settings: EvaluationSettings, camera: Camera | None = None
+) -> Evaluation:
     """Evaluate on a new fish as configured, not a randomised one, and with other noise."""
     noise = replace(config.simulation, seed=config.simulation.seed + 1)
-    found = judge(replace(config, simulation=noise), decide, settings.seconds, settings.settle)
+    if camera:
+        light = replace(camera.settings, seed=camera.settings.seed + 1)
+        camera = replace(camera, settings=light)
+    found = judge(
+        replace(config, simulation=noise), decide, settings.seconds, settings.settle, camera
+    )
     return Evaluation(
         thrust=float(found.mean_thrust),
         efficiency=float(found.efficiency),
@@ -87,7 +110,9 @@ def in_simulation(config: Config, decide: Decide, settings: EvaluationSettings) 
     )
 
 
-def worst_of_others(config: Config, decide: Decide, settings: TrainingSettings) -> float:
+def worst_of_others(
+    config: Config, decide: Decide, settings: TrainingSettings, camera: Camera | None = None
+) -> float:
     """Lowest efficiency on fish at the edges of the randomisation, each over its own optimum.
 
     Each begins with rapid reversals, which some policies never leave.
@@ -99,6 +124,7 @@ def worst_of_others(config: Config, decide: Decide, settings: TrainingSettings) 
             _shaken(decide, config),
             found.seconds,
             found.settle,
+            camera,
         ).efficiency
         for seed in range(found.others)
     )
@@ -120,7 +146,7 @@ def on_link(
         for _ in range(round(seconds / tick)):
             if stop():
                 return None
-            angle = max(-amplitude, min(amplitude, decide(env.latest))) if swims else 0.0
+            angle = max(-amplitude, min(amplitude, decide(env.latest, env.stack))) if swims else 0.0
             seen = env.latest
             samples.append(
                 Sample(round(seen.time / tick), seen.fx, seen.fin_velocity, angle, swims)
@@ -161,10 +187,10 @@ def _shaken(decide: Decide, config: Config) -> Decide:
     """Reverse in every tick at first, and decide only then."""
     ticks = itertools.count()
 
-    def decided(observation: Observation) -> float:
+    def decided(observation: Observation, stack: Stack | None) -> float:
         tick = next(ticks)
         if tick * config.tick < SHAKE:
             return config.amplitude_limit * (-1.0) ** tick
-        return decide(observation)
+        return decide(observation, stack)
 
     return decided

@@ -5,6 +5,7 @@ One step of an agent: it sends an instruction angle, one tick passes, it receive
 
 from typing import NamedTuple, Protocol
 
+from fishd.camera.frames import Stack
 from fishd.core.errors import FishdError
 from fishd.core.signals import Observation
 
@@ -40,6 +41,12 @@ class Link(Protocol):
 
     def step(self, angle: float) -> StepResult:
         """Apply an instruction angle [rad] for one tick; raises `LinkLost`."""
+
+    def look(self) -> Stack | None:
+        """The frames for the latest observation.
+
+        None where the camera has not shown them, or there is none; to be asked once a tick.
+        """
 
     def pause(self, seconds: float) -> None:
         """Stay at neutral while the agent learns, for `seconds` at most; raises `LinkLost`.

@@ -8,11 +8,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.assembly import build_loop
+from fishd.camera.frames import Stack, StackSettings
+from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
-from fishd.core.signals import Event, Observation, Tick
+from fishd.core.signals import Event, Observation, Tick, Truth
 from fishd.learning.env.link import LinkLost, StepResult
 from fishd.learning.settings import Randomisation
 from fishd.virtual.fish import SimulatedFish
@@ -81,6 +84,17 @@ class NullPublisher:
         """Drop it."""
 
 
+class Camera(Struct, frozen=True):
+    """A simulated camera, and which of its frames an agent is shown."""
+
+    settings: SimulatedCameraSettings
+    stack: StackSettings
+
+    def on(self, truth: Callable[[], Truth], tick: float) -> SimulatedSight:
+        """Look at a fish that is at rest; tick: period of the loop [s]"""
+        return SimulatedSight(self.settings, self.stack, tick, truth)
+
+
 class SimulatedLink:
     """The link to a `ControlLoop` on a `SimulatedFish` in the same process.
 
@@ -88,10 +102,16 @@ class SimulatedLink:
     stands still.
     """
 
-    def __init__(self, config: Config, randomisation: Randomisation | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        randomisation: Randomisation | None = None,
+        camera: Camera | None = None,
+    ) -> None:
         """
         config: fish, rig, tick and limits; its robot and start are ignored
         randomisation: how much the fish and rig of each episode vary; by default not at all
+        camera: what looks at the fish, if anything does
         """
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
@@ -100,6 +120,8 @@ class SimulatedLink:
         self._nominal = self.config
         self._randomisation = randomisation or Randomisation()
         self._varies = self._randomisation != Randomisation()
+        self._camera = camera
+        self._sight: SimulatedSight | None = None
         self._angle = 0.0
         self._loop: ControlLoop
         self._slots: Iterator[Slot]
@@ -124,6 +146,10 @@ class SimulatedLink:
             raise LinkLost(f"the loop is in {self._loop.supervisor.mode}: {reason.message}")
         return StepResult(self._turn.observation)
 
+    def look(self) -> Stack | None:
+        """What the simulated camera shows."""
+        return self._sight.look(self.resume().time) if self._sight else None
+
     def pause(self, seconds: float) -> None:
         """Nothing: virtual time stands still while the agent learns."""
 
@@ -141,4 +167,6 @@ class SimulatedLink:
         self._loop = build_loop(config, fish.robot(), clock, NullPublisher())
         self._loop.set_controller("agent", FunctionController(config, lambda _: self._angle))
         self._slots = virtual_slots(clock, config.tick)
+        if self._camera:
+            self._sight = self._camera.on(fish.truth, config.tick)
         self._turn = self._loop.observe(next(self._slots))

@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
-from zipfile import ZipFile
+from zipfile import BadZipFile, ZipFile
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -25,10 +26,13 @@ from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
 from fishd.core.errors import FishdError, PolicyError
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.env.perception import Perception
+from fishd.learning.eyes import making as eyes
+from fishd.learning.eyes.base import Eye
 from fishd.learning.ppo import make_policy
 from fishd.learning.settings import TrainingSettings
 
-MODEL, CARD, STATE = "model.zip", "card.json", "state.json"
+MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.npz"
 
 LARGEST_MODEL = 256 * 2**20
 """Of networks and optimiser [bytes]."""
@@ -59,7 +63,9 @@ class State(Struct, frozen=True):
     best: Evaluation | None
 
 
-def save(folder: Path, kind: str, model: PPO, card: Card, state: State) -> Path:
+def save(
+    folder: Path, kind: str, model: PPO, card: Card, state: State, eye: Eye | None = None
+) -> Path:
     """Write a checkpoint; kind: step or best, of which only the newest is kept."""
     name = f"{kind}-{state.steps:06d}"
     final, part = folder / name, folder / f".{name}.part"
@@ -70,6 +76,10 @@ def save(folder: Path, kind: str, model: PPO, card: Card, state: State) -> Path:
     (part / MODEL).write_bytes(archive.getvalue())
     (part / CARD).write_text(msgspec.json.format(encode(card), indent=2) + "\n", encoding="utf-8")
     (part / STATE).write_bytes(msgspec.json.encode(state))
+    if eye and eye.is_fitted:
+        constants: dict[str, Any] = eye.constants
+        with (part / EYE).open("wb") as file:
+            np.savez(file, **constants)
     if final.exists():  # a run that was stopped before it learned any more
         _discard(final)
     part.rename(final)
@@ -158,15 +168,33 @@ def load_parameters(model: PPO, checkpoint: Path, *, optimiser: bool = True) -> 
         model.policy.optimizer.load_state_dict(fresh)
 
 
-def load_policy(checkpoint: Path) -> ActorCriticPolicy:
-    """The networks of a checkpoint; raises `CheckpointError`."""
+def load_policy(checkpoint: Path) -> tuple[ActorCriticPolicy, Perception]:
+    """The networks of a checkpoint, and what they are given; raises `CheckpointError`."""
     card = read_card(checkpoint)
+    settings = msgspec.convert(card.provenance.settings, TrainingSettings)
+    eye = eyes.make(settings)
+    if eye:
+        load_eye(eye, checkpoint)
     with _readable(checkpoint / MODEL) as parameters:
-        settings = msgspec.convert(card.provenance.settings, TrainingSettings)
-        policy = make_policy(settings.ppo, len(card.observation))
+        policy = make_policy(settings.ppo, len(card.observation), eye)
         policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
-    return policy
+    return policy, Perception(card.observation, eye)
+
+
+def load_eye(eye: Eye, checkpoint: Path) -> None:
+    """Give an eye the constants of a checkpoint, if it had any; raises `CheckpointError`."""
+    path = checkpoint / EYE
+    if not path.exists() or not eye.names:
+        return
+    try:
+        content = files.read(path, LARGEST_MODEL, "the constants of an eye")
+        with np.load(io.BytesIO(content), allow_pickle=False) as found:
+            eye.restore(dict(found))
+    except files.FileProblem as problem:
+        raise CheckpointError(f"{path}: {problem}; {_ADVICE}") from None
+    except (ValueError, OSError, BadZipFile, EOFError) as error:
+        raise CheckpointError(f"{path}: cannot be read: {_brief(error)}; {_ADVICE}") from None
 
 
 @contextmanager

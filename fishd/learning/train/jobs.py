@@ -6,8 +6,10 @@ from typing import Literal
 
 from msgspec import Struct
 
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.env.simulated_link import Camera
 from fishd.learning.settings import TrainingSettings
 
 On = Literal["simulation", "robot"]
@@ -32,6 +34,18 @@ class Job(Struct, frozen=True, kw_only=True):
     """Go on from the newest checkpoint in `folder`."""
     parent: Path | None = None
     """Checkpoint whose networks a new run begins with."""
+
+    camera: SimulatedCameraSettings = SimulatedCameraSettings()
+    """What a simulated fish is seen with, where it is to be seen."""
+    camera_endpoint: str | None = None
+    """Where the camera of a robot takes requests; None: $FISHD_CAMERA, or that of this machine."""
+
+    @property
+    def simulated_camera(self) -> Camera | None:
+        """That camera, and what is shown of it; None where only forces are seen."""
+        if self.settings.see == "force":
+            return None
+        return Camera(self.camera, self.settings.camera.stack)
 
     def last_step(self, done: int = 0) -> int:
         """The step with which it ends: PPO learns from whole rollouts; done: steps before."""

@@ -2,7 +2,7 @@
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -47,7 +47,8 @@ class RunRecorder:
             else:
                 if job.parent:
                     self._begin_with(job.parent)
-                runs.create(job.folder, job.config, job.settings)
+                camera = job.camera if job.simulated_camera and job.on == "simulation" else None
+                runs.create(job.folder, job.config, job.settings, camera)
                 self._lock_folder(lock)
             progress = self._open_table("progress.csv", tuple(PROGRESS))
             self._evaluations = self._open_table(EVALUATIONS, Evaluation.__struct_fields__)
@@ -114,7 +115,9 @@ class RunRecorder:
             latest=self.latest,
             best=self.best,
         )
-        return checkpoints.save(self._job.folder, kind, self._model, self._card(), state)
+        return checkpoints.save(
+            self._job.folder, kind, self._model, self._card(), state, self._env.eye
+        )
 
     def _card(self) -> Card:
         job, seen = self._job, self._env.features
@@ -126,6 +129,7 @@ class RunRecorder:
         """Take over the networks of another run; raises `CheckpointError`."""
         past = self._checked_card(parent).provenance
         checkpoints.load_parameters(self._model, parent, optimiser=False)
+        self._load_eye(parent)
         name = f"{parent.resolve().parent.name}/{parent.name}"
         self._note = f"began with {name}, {past.steps} steps in {past.on}"
 
@@ -135,21 +139,25 @@ class RunRecorder:
         Raises `CheckpointError`.
         """
         card, own = checkpoints.read_card(checkpoint), self._card()
+        theirs = _architecture(card.provenance.settings)
+        ours = _architecture(own.provenance.settings)
+        for key, here in ours.items():
+            if theirs.get(key) != here:
+                raise CheckpointError(
+                    f"{checkpoint}: its {key} is {theirs.get(key)}, that of this training is "
+                    f"{here}; eye and networks must be alike"
+                )
         for what in ("observation", "tick", "amplitude"):
             if getattr(card, what) != getattr(own, what):
                 raise CheckpointError(
                     f"{checkpoint}: its {what}, with scales, differs from that of this training; "
                     "use the configuration and the environment settings that it was trained with"
                 )
-        theirs = card.provenance.settings.get("ppo", {})
-        ours = msgspec.json.decode(msgspec.json.encode(self._job.settings.ppo))  # lists, as theirs
-        for key in ("hidden", "activation", "symmetric"):
-            if theirs.get(key) != ours.get(key):
-                raise CheckpointError(
-                    f"{checkpoint}: its ppo.{key} is {theirs.get(key)}, that of this training is "
-                    f"{ours.get(key)}; the networks must be alike"
-                )
         return card
+
+    def _load_eye(self, checkpoint: Path) -> None:
+        if self._env.eye:
+            checkpoints.load_eye(self._env.eye, checkpoint)
 
     def _resume(self) -> None:
         """Go on from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
@@ -168,6 +176,7 @@ class RunRecorder:
                 f"a larger total, such as --steps {state.steps + job.settings.steps}"
             )
         checkpoints.load_parameters(model, self.checkpoint)
+        self._load_eye(self.checkpoint)
         self._note = card.provenance.note
         self.steps = model.num_timesteps = state.steps
         self.rollouts, model._n_updates = state.rollouts, state.updates
@@ -181,3 +190,15 @@ class RunRecorder:
         if self._job.resume:
             table.keep_until(self.steps)
         return table
+
+
+def _architecture(settings: dict[str, Any]) -> dict[str, Any]:
+    """What makes two networks alike, of a training's settings, by key."""
+    settings = msgspec.json.decode(msgspec.json.encode(settings))  # lists, as in a file
+    see, ppo = settings.get("see", "force"), settings.get("ppo", {})
+    camera = {} if see == "force" else settings.get("camera", {})
+    return {
+        "see": see,
+        **{f"ppo.{key}": ppo.get(key) for key in ("hidden", "activation", "symmetric")},
+        **{f"camera.{key}": value for key, value in camera.items()},
+    }

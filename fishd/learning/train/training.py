@@ -24,6 +24,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.eyes import making as eyes
 from fishd.learning.ppo import DeterministicPolicy, is_finite, learning_rate, make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
@@ -49,9 +50,10 @@ def train(
     torch.set_num_threads(1)
     link: Link
     if job.on == "robot":
-        link = FishdLink(job.endpoint, address=job.agent)
+        stack = job.settings.camera.stack if job.settings.see != "force" else None
+        link = FishdLink(job.endpoint, address=job.agent, stack=stack, camera=job.camera_endpoint)
     else:
-        link = SimulatedLink(job.config, job.settings.randomisation)
+        link = SimulatedLink(job.config, job.settings.randomisation, job.simulated_camera)
     try:
         return Training(job, link, display or Display(), stop).run()
     except OSError as error:
@@ -71,9 +73,10 @@ class Training:
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Makes or opens the run folder; nothing moves yet. Raises as `train` does."""
         self._job, self._display, self._stop = job, display, stop
-        self._env = SwimEnv(link, job.config, job.settings.environment)
+        self._eye = eyes.make(job.settings)
+        self._env = SwimEnv(link, job.config, job.settings.seen, self._eye)
         self._vec_env = DummyVecEnv([lambda: self._env])
-        self._model = make_learner(job.settings, self._vec_env)
+        self._model = make_learner(job.settings, self._vec_env, self._eye)
         self._callback = RolloutCallback(self._env, display, stop)
         self._recorder = RunRecorder(job, self._env, self._model)
         self._paused = False
@@ -90,6 +93,8 @@ class Training:
         message = ""
         try:
             self._reset()
+            if self._eye and not self._eye.is_fitted:
+                ended, message = self._babble()
             while recorder.steps < job.settings.steps and ended == "finished":
                 ended, message = self._update()
         except LinkLost as error:
@@ -113,9 +118,15 @@ class Training:
 
     def _introduce(self) -> None:
         recorder, job = self._recorder, self._job
-        last, rollout = job.last_step(recorder.steps), job.settings.ppo.n_steps
+        done, rollout = recorder.steps, job.settings.ppo.n_steps
+        if self._eye and not self._eye.is_fitted:
+            done = job.settings.camera.babble
+        last = job.last_step(done)
         whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
         text = f"{job.folder}: {last} steps{whole} on {job.on}"
+        if self._eye:
+            also = " and forces" if job.settings.see == "both" else ""
+            text += f", from pictures{also} with the eye {job.settings.camera.eye}"
         if job.resume:
             tank = minutes(self._env.tank_time)
             text += f", resumed from {recorder.checkpoint}, {tank} in the tank"
@@ -132,6 +143,21 @@ class Training:
         """The observation of the next step, which begins an episode."""
         self._model._last_obs = observations
         self._model._last_episode_starts = np.ones(1, dtype=bool)
+
+    def _babble(self) -> tuple[Ended, str]:
+        """Move at random first, so that the eye knows what it sees; these steps count, too."""
+        env, ticks = self._env, self._job.settings.camera.babble
+
+        def stop() -> bool:
+            self._display.step(env.tank_time)
+            return self._stop()
+
+        if not env.babble(self._job.settings.seed, ticks, stop):
+            return "interrupted", ""
+        env.pause()
+        self._paused = True
+        self._recorder.steps = self._model.num_timesteps = ticks
+        return "finished", ""
 
     def _update(self) -> tuple[Ended, str]:
         """One rollout, its update and evaluation; how it ended, and why."""
@@ -171,11 +197,12 @@ class Training:
     def _evaluate(self) -> None:
         """Evaluate the policy without exploration."""
         job, env = self._job, self._env
-        policy = DeterministicPolicy(self._model.policy, env.features, env.link.amplitude)
+        policy = DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
         if job.on == "simulation":
-            found = evaluation.in_simulation(job.config, policy, job.settings.evaluation)
+            camera = job.simulated_camera
+            found = evaluation.in_simulation(job.config, policy, job.settings.evaluation, camera)
             if job.settings.evaluation.others:
-                others = evaluation.worst_of_others(job.config, policy, job.settings)
+                others = evaluation.worst_of_others(job.config, policy, job.settings, camera)
                 found = replace(found, worst=min(others, found.efficiency))
         else:
             env.resume()

@@ -1,0 +1,82 @@
+"""The eye `modes`: how strongly the tail moves in a few patterns that follow the command.
+
+A lock-in: each pixel of what changes sign in the mirror is regressed on the latest commands, and
+the strongest patterns of what the commands explain are kept. Light, noise and ripples of the water
+do not follow the command, and so are not seen.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fishd.camera.axis import Axis, find_motion
+from fishd.camera.frames import Pixels, StackSettings
+from fishd.learning.eyes.base import Array, Eye, lit
+
+
+class ModesEye(Eye):
+    """The amplitudes of a few patterns in each frame, newest frame first."""
+
+    names = ("patterns", "zero")
+
+    def __init__(self, stack: StackSettings, modes: int, memory: int, align: bool) -> None:
+        """
+        modes: number of patterns
+        memory: number of commands that a frame is explained by
+        align: look for the axis, rather than take the middle row
+        """
+        super().__init__(stack)
+        self._modes, self._memory, self._align = modes, memory, align
+        self.outputs = stack.frames * modes
+
+    def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
+        """Find the patterns; see the base class."""
+        axis = find_motion(frames).axis if self._align else Axis(offset=0.0)
+        values = lit(frames)
+        mean = values.mean(axis=0)
+        odd = _odd(values - mean, axis).reshape(len(frames), -1)[self._memory :]
+        lags = np.stack(
+            [
+                angles[self._memory - lag : len(angles) - lag]  # angles[i]: applied until tick i
+                for lag in range(self._memory)
+            ],
+            axis=1,
+        )
+        commands = np.linalg.qr(lags - lags.mean(axis=0))[0]
+        explained = commands.T @ odd
+        patterns = np.linalg.svd(explained, full_matrices=False)[2][: self._modes]
+        scale = (odd @ patterns.T).std(axis=0)
+        patterns = patterns / scale[:, None]
+        self.constants = {
+            "patterns": patterns.astype(np.float32),
+            "zero": (patterns @ mean.ravel()).astype(np.float32),
+        }
+
+    def glimpse(self, frame: Pixels) -> Array:
+        """Amplitude over its deviation in the babble, of each pattern."""
+        patterns = self.constants["patterns"]
+        found: Array = patterns @ lit(frame).ravel() - self.constants["zero"]
+        return found
+
+    def joined(self, glimpses: list[Array]) -> Array:
+        """See the base class."""
+        return np.concatenate(glimpses)
+
+    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+        """See the base class."""
+        raise NotImplementedError
+
+
+def _odd(pictures: Array, axis: Axis) -> Array:
+    """Half the difference between pictures and their mirror images about an axis."""
+    height, width = pictures.shape[1:]
+    mirrored = 2.0 * axis.rows(height, width)[None, :] - np.arange(height)[:, None]
+    below = np.floor(mirrored).astype(int)
+    share = (mirrored - below).astype(np.float32)
+    inside = (below >= 0) & (below < height - 1)
+    below = np.where(inside, below, 0)
+    columns = np.arange(width)[None, :]
+    image = (1.0 - share) * pictures[:, below, columns] + share * pictures[:, below + 1, columns]
+    odd = np.where(inside, pictures - image, 0.0)
+    return (0.5 * odd).astype(np.float32)

@@ -1,0 +1,102 @@
+"""The eyes that leave seeing to a network: `cnn` prepares the picture, `nature` does not."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fishd.camera.axis import find_motion
+from fishd.camera.frames import Pixels, StackSettings
+from fishd.learning.eyes.base import Array, Eye, lit
+
+
+class CnnEye(Eye):
+    """The newest frame and the differences between frames, at half the size, about the axis."""
+
+    names = ("rows", "columns", "mean", "scale")
+
+    def __init__(self, stack: StackSettings, align: bool) -> None:
+        super().__init__(stack)
+        self._align = align
+        half = stack.size // 2
+        self.shape = (stack.frames, half, half)
+        self.outputs = stack.frames * half * half
+
+    def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
+        """Find axis, mean picture and contrast; see the base class."""
+        size = self.stack.size
+        shift = 0.0
+        if self._align:
+            motion = find_motion(frames)
+            column = round(motion.centre)
+            shift = float(motion.axis.rows(size, size)[column]) - 0.5 * (size - 1)
+        rows, columns = _halving(size, shift), _halving(size, 0.0).T.copy()
+        halved = np.stack([rows @ frame @ columns for frame in lit(frames)])
+        mean = halved.mean(axis=0)
+        self.constants = {
+            "rows": rows,
+            "columns": columns,
+            "mean": mean.astype(np.float32),
+            "scale": np.array([1.0 / (halved - mean).std()], np.float32),
+        }
+
+    def glimpse(self, frame: Pixels) -> Array:
+        """Deviation from the mean picture, over its deviation in the babble."""
+        found = self.constants
+        small = found["rows"] @ lit(frame) @ found["columns"]
+        return np.asarray((small - found["mean"]) * found["scale"], np.float32)
+
+    def joined(self, glimpses: list[Array]) -> Array:
+        """The newest, then the differences to older ones."""
+        newest, *_ = glimpses
+        pairs = pairwise(glimpses)
+        return np.stack([newest, *(newer - older for newer, older in pairs)])
+
+    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+        """See the base class."""
+        raise NotImplementedError
+
+
+class NatureEye(Eye):
+    """The frames as they are, from 0 to 1, as in the paper."""
+
+    names = ()
+    network = "nature"
+
+    def __init__(self, stack: StackSettings) -> None:
+        super().__init__(stack)
+        self.shape = (stack.frames, stack.size, stack.size)
+        self.outputs = stack.frames * stack.size**2
+
+    def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
+        """There is nothing to find."""
+
+    def glimpse(self, frame: Pixels) -> Array:
+        """Grey levels over 255."""
+        return frame.astype(np.float32) * np.float32(1.0 / 255.0)
+
+    def joined(self, glimpses: list[Array]) -> Array:
+        """See the base class."""
+        return np.stack(glimpses)
+
+    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+        """See the base class."""
+        raise NotImplementedError
+
+
+def _halving(size: int, shift: float) -> Array:
+    """Weights, shape (size // 2, size), that average pairs of rows about a shifted middle.
+
+    shift: of the middle [px]; rows beyond the picture are those of its edge
+    """
+    half = size // 2
+    weights = np.zeros((half, size), np.float32)
+    for row in range(half):
+        for each in (2 * row, 2 * row + 1):
+            place = each + shift + 0.5 * (size - 2 * half)
+            below = int(np.floor(place))
+            share = place - below
+            weights[row, min(max(below, 0), size - 1)] += 0.5 * (1.0 - share)
+            weights[row, min(max(below + 1, 0), size - 1)] += 0.5 * share
+    return weights

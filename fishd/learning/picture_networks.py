@@ -1,0 +1,113 @@
+"""Networks that look at pictures: a small one, and the one of the paper."""
+
+import math
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor, NatureCNN
+from torch import nn
+
+PictureKind = Literal["cnn", "nature"]
+Shape = tuple[int, int, int]
+
+SMALL = 64
+"""What the small network compresses a picture to."""
+LARGE = 512
+"""What that of the paper does."""
+
+_HALF = math.sqrt(0.5)
+
+
+def small_network(shape: Shape) -> nn.Sequential:
+    """Three convolutions of stride 2, and one layer; shape: channels, height, width."""
+    layers = [
+        nn.Conv2d(shape[0], 16, 5, 2),
+        nn.ReLU(),
+        nn.Conv2d(16, 32, 3, 2),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 3, 2),
+        nn.ReLU(),
+        nn.Flatten(),
+    ]
+    with torch.no_grad():
+        width = nn.Sequential(*layers)(torch.zeros(1, *shape)).shape[1]
+    return nn.Sequential(*layers, nn.Linear(width, SMALL), nn.ReLU())
+
+
+def nature_network(shape: Shape) -> nn.Sequential:
+    """That of Mnih et al., "Human-level control through deep reinforcement learning" (2015)."""
+    space: Any = gymnasium.spaces.Box(0.0, 1.0, shape, np.float32)
+    whole = NatureCNN(space, LARGE, normalized_image=True)
+    return nn.Sequential(*whole.cnn, *whole.linear)
+
+
+class PictureExtractor(BaseFeaturesExtractor):
+    """A picture, compressed, and the numbers beside it.
+
+    The input is flat: the picture's levels, then the other numbers.
+    """
+
+    def __init__(
+        self, observation_space: Any, shape: Shape, kind: PictureKind, mirrored: bool
+    ) -> None:
+        """
+        shape: channels, height and width of the picture
+        mirrored: give the same for the mirrored fish too, behind the first
+        """
+        self._levels = math.prod(shape)
+        others = observation_space.shape[0] - self._levels
+        compressed = SMALL if kind == "cnn" else LARGE
+        self.single = compressed + others
+        """How many numbers it gives for one picture."""
+        super().__init__(observation_space, self.single * (2 if mirrored else 1))
+        self._shape, self._mirrored = shape, mirrored
+        self.network = small_network(shape) if kind == "cnn" else nature_network(shape)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Shape (batch, features_dim)."""
+        picture = observations[:, : self._levels].reshape(-1, *self._shape)
+        others = observations[:, self._levels :]
+        if not self._mirrored:
+            return torch.cat((self.network(picture), others), dim=1)
+        both = self.network(torch.cat((picture, picture.flip(2))))
+        seen, mirrored = both.chunk(2)
+        return torch.cat((seen, others, mirrored, -others), dim=1)
+
+
+class PairExtractor(MlpExtractor):
+    """Hidden layers for features of a fish, and of its mirror image behind them."""
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        """f(x) − f(mirrored x), over √2."""
+        seen, mirrored = self.policy_net(_stacked(features)).chunk(2)
+        odd: torch.Tensor = _HALF * (seen - mirrored)
+        return odd
+
+    def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
+        """The mean of f(x) and f(mirrored x)."""
+        seen, mirrored = self.value_net(_stacked(features)).chunk(2)
+        even: torch.Tensor = 0.5 * (seen + mirrored)
+        return even
+
+
+def _stacked(features: torch.Tensor) -> torch.Tensor:
+    return torch.cat(features.chunk(2, dim=1))
+
+
+class SymmetricPicturePolicy(ActorCriticPolicy):
+    """`SymmetricPolicy` for pictures: their mirror image is flipped, the other numbers negated."""
+
+    def _build_mlp_extractor(self) -> None:
+        self.mlp_extractor = PairExtractor(
+            self.features_dim // 2,
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            device=self.device,
+        )
+
+    def _build(self, lr_schedule: object) -> None:
+        super()._build(lr_schedule)  # type: ignore[arg-type]
+        self.action_net.bias.requires_grad_(False)

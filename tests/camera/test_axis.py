@@ -1,0 +1,48 @@
+"""The axis of motion, found in pictures of a simulated camera."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from fishd.camera.axis import NoMotion, find_motion
+from fishd.camera.frames import Pixels
+from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated.tail_painter import TailPainter
+
+BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)
+
+
+def swinging(settings: SimulatedCameraSettings, *, amplitude: float = 0.2) -> Pixels:
+    painter = TailPainter(settings, 84)
+    ticks = 0.05 * np.arange(200)
+    angles = amplitude * np.sin(math.tau * 1.3 * ticks + settings.seed)
+    rates = amplitude * math.tau * 1.3 * np.cos(math.tau * 1.3 * ticks + settings.seed)
+    return np.stack([painter.paint(*one) for one in zip(angles, rates, ticks, strict=True)])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("rig", [DEFAULT, WEB, BAD])
+@pytest.mark.parametrize(("off", "tilt"), [(0.0, 0.0), (3.0, 0.02), (-3.0, -0.02), (6.5, 0.1)])
+def test_the_axis_is_found_within_a_quarter_of_a_pixel(
+    rig: SimulatedCameraSettings, off: float, tilt: float, seed: int
+) -> None:
+    axis = find_motion(swinging(replace(rig, off_axis=off, tilt=tilt, seed=seed))).axis
+    assert axis.offset == pytest.approx(off, abs=0.25)
+    assert axis.tilt == pytest.approx(tilt, abs=0.02)
+
+
+def test_a_tail_that_rests_has_no_axis() -> None:
+    with pytest.raises(NoMotion, match="nothing moves in these pictures but noise; let the fish"):
+        find_motion(swinging(WEB, amplitude=0.0))
+
+
+def test_few_pictures_are_refused() -> None:
+    with pytest.raises(NoMotion, match="9 pictures are too few"):
+        find_motion(swinging(DEFAULT)[:9])
+
+
+def test_black_pictures_have_no_axis() -> None:
+    with pytest.raises(NoMotion, match="nothing moves"):
+        find_motion(np.zeros((20, 84, 84), np.uint8))

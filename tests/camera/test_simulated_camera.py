@@ -1,0 +1,92 @@
+"""The simulated camera: what it draws, and when."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from fishd.camera.frames import Frame
+from fishd.camera.simulated.camera import SimulatedCamera, Tail
+from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated.tail_painter import TailPainter
+
+CLEAR = replace(DEFAULT, noise=0.0)
+TICK = 0.05
+
+
+def frames_of(settings: SimulatedCameraSettings, ticks: int) -> list[Frame]:
+    camera = SimulatedCamera(settings, 84)
+    found = []
+    for tick in range(ticks):
+        ends = (Tail(time, 0.1, 0.0) for time in (tick * TICK, (tick + 1) * TICK))
+        found += camera.frames(*ends)
+    return found
+
+
+def tip(settings: SimulatedCameraSettings, alpha: float, rate: float = 0.0) -> tuple[float, float]:
+    """Row of the tail's tip, and how wide it is smeared [px]."""
+    column = TailPainter(settings, 84).paint(alpha, rate, 0.0)[:, 72].astype(float)
+    dark = column.max() - column
+    rows = np.arange(84)
+    centre = float(dark @ rows / dark.sum())
+    return centre, float(np.sqrt(dark @ (rows - centre) ** 2 / dark.sum()))
+
+
+def test_the_tip_is_where_the_fin_angle_puts_it() -> None:
+    assert tip(CLEAR, 0.0)[0] == pytest.approx(41.5, abs=0.05)
+    assert tip(CLEAR, 0.2)[0] - 41.5 == pytest.approx(0.74 * 84 * np.tan(0.2), rel=0.05)
+
+
+def test_its_picture_is_mirrored_with_the_angle() -> None:
+    painter = TailPainter(CLEAR, 84)
+    one, other = painter.paint(0.15, 1.0, 0.0), painter.paint(-0.15, -1.0, 0.0)
+    assert np.array_equal(one, other[::-1])
+
+
+def test_a_fast_tail_is_smeared_by_a_long_exposure() -> None:
+    still, fast = tip(CLEAR, 0.0)[1], tip(CLEAR, 0.0, 6.0)[1]
+    assert fast > 1.2 * still
+    assert tip(replace(CLEAR, exposure=0.0), 0.0, 3.0)[1] == pytest.approx(still)
+
+
+def test_the_axis_can_be_off_and_tilted() -> None:
+    assert tip(replace(CLEAR, off_axis=3.0), 0.0)[0] == pytest.approx(44.5, abs=0.05)
+    shift = 0.02 * (72 - 41.5)
+    assert tip(replace(CLEAR, tilt=0.02), 0.0)[0] == pytest.approx(41.5 + shift, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"noise": 6.0}, {"caustics": 12.0}, {"light_drift": 0.3}, {"side_light": 20.0}],
+)
+def test_each_imperfection_shows(change: dict[str, float]) -> None:
+    clear = TailPainter(CLEAR, 84).paint(0.0, 0.0, 5.0).astype(float)
+    worse = TailPainter(replace(CLEAR, **change), 84).paint(0.0, 0.0, 5.0).astype(float)
+    assert np.abs(worse - clear).mean() > 2.0
+
+
+def test_the_same_seed_gives_the_same_pictures() -> None:
+    one, other = frames_of(WEB, 10), frames_of(WEB, 10)
+    assert all(
+        np.array_equal(a.pixels, b.pixels) and a[:2] == b[:2]
+        for a, b in zip(one, other, strict=True)
+    )
+    third = frames_of(replace(WEB, seed=1), 10)
+    assert not np.array_equal(one[0].pixels, third[0].pixels)
+
+
+def test_a_camera_in_phase_has_a_frame_there_when_each_tick_begins() -> None:
+    frames = frames_of(DEFAULT, 20)
+    assert [frame.available for frame in frames] == pytest.approx(
+        [TICK * (tick + 1) for tick in range(20)]
+    )
+    assert [frame.available - frame.time for frame in frames] == pytest.approx([0.03] * 20)
+
+
+def test_a_web_camera_runs_at_its_own_rate_and_late() -> None:
+    frames = frames_of(WEB, 200)
+    assert len(frames) == pytest.approx(10.0 * 30, abs=1)
+    assert np.diff([frame.time for frame in frames]) == pytest.approx(1 / 30)
+    late = np.array([frame.available - frame.time for frame in frames])
+    assert late.mean() == pytest.approx(0.05, abs=0.002)
+    assert late.std() == pytest.approx(0.005, rel=0.2)
+    assert (np.diff([frame.available for frame in frames]) >= 0.0).all()
