@@ -16,6 +16,7 @@ from fishd.camera.settings import load
 from fishd.camera.sources.base import Shot, Sink, Source, Timeline
 
 Stopping = Callable[[float], bool]
+pytestmark = pytest.mark.slow
 
 
 class FailsOnce:
