@@ -26,7 +26,8 @@ test: $(VENV)/installed-dev  ## Run the whole test suite
 	alone=$$?; exit $$((shared || alone))
 
 test-fast: $(VENV)/installed-dev  ## Run what is on the virtual clock: no processes, no torch
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --fast
+	@# These compute and hardly ever wait.
+	$(BIN)/python -m pytest -n $$(nproc) --dist worksteal --fast
 
 lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 	$(BIN)/ruff check .

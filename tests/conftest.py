@@ -1,5 +1,6 @@
 """What holds for every test: which are fast, what may be reported, how many threads compute."""
 
+import gc
 import os
 import re
 import signal
@@ -17,6 +18,9 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 for variable in ("COLUMNS", "LINES"):  # which workers have; a terminal says itself how large it is
     os.environ.pop(variable, None)
 
+# Little of what is loaded until the first test begins is ever garbage.
+gc.disable()
+
 # How long an example takes says something of the machine only.
 settings.register_profile("fishd", deadline=None)
 settings.load_profile("fishd")
@@ -26,7 +30,7 @@ STOLEN = 0.03
 
 SLOW = re.compile(
     r"subprocess|multiprocessing|asyncio|time\.sleep|SystemClock|running\("
-    r"|operator_rig|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
+    r"|operator_rig|camera_process|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
 )
 """A module of tests that mentions one of these starts processes, waits, or loads torch."""
 
@@ -56,6 +60,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     whole = "end_to_end" in collection_path.parts
     return whole or bool(SLOW.search(collection_path.read_text(encoding="utf-8"))) or None
+
+
+def pytest_collection_finish() -> None:
+    """Keep the collector away from modules and tests: looking at all of them takes 0.2 s."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

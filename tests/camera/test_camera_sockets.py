@@ -18,6 +18,10 @@ from rigs.processes import Daemon, Subscriber, call, running, sets
 
 from fishd.camera.client import CameraClient, CameraLost
 from fishd.camera.messages import STATE
+from fishd.camera.requests import reachable
+from fishd.cli.doctor import service
+from fishd.cli.doctor.base import Context
+from fishd.config import Config
 from fishd.core.errors import Refused
 
 Both = tuple[Daemon, CameraProcess]
@@ -159,6 +163,33 @@ def test_a_camera_of_another_version_is_refused(tmp_path: Path) -> None:
         thread.join()
     finally:
         context.destroy(linger=0)
+
+
+@pytest.mark.parametrize(
+    ("frames", "endpoint", "seen"),
+    [
+        ("tcp://0.0.0.0:9874", "tcp://fish.local:9875", "tcp://fish.local:9874"),
+        ("tcp://0.0.0.0:9874", "tcp://[::1]:9875", "tcp://[::1]:9874"),
+        ("tcp://10.0.0.2:9874", "tcp://fish.local:9875", "tcp://10.0.0.2:9874"),
+        ("ipc:///run/f", "tcp://fish.local:9875", "ipc:///run/f"),
+    ],
+)
+def test_a_camera_that_serves_the_network_is_reached_where_it_answers(
+    frames: str, endpoint: str, seen: str
+) -> None:
+    assert reachable(frames, endpoint) == seen
+
+
+def test_the_doctor_says_how_the_camera_is(
+    camera: CameraProcess, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    context = Context(Config())
+    monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
+    found = service.camera(context)
+    assert found
+    assert (found.level, found.message[:5]) == ("ok", "60.0 ")
+    monkeypatch.setenv("FISHD_CAMERA", f"ipc://{tmp_path}/nobody")
+    assert service.camera(context) is None
 
 
 def test_a_second_camera_at_the_same_address_is_refused(camera: CameraProcess) -> None:
