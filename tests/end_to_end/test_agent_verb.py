@@ -217,3 +217,20 @@ def test_a_live_comparison_leaves_out_what_the_camera_does_not_suit(
     assert (done.returncode, done.stdout) == (1, "")
     assert f"{path}: left out: it was trained on frames of 48 x 48 pixels" in done.stderr
     assert daemon.status().mode == "idle"
+
+
+def test_a_camera_that_dies_ends_a_live_comparison_with_the_fish_at_rest(
+    tmp_path: Path, daemon: Daemon, eye: str
+) -> None:
+    with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
+        camera.is_in("streaming")
+        own = ("--endpoint", daemon.endpoint, "compare", "--on", "robot", eye)
+        comparing = Process(FISHCTL, *own, "--camera", camera.endpoint)
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            ticks.until(controller="remote", mode="running", phi_c=0.42)
+            camera.end(signal.SIGKILL)
+            status, out, err = comparing.finish()
+    assert (status, out) == (1, "")
+    assert err.startswith(f"fishctl: {eye}: no camera at {camera.endpoint}: no answer within 2 s")
+    found = daemon.status()
+    assert (found.mode, found.reason) == ("idle", None)

@@ -19,6 +19,8 @@ from fishd.lab.rig import Disturbed, LiveRig
 
 GIVE_UP = 2.0
 """After so long without frames the camera counts as lost [s]."""
+_REST = 60.0
+"""Longest rest after that, in which fishd expects no answer [s]."""
 _PATIENCE = 0.1
 """How long an agent waits for an observation before it looks whether it is to end [s]."""
 
@@ -123,6 +125,7 @@ class _PilotThread:
                 else:
                     agent.act(self._pilot.angle(seen, self._sight.look(seen.time)))
                     if self._pilot.blind > GIVE_UP:
+                        agent.pause(_REST)  # at neutral: to find out why takes a while
                         self.problem = self._sight.lost()
             except FishdError as error:
                 self.problem = error

@@ -8,24 +8,20 @@ from fishd.camera.simulated.sight import SimulatedSight
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import opening
 from fishd.controllers.policy.controller import PpoParameters
-from fishd.core.errors import ParameterError, PolicyError
+from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.simulation import VirtualRun
 
 
 def sees_pictures(policy: Any, limits: Limits) -> bool:
-    """Is it a policy that sees pictures?
+    """Is it a policy that sees pictures? False for one that does not fit: `ppo` says why.
 
     policy: name or path
-
-    Raises `ParameterError` for one that does not fit these limits.
     """
-    if not isinstance(policy, str):
-        return False
     try:
-        return opening.read(policy, limits).card.pictures is not None
-    except PolicyError as error:
-        raise ParameterError(f"policy: {error}", ("policy",)) from None
+        return isinstance(policy, str) and opening.read(policy, limits).card.pictures is not None
+    except PolicyError:
+        return False
 
 
 class SeeingController(Controller[PpoParameters]):
