@@ -2,7 +2,8 @@
 
 import threading
 import time
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
 import click
@@ -76,15 +77,17 @@ def agent(
         pilot = Pilot(policy, adopt(fish.config()).limits)
         sight = None
         if pilot.card.pictures:
-            sight = stack.enter_context(LiveSight(camera, fish, pilot.card.pictures))
-            sight.await_frames()
+            with _named(policy):
+                sight = stack.enter_context(LiveSight(camera, fish, pilot.card.pictures))
+                sight.await_frames()
         elif camera:
             raise click.UsageError("--camera cannot be given here: this policy sees no pictures")
         link = stack.enter_context(closing(FishdLink(endpoint, address=address)))
         swim = _Swim(link, pilot, sight, unit)
         echo(f"{policy} swims; it sees {pilot.card.sees}; Ctrl-C ends it")
         try:
-            swim.run(stopping, seconds)
+            with _named(policy):
+                swim.run(stopping, seconds)
         except ControllerFault as fault:
             raise PolicyError(f"{policy}: {fault}; {_hand_over(fish, fault)}") from None
         finally:
@@ -93,6 +96,15 @@ def agent(
             raise sight.lost()
     echo(f"the fish rests, after {swim.swum:.0f} s")
     return 0
+
+
+@contextmanager
+def _named(policy: str) -> Iterator[None]:
+    """Let what a policy is refused for begin with its name."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"{policy}: {error}") from None
 
 
 def _hand_over(fish: Fish, fault: ControllerFault) -> str:

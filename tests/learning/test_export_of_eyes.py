@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from msgspec.structs import replace
 from rigs.seeing_policies import babbled
 from rigs.swimming import brief_job
+from stable_baselines3 import PPO
 
 from fishd.camera.frames import StackSettings
 from fishd.camera.simulated.settings import DEFAULT, WEB
@@ -22,7 +23,9 @@ from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
 from fishd.learning import export as exporting
-from fishd.learning.export import export
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.export import export, export_model
 from fishd.learning.look import look
 from fishd.learning.ppo import activation_of, layers_of
 from fishd.learning.settings import (
@@ -113,6 +116,15 @@ def test_a_file_that_would_see_something_else_is_never_put_in_place(
     monkeypatch.setattr(exporting, "_sight", careless)
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the policy"):
         exporting._write(tmp_path / "eye.onnx", card, policy, perception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_of_ones_own_that_sees_pictures_is_refused(tmp_path: Path) -> None:
+    settings, config = settings_of("modes"), Config()
+    link = SimulatedLink(config, camera=Camera(DEFAULT, settings.camera.stack))
+    env = SwimEnv(link, config, settings.seen, babbled(settings)[2].eye)
+    with pytest.raises(PolicyError, match="sees pictures is not exported from Python; train it"):
+        export_model(PPO("MlpPolicy", env, device="cpu"), tmp_path / "eye.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
