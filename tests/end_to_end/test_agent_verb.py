@@ -173,8 +173,8 @@ def test_frames_of_another_size_or_rate_are_refused_before_anything_moves(
         return refused(done)
 
     assert refusal(StackSettings(size=48, frames=2)) == (
-        f"fishctl: {tmp_path}/other.onnx: it was trained on frames of 48 x 48 pixels, the camera at "
-        f"{camera.endpoint} shows 32 x 32; start that with --set picture.size=48\n"
+        f"fishctl: {tmp_path}/other.onnx: it was trained on frames of 48 x 48 pixels, the camera "
+        f"at {camera.endpoint} shows 32 x 32; start that with --set picture.size=48\n"
     )
     quick = StackSettings(size=32, frames=2, interval=0.02)
     assert "it is shown frames 20 ms apart, so it needs 50 a second; the camera at" in (
