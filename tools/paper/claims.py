@@ -201,9 +201,26 @@ def learning() -> Iterator[Claim]:
         "settings of [learning-paper.yaml](../config/learning-paper.yaml)",
         None,
     )
+    seen = read(figure_3.NAME, source=figure_3.SEEN)
+    amplitudes = column(seen, "amplitude_rad")
+    forces = [read(figure_3.NAME, source=figure_3.LEARNT, amplitude_rad=a)[0] for a in amplitudes]
+    apart = [
+        abs(one["frequency_Hz"] - other["frequency_Hz"])
+        for one, other in zip(seen, forces, strict=True)
+    ]
+    ratios = [
+        one["thrust_mN"] / other["thrust_mN"] for one, other in zip(seen, forces, strict=True)
+    ]
+    yield Claim(
+        "from images it finds the same square wave as from forces",
+        f"frequencies {max(apart):.2f} Hz apart at most, thrust {min(ratios):.1%} to "
+        f"{max(ratios):.1%} of that from forces, over {len(seen)} amplitudes",
+        max(apart) <= NEAR * max(column(forces, "frequency_Hz")) and min(ratios) > 1.0 - NEAR,
+    )
     yield Claim(
         "from images: 4 frames of 84 × 84, compressed to 512 numbers",
-        "not part of fishd: an external program can [swim the fish](remote.md)",
+        "settings of [learning-camera-paper.yaml](../config/learning-camera-paper.yaml); the "
+        "points of figure 3 have the eye `modes`, see [the camera](camera.md)",
         None,
     )
 

@@ -5,7 +5,7 @@ import numpy as np
 from common.report import DOCS
 from fishd.config import Config
 from fishd.lab import drawing
-from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE
+from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, PURPLE
 from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
 from fishd.simulation import Report
 from paper.runs import FOLDER, PLANT, Row, Run, column, read, swim_all, write
@@ -19,8 +19,11 @@ NEAR = np.linspace(0.8, 1.2, 13)
 """Frequencies that are tried in the loop, over the best of the equations."""
 SECONDS, SETTLE = 40.0, 10.0
 RANGE = (0.04, 1.57)
+BY_SIGHT = (0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
+"""Amplitudes of the policies that learned from pictures, and see nothing else."""
 BEST, FAST, SLOW = "best square wave", "fast servo", "slow servo"
 LOOP, SWING, LEARNT = "square wave in the loop", "swing in the loop", "learned, in the loop"
+SEEN = "learned from pictures, in the loop"
 
 
 def policy(amplitude: float) -> str:
@@ -28,6 +31,11 @@ def policy(amplitude: float) -> str:
     if amplitude == SHIPPED:
         return "default-fish"
     return str(DOCS / "figures" / "policies" / f"amplitude-{amplitude:.2f}.onnx")
+
+
+def sighted_policy(amplitude: float) -> str:
+    """The policy that has learned to swim at an amplitude [rad] from pictures."""
+    return str(DOCS / "figures" / "policies" / f"sight-{amplitude:.2f}.onnx")
 
 
 def run(controller: str, parameters: dict[str, float | str], amplitude: float) -> Run:
@@ -61,6 +69,8 @@ def compute(jobs: int) -> None:
     rows += [_of(SWING, report) for report in swings]
     learned = swim_all((run("ppo", {"policy": policy(a)}, a) for a in LEARNED), jobs)
     rows += [_of(LEARNT, report) for report in learned]
+    seen = swim_all((run("ppo", {"policy": sighted_policy(a)}, a) for a in BY_SIGHT), jobs)
+    rows += [_of(SEEN, report) for report in seen]
     write(NAME, rows)
 
 
@@ -102,6 +112,7 @@ def draw() -> None:
         (LOOP, {"marker": "s", "mec": BLUE, "mfc": "none", "ms": 6}),
         (SWING, {"marker": "x", "mec": BLACK, "ms": 5}),
         (LEARNT, {"marker": "o", "mec": ORANGE, "mfc": ORANGE, "ms": 3.5}),
+        (SEEN, {"marker": "D", "mec": PURPLE, "mfc": "none", "ms": 4.5}),
     )
     panels = (
         ("A", "thrust_mN", "mean thrust (mN)", (0.2, 200)),
@@ -136,4 +147,4 @@ def draw() -> None:
                 axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
             axes.text(saturation_amplitude(PLANT), limits[0], " $Φ_s$", va="bottom", color="0.4")
         handles, labels = axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=6)
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)

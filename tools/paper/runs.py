@@ -6,11 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import joblib
+from msgspec.structs import replace
 
 from common.report import DOCS
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.control.estimators.base import EstimatorSettings
-from fishd.simulation import Report, simulate
+from fishd.lab.compare.contestants import Contestant, build
+from fishd.lab.compare.seeing import SeeingController
+from fishd.simulation import KeepingPublisher, Report, VirtualRun, judge
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -37,11 +41,26 @@ class Run(NamedTuple):
 
 
 def swim(run: Run) -> Report:
-    """One run; raises SystemExit where it ended in mode fault or another controller took over."""
-    report = simulate(run.config, run.controller, run.parameters, run.seconds, run.settle)
+    """One run; raises SystemExit where it ended in mode fault or another controller took over.
+
+    A policy that sees is shown the fish by the default simulated camera.
+    """
+    limits = replace(run.config.limits, virtual=True)
+    contestant = Contestant(run.controller, run.controller, run.parameters)
+    controller = build(contestant, limits, SimulatedCameraSettings())
+    watch = controller.watch if isinstance(controller, SeeingController) else _nothing
+    report = judge(
+        *(run.config, run.controller, controller, run.seconds, run.settle),
+        KeepingPublisher(),
+        watch,
+    )
     if trouble := report.reason or report.fallback:
         raise SystemExit(f"{run.controller} {run.parameters}: {trouble.message}")
     return report
+
+
+def _nothing(_: VirtualRun) -> None:
+    """No camera is needed."""
 
 
 def swim_all(runs: Iterable[Run], jobs: int) -> list[Report]:
