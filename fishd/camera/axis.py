@@ -69,12 +69,13 @@ def find_motion(pictures: NDArray[np.uint8]) -> Motion:
             "nothing moves in these pictures but noise; let the fish swim, and see that the camera "
             "looks at its tail"
         )
-    axis = _axis(energy)
+    axis = find_axis(energy)
     centre = float(energy.sum(axis=0) @ np.arange(energy.shape[1]) / energy.sum())
     return Motion(energy, axis, centre)
 
 
-def _axis(energy: Floats) -> Axis:
+def find_axis(energy: Floats) -> Axis:
+    """The line about which a picture of motion, shape (height, width), is its own mirror image."""
     height, width = energy.shape
     spectrum = np.fft.rfft(energy, 2 * height, axis=0).T
     folded = np.fft.irfft(spectrum**2, 2 * height * _FINE, axis=1)
