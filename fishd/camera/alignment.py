@@ -108,7 +108,8 @@ def _behind(energy: Floats) -> bool:
     strength = energy.sum(axis=0)
     moving = np.flatnonzero(strength > 0.05 * strength.max())
     middle = 0.5 * (moving[0] + moving[-1])
-    return float(strength @ np.arange(len(strength)) / strength.sum()) >= middle
+    centre = float(strength @ np.arange(len(strength)) / strength.sum())
+    return centre >= float(middle)
 
 
 def _likeness(energy: Floats, axis: Axis) -> float:

@@ -93,8 +93,8 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
     agreement = 1.0 - fit.misfit(delay, log_rate)
     if agreement < _ENOUGH:
         raise NoDelay(
-            f"pictures and forces agree by {max(0.0, agreement):.0%} only: is it the same fish, and "
-            "does the camera see its whole tail?"
+            f"pictures and forces agree by {max(0.0, agreement):.0%} only: is it the same fish, "
+            "and does the camera see its whole tail?"
         )
     left_out = [
         _Fit(angle, times[kept], position[kept]).near(delay, log_rate)[0]
@@ -166,7 +166,7 @@ class _Fit:
         """Delay [s] and logarithm of the rate of the best agreement."""
         grid = [
             (float(delay), float(log_rate))
-            for log_rate in np.linspace(*map(math.log, _RATES), 10)
+            for log_rate in np.linspace(math.log(_RATES[0]), math.log(_RATES[1]), 10)
             for delay in np.arange(EARLIEST, LATEST, 0.02)
         ]
         return self.near(*min(grid, key=lambda point: self.misfit(*point)))

@@ -109,7 +109,7 @@ class PageServer:
         asyncio.get_running_loop().call_later(GREETING, self._close_if_silent, handler)
         return handler
 
-    def _close_if_silent(self, handler: "web.RequestHandler[web.Request]") -> None:
+    def _close_if_silent(self, handler: web.RequestHandler) -> None:
         if handler in self._silent:
             self._silent.discard(handler)
             if handler.transport is not None:

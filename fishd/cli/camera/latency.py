@@ -114,7 +114,9 @@ def _advice(found: "Latency", settings: "CameraSettings") -> list[str]:
             lines.append("the stamps of a simulated camera are exact: this is an error of the fit")
         else:
             delay = getattr(settings, settings.source).delay + found.stamps
-            lines.append(f"write into the settings of the camera: {settings.source}.delay={delay:.4f}")
+            lines.append(
+                f"write into the settings of the camera: {settings.source}.delay={delay:.4f}"
+            )
     else:
         lines.append("its time stamps are right: nothing to set in the camera")
     lines.append(f"write into those of a training: camera.stack.delay={stack_delay(found):.3f}")

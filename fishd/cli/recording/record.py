@@ -110,7 +110,9 @@ def record(
     if black_box and run:
         raise click.UsageError("--black-box names its files itself: leave RUN out")
     if black_box and with_camera:
-        raise click.UsageError("a black box keeps no frames, which fill it in hours: one of the two")
+        raise click.UsageError(
+            "a black box keeps no frames, which fill it in hours: one of the two"
+        )
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
         box = BlackBox(made(folder or runs_folder()), keep, begin)
