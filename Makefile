@@ -3,7 +3,7 @@ PYTHON ?= python3
 # What `make test` and `make lint` install; without `learn`, its tests are skipped.
 EXTRAS ?= dev,learn,cluster
 # How many tests run at a time: many only wait.
-JOBS ?= $(shell expr $$(nproc) + 3)
+JOBS ?= $(shell expr $$(nproc) + 4)
 VENV ?= .venv
 BIN := $(VENV)/bin
 # Each of the hundreds of processes that tests start would compile fishd again.
@@ -26,7 +26,8 @@ test: $(VENV)/installed-dev  ## Run the whole test suite
 	alone=$$?; exit $$((shared || alone))
 
 test-fast: $(VENV)/installed-dev  ## Run what is on the virtual clock: no processes, no torch
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --fast
+	@# These compute and hardly ever wait.
+	$(BIN)/python -m pytest -n $$(nproc) --dist worksteal --fast
 
 lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 	$(BIN)/ruff check .

@@ -169,7 +169,9 @@ install_gpio() {
   step "$extra: installed, for E-stop button and status light"
 }
 
-has() { pip show "$1" >/dev/null 2>&1; }
+has() {
+  "$venv/bin/python" -I -c 'import importlib.metadata, sys; importlib.metadata.version(sys.argv[1])' "$1" 2>/dev/null
+}
 
 # What is in the folder must not know of DESTDIR, it will be gone when the folder is in its place.
 forget_destdir() {

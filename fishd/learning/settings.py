@@ -191,6 +191,14 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
         raise ConfigError(problem.located(sources)) from None
 
 
+def check(settings: TrainingSettings) -> None:
+    """Refuse settings that were changed since they were loaded; raises `ConfigError`."""
+    try:
+        _check(settings)
+    except Problem as problem:
+        raise ConfigError(problem.located({})) from None
+
+
 def to_yaml(settings: TrainingSettings) -> str:
     """All settings, defaults included, as YAML that `load` reads back."""
     return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False)

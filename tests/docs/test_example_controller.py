@@ -7,6 +7,8 @@ import pytest
 from rigs.documents import ROOT
 from rigs.example_packages import fishctl, install
 
+pytestmark = pytest.mark.slow  # it starts processes
+
 
 @pytest.fixture(scope="module")
 def laptop(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -54,7 +54,7 @@ def test_an_exception_outside_the_phases_ends_fishd_and_the_servo_comes_to_rest_
 
 
 def test_a_fishd_that_is_killed_at_any_moment_leaves_no_pulses() -> None:
-    kills = measured(*["kills", "--kills", "30", "--lanes", "3", "--seed", "4", "--limit", "60"])
+    kills = measured(*["kills", "--kills", "30", "--lanes", "6", "--seed", "4", "--limit", "60"])
     assert [kill for kill in kills if kill["off"] is None] == []
     assert len(kills) >= 10
     assert any(kill["swimming"] for kill in kills)

@@ -116,10 +116,10 @@ class Outcome(Struct):
     """Reason of the fault, from `status`, where fishd still answers."""
 
 
-def await_pulses(pi: VirtualPi, fishd: Fishd) -> None:
-    """Until the tail has beaten from side to side a few times."""
+def await_pulses(pi: VirtualPi, fishd: Fishd, count: int) -> None:
+    """Until the servo was told to go to so many angles."""
     deadline = time.monotonic() + PATIENCE
-    while len(pi.pigpiod.history(GPIO)) < 6:
+    while len(pi.pigpiod.history(GPIO)) < count:
         if time.monotonic() > deadline or fishd.process.poll() is not None:
             raise SystemExit(f"fishd does not swim: {fishd.log.read_text()}")
         time.sleep(0.01)
@@ -151,7 +151,8 @@ def die(name: str, together: Barrier) -> Outcome:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fishd-")))
             pi, on_it = stack.enter_context(virtual_pi(folder))
             fishd = stack.enter_context(Fishd(*on_it, *settings, command=command))
-            await_pulses(pi, fishd)
+            await_pulses(pi, fishd, 1)
+        await_pulses(pi, fishd, 6)  # the tail has beaten from side to side a few times
         together.wait(3 * PATIENCE)
         if not pi.pigpiod.width(GPIO, time.monotonic()):
             swim_again(fishd)  # the machine stood still meanwhile, and fishd is in fault

@@ -4,6 +4,7 @@ fishd publishes a tick at its end, but the command of that tick holds until the 
 motion until then is known: a model of the same fish swims one tick ahead from the true state.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -42,7 +43,7 @@ class TickTruth(Struct, frozen=True, gc=False):
     seq: int
     phi_c: float
     servo_on: bool
-    time: float = 0.0
+    time: float = math.nan
     alpha: float | UnsetType = UNSET
     alpha_rate: float = 0.0
     phi: float = 0.0
@@ -187,7 +188,7 @@ class _View:
         """
         if not isinstance(tick.alpha, float):
             raise _blind(status.robot)
-        if not tick.time:
+        if math.isnan(tick.time):
             raise Trouble(
                 "unusable",
                 f"fishd {status.version} does not tell the times of its ticks: it is older than "

@@ -49,6 +49,13 @@ IMPLAUSIBLE = 1.03
     "pictures become numbers. [default: that of the settings, force]",
 )
 @click.option(
+    "--camera",
+    metavar="FILE|ENDPOINT",
+    help="With --see: in simulation, the YAML file of a simulated camera, such as "
+    "config/camera-web.yaml; on a robot, where its fishd-camera takes requests. [default: a good "
+    "simulated one; $FISHD_CAMERA, else that of this machine]",
+)
+@click.option(
     "--steps",
     type=click.IntRange(min=1),
     help="Control steps to learn from, in all; rounded up to whole rollouts of ppo.n_steps.",
@@ -94,6 +101,7 @@ def ppo(
     overrides: tuple[str, ...],
     settings_file: Path | None,
     see: Literal["force", "camera", "both"] | None,
+    camera: str | None,
     steps: int | None,
     seed: int | None,
     folder: Path | None,
@@ -121,9 +129,11 @@ def ppo(
     job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
+        if resume:
+            _refuse("goes on as the run began", {"--camera": camera})
     given = {"steps": steps, "seed": seed, "see": see}
     changed = {name: value for name, value in given.items() if value is not None}
-    job = replace(job, agent=agent, settings=replace(job.settings, **changed))
+    job = _with_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
     if seeds is not None:
         return _train_seeds(job, seeds, jobs, cluster)
     return _train(job)
@@ -182,6 +192,23 @@ def _job(
     )
 
 
+def _with_camera(job: "Job", camera: str | None) -> "Job":
+    """The job with what looks at its fish; raises `ConfigError` and `ParameterError`."""
+    from fishd.camera import settings as cameras
+    from fishd.learning.run_folder import runs
+    from fishd.learning.settings import check
+
+    check(job.settings)
+    if job.settings.see == "force":
+        _refuse("sees forces only; give --see camera, too", {"--camera": camera})
+        return job
+    if job.on == "robot":
+        return replace(job, camera_endpoint=camera)
+    if job.resume:
+        return replace(job, camera=runs.read_camera(job.folder))
+    return replace(job, camera=cameras.load(camera).simulated)
+
+
 def _train(job: "Job") -> int:
     from fishd.learning.train.progress import on_terminal
     from fishd.learning.train.training import train
@@ -197,7 +224,11 @@ def report(outcome: "Outcome", job: "Job") -> int:
     from fishd.learning.train.progress import described, minutes
 
     again = f"fishctl learn ppo --resume {outcome.folder}"
-    for option, address in (("--endpoint", job.endpoint), ("--agent", job.agent)):
+    for option, address in (
+        ("--endpoint", job.endpoint),
+        ("--agent", job.agent),
+        ("--camera", job.camera_endpoint),
+    ):
         if address:
             again += f" {option} {address}"
     if outcome.ended == "diverged":  # and would again

@@ -11,6 +11,7 @@ An episode is truncated after `episode` steps, and never terminates: a fish has 
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -26,6 +27,7 @@ from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes.making import babble
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -80,7 +82,7 @@ _FARTHEST = 1e6
 SHORTEST_PAUSE, LONGEST_PAUSE = 10.0, 120.0
 """Bounds of a pause whose length is not given; the first one is the longest [s]."""
 FIRST_FRAMES = 5.0
-"""How long a camera may take to show a whole stack [s]."""
+"""How long a camera may take to show a whole stack, in real and in virtual time [s]."""
 _ALLOWANCE = 4.0
 """Such a pause may last so many times the longest one so far."""
 
@@ -190,6 +192,26 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.lost += lost
         return lost
 
+    def babble(self, seed: int, ticks: int, stop: Callable[[], bool] = lambda: False) -> bool:
+        """Move at random, outside of any episode, and let the eye find out what it sees of that.
+
+        ticks: for how long
+        stop: called after each of them; True ends it
+
+        False where it was stopped. Raises `LinkLost`, and `NoMotion` where the tail is not to be
+        seen.
+        """
+        assert self.eye
+        frames = []
+        angles = babble(seed, ticks, self.link.amplitude)
+        for angle in angles.tolist():
+            if self.stack is None or stop():
+                return False
+            self.advance(angle)
+            frames.append(self.stack[0])
+        self.eye.fit(np.stack(frames), angles)
+        return True
+
     def pause(self, seconds: float | None = None) -> None:
         """Let the fish wait at neutral while the agent learns.
 
@@ -233,7 +255,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         """Stay at neutral until the camera shows a whole stack; raises `LinkLost`."""
         if self.eye is None or self._look():
             return
-        for _ in range(round(FIRST_FRAMES / self.link.tick)):
+        begun, began = self.latest.time, time.monotonic()
+        while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
             self.latest, _ = self.link.step(0.0)
             if self._look():
                 return

@@ -6,7 +6,8 @@ from typing import Any
 
 import msgspec
 
-from fishd.camera.frames import Stack
+from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.frames import Stack, StackSettings
 from fishd.client import Fish
 from fishd.client.agent import Agent
 from fishd.config import Config
@@ -50,17 +51,23 @@ class FishdLink:
         *,
         address: str | None = None,
         deadline: float | None = None,
+        stack: StackSettings | None = None,
+        camera: str | None = None,
     ) -> None:
         """
         endpoint: control socket of the fishd; None looks for that of this machine
         address: where that fishd can reach this program, as for `Agent`; None: where fishd waits
             for an agent already, else any free port of this machine
         deadline: how long a tick waits for an action [s]; None for fishd's default
+        stack: which frames of a camera are wanted; None: none
+        camera: where that camera takes requests; None: as for `CameraClient`
 
-        Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop, and
-        `FishError` when the address cannot be bound.
+        Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop,
+        `CameraLost` when no camera answers, and `FishError` when the address cannot be bound or the
+        frames have another size.
         """
         self._fish = Fish(endpoint)
+        self._camera: CameraClient | None = None
         try:
             status = self._fish.status()
             if status.reason:
@@ -69,8 +76,10 @@ class FishdLink:
                     f"fishd is in mode {status.mode}: {status.reason.message}; "
                     "when that is mended, leave it with 'fishctl clear-fault'",
                 )
+            self._camera = _camera(camera, self._fish, stack) if stack else None
             self._agent = _agent(address, status)
         except FishError:
+            self._close_camera()
             self._fish.close()
             raise
         self._deadline = deadline
@@ -122,8 +131,13 @@ class FishdLink:
         return StepResult(found, max(self._agent.lost, 0 if applied else 1))
 
     def look(self) -> Stack | None:
-        """Nothing yet."""
-        return None
+        """What the camera shows; in lockstep, once it has come so far. Raises `LinkLost`."""
+        if self._camera is None:
+            return None
+        try:
+            return self._camera.stack_at(self._asked().time)
+        except CameraLost as error:
+            raise LinkLost(str(error)) from None
 
     def pause(self, seconds: float) -> None:
         """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""
@@ -148,7 +162,12 @@ class FishdLink:
                 if self._is_ours(self._fish.status()):
                     self._fish.stop()
         self._agent.close()
+        self._close_camera()
         self._fish.close()
+
+    def _close_camera(self) -> None:
+        if self._camera:
+            self._camera.close()
 
     def _check_open(self) -> None:
         if self._closed:
@@ -235,6 +254,18 @@ class FishdLink:
 
 def _waits_for_an_agent(status: Status) -> bool:
     return status.mode == "running" and status.controller == "remote"
+
+
+def _camera(endpoint: str | None, fish: Fish, stack: StackSettings) -> CameraClient:
+    camera = CameraClient(endpoint, fish=fish, stack=stack)
+    size = camera.settings().picture.size
+    if size != stack.size:
+        camera.close()
+        raise FishError(
+            f"the camera at {camera.endpoint} shows {size} x {size} pixels, and camera.stack.size "
+            f"is {stack.size}: make them equal"
+        )
+    return camera
 
 
 def _agent(address: str | None, status: Status) -> Agent:

@@ -28,20 +28,31 @@ def swim(
     config: str | Path | None = None,
     settings: str | Path | None = None,
     overrides: Iterable[str] = (),
+    camera: str | Path | None = None,
 ) -> "SwimEnv":
     """A simulated fish in this process, on the virtual clock.
 
     config, overrides: as for fishd, a YAML file and `KEY=VALUE`s; by default the default fish
-    settings: YAML file of a training, of which `environment` and `randomisation` count
+    settings: YAML file of a training, of which `see`, `environment`, `camera` and `randomisation`
+        count; an eye that has to learn to see babbles first
+    camera: YAML file of the simulated camera, where the settings say `see: camera` or `both`
 
     Raises `ConfigError`.
     """
+    from fishd.camera import settings as cameras
     from fishd.learning.env.environment import SwimEnv
-    from fishd.learning.env.simulated_link import SimulatedLink
+    from fishd.learning.env.simulated_link import Camera, SimulatedLink
+    from fishd.learning.eyes.making import make
 
     fish = load(config, overrides)
     chosen = training.load(settings)
-    return SwimEnv(SimulatedLink(fish, chosen.randomisation), fish, chosen.environment)
+    eye = make(chosen)
+    sight = Camera(cameras.load(camera).simulated, chosen.camera.stack) if eye else None
+    env = SwimEnv(SimulatedLink(fish, chosen.randomisation, sight), fish, chosen.seen, eye)
+    if eye and not eye.is_fitted:
+        env.reset(seed=0)
+        env.babble(chosen.seed, chosen.camera.babble)
+    return env
 
 
 def swim_on_daemon(
@@ -50,6 +61,7 @@ def swim_on_daemon(
     settings: str | Path | None = None,
     overrides: Iterable[str] = (),
     agent: str | None = None,
+    camera: str | None = None,
 ) -> "SwimEnv":
     """The fish of a running fishd; this process acquires control of it when an episode begins.
 
@@ -58,17 +70,25 @@ def swim_on_daemon(
         daemon
     agent: where the daemon can reach this process, as for `Agent`; None: any free port of this
         machine
+    camera: where its camera takes requests, where the settings say `see: camera` or `both`
 
     Raises `ConfigError`, also where tick or Φ are not the daemon's, and `FishError`.
     """
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.env.fishd_link import FishdLink, config_of
+    from fishd.learning.eyes.making import make
 
-    chosen = training.load(settings).environment
+    chosen = training.load(settings)
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)
-    link = FishdLink(endpoint, address=agent)
+    eye = make(chosen)
+    stack = chosen.camera.stack if eye else None
+    link = FishdLink(endpoint, address=agent, stack=stack, camera=camera)
     try:
-        return SwimEnv(link, fish, chosen)
+        env = SwimEnv(link, fish, chosen.seen, eye)
+        if eye and not eye.is_fitted:
+            env.reset()
+            env.babble(chosen.seed, chosen.camera.babble)
+        return env
     except BaseException:
         link.close()
         raise

@@ -10,6 +10,8 @@ from msgspec import Struct
 
 from fishd import __version__
 from fishd import config as configuration
+from fishd.camera import settings as cameras
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.core import strict_yaml
@@ -20,7 +22,7 @@ from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import TrainingSettings
 
-CONFIG, SETTINGS = "config.yaml", "settings.yaml"
+CONFIG, SETTINGS, CAMERA = "config.yaml", "settings.yaml", "camera.yaml"
 
 
 def default_folder() -> Path:
@@ -28,8 +30,16 @@ def default_folder() -> Path:
     return Path("runs") / f"ppo-{datetime.now():%Y%m%d-%H%M%S}"
 
 
-def create(folder: Path, config: Config, settings: TrainingSettings) -> None:
-    """Make a run folder; raises `ConfigError` where it exists already."""
+def create(
+    folder: Path,
+    config: Config,
+    settings: TrainingSettings,
+    camera: SimulatedCameraSettings | None = None,
+) -> None:
+    """Make a run folder; raises `ConfigError` where it exists already.
+
+    camera: what a simulated fish is seen with
+    """
     otherwise = ""
     if checkpoints.all_in(folder):
         otherwise = f", or go on with --resume {folder}"
@@ -39,6 +49,9 @@ def create(folder: Path, config: Config, settings: TrainingSettings) -> None:
     try:
         write_atomically(folder / CONFIG, configuration.to_yaml(config))
         write_settings(folder, settings)
+        if camera:
+            seen = cameras.CameraSettings(simulated=_without_address(camera))
+            write_atomically(folder / CAMERA, cameras.to_yaml(seen))
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
 
@@ -71,6 +84,16 @@ def read(folder: Path) -> tuple[Config, TrainingSettings]:
     for file, kind in ((folder / CONFIG, Config), (folder / SETTINGS, TrainingSettings)):
         _check_complete(file, kind)
     return configuration.load(folder / CONFIG), training.load(folder / SETTINGS)
+
+
+def read_camera(folder: Path) -> SimulatedCameraSettings:
+    """What the simulated fish of a run is seen with; raises `ConfigError`."""
+    return cameras.load(folder / CAMERA).simulated
+
+
+def _without_address(camera: SimulatedCameraSettings) -> cameras.SimulatedSettings:
+    names = SimulatedCameraSettings.__struct_fields__
+    return cameras.SimulatedSettings(**{name: getattr(camera, name) for name in names})
 
 
 def _check_complete(file: Path, kind: type[Struct]) -> None:

@@ -37,6 +37,8 @@ class Job(Struct, frozen=True, kw_only=True):
 
     camera: SimulatedCameraSettings = SimulatedCameraSettings()
     """What a simulated fish is seen with, where it is to be seen."""
+    camera_endpoint: str | None = None
+    """Where the camera of a robot takes requests; None: $FISHD_CAMERA, or that of this machine."""
 
     @property
     def simulated_camera(self) -> Camera | None:

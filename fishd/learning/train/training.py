@@ -25,8 +25,6 @@ from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.eyes import making as eyes
-from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import babble
 from fishd.learning.ppo import DeterministicPolicy, is_finite, learning_rate, make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
@@ -52,7 +50,8 @@ def train(
     torch.set_num_threads(1)
     link: Link
     if job.on == "robot":
-        link = FishdLink(job.endpoint, address=job.agent)
+        stack = job.settings.camera.stack if job.settings.see != "force" else None
+        link = FishdLink(job.endpoint, address=job.agent, stack=stack, camera=job.camera_endpoint)
     else:
         link = SimulatedLink(job.config, job.settings.randomisation, job.simulated_camera)
     try:
@@ -95,7 +94,7 @@ class Training:
         try:
             self._reset()
             if self._eye and not self._eye.is_fitted:
-                ended, message = self._babble(self._eye)
+                ended, message = self._babble()
             while recorder.steps < job.settings.steps and ended == "finished":
                 ended, message = self._update()
         except LinkLost as error:
@@ -145,21 +144,18 @@ class Training:
         self._model._last_obs = observations
         self._model._last_episode_starts = np.ones(1, dtype=bool)
 
-    def _babble(self, eye: Eye) -> tuple[Ended, str]:
-        """Move at random for a while, and let the eye find out what it sees of that."""
+    def _babble(self) -> tuple[Ended, str]:
+        """Move at random first, so that the eye knows what it sees; these steps count, too."""
         env, ticks = self._env, self._job.settings.camera.babble
-        frames = []
-        angles = babble(self._job.settings.seed, ticks, env.link.amplitude)
-        for angle in angles.tolist():
-            if self._stop():
-                return "interrupted", ""
-            env.advance(angle)
-            assert env.stack is not None
-            frames.append(env.stack[0])
+
+        def stop() -> bool:
             self._display.step(env.tank_time)
+            return self._stop()
+
+        if not env.babble(self._job.settings.seed, ticks, stop):
+            return "interrupted", ""
         env.pause()
         self._paused = True
-        eye.fit(np.stack(frames), angles)
         self._recorder.steps = self._model.num_timesteps = ticks
         return "finished", ""
 

@@ -48,6 +48,8 @@ class Faults:
         """`seed`: of the random errors of I2C transfers."""
         self._clock = clock
         self._until = dict.fromkeys(FAULTS, -math.inf)
+        self._latest = -math.inf
+        """When the last of them ends; asked at each transfer, of which there are thousands [s]."""
         self._listeners: dict[str, list[Callable[[], None]]] = {name: [] for name in FAULTS}
         self.error_rate = 0.0
         """Share of the I2C transfers that fail with an error chosen at random, 0 to 1."""
@@ -64,6 +66,7 @@ class Faults:
             raise ValueError(f"{seconds:g} s of '{name}': a positive number is needed")
         if name not in INSTANTANEOUS:
             self._until[name] = math.inf if seconds is None else self._clock.monotonic() + seconds
+            self._latest = max(self._latest, self._until[name])
         elif seconds is not None:
             raise ValueError(f"'{name}' happens at once and takes no seconds")
         for callback in tuple(self._listeners[name]):
@@ -77,6 +80,7 @@ class Faults:
         else:
             self._check(name)
             self._until[name] = -math.inf
+        self._latest = max(self._until.values())
 
     def active(self, name: str) -> bool:
         """True while the fault lasts; KeyError for an unknown name."""
@@ -99,9 +103,10 @@ class Faults:
 
     def transfer_error(self) -> str | None:
         """The error that the next I2C transfer meets: one that is active, or a random one."""
-        for name in TRANSFER_ERRORS:
-            if self.active(name):
-                return name
+        if self._latest > -math.inf:
+            for name in TRANSFER_ERRORS:
+                if self.active(name):
+                    return name
         if self.error_rate and self.random.random() < self.error_rate:
             return self.random.choice(tuple(TRANSFER_ERRORS))
         return None

@@ -107,7 +107,7 @@ class Pigpiod:
         now = self._clock.monotonic()
         if not self._running:
             return now
-        gone, frozen = (self._faults.active(f"pigpiod-{name}") for name in ("gone", "frozen"))
+        gone, frozen = self._faults.active("pigpiod-gone"), self._faults.active("pigpiod-frozen")
         if gone != self._gone:
             self._gone = gone
             if gone:

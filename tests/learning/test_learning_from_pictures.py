@@ -1,0 +1,191 @@
+"""Training on what a simulated camera shows, instead of on forces."""
+
+import shutil
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from rigs.swimming import brief_job, rows
+
+from fishd.camera.axis import NoMotion
+from fishd.camera.frames import StackSettings
+from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.config import Config
+from fishd.core.errors import ConfigError
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.run_folder import checkpoints, runs
+from fishd.learning.run_folder.checkpoints import CheckpointError
+from fishd.learning.settings import (
+    EnvironmentSettings,
+    EvaluationSettings,
+    TrainingSettings,
+    VisionSettings,
+    check,
+    load,
+)
+from fishd.learning.train.jobs import Job, Outcome
+from fishd.learning.train.training import train
+
+BRIEF = EvaluationSettings(seconds=6.0, settle=2.0)
+
+
+def job_of(
+    folder: Path, eye: str = "modes", steps: int = 384, rig: SimulatedCameraSettings = DEFAULT
+) -> Job:
+    settings = TrainingSettings(
+        see="camera", steps=steps, camera=VisionSettings(eye=eye), evaluation=BRIEF
+    )
+    return replace(brief_job(folder), settings=settings, camera=rig)
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Outcome]:
+    """A babble and one update; its folder must not be changed."""
+    job = job_of(tmp_path_factory.mktemp("pictures") / "first")
+    return job, train(job)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", [DEFAULT, WEB])
+def test_two_thousand_steps_teach_it_to_swim_by_sight(
+    tmp_path: Path, rig: SimulatedCameraSettings
+) -> None:
+    outcome = train(job_of(tmp_path / "run", steps=2048, rig=rig))
+    assert (outcome.ended, outcome.steps) == ("finished", 2048)
+    assert outcome.best_evaluation
+    assert outcome.best_evaluation.efficiency > 0.9
+
+
+@pytest.mark.parametrize("eye", ["cnn", "nature"])
+def test_a_network_that_sees_learns_from_whole_rollouts(tmp_path: Path, eye: str) -> None:
+    outcome = train(job_of(tmp_path / "run", eye))
+    assert (outcome.ended, outcome.steps) == ("finished", 384)
+    assert outcome.latest_evaluation
+
+
+def test_the_same_seed_sees_the_same(tmp_path: Path, brief: tuple[Job, Outcome]) -> None:
+    again = train(job_of(tmp_path / "again"))
+    for table in ("progress.csv", "evaluations.csv"):
+        assert (again.folder / table).read_bytes() == (brief[0].folder / table).read_bytes()
+
+
+def test_the_babble_counts_as_steps(brief: tuple[Job, Outcome]) -> None:
+    assert [row["steps"] for row in rows(brief[0].folder / "evaluations.csv")] == ["384"]
+    assert brief[1].tank_time > 384 * 0.05
+
+
+def test_a_run_goes_on_with_the_eye_that_it_began_with(
+    tmp_path: Path, brief: tuple[Job, Outcome]
+) -> None:
+    folder = shutil.copytree(brief[0].folder, tmp_path / "run")
+    _, before = checkpoints.load_policy(folder / "step-000384")
+    job = replace(brief[0], folder=folder, resume=True)
+    longer = replace(job, settings=replace(job.settings, steps=512))
+    outcome = train(longer)
+    assert outcome.steps == 512
+    _, after = checkpoints.load_policy(folder / "step-000512")
+    assert before.eye
+    assert after.eye
+    assert np.array_equal(before.eye.constants["patterns"], after.eye.constants["patterns"])
+
+
+def test_a_run_keeps_the_camera_that_it_saw_with(tmp_path: Path) -> None:
+    job = job_of(tmp_path / "run", steps=256, rig=replace(WEB, seed=3))
+    train(replace(job, settings=replace(job.settings, steps=257)))
+    kept = runs.read_camera(job.folder)
+    assert all(getattr(kept, name) == value for name, value in fields(job.camera).items())
+
+
+def fields(rig: SimulatedCameraSettings) -> dict[str, object]:
+    return {name: getattr(rig, name) for name in SimulatedCameraSettings.__struct_fields__}
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (TrainingSettings(), "its see is camera, that of this training is force"),
+        (
+            TrainingSettings(see="camera", camera=VisionSettings(modes=3)),
+            "its camera.modes is 4, that of this training is 3; eye and networks must be alike",
+        ),
+        (
+            TrainingSettings(see="both"),
+            "its see is camera, that of this training is both",
+        ),
+    ],
+)
+def test_networks_are_not_given_to_another_eye(
+    tmp_path: Path, brief: tuple[Job, Outcome], change: TrainingSettings, complaint: str
+) -> None:
+    parent = checkpoints.find(brief[0].folder)
+    with pytest.raises(CheckpointError, match=complaint):
+        train(Job(config=Config(), settings=change, folder=tmp_path / "new", parent=parent))
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"no archive at all"])
+def test_an_eye_that_cannot_be_read_is_told(
+    tmp_path: Path, brief: tuple[Job, Outcome], content: bytes
+) -> None:
+    folder = shutil.copytree(brief[0].folder, tmp_path / "run")
+    path = folder / "step-000384" / "eye.npz"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"eye\.npz: .*move this checkpoint away"):
+        checkpoints.load_policy(path.parent)
+
+
+def test_a_training_whose_camera_does_not_show_the_tail_ends_with_a_word(tmp_path: Path) -> None:
+    blind = replace(DEFAULT, contrast=0.1)
+    with pytest.raises(NoMotion, match="see that the camera looks at its tail"):
+        train(job_of(tmp_path / "run", rig=blind))
+
+
+def test_steps_without_a_frame_are_void() -> None:
+    rare = replace(DEFAULT, rate=3.0)
+    camera = Camera(rare, StackSettings(frames=1))
+    env = SwimEnv(
+        SimulatedLink(Config(), camera=camera), Config(), EnvironmentSettings(), job_eye("nature")
+    )
+    env.reset(seed=0)
+    lost = [env.advance(0.1) for _ in range(100)]
+    assert 0.3 < np.mean(lost) < 0.7
+
+
+def job_eye(kind: str):  # type: ignore[no-untyped-def]
+    from fishd.learning.eyes.making import make
+
+    stack = StackSettings(frames=1)
+    return make(TrainingSettings(see="camera", camera=VisionSettings(eye=kind, stack=stack)))
+
+
+def test_gymnasium_makes_an_environment_that_sees(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("see: both\n", encoding="utf-8")
+    env = gymnasium.make("fishd/Swim-v0", settings=file)
+    seen, _ = env.reset(seed=1)
+    assert seen.shape == (16 + 5,)
+    assert np.count_nonzero(seen[:16]) == 16
+    env.close()
+
+
+def test_with_both_forces_and_pictures_it_learns_too(tmp_path: Path) -> None:
+    job = job_of(tmp_path / "run", steps=640)
+    outcome = train(replace(job, settings=replace(job.settings, see="both")))
+    assert outcome.steps == 640
+
+
+def test_what_cannot_be_is_said(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    for text, complaint in (
+        ("environment: {observation: []}", "the agent would see nothing"),
+        ("see: camera\ncamera: {babble: 64, memory: 16}", "less than a quarter of babble"),
+        ("see: camera\ncamera: {eye: fish}", "camera.eye"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigError, match=complaint):
+            load(file)
+    with pytest.raises(ConfigError, match="the agent would see nothing"):
+        check(TrainingSettings(environment=EnvironmentSettings(observation=())))
