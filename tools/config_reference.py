@@ -1,4 +1,4 @@
-"""Writes the keys of the configuration into docs/configuration.md, from the schema.
+"""Writes the keys of the configuration, and those of a camera, into docs/, from their schemas.
 
 python tools/config_reference.py --write
 python tools/config_reference.py --check     exits with 1 when they are out of date
@@ -13,11 +13,11 @@ import yaml
 from msgspec import Struct
 
 from common.report import DOCS, between, put, table
+from fishd.camera.settings import CameraSettings
 from fishd.config import Config
 from fishd.config.drivers import DRIVERS
 from fishd.core.schema import Field, fields_of
 
-TARGET = DOCS / "configuration.md"
 MARKER = "keys"
 HEAD = "key | unit | permitted | default | description"
 ANY = {
@@ -30,9 +30,10 @@ ANY = {
 """What is permitted where there are no bounds."""
 
 
-def reference() -> str:
-    """A table for each section of the configuration."""
-    return "\n\n".join(_sections(Config(), ""))
+def references() -> dict[str, str]:
+    """A table for each section, by the document in which they stand."""
+    whole: dict[str, Struct] = {"configuration.md": Config(), "camera.md": CameraSettings()}
+    return {name: "\n\n".join(_sections(struct, "")) for name, struct in whole.items()}
 
 
 def _sections(section: Struct, prefix: str) -> Iterator[str]:
@@ -49,7 +50,7 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
     for field, value in nested:
         name = prefix + field.name
         yield f"### `{name}`\n\n{field.description}"
-        if field.name in DRIVERS and not prefix:
+        if field.name in DRIVERS and isinstance(section, Config):
             yield from _driver_section(name)
         else:
             yield from _sections(value, name + ".")
@@ -101,19 +102,20 @@ def _spelled(value: object) -> str:
 def main() -> int:
     """Print, write or check; the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--write", action="store_true", help="put them into docs/configuration.md")
+    parser.add_argument("--write", action="store_true", help="put them into docs/")
     parser.add_argument("--check", action="store_true", help="exit with 1 when out of date there")
     options = parser.parse_args()
-    text = reference()
-    if options.write:
-        put(TARGET, MARKER, text)
-    elif not options.check:
-        print(text)
-    elif between(TARGET, MARKER) != text:
-        command = "python tools/config_reference.py --write"
-        print(f"docs/configuration.md is out of date: run {command}", file=sys.stderr)
-        return 1
-    return 0
+    stale = 0
+    for document, text in references().items():
+        if options.write:
+            put(DOCS / document, MARKER, text)
+        elif not options.check:
+            print(text)
+        elif between(DOCS / document, MARKER) != text:
+            command = "python tools/config_reference.py --write"
+            print(f"docs/{document} is out of date: run {command}", file=sys.stderr)
+            stale = 1
+    return stale
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@
 # FISHD_WHEEL  a wheel to install instead of building one from this checkout
 # FISHD_GPIO   rpi-gpio or rpi-lgpio, if not what suits this Pi; or none, for a robot without E-stop
 #              button and status light. Where it cannot be had, all else is installed, and it says so
+# FISHD_CAMERA yes: install what fishd-camera needs, too; once it is there, it is renewed
 # DESTDIR      a folder to install into, without touching the running system
 # pip's own variables work too: PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER installs without a network.
 set -euo pipefail
@@ -120,6 +121,7 @@ install_package() {
   local extras wheel=${FISHD_WHEEL:-}
   # shellcheck disable=SC2046
   extras=$(core_extras $(about_python "$PYTHON"))
+  if [[ ${FISHD_CAMERA:-} == yes ]] || has linuxpy; then extras+=,camera; fi
   if [[ -z $wheel ]]; then
     try_pip wheel --no-deps --wheel-dir "$workspace" "$checkout" || give_up "building fishd failed"
     wheel=$(echo "$workspace"/fishd-*.whl)
@@ -185,27 +187,33 @@ forget_destdir() {
 put() { install -D -m 0644 "$1" "$DESTDIR$2"; }
 
 install_config() {
-  local new=$checkout/config/pi.yaml there=$DESTDIR$CONFIG as_installed=$DESTDIR$CONFIG_AS_INSTALLED
-  if [[ -e $there ]] && ! cmp -s "$there" "$as_installed" && ! cmp -s "$there" "$new"; then
-    if cmp -s "$new" "$as_installed"; then
-      step "$CONFIG: yours, kept"
+  install_one_config "$checkout/config/pi.yaml" "$CONFIG"
+  install_one_config "$checkout/config/camera.yaml" "$CAMERA_CONFIG"
+}
+
+install_one_config() {
+  local new=$1 target=$2 there=$DESTDIR$2 copy
+  copy=$(as_installed "$target")
+  if [[ -e $there ]] && ! cmp -s "$there" "$DESTDIR$copy" && ! cmp -s "$there" "$new"; then
+    if cmp -s "$new" "$DESTDIR$copy"; then
+      step "$target: yours, kept"
     else
-      put "$new" "$CONFIG.new"
-      put "$new" "$CONFIG_AS_INSTALLED"
-      step "$CONFIG: yours, kept; what is new is in $CONFIG.new"
+      put "$new" "$target.new"
+      put "$new" "$copy"
+      step "$target: yours, kept; what is new is in $target.new"
     fi
     return
   fi
-  put "$new" "$CONFIG"
-  put "$new" "$CONFIG_AS_INSTALLED"
+  put "$new" "$target"
+  put "$new" "$copy"
   rm -f "$there.new"
-  step "$CONFIG: installed"
+  step "$target: installed"
 }
 
 install_files() {
   local entry source target
   mkdir -p "$DESTDIR$COMMANDS"
-  for source in fishd fishctl; do
+  for source in fishd fishctl fishd-camera; do
     ln -sfn "$HOME_FOLDER/bin/$source" "$DESTDIR$COMMANDS/$source"
     step "$COMMANDS/$source: installed"
   done
@@ -232,6 +240,15 @@ take_effect() {
   if ! systemctl --quiet is-enabled fishd-recorder.service 2>/dev/null; then
     step "to record always: sudo systemctl enable --now fishd-recorder"
   fi
+  if ! systemctl --quiet is-enabled fishd-camera.service 2>/dev/null; then
+    step "to serve a camera: $(camera_next)"
+  fi
+}
+
+# What a camera still takes.
+camera_next() {
+  has linuxpy || echo -n "sudo make install-pi FISHD_CAMERA=yes; "
+  echo "look over $CAMERA_CONFIG; sudo systemctl enable --now fishd-camera"
 }
 
 say_what_next() {

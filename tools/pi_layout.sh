@@ -5,7 +5,7 @@
 DESTDIR=${DESTDIR:-}
 HOME_FOLDER=/opt/fishd
 CONFIG=/etc/fishd/fishd.yaml
-CONFIG_AS_INSTALLED=$HOME_FOLDER/fishd.yaml.installed
+CAMERA_CONFIG=/etc/fishd/camera.yaml
 STATE_FOLDER=/var/lib/fishd
 RECORDINGS=/var/lib/fishd-recorder
 COMMANDS=/usr/local/bin
@@ -14,6 +14,7 @@ COMMANDS=/usr/local/bin
 SYSTEM_FILES=(
   "fishd.service /etc/systemd/system/fishd.service"
   "fishd-failure.service /etc/systemd/system/fishd-failure.service"
+  "fishd-camera.service /etc/systemd/system/fishd-camera.service"
   "fishd-recorder.service /etc/systemd/system/fishd-recorder.service"
   "pigpiod.service.d/fishd.conf /etc/systemd/system/pigpiod.service.d/fishd.conf"
   "sysusers.d/fishd.conf /etc/sysusers.d/fishd.conf"
@@ -21,6 +22,9 @@ SYSTEM_FILES=(
   "modules-load.d/fishd.conf /etc/modules-load.d/fishd.conf"
   "udev/rules.d/60-fishd.rules /etc/udev/rules.d/60-fishd.rules"
 )
+
+# The copy of a configuration as it was installed, by which one is known that nobody has edited.
+as_installed() { echo "$HOME_FOLDER/$(basename "$1").installed"; }
 
 step() { printf '%s\n' "$*"; }
 

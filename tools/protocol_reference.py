@@ -1,4 +1,4 @@
-"""The tables of docs/protocol.md, and that of faults in docs/concepts.md, from the code.
+"""The tables of docs/protocol.md, those of messages in docs/camera.md, and that of faults.
 
 `tools/protocol_reference.py --write` puts them into the documents; `--check` exits with 1 where one
 is out of date there.
@@ -12,6 +12,7 @@ import msgspec
 from msgspec import NODEFAULT, Struct, inspect
 
 from common.report import DOCS, between, put, table
+from fishd.camera import messages
 from fishd.control.faults import FAULTS
 from fishd.core import protocol, signals
 from fishd.core.schema import fields_of
@@ -23,6 +24,7 @@ TYPES = {
     inspect.BoolType: "boolean",
     inspect.NoneType: "null",
     inspect.DictType: "object",
+    inspect.LiteralType: "string",
     inspect.StructType: "object",
     inspect.RawType: "any",
     inspect.AnyType: "any",
@@ -40,12 +42,23 @@ STRUCTS: dict[str, type[Struct]] = {
     "calibrations": protocol.Calibrations,
 }
 """By the name of their markers."""
+CAMERA: dict[str, type[Struct]] = {
+    "frame": messages.FrameHeader,
+    "view": messages.ViewHeader,
+    "camera-state": messages.CameraState,
+    "until": messages.Until,
+}
+"""Likewise, in docs/camera.md."""
 
 
 def references() -> Iterator[tuple[str, str, str]]:
     """Document, name of the markers, and the table between them."""
     for name, struct in STRUCTS.items():
         yield "protocol.md", name, _fields(struct)
+    for name, struct in CAMERA.items():
+        yield "camera.md", name, _fields(struct)
+    conditions = [[f"`{name}`", meaning] for name, meaning in messages.CONDITIONS.items()]
+    yield "camera.md", "conditions", table("state | what it means", conditions)
     kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]
     yield "protocol.md", "kinds", table("kind | level | when | `data`", kinds)
     operations = [
@@ -69,7 +82,7 @@ def _fields(struct: type[Struct]) -> str:
         [
             f"`{field.name}`",
             _type(types[field.name]),
-            *([field.unit.replace("1", "–")] if units else []),
+            *(["–" if field.unit == "1" else field.unit] if units else []),
             field.description[:1].lower() + field.description[1:].rstrip("."),
         ]
         for field in fields

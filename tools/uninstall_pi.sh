@@ -20,8 +20,11 @@ remove_if_empty() { rmdir "$DESTDIR$1" 2>/dev/null || true; }
 
 stop_service() {
   local status=0
-  systemctl stop fishd-recorder.service 2>/dev/null || true
-  systemctl --quiet disable fishd-recorder.service 2>/dev/null || true
+  local other
+  for other in fishd-recorder fishd-camera; do
+    systemctl stop "$other.service" 2>/dev/null || true
+    systemctl --quiet disable "$other.service" 2>/dev/null || true
+  done
   # Whether it is active or not: one that waits for its restart is not, and would come back.
   systemctl stop fishd.service 2>/dev/null || status=$?
   case $status in
@@ -33,13 +36,15 @@ stop_service() {
 }
 
 remove_config() {
-  local there=$DESTDIR$CONFIG
-  if [[ $PURGE == 1 ]] || cmp -s "$there" "$DESTDIR$CONFIG_AS_INSTALLED"; then
-    remove "$CONFIG"
-  elif [[ -e $there ]]; then
-    step "$CONFIG: yours, kept; PURGE=1 removes it"
-  fi
-  remove "$CONFIG.new"
+  local config
+  for config in "$CONFIG" "$CAMERA_CONFIG"; do
+    if [[ $PURGE == 1 ]] || cmp -s "$DESTDIR$config" "$DESTDIR$(as_installed "$config")"; then
+      remove "$config"
+    elif [[ -e $DESTDIR$config ]]; then
+      step "$config: yours, kept; PURGE=1 removes it"
+    fi
+    remove "$config.new"
+  done
   remove_if_empty "$(dirname "$CONFIG")"
 }
 
@@ -52,6 +57,7 @@ remove_files() {
   remove_if_empty /etc/systemd/system/pigpiod.service.d
   remove "$COMMANDS/fishd"
   remove "$COMMANDS/fishctl"
+  remove "$COMMANDS/fishd-camera"
   remove "$HOME_FOLDER"
 }
 
@@ -62,6 +68,7 @@ remove_state() {
     remove "$RECORDINGS"
     remove /etc/systemd/system/fishd.service.d
     remove /etc/systemd/system/fishd-recorder.service.d
+    remove /etc/systemd/system/fishd-camera.service.d
   elif [[ -e $DESTDIR$STATE_FOLDER ]]; then
     step "$STATE_FOLDER: calibrations, kept; PURGE=1 removes them"
   fi

@@ -9,7 +9,7 @@ import numpy as np
 from fishd.camera.axis import Axis, NoMotion, find_motion
 from fishd.camera.frames import Frame, Pixels
 
-SPAN = 10.0
+SPAN = 20.0
 """It is found in the frames of so long [s]."""
 APART = 0.045
 """Frames nearer to one another are left out [s]."""

@@ -1,13 +1,9 @@
 """`CameraClient`: frames of a running `fishd-camera`, with their times on the clock of fishd."""
 
-import itertools
-import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from typing import Self, TypeVar
+from typing import Self
 
-import msgspec
 import zmq
 
 from fishd.camera import messages
@@ -21,13 +17,21 @@ from fishd.camera.messages import (
     PublishedView,
     Until,
 )
-from fishd.camera.settings import CameraSettings, PublishSettings
+from fishd.camera.requests import (
+    LONGEST,
+    CameraLost,
+    CameraRequests,
+    connect,
+    find_camera,
+    reachable,
+)
+from fishd.camera.settings import CameraSettings
 from fishd.client import Fish
 from fishd.client.connection import milliseconds_until
-from fishd.core import addresses, protocol, text
-from fishd.core.errors import FishError, Refused
+from fishd.core import text
 
-ENDPOINT_VARIABLE = "FISHD_CAMERA"
+__all__ = ["CameraClient", "CameraLost"]
+
 TIMEOUT = 2.0
 """How long to wait for an answer, or for a frame, until the camera counts as lost [s]."""
 PATIENCE = 5.0
@@ -36,16 +40,8 @@ WAITING = 256
 """Messages that may wait for a client that is busy."""
 _ASK = 0.5
 """In lockstep the camera is asked after so long without a word [s]."""
-_MOST = 16 * 2**20
-"""Longest message that is received [bytes]."""
 _EARLY = 1e-6
 """Times that differ by less are equal [s]."""
-
-T = TypeVar("T")
-
-
-class CameraLost(FishError, ConnectionError):
-    """No camera answers, or it has no frames; the message says which, and what to do."""
 
 
 class CameraClient:
@@ -75,8 +71,8 @@ class CameraClient:
 
         Raises `CameraLost` when no camera answers, `Refused` when it speaks another version.
         """
-        self.endpoint = endpoint or os.environ.get(ENDPOINT_VARIABLE) or PublishSettings().requests
-        self.timeout = timeout
+        self.endpoint = endpoint or find_camera()
+        self._timeout = timeout
         self.history = FrameHistory(stack or StackSettings())
         """The latest frames, with their times on the clock of `fish`."""
         self.latest: PublishedFrame | None = None
@@ -87,18 +83,18 @@ class CameraClient:
         """Messages that were none of a camera, or of another version."""
         self.missed = 0
         """Frames that were sent but have not come."""
-        self._ids = itertools.count(1)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._requests: zmq.Socket[bytes] | None = None
         self._heard = time.monotonic()
         self._until: float | None = None
+        self._until_moved = False
         self._complaint = ""
         try:
+            self._requests = CameraRequests(self.endpoint, self._context, timeout)
             self.state = self.status()
             self._session = self.state.session
             self._camera_clock = ClockOffset(self._read_clock)
             self._fishd_clock = ClockOffset(_clock_of(fish)) if fish else None
-            self._subscribe(frames or self._address_of_frames(), views)
+            self._subscribe(frames or reachable(self.state.frames, self.endpoint), views)
             self._await_subscription()
         except BaseException:
             self.close()
@@ -116,11 +112,11 @@ class CameraClient:
 
     def status(self) -> CameraState:
         """What the camera says of itself; raises `CameraLost`."""
-        return self._call(CameraState, "status")
+        return self._requests.status()
 
     def settings(self) -> CameraSettings:
-        """The settings that the camera was started with; raises `CameraLost`."""
-        return self._call(CameraSettings, "config")
+        """The settings that it was started with, but for a password; raises `CameraLost`."""
+        return self._requests.settings()
 
     def offset(self) -> Offset:
         """What is added to the camera's times to have those of fishd; raises `FishError`."""
@@ -149,7 +145,7 @@ class CameraClient:
     def frames(self) -> Iterator[Frame]:
         """Every frame from now on; raises `CameraLost` when none comes in time."""
         while True:
-            yield from self.poll(self.timeout)
+            yield from self.poll(self._timeout)
             self.check()
 
     def views(self) -> Iterator[PublishedView]:
@@ -183,7 +179,7 @@ class CameraClient:
     def check(self) -> None:
         """Raises `CameraLost` when frames have not come for `timeout`, and says why."""
         silent = time.monotonic() - self._heard
-        if silent <= self.timeout:
+        if silent <= self._timeout:
             return
         self.state = self.status()
         raise CameraLost(self._why(silent))
@@ -229,32 +225,21 @@ class CameraClient:
     def _subscribe(self, address: str, views: bool) -> None:
         self._socket = self._context.socket(zmq.SUB)
         self._socket.set(zmq.RCVHWM, WAITING)
-        self._socket.set(zmq.MAXMSGSIZE, _MOST)
+        self._socket.set(zmq.MAXMSGSIZE, LONGEST)
         self._socket.set(zmq.RECONNECT_IVL, 20)
         self._socket.set(zmq.RECONNECT_IVL_MAX, 500)
         topics = [messages.FRAME, messages.STATE, messages.UNTIL]
         for topic in [*topics, messages.VIEW] if views else topics:
             self._socket.subscribe(topic)
-        _connect(self._socket, address)
+        connect(self._socket, address)
 
     def _await_subscription(self) -> None:
         """The camera tells its state to whoever subscribes: from then on nothing is missed."""
-        if not self._socket.poll(int(self.timeout * 1e3)):
+        if not self._socket.poll(int(self._timeout * 1e3)):
             raise CameraLost(
                 f"the camera at {self.endpoint} answers, but nothing comes from its frames at "
                 f"{self.state.frames}; can this machine reach that address?"
             )
-
-    def _address_of_frames(self) -> str:
-        """Where the camera publishes, as seen from here."""
-        address = self.state.frames
-        ours, theirs = addresses.parse(self.endpoint), addresses.parse(address)
-        if isinstance(ours, addresses.Ipc) or isinstance(theirs, addresses.Ipc):
-            return address
-        if theirs.host not in ("0.0.0.0", "::"):
-            return address
-        host = f"[{ours.host}]" if ":" in ours.host else ours.host
-        return f"tcp://{host}:{theirs.port}"  # of all its addresses, the one that answers
 
     def _take_all(self) -> list[tuple[FrameHeader, Frame]]:
         found: list[tuple[FrameHeader, Frame]] = []
@@ -279,8 +264,6 @@ class CameraClient:
             else:
                 self._follow(message)
         return found
-
-    _until_moved = False
 
     def _take(self, published: PublishedFrame) -> Frame:
         header = published.header
@@ -312,33 +295,6 @@ class CameraClient:
         state = self.status()
         return Reading(state.clock or 0.0, state.boot)
 
-    def _call(self, kind: type[T], op: str) -> T:
-        """Ask; raises `CameraLost` and `Refused`."""
-        if self._requests is None:
-            self._requests = self._context.socket(zmq.DEALER)
-            self._requests.set(zmq.LINGER, 0)
-            self._requests.set(zmq.IMMEDIATE, 1)
-            self._requests.set(zmq.MAXMSGSIZE, _MOST)
-            _connect(self._requests, self.endpoint)
-        identity = next(self._ids)
-        request = protocol.Request(v=protocol.VERSION, id=identity, op=op)
-        deadline = time.monotonic() + self.timeout
-        if self._requests.poll(milliseconds_until(deadline), zmq.POLLOUT):
-            self._requests.send(protocol.encode(request))
-            while self._requests.poll(milliseconds_until(deadline)):
-                with suppress(msgspec.DecodeError, UnicodeDecodeError):
-                    reply = protocol.decode_reply(self._requests.recv_multipart()[-1])
-                    if reply.id != identity:
-                        continue
-                    if reply.error:
-                        raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
-                    if reply.result:
-                        return msgspec.json.decode(reply.result, type=kind)
-        raise CameraLost(
-            f"no camera at {self.endpoint}: no answer within {self.timeout:g} s; start one with "
-            f"'fishd-camera', or name another with --camera or ${ENDPOINT_VARIABLE}"
-        )
-
 
 def _clock_of(fish: Fish) -> Callable[[], Reading]:
     def ask() -> Reading:
@@ -346,14 +302,3 @@ def _clock_of(fish: Fish) -> Callable[[], Reading]:
         return Reading(status.clock, status.boot)
 
     return ask
-
-
-def _connect(socket: "zmq.Socket[bytes]", address: str) -> None:
-    if complaint := addresses.why_not_connected(address):
-        raise CameraLost(f"'{address}' is no address of a camera: {complaint}")
-    try:
-        socket.connect(address)
-    except zmq.ZMQError as error:
-        raise CameraLost(
-            f"'{address}' is no address of a camera: {zmq.strerror(error.errno or 0)}"
-        ) from None

@@ -53,12 +53,18 @@ class FrameHistory:
 
     def __init__(self, settings: StackSettings) -> None:
         self.settings = settings
-        self._frames: deque[Frame] = deque(maxlen=64)
+        self._frames: deque[Frame] = deque(maxlen=_MOST)
+        span = settings.delay + (settings.frames - 1) * settings.interval + settings.oldest
+        self._span = span + _AHEAD
 
     def add(self, frame: Frame) -> None:
         """Keep a frame; one that is not newer than all others is dropped."""
-        if not self._frames or frame.time > self._frames[-1].time:
-            self._frames.append(frame)
+        frames = self._frames
+        if frames and frame.time <= frames[-1].time:
+            return
+        frames.append(frame)
+        while frames[0].time < frame.time - self._span:
+            frames.popleft()
 
     def clear(self) -> None:
         """Forget all frames."""
@@ -86,5 +92,9 @@ class FrameHistory:
         return None
 
 
+_AHEAD = 2.0
+"""Frames may come so much earlier than the tick that they are for [s]."""
+_MOST = 4096
+"""Frames that are kept."""
 _ROUNDING = 1e-6
 """Times of a frame and a tick that differ by less are equal [s]."""

@@ -15,7 +15,7 @@ from fishd.camera import messages, picture
 from fishd.camera.frames import Pixels
 from fishd.camera.messages import FrameHeader, Until, ViewHeader
 from fishd.camera.monitor import Monitor
-from fishd.camera.settings import CameraSettings
+from fishd.camera.settings import CameraSettings, without_password
 from fishd.camera.sockets import Publisher, Requests
 from fishd.camera.sources.base import Shot, Source, Timeline, Trouble
 from fishd.core import text
@@ -29,6 +29,8 @@ HANGS = 10.0
 """A source that is silent for so long hangs [s]."""
 GIVEN_UP = 30.0
 """From then on systemd's watchdog is not fed any more [s]."""
+AGAIN = 1.0
+"""A source that has failed begins anew after so long [s]."""
 LEAVING = 2.0
 """How long the source may take to let go of its camera [s]."""
 _LOOK = 50
@@ -50,7 +52,8 @@ class Server:
         self._news = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._alive = time.monotonic()
         self._stopping = threading.Event()
-        self._failure: BaseException | None = None
+        self._failure = ""
+        """The latest error that nobody had expected."""
         self._sessions = 0
         self._next_view = self._next_state = 0.0
         self._stack = ExitStack()
@@ -67,7 +70,7 @@ class Server:
             self._monitor.session = self._new_session()
             self._requests.operations = {
                 "status": self._monitor.state,
-                "config": lambda: self._settings,
+                "config": lambda: without_password(self._settings),
             }
             self._stack = stack.pop_all()
         return self
@@ -76,7 +79,7 @@ class Server:
         self._stack.close()
 
     def run(self, stopping: Callable[[], bool]) -> None:
-        """Serve until `stopping`; raises what the source raises, which is a defect of fishd."""
+        """Serve until `stopping`."""
         log.info(
             "a camera, %s: frames at %s, requests at %s",
             self._source.device,
@@ -91,8 +94,6 @@ class Server:
         try:
             while not stopping():
                 self._turn({each for each, _ in poller.poll(_LOOK)})
-                if self._failure is not None:
-                    raise self._failure
         finally:
             self._notifier.stopping()
             self._stopping.set()
@@ -123,11 +124,17 @@ class Server:
             self._tell(False)
 
     def _run_source(self) -> None:
-        try:
-            self._source.run(self, self._stopping.wait)
-        except BaseException as error:
-            self._failure = error
-            self._wake()
+        """A driver or library that fails unexpectedly must not end the process: try again."""
+        while not self._stopping.is_set():
+            try:
+                self._source.run(self, self._stopping.wait)
+            except Exception as error:
+                why = f"{self._source.device} cannot be used: {text.named(error)}"
+                if str(error) != self._failure:
+                    log.exception("%s", why)
+                self._failure = str(error)
+                self.trouble(Trouble("unusable", why, "the log of fishd-camera says where"))
+                self._stopping.wait(AGAIN)
 
     # The sink: called by the source, in its thread.
 

@@ -7,10 +7,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 import yaml
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config.overrides import apply_overrides
-from fishd.core import strict_yaml
+from fishd.core import strict_yaml, text
 from fishd.core.addresses import why_not_connected, why_not_served
 from fishd.core.errors import ConfigError
 from fishd.core.schema import PRINTABLE, Problem, convert, note, unit, without_empty_sections
@@ -20,11 +21,12 @@ _Delay = Annotated[
     unit(
         "s",
         "So much earlier than its time stamp says was the middle of a frame's exposure, beyond "
-        "what the exposure explains; `fishctl camera latency` measures it.",
+        "what the exposure explains.",
         ge=-1,
         le=5,
     ),
 ]
+_SCHEMES = ("rtsp", "rtsps", "http", "https", "rtp", "udp", "tcp")
 _Text = Annotated[str, Meta(min_length=1, max_length=500, pattern=PRINTABLE)]
 
 
@@ -160,6 +162,21 @@ def load(
         raise ConfigError(problem.located(sources)) from None
 
 
+def without_password(settings: CameraSettings) -> CameraSettings:
+    """The same for whoever asks."""
+    url = settings.stream.url
+    if url is None:
+        return settings
+    return replace(settings, stream=replace(settings.stream, url=public(url)))
+
+
+def public(url: str) -> str:
+    """The path of a file, or a URL without user and password."""
+    scheme, network, rest = url.partition("://")
+    place, slash, path = rest.partition("/")
+    return f"{scheme}://{place.rpartition('@')[2]}{slash}{path}" if network else url
+
+
 def to_yaml(settings: CameraSettings) -> str:
     """All settings, defaults included, as YAML that `load` reads back."""
     return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False, allow_unicode=True)
@@ -176,6 +193,13 @@ def _check(settings: CameraSettings) -> None:
     if settings.source == "stream" and not stream.url:
         raise Problem(
             ("stream", "url"), "is missing: the path of a video file, or rtsp://HOST/PATH is needed"
+        )
+    scheme, network, _ = (stream.url or "").partition("://")
+    if network and scheme not in _SCHEMES:
+        raise Problem(
+            ("stream", "url"),
+            f"'{text.quoted(scheme)}://' is not valid: the path of a file, or a URL that begins "
+            f"with one of {', '.join(_SCHEMES)} is needed",
         )
     for name, value in settings.v4l2.controls.items():
         if not isinstance(value, int):

@@ -15,7 +15,7 @@ from fishd.config import Config, load
 
 SYSTEMD = ROOT / "systemd"
 ON_THE_ROBOT = ("fishd.service", "fishd-failure.service")
-UNITS = (*ON_THE_ROBOT, "fishd-recorder.service")
+UNITS = (*ON_THE_ROBOT, "fishd-recorder.service", "fishd-camera.service")
 MOST_EXPOSED = 2.0
 """`systemd-analyze security`: 0 is shut, 10 is open."""
 SHIPPED_UNITS = Path("/usr/lib/systemd/system")
@@ -51,6 +51,7 @@ def root(tmp_path: Path) -> Path:
         fishd,
         f"{fishd}-release",
         fishctl,
+        f"{fishd}-camera",
         "usr/bin/pigpiod",
         "bin/sh",
         "bin/systemctl",
@@ -168,6 +169,16 @@ def test_the_black_box_gives_way_to_fishd_and_reaches_no_device() -> None:
     (fishd,) = setting("fishd.service", "RuntimeDirectory")
     assert setting(unit, "Environment") == [f"FISHD_ENDPOINT=ipc:///run/{fishd}/control"]
     assert setting(unit, "User") == setting("fishd.service", "User")
+
+
+def test_the_camera_gives_way_to_fishd_and_reaches_video_devices_only() -> None:
+    unit = "fishd-camera.service"
+    assert setting(unit, "DevicePolicy") == ["closed"]
+    assert setting(unit, "DeviceAllow") == ["char-video4linux rw"]
+    assert setting(unit, "SupplementaryGroups") == ["video"]
+    assert int(setting(unit, "Nice")[0]) > 0
+    assert setting(unit, "User") == setting("fishd.service", "User")
+    assert setting(unit, "RestartPreventExitStatus") == [str(os.EX_CONFIG)]
 
 
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:

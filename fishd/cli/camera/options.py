@@ -35,7 +35,7 @@ def check_png(path: Path | None) -> None:
     """Refuse a picture of another kind, before there is anything to draw."""
     if path is not None and path.suffix.lower() != ".png":
         raise click.UsageError(
-            f"'{path}' is not valid for --png: a name that ends in .png is needed"
+            f"'{path}' is not valid for --png: a name ending in .png is needed"
         )
 
 

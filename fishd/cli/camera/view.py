@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import Colours
 
-LOOK = 6.0
+LOOK = 8.0
 """How long to look for an axis [s]."""
 REDRAW = 0.2
 """Least time from one drawing to the next [s]."""
@@ -30,10 +30,10 @@ REDRAW = 0.2
 @png_option
 @click.option("--follow", is_flag=True, help="Go on until Ctrl-C; axis and numbers are renewed.")
 @click.option(
-    "--axis", is_flag=True, help="Look for some seconds first, to find the axis of motion."
+    "--axis", is_flag=True, help="Look for some seconds first, to find the axis."
 )
 @click.option(
-    "--whole", is_flag=True, help="The camera's whole picture, not only what frames show."
+    "--whole", is_flag=True, help="The camera's whole picture, not what frames show."
 )
 def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole: bool) -> None:
     """Show the camera's picture in the terminal: what frames show, with the axis of motion.
@@ -102,7 +102,7 @@ def _find_axis(client: "CameraClient", watch: "AxisWatch") -> None:
     watch.find()
     if watch.axis is None:
         raise FishdError(
-            "no axis is found, as nothing moves: let the fish swim, or leave --axis out"
+            "no axis is found, as nothing moves: let the fish swim, or omit --axis"
         )
 
 

@@ -58,7 +58,7 @@ def ask(endpoint: str | None) -> Running | Unreachable | None:
     """
     named, endpoint = endpoint, endpoint or find_control()
     try:
-        if _is_nobody_at(endpoint):
+        if is_nobody_at(endpoint):
             return None
     except PermissionError:
         return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
@@ -74,7 +74,7 @@ def ask(endpoint: str | None) -> Running | Unreachable | None:
     return Unreachable(why, False)
 
 
-def _is_nobody_at(endpoint: str) -> bool:
+def is_nobody_at(endpoint: str) -> bool:
     """True where it is certain; raises PermissionError where this user cannot know."""
     path = socket_path(endpoint)
     if path is None:

@@ -1,10 +1,14 @@
 """Checks of the daemon: whether it runs, its addresses, and its systemd unit."""
 
+from contextlib import suppress
 from pathlib import Path
 
-from fishd.cli.doctor.base import Context, Running, Unreachable
+import msgspec
+import zmq
+
+from fishd.cli.doctor.base import PATIENCE, Context, Running, Unreachable, is_nobody_at
 from fishd.core import addresses
-from fishd.core.errors import StartupError
+from fishd.core.errors import FishError, StartupError
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
 
 UNIT = "fishd.service"
@@ -69,6 +73,33 @@ def unit(context: Context) -> Result:
     return ok(f"{Path(found[0]) / UNIT}, enabled")
 
 
+def camera(context: Context) -> Result | None:
+    """What a fishd-camera of this machine says, where there is one."""
+    try:
+        from fishd.camera import requests  # numpy, which nothing else here needs
+    except ImportError:
+        return None
+    address = requests.find_camera()
+    with suppress(PermissionError):
+        if is_nobody_at(address):
+            return None
+    zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        asking = requests.CameraRequests(address, zmq_context, PATIENCE)
+        state = asking.status()
+    except (FishError, msgspec.MsgspecError) as error:
+        return warning(str(error), "see what listens there, or restart fishd-camera")
+    finally:
+        zmq_context.destroy(linger=0)
+    if state.state != "streaming":
+        return warning(f"{state.state}: {state.problem}", state.remedy)
+    lost = f", {state.dropped} lost, {state.broken} broken" if state.dropped + state.broken else ""
+    message = f"{state.rate:.1f} frames a second from {state.device}{lost}"
+    if state.degraded:
+        return warning(f"{message}; {'; '.join(state.degraded)}", "see docs/camera.md")
+    return ok(message)
+
+
 def _address(context: Context, address: str, key: str) -> Result:
     found = context.daemon
     if isinstance(found, Unreachable):  # to bind could take its socket away
@@ -87,5 +118,6 @@ CHECKS = (
     Check("daemon", daemon),
     Check("telemetry", telemetry),
     Check("control", control),
+    Check("camera", camera),
     Check("systemd", unit, ("pi",)),
 )

@@ -111,7 +111,7 @@ def record(
         raise click.UsageError("--black-box names its files itself: leave RUN out")
     if black_box and with_camera:
         raise click.UsageError(
-            "a black box keeps no frames, which fill it in hours: one of the two"
+            "a black box keeps no frames: they would fill it within hours"
         )
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:

@@ -1,0 +1,86 @@
+"""The loop of `fishd-camera`, above a driver that does what none should."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rigs.processes import PATIENCE, wait_until
+
+from fishd.camera import server
+from fishd.camera.client import CameraClient
+from fishd.camera.server import Server
+from fishd.camera.settings import load
+from fishd.camera.sources.base import Shot, Sink, Source, Timeline
+
+Stopping = Callable[[float], bool]
+
+
+class FailsOnce:
+    device = "a camera"
+
+    def __init__(self) -> None:
+        self.runs = 0
+
+    def run(self, sink: Sink, stopping: Stopping) -> None:
+        self.runs += 1
+        if self.runs == 1:
+            raise ZeroDivisionError("in a library")
+        sink.begin(Timeline(False, "", None))
+        picture = np.full((120, 160), 7, np.uint8)
+        number = 0
+        while not stopping(0.01):
+            number += 1
+            sink.put(Shot(0.01 * number, 0.01 * number, picture))
+
+
+class Hangs:
+    device = "a camera"
+
+    def __init__(self) -> None:
+        self.goes_on = threading.Event()
+
+    def run(self, sink: Sink, stopping: Stopping) -> None:
+        self.goes_on.wait(PATIENCE)
+        while not stopping(0.01):
+            sink.put(Shot(1.0, 1.0, np.zeros((120, 160), np.uint8)))
+
+
+@contextmanager
+def serving(folder: Path, source: Source) -> Iterator[CameraClient]:
+    stopping = threading.Event()
+    endpoint = f"ipc://{folder}/r"
+    pairs = (f"publish.requests={endpoint}", f"publish.frames=ipc://{folder}/f")
+    with Server(load(None, pairs), source) as each:
+        thread = threading.Thread(target=each.run, args=(stopping.is_set,))
+        thread.start()
+        try:
+            with CameraClient(endpoint, timeout=PATIENCE) as client:
+                yield client
+        finally:
+            stopping.set()
+            thread.join(PATIENCE)
+
+
+def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(tmp_path: Path) -> None:
+    with serving(tmp_path, FailsOnce()) as client:
+        problem = "a camera cannot be used: ZeroDivisionError: in a library"
+        assert client.status().problem == problem
+        (frame, *_) = client.poll(PATIENCE)
+        assert np.all(frame.pixels == 7)
+        wait_until(lambda: client.status().state == "streaming")
+        assert client.status().problem == ""
+
+
+def test_a_driver_that_hangs_is_said_while_requests_are_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "HANGS", 0.1)
+    source = Hangs()
+    with serving(tmp_path, source) as client:
+        wait_until(lambda: client.status().state == "stalled")
+        assert "it hangs" in client.status().problem
+        source.goes_on.set()
+        wait_until(lambda: client.status().state == "streaming")

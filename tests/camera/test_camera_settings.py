@@ -1,0 +1,62 @@
+"""The settings of `fishd-camera`: what is wrong is said in one line, with its place."""
+
+from pathlib import Path
+
+import pytest
+from rigs.camera_process import COMMAND
+from rigs.documents import ROOT
+from rigs.processes import call, one_line
+
+from fishd.camera.settings import CameraSettings, load, to_yaml
+from fishd.core.errors import ConfigError
+
+
+@pytest.mark.parametrize("name", ["camera.yaml", "camera-simulated.yaml"])
+def test_the_examples_are_valid(name: str) -> None:
+    settings = load(ROOT / "config" / name)
+    assert settings.source == ("v4l2" if name == "camera.yaml" else "simulated")
+
+
+def test_all_settings_are_read_back(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text(to_yaml(CameraSettings()))
+    assert load(file) == CameraSettings()
+
+
+@pytest.mark.parametrize(
+    ("override", "why"),
+    [
+        ("source=usb", "one of simulated | stream | v4l2 is needed"),
+        ("source=stream", "stream.url: is missing"),
+        ("picture.rotate=45", "one of 0 | 90 | 180 | 270 is needed"),
+        ("picture.size=1000", "a whole number in [16, 256] px is needed"),
+        ("publish.view_rate=30", "a number in [0, 5] 1/s is needed"),
+        ("publish.frames=localhost:9874", "tcp://HOST:PORT or ipc://PATH is needed"),
+        ("publish.requests=tcp://127.0.0.1:9874", "is that of frames already"),
+        ("simulated.fishd=tcp://127.0.0.1:*", "is not valid"),
+        ("simulated.rate=0", "a number in (0, 1000] 1/s (or null) is needed"),
+        ("v4l2.controls.gain=1.5", "a whole number, true or false is needed"),
+        ("v4l2.format=H264", "one of GREY | MJPG | YUYV is needed"),
+        ("picture.crop.size=1", "unknown key"),
+        ("stream.url=gopher://host/video", "rtsp"),
+    ],
+)
+def test_a_wrong_value_is_named(override: str, why: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(None, [override])
+    assert str(caught.value).count("\n") == 0
+    assert why in str(caught.value)
+
+
+def test_a_wrong_file_is_named_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text("source: v4l2\nv4l2:\n  widht: 640\n")
+    done = call(*COMMAND, "--config", str(file))
+    assert done.returncode == 78
+    expected = f"{file}:3: v4l2.widht: unknown key; did you mean 'width'?"
+    assert one_line(done) == f"fishd-camera: {expected}\n"
+
+
+def test_help_and_version_are_quick_and_whole() -> None:
+    assert "Publish the frames" in call(*COMMAND, "--help").stdout
+    assert call(*COMMAND, "--version").stdout.startswith("fishd-camera, version ")

@@ -1,0 +1,210 @@
+"""What strangers send to the sockets of `fishd-camera` does it no harm."""
+
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import simplejpeg
+import zmq
+from rigs.camera_process import COMMAND, CameraProcess, running_camera
+from rigs.processes import Daemon, Subscriber, call, running, sets
+
+from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.messages import STATE
+from fishd.camera.requests import reachable
+from fishd.cli.doctor import service
+from fishd.cli.doctor.base import Context
+from fishd.config import Config
+from fishd.core.errors import Refused
+
+Both = tuple[Daemon, CameraProcess]
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Both]:
+    folder = tmp_path_factory.mktemp("camera")
+    with (
+        running(folder) as daemon,
+        running_camera(folder, f"simulated.fishd={daemon.endpoint}", "simulated.rate=60") as camera,
+    ):
+        camera.is_in("streaming")
+        yield daemon, camera
+
+
+@pytest.fixture
+def camera(both: Both) -> CameraProcess:
+    return both[1]
+
+
+def ask(camera: CameraProcess, *parts: bytes) -> list[bytes] | None:
+    """The answer to a message from a bare client."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        dealer = context.socket(zmq.DEALER)
+        dealer.connect(camera.endpoint)
+        dealer.send_multipart(parts)
+        return dealer.recv_multipart() if dealer.poll(500) else None
+    finally:
+        context.destroy(linger=0)
+
+
+def test_the_state_comes_at_once_and_again_and_again(camera: CameraProcess) -> None:
+    begun = time.monotonic()
+    with Subscriber(camera.frames, STATE) as telemetry:
+        first, second = telemetry.message(), telemetry.message()
+    assert time.monotonic() - begun < 5.0
+    assert first["state"] == second["state"] == "streaming"
+    assert first["pid"] == camera.process.pid
+
+
+@pytest.mark.parametrize(
+    ("request_", "code"),
+    [
+        (b"", "bad-request"),
+        (b"\x00" * 100, "bad-request"),
+        (b'{"v":1,"op":"stauts"}', "unknown-op"),
+        (b'{"v":9,"op":"status"}', "version"),
+        (b'{"v":1,"op":"status","args":{"x":1}}', "bad-arguments"),
+    ],
+)
+def test_a_request_that_is_none_gets_an_error(
+    camera: CameraProcess, request_: bytes, code: str
+) -> None:
+    reply = ask(camera, request_)
+    assert reply
+    assert json.loads(reply[-1])["error"]["code"] == code
+    assert camera.status().state == "streaming"
+
+
+def test_a_flood_of_garbage_is_survived_while_frames_go_on(camera: CameraProcess) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    strangers = []
+    with camera.client() as client:
+        try:
+            for address in (camera.endpoint, camera.frames):
+                for kind in (zmq.DEALER, zmq.SUB, zmq.PUSH):
+                    stranger = context.socket(kind)
+                    strangers.append(stranger)
+                    if kind == zmq.SUB:
+                        for number in range(200):
+                            stranger.subscribe(os.urandom(number))
+                    stranger.connect(address)
+                    for _ in range(50 if kind == zmq.DEALER else 0):
+                        stranger.send_multipart([os.urandom(100), b"", os.urandom(1000)])
+                raw = socket.socket(socket.AF_UNIX)
+                raw.connect(address.removeprefix("ipc://"))
+                raw.send(os.urandom(2000))
+                raw.close()
+            before = client.status().seq
+            found = 0
+            while found < 30:
+                found += len(client.poll(5.0))
+        finally:
+            context.destroy(linger=0)
+    assert camera.status().seq > before
+
+
+def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess) -> None:
+    with camera.client(views=True) as client:
+        views, begun = [], time.monotonic()
+        for view in client.views():
+            views.append(view)
+            if len(views) == 4:
+                break
+        assert time.monotonic() - begun > 0.5  # 5 a second at most
+    header = views[-1].header
+    picture = simplejpeg.decode_jpeg(views[-1].jpeg, colorspace="GRAY")
+    assert picture.shape[:2] == (header.height, header.width) == (420, 420)
+    assert (header.crop.left, header.crop.width) == (0.0, 1.0)
+    with camera.client() as client:
+        client.poll(1.0)
+        assert client.view is None
+
+
+def test_the_settings_can_be_asked_for(camera: CameraProcess) -> None:
+    with camera.client() as client:
+        assert client.settings().simulated.rate == 60.0
+
+
+def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(CameraLost, match=r"no camera at ipc:\S+: no answer within 0.2 s; start"):
+        CameraClient(f"ipc://{tmp_path}/nobody", timeout=0.2)
+
+
+def test_what_is_no_address_is_said(tmp_path: Path) -> None:
+    with pytest.raises(CameraLost, match="'tcp://x' is no address of a camera"):
+        CameraClient("tcp://x")
+
+
+def test_a_camera_of_another_version_is_refused(tmp_path: Path) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        router = context.socket(zmq.ROUTER)
+        router.bind(f"ipc://{tmp_path}/r")
+
+        def answer() -> None:
+            name, request = router.recv_multipart()
+            identity = msgspec.json.decode(request)["id"]
+            error = {"code": "version", "message": "version 1 is not spoken here"}
+            reply = {"v": 2, "id": identity, "ok": False, "error": error}
+            router.send_multipart([name, msgspec.json.encode(reply)])
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(Refused, match="not spoken here"):
+            CameraClient(f"ipc://{tmp_path}/r")
+        thread.join()
+    finally:
+        context.destroy(linger=0)
+
+
+@pytest.mark.parametrize(
+    ("frames", "endpoint", "seen"),
+    [
+        ("tcp://0.0.0.0:9874", "tcp://fish.local:9875", "tcp://fish.local:9874"),
+        ("tcp://0.0.0.0:9874", "tcp://[::1]:9875", "tcp://[::1]:9874"),
+        ("tcp://10.0.0.2:9874", "tcp://fish.local:9875", "tcp://10.0.0.2:9874"),
+        ("ipc:///run/f", "tcp://fish.local:9875", "ipc:///run/f"),
+    ],
+)
+def test_a_camera_that_serves_the_network_is_reached_where_it_answers(
+    frames: str, endpoint: str, seen: str
+) -> None:
+    assert reachable(frames, endpoint) == seen
+
+
+def test_the_doctor_says_how_the_camera_is(
+    camera: CameraProcess, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    context = Context(Config())
+    monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
+    found = service.camera(context)
+    assert found
+    assert (found.level, found.message[:5]) == ("ok", "60.0 ")
+    monkeypatch.setenv("FISHD_CAMERA", f"ipc://{tmp_path}/nobody")
+    assert service.camera(context) is None
+
+
+def test_a_second_camera_at_the_same_address_is_refused(camera: CameraProcess) -> None:
+    addresses = sets(f"publish.requests={camera.endpoint}", f"publish.frames={camera.frames}")
+    done = call(*COMMAND, *addresses)
+    assert done.returncode == 1
+    assert "another fishd-camera" in done.stderr
+
+
+@pytest.mark.realtime
+def test_a_frame_is_young_when_a_learner_has_it(camera: CameraProcess) -> None:
+    ages = []
+    with camera.client() as client:
+        for frame in client.frames():
+            ages.append(time.monotonic() - frame.available)
+            if len(ages) == 600:
+                break
+    assert float(np.percentile(ages, 99)) <= 0.010

@@ -1,0 +1,91 @@
+"""What the simulated camera believes of the motion until the next tick is what happens."""
+
+import random
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fishd.camera.simulated.camera import Tail
+from fishd.camera.sources.simulated import Foresight, Swimmer, TickTruth
+from fishd.virtual.fish import SimulatedFish
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.plant.parameters import PlantParameters
+
+TICK = 0.05
+
+
+class Swim:
+    """A simulated fish under random commands, and what a camera would hear of it."""
+
+    def __init__(self, plant: PlantParameters, seed: int) -> None:
+        self._fish = SimulatedFish(plant, SimulationSettings(), TICK)
+        self._random = random.Random(seed)
+        self._slot = self._seq = 0
+        self.command = 0.0
+
+    def tick(self, slots: int = 1, *, released: bool = False) -> TickTruth:
+        """slots: how many periods after the previous one"""
+        self._slot += slots
+        self._seq += 1
+        now = self._slot * TICK
+        self._fish.read(now)
+        truth = self._fish.truth()
+        self.command = self._random.uniform(-0.42, 0.42)
+        if released:
+            self._fish.release()
+        else:
+            self._fish.write(self.command)
+        state = {"alpha": truth.alpha, "alpha_rate": truth.alpha_rate, "phi": truth.phi}
+        return TickTruth(self._seq, self.command, not released, now, **state)
+
+
+def foresight(plant: PlantParameters, **options: Any) -> Foresight:
+    return Foresight(Swimmer(TICK, plant, 200.0, options.get("lockstep", True)))
+
+
+@settings(max_examples=20)
+@given(
+    seed=st.integers(0, 1000),
+    delay=st.sampled_from([0.0, 0.03, 0.12]),
+    backlash=st.sampled_from([0.0, 0.05]),
+    slack=st.sampled_from([0.0, 0.03]),
+)
+def test_the_next_tick_is_known_to_the_last_bit(
+    seed: int, delay: float, backlash: float, slack: float
+) -> None:
+    plant = PlantParameters(servo_delay=delay, backlash=backlash, cable_slack=slack)
+    swim, ahead = Swim(plant, seed), foresight(plant)
+    believed = Tail(0.0, 0.0, 0.0)
+    for number in range(40):
+        tick = swim.tick(released=number in (20, 21))
+        if number > 5:  # what was under way to the servo at first has arrived
+            assert believed == (tick.time, tick.alpha, tick.alpha_rate)
+        ((_, believed),) = ahead.follow(tick)
+    assert ahead.end == believed.time
+
+
+def test_slots_that_fishd_skips_leave_no_hole() -> None:
+    swim, ahead = Swim(PlantParameters(), 1), foresight(PlantParameters(), lockstep=False)
+    course = []
+    for slots in (1, 1, 3, 1, 2, 1):
+        course += ahead.follow(swim.tick(slots))
+    for (_, left), (right, _) in pairwise(course):
+        assert right.time == pytest.approx(left.time)
+        assert right.alpha == pytest.approx(left.alpha, abs=1e-6)
+
+
+def test_after_ticks_that_nobody_heard_it_begins_anew_from_the_true_state() -> None:
+    plant = PlantParameters(servo_delay=0.08)
+    swim, ahead = Swim(plant, 2), foresight(plant)
+    ahead.follow(swim.tick())
+    for _ in range(5):
+        swim.tick()
+    tick = swim.tick()
+    ((begin, _),) = ahead.follow(tick)
+    assert (begin.time, begin.alpha) == (tick.time, tick.alpha)
+    for _ in range(4):  # until what was under way to the servo has arrived
+        ((_, believed),) = ahead.follow(swim.tick())
+    assert swim.tick().alpha == pytest.approx(believed.alpha, abs=1e-9)

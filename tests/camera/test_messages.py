@@ -1,0 +1,67 @@
+"""What a camera says: what fits is read back, what does not is refused in one line."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fishd.camera import messages
+from fishd.camera.messages import BadMessage, FrameHeader, PublishedFrame, Until
+
+PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
+HEADER = FrameHeader(session="s", seq=7, time=1.25, available=1.5, width=4, height=3)
+
+
+def test_a_frame_is_read_back_as_it_was_sent() -> None:
+    found = messages.decode(messages.frame(HEADER, PIXELS))
+    assert isinstance(found, PublishedFrame)
+    assert found.header == HEADER
+    assert np.array_equal(found.pixels, PIXELS)
+
+
+def test_a_part_of_a_larger_picture_is_sent_as_what_it_shows() -> None:
+    whole = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    found = messages.decode(messages.frame(HEADER, whole[::2, ::2]))
+    assert isinstance(found, PublishedFrame)
+    assert np.array_equal(found.pixels, whole[::2, ::2])
+
+
+def test_no_topic_begins_like_another() -> None:
+    topics = [messages.FRAME, messages.VIEW, messages.STATE, messages.UNTIL]
+    assert not [(a, b) for a in topics for b in topics if a != b and a.startswith(b)]
+
+
+@pytest.mark.parametrize(
+    ("parts", "why"),
+    [
+        ([b"tick", b"{}"], "topic b'tick' is none of a camera's"),
+        ([b"frame", b"{}"], "a message of topic frame has 3 parts, not 2"),
+        ([b"until", b"{}", b""], "a message of topic until has 2 parts, not 3"),
+        ([b"until", b"nonsense"], "a message of topic until that cannot be read"),
+        ([b"until", b'{"v":1}'], "missing required field `session`"),
+        ([b"until", b'{"v":2}'], "in version 2; version 1 is needed"),
+        (
+            [*messages.frame(HEADER, PIXELS)[:2], b"short"],
+            "a frame of 4 x 3 px has 12 bytes, not 5",
+        ),
+        ([b"frame", b'{"v":1,"width":100000}', b""], "cannot be read"),
+    ],
+)
+def test_what_is_no_message_is_refused(parts: list[bytes], why: str) -> None:
+    with pytest.raises(BadMessage) as caught:
+        messages.decode(parts)
+    assert why in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.lists(st.binary(max_size=100), min_size=1, max_size=4))
+def test_anything_is_a_message_or_refused(parts: list[bytes]) -> None:
+    for topic in (parts[0], b"frame", b"view", b"state", b"until"):
+        with pytest.raises(BadMessage):
+            messages.decode([topic, *parts[1:]])
+
+
+def test_a_field_of_a_later_version_is_ignored() -> None:
+    sent = msgspec.json.encode({"v": 1, "session": "s", "until": 2.0, "more": True})
+    assert messages.decode([b"until", sent]) == Until(session="s", until=2.0)

@@ -1,0 +1,247 @@
+"""A simulated camera above a running fishd: true processes, in real time and in lockstep."""
+
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from rigs.camera_process import CameraProcess, running_camera
+from rigs.processes import Daemon, Subscriber, running, wait_until
+from rigs.virtual_pi_process import virtual_pi
+
+from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.frames import Frame, StackSettings
+from fishd.camera.simulated.camera import SimulatedCamera, Tail
+from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.client import Agent, Fish
+from fishd.core.signals import Tick
+
+SWIMMING = ("--set", "start.controller=square", "--set", "start.parameters.frequency=1.5")
+
+
+def settings(daemon: Daemon, *pairs: str) -> tuple[str, ...]:
+    return (f"simulated.fishd={daemon.endpoint}", *pairs)
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with running(tmp_path_factory.mktemp("fishd"), *SWIMMING) as daemon:
+        yield daemon
+
+
+def collect(client: CameraClient, number: int) -> list[Frame]:
+    found: list[Frame] = []
+    for frame in client.frames():
+        found.append(frame)
+        if len(found) == number:
+            break
+    return found
+
+
+def expected(ticks: list[Tick], camera: SimulatedCameraSettings) -> dict[float, np.ndarray]:
+    """Frames as they would be drawn from the true states of successive ticks, by their times."""
+    clean = SimulatedCamera(camera, 84)
+    frames = {}
+    tails = [Tail(t.time, float(t.alpha), float(t.alpha_rate)) for t in ticks]  # type: ignore[arg-type]
+    for before, after in pairwise(tails):
+        for frame in clean.frames(before, after):
+            frames[round(frame.time, 6)] = frame.pixels
+    return frames
+
+
+def test_frames_show_the_tail_as_it_truly_was(tmp_path: Path, daemon: Daemon) -> None:
+    bare = ("simulated.noise=0", "simulated.rate=40")
+    with running_camera(tmp_path, *settings(daemon, *bare)) as camera:
+        camera.is_in("streaming")
+        with Fish(daemon.endpoint) as fish, camera.client(fish=fish) as client:
+            ticks = []
+            for tick in fish.ticks():
+                ticks.append(tick)
+                if len(ticks) == 40:
+                    break
+            frames = client.poll()
+    truth = expected(ticks, SimulatedCameraSettings(noise=0.0, rate=40.0))
+    shared = [(frame, truth[key]) for frame in frames if (key := round(frame.time, 6)) in truth]
+    assert len(shared) > 30
+    for frame, pixels in shared:
+        difference = np.abs(frame.pixels.astype(int) - pixels.astype(int))
+        assert difference.mean() < 0.02  # the light, which has another phase, is not on
+
+
+def test_times_of_frames_and_ticks_are_on_one_clock(tmp_path: Path, daemon: Daemon) -> None:
+    with (
+        running_camera(tmp_path, *settings(daemon, "simulated.rate=30")) as camera,
+        Fish(daemon.endpoint) as fish,
+    ):
+        camera.is_in("streaming")
+        with camera.client(fish=fish) as client:
+            frames = collect(client, 20)
+            assert client.offset() == (0.0, 0.0)
+            tick = next(fish.ticks())
+    assert 0.0 <= tick.time - frames[-1].time < 5.0
+    assert all(frame.available - frame.time >= 0.03 for frame in frames)
+
+
+def test_from_another_machine_the_offset_is_estimated(
+    tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fishd.camera.clock_offset.boot_id", lambda: "of another machine")
+    with (
+        running_camera(tmp_path, *settings(daemon)) as camera,
+        Fish(daemon.endpoint) as fish,
+    ):
+        camera.is_in("streaming")
+        with camera.client(fish=fish) as client:
+            frames = collect(client, 5)
+            offset = client.offset()
+            here = {each.header.seq: each for each in [client.latest] if each}
+    assert 0.0 < offset.uncertainty < 1.0
+    assert abs(offset.seconds) <= offset.uncertainty  # it is one clock in truth
+    (sent,) = here.values()
+    assert frames[-1].time == pytest.approx(sent.header.time, abs=offset.uncertainty)
+
+
+def test_a_stack_has_the_frames_before_the_tick(tmp_path: Path, daemon: Daemon) -> None:
+    with running_camera(tmp_path, *settings(daemon, "simulated.rate=100")) as camera:
+        camera.is_in("streaming")
+        stack = StackSettings(frames=3, interval=0.05, delay=0.1, oldest=1.0)
+        with Fish(daemon.endpoint) as fish, camera.client(fish=fish, stack=stack) as client:
+            collect(client, 40)
+            seen = client.stack_at(time.monotonic())
+    assert seen is not None
+    assert seen.shape == (3, 84, 84)
+    assert np.any(seen[0] != seen[2])
+
+
+def test_the_camera_waits_for_a_fishd_and_follows_it_through_a_restart(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/control"
+    with running_camera(tmp_path, f"simulated.fishd={endpoint}") as camera:
+        state = camera.is_in("waiting")
+        assert state.problem.startswith(f"no fishd at {endpoint}")
+        sessions = {state.session}
+        for _ in range(2):
+            with running(tmp_path, *SWIMMING) as daemon:
+                sessions.add(camera.is_in("streaming").session)
+                daemon.kill()
+            camera.is_in("waiting")
+    assert len(sessions) == 3
+
+
+def test_a_fishd_that_drives_no_simulated_fish_is_named(tmp_path: Path) -> None:
+    with (
+        virtual_pi(tmp_path) as pi,
+        running(tmp_path, *pi.settings) as daemon,
+        running_camera(tmp_path, *settings(daemon)) as camera,
+    ):
+        state = camera.is_in("unusable")
+    assert state.problem == "a virtual Pi does not tell where the tail is"
+    assert state.remedy == "let fishd drive robot: simulated"
+
+
+class Lockstep:
+    """An agent that waits for its camera in each tick."""
+
+    def __init__(self, daemon: Daemon, camera: CameraProcess, stack: StackSettings) -> None:
+        self.fish = Fish(daemon.endpoint)
+        self.agent = Agent(f"{daemon.endpoint}-agent")
+        self.client = camera.client(fish=self.fish, stack=stack, timeout=4.0)
+        self.fish.set_controller("remote", agent=self.agent.address)
+
+    def __enter__(self) -> "Lockstep":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for each in (self.client, self.agent, self.fish):
+            each.close()
+
+    def swim(self, ticks: int) -> list[np.ndarray | None]:
+        seen = []
+        for number in range(ticks):
+            asked = self.agent.observe()
+            seen.append(self.client.stack_at(asked.time))
+            history = self.client.history.stack(asked.time - 1.0)
+            assert history is None or history.shape == (2, 84, 84)
+            self.agent.act(0.3 if number % 8 < 4 else -0.3)
+        return seen
+
+
+@pytest.mark.parametrize("rate", ["null", "30", "400"])
+def test_in_lockstep_every_tick_has_its_frames_however_fast_it_is(
+    tmp_path: Path, rate: str
+) -> None:
+    with (
+        running(tmp_path, "--set", "lockstep=true") as daemon,
+        running_camera(tmp_path, *settings(daemon, f"simulated.rate={rate}")) as camera,
+    ):
+        camera.is_in("streaming")
+        with Lockstep(daemon, camera, StackSettings(frames=2)) as run:
+            seen = run.swim(300)
+            assert run.client.missed == run.client.strange == 0
+            assert run.client.status().virtual
+    assert all(stack is not None for stack in seen[10:])
+    different = [np.any(a != b) for a, b in pairwise(seen[10:])]
+    assert sum(different) > 280
+
+
+def test_in_lockstep_a_frame_is_the_same_as_beside_the_simulation(tmp_path: Path) -> None:
+    clean = ("simulated.noise=0", "simulated.rate=null")
+    with (
+        running(tmp_path, "--set", "lockstep=true") as daemon,
+        running_camera(tmp_path, *settings(daemon, *clean)) as camera,
+    ):
+        camera.is_in("streaming")
+        with Subscriber(daemon.telemetry, b"tick") as telemetry:
+            telemetry.message()  # from here on none is missed
+            with Lockstep(daemon, camera, StackSettings(frames=2)) as run:
+                run.swim(40)
+                ticks = [msgspec.convert(telemetry.message(), Tick) for _ in range(38)]
+                frames = {round(f.time, 6): f.pixels for f in run.client.history._frames}
+    truth = expected(ticks, SimulatedCameraSettings(noise=0.0))
+    shared = frames.keys() & truth.keys()
+    assert len(shared) > 30
+    assert all(np.array_equal(frames[key], truth[key]) for key in shared)
+
+
+def test_in_lockstep_a_camera_that_dies_is_noticed(tmp_path: Path) -> None:
+    with (
+        running(tmp_path, "--set", "lockstep=true") as daemon,
+        running_camera(tmp_path, *settings(daemon)) as camera,
+    ):
+        camera.is_in("streaming")
+        with Lockstep(daemon, camera, StackSettings(frames=2)) as run:
+            run.swim(20)
+            camera.process.kill()
+            with pytest.raises(CameraLost, match="no camera at"):
+                run.swim(20)
+
+
+def test_processes_that_are_stopped_and_killed_at_random_are_survived(tmp_path: Path) -> None:
+    random.seed(1)
+    pairs = ("simulated.rate=60",)
+    with running(tmp_path, *SWIMMING) as daemon:
+        camera = CameraProcess(tmp_path, *settings(daemon, *pairs))
+        try:
+            camera.is_in("streaming")
+            with camera.client(timeout=1.0) as client:
+                for _ in range(4):
+                    victim = random.choice(["camera", "fishd"])
+                    if victim == "camera":
+                        camera.process.send_signal(random.choice([signal.SIGSTOP, signal.SIGKILL]))
+                        client.poll(random.uniform(0.0, 0.6))
+                        camera.process.kill()
+                        camera.finish()
+                        camera = CameraProcess(tmp_path, *settings(daemon, *pairs))
+                    else:
+                        os.kill(daemon.process.pid, signal.SIGSTOP)
+                        client.poll(random.uniform(0.0, 1.5))
+                        os.kill(daemon.process.pid, signal.SIGCONT)
+                    camera.is_in("streaming")
+                    wait_until(lambda: bool(client.poll(0.5)))
+        finally:
+            camera.end()

@@ -1,0 +1,322 @@
+"""A V4L2 camera as the kernel shows it, below linuxpy: open, ioctl and mmap of one device file.
+
+Run as a program it is `fishd-camera` with that camera: rigs/v4l2_kernel.py FAULTS ARGUMENTS...
+FAULTS is a JSON file that says what is wrong with the camera; a test writes it at any time.
+"""
+
+import errno
+import fcntl
+import mmap
+import os
+import sys
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import linuxpy.io
+import linuxpy.ioctl
+import linuxpy.video.device
+import msgspec
+import numpy as np
+import simplejpeg
+from linuxpy.video import raw
+from linuxpy.video.raw import IOC
+
+DEVICE = "/dev/video7"
+BUFFER = 2**20
+FORMATS = ("MJPG", "YUYV", "GREY")
+TICKS_OF_EXPOSURE = 100e-6
+
+
+class Faults(msgspec.Struct, frozen=True):
+    """What is wrong with the camera; the defaults are a good one."""
+
+    unplugged: bool = False
+    denied: bool = False
+    busy: bool = False
+    stalled: bool = False
+    broken: bool = False
+    """Its JPEGs are cut off."""
+    garbage: bool = False
+    """It sends anything."""
+    extraneous: bool = False
+    """Bytes between the end of the image and its end marker, as many cameras send."""
+    realtime_stamps: bool = False
+    """Time stamps are of another clock than the monotonic one."""
+    end_of_frame: bool = False
+    formats: tuple[str, ...] = FORMATS
+    rate: float | None = None
+    """The only one that it has [1/s]; None takes any."""
+    skip: int = 0
+    """Of so many frames, one is lost between camera and kernel; 0 for none."""
+    no_video: bool = False
+    """It is a device for metadata."""
+
+
+class Control:
+    def __init__(self, name: str, kind: Any, low: int, high: int, value: int) -> None:
+        self.name, self.kind, self.low, self.high, self.value = name, kind, low, high, value
+
+
+def _controls() -> dict[int, Control]:
+    ids, kinds = raw.ControlID, raw.CtrlType
+    return {
+        int(ids.GAIN): Control("Gain", kinds.INTEGER, 0, 100, 10),
+        int(ids.EXPOSURE_AUTO): Control("Auto Exposure", kinds.MENU, 0, 3, 3),
+        int(ids.EXPOSURE_ABSOLUTE): Control("Exposure Time, Absolute", kinds.INTEGER, 1, 5000, 200),
+    }
+
+
+class V4l2Camera:
+    """One camera: its driver, and the light that falls on it."""
+
+    def __init__(self, faults: Path) -> None:
+        self._file = faults
+        self.faults = Faults()
+        self._lock = threading.RLock()
+        self._memory = os.memfd_create("buffers")
+        self._event: int | None = None
+        self._ours: int | None = None
+        self._gone: set[int] = set()
+        """Descriptors that were open when the camera was unplugged."""
+        self._format = ("MJPG", 640, 480)
+        self._rate = 30.0
+        self._controls = _controls()
+        self._queued: deque[int] = deque()
+        self._done: deque[Any] = deque()
+        self._buffers = 0
+        self._streaming = False
+        self._sequence = -1
+        self._start_reading()
+        threading.Thread(target=self._live, daemon=True).start()
+
+    def plug_in(self) -> None:
+        """Put it below linuxpy."""
+        own = {"open": self.open, "O_NONBLOCK": os.O_NONBLOCK, "O_CLOEXEC": os.O_CLOEXEC}
+        linuxpy.io.os = SimpleNamespace(**own)
+        linuxpy.ioctl.fcntl = SimpleNamespace(ioctl=self.ioctl)
+        linuxpy.video.device.mmap = SimpleNamespace(mmap=self.mmap)
+
+    def open(self, path: Any, flags: int) -> int:
+        if str(path) != DEVICE:
+            return os.open(path, flags)
+        with self._lock:
+            self._read_faults()
+            if self.faults.unplugged:
+                raise OSError(errno.ENOENT, "No such file or directory")
+            if self.faults.denied:
+                raise PermissionError(errno.EACCES, "Permission denied")
+            self._streaming, self._buffers = False, 0
+            self._queued.clear()
+            self._done.clear()
+            # Readable as often as there are frames; FileIO closes it.
+            self._event = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_NONBLOCK)
+            self._gone.discard(self._event)
+            if self._ours is not None:
+                os.close(self._ours)
+            self._ours = os.dup(self._event)  # whose number nobody else may have meanwhile
+            return self._event
+
+    def mmap(self, descriptor: int, length: int, offset: int = 0) -> mmap.mmap:
+        if descriptor != self._event:
+            return mmap.mmap(descriptor, length, offset=offset)
+        os.ftruncate(self._memory, 64 * BUFFER)
+        return mmap.mmap(self._memory, length, offset=offset)
+
+    def ioctl(self, file: Any, request: int, argument: Any = None) -> int:
+        descriptor = file if isinstance(file, int) else file.fileno()
+        with self._lock:
+            if descriptor != self._event:
+                return fcntl.ioctl(descriptor, request, argument)
+            if self.faults.unplugged or descriptor in self._gone:
+                raise OSError(errno.ENODEV, "No such device")
+            handler = getattr(self, f"_{IOC(request).name.lower()}", None)
+            if handler is None:
+                raise OSError(errno.ENOTTY, "Inappropriate ioctl for device")
+            handler(argument)
+        return 0
+
+    def _querycap(self, found: Any) -> None:
+        found.driver, found.card = b"emulated", b"Emulated camera"
+        kind = raw.Capability.META_CAPTURE if self.faults.no_video else raw.Capability.VIDEO_CAPTURE
+        found.device_caps = found.capabilities = int(kind | raw.Capability.STREAMING)
+
+    def _enum_fmt(self, found: Any) -> None:
+        if self.faults.no_video or found.index >= len(self.faults.formats):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        found.pixelformat = raw.v4l2_fourcc(*self.faults.formats[found.index])
+
+    def _s_fmt(self, wanted: Any) -> None:
+        if self.faults.no_video:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        if self.faults.busy:
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        pix = wanted.fmt.pix
+        fourcc = linuxpy.video.device.human_pixel_format(pix.pixelformat)
+        if fourcc not in self.faults.formats:
+            fourcc = self.faults.formats[0]
+        self._format = (fourcc, min(1280, pix.width), min(720, pix.height))
+        self._g_fmt(wanted)
+
+    def _g_fmt(self, found: Any) -> None:
+        fourcc, width, height = self._format
+        pix = found.fmt.pix
+        pix.pixelformat, pix.width, pix.height = raw.v4l2_fourcc(*fourcc), width, height
+        pix.bytesperline = {"YUYV": 2 * width, "GREY": width + 16}.get(fourcc, 0)
+        pix.sizeimage = BUFFER
+
+    def _s_parm(self, wanted: Any) -> None:
+        time_per_frame = wanted.parm.capture.timeperframe
+        rate = self.faults.rate or time_per_frame.denominator / time_per_frame.numerator
+        self._rate = rate
+        self._g_parm(wanted)
+
+    def _g_parm(self, found: Any) -> None:
+        found.parm.capture.timeperframe.numerator = 1000
+        found.parm.capture.timeperframe.denominator = round(1000 * self._rate)
+
+    def _query_ext_ctrl(self, found: Any) -> None:
+        after = found.id & ~int(raw.ControlFlag.NEXT_CTRL | raw.ControlFlag.NEXT_COMPOUND)
+        later = [number for number in sorted(self._controls) if number > after]
+        if not later:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        control = self._controls[later[0]]
+        found.id, found.type, found.name = later[0], int(control.kind), control.name.encode()
+        found.minimum, found.maximum, found.step = control.low, control.high, 1
+        found.elems, found.elem_size, found.flags = 1, 4, 0
+
+    def _querymenu(self, found: Any) -> None:
+        if found.index not in (1, 3):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        found.m1.name = {1: b"Manual Mode", 3: b"Aperture Priority Mode"}[found.index]
+
+    def _g_ext_ctrls(self, found: Any) -> None:
+        each = found.controls[0]
+        each.m1.value = self._controls[each.id].value
+
+    def _s_ext_ctrls(self, wanted: Any) -> None:
+        each = wanted.controls[0]
+        auto = self._controls[int(raw.ControlID.EXPOSURE_AUTO)].value
+        if each.id == int(raw.ControlID.EXPOSURE_ABSOLUTE) and auto != 1:
+            raise OSError(errno.EACCES, "Permission denied")
+        self._controls[each.id].value = each.m1.value
+
+    def _reqbufs(self, wanted: Any) -> None:
+        if wanted.count and self.faults.busy:
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        self._buffers = wanted.count = min(wanted.count, 32)
+
+    def _querybuf(self, found: Any) -> None:
+        found.length, found.m.offset = BUFFER, found.index * BUFFER
+
+    def _qbuf(self, given: Any) -> None:
+        # As vb2 does: what the caller has in hand loses what it knew of its frame.
+        given.sequence = given.flags = 0
+        given.timestamp.secs = given.timestamp.usecs = 0
+        self._queued.append(given.index)
+
+    def _dqbuf(self, found: Any) -> None:
+        if not self._done:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        assert self._ours is not None
+        os.eventfd_read(self._ours)
+        index, size, sequence, stamp, flags = self._done.popleft()
+        found.index, found.bytesused, found.sequence, found.flags = index, size, sequence, flags
+        found.timestamp.secs, found.timestamp.usecs = int(stamp), round(stamp % 1.0 * 1e6) % 10**6
+
+    def _streamon(self, _: Any) -> None:
+        self._streaming, self._sequence = True, -1
+
+    def _streamoff(self, _: Any) -> None:
+        self._streaming = False
+        self._queued.clear()
+        self._done.clear()
+
+    def _start_reading(self) -> None:
+        self._stamp = 0
+        self._read_faults()
+
+    def _read_faults(self) -> None:
+        try:
+            stamp = self._file.stat().st_mtime_ns
+            if stamp == self._stamp:
+                return
+            self._stamp = stamp
+            self.faults = msgspec.json.decode(self._file.read_bytes(), type=Faults)
+        except (OSError, msgspec.DecodeError):
+            return
+        if self.faults.unplugged and self._event is not None and self._ours is not None:
+            self._gone.add(self._event)
+            self._streaming = False
+            os.eventfd_write(self._ours, 1)  # poll returns, as for an error
+
+    def _live(self) -> None:
+        due = time.monotonic()
+        while True:
+            due = max(due + 1.0 / self._rate, time.monotonic() - 0.1)
+            time.sleep(max(0.0, due - time.monotonic()))
+            with self._lock:
+                self._read_faults()
+                if self._streaming and not (self.faults.stalled or self.faults.unplugged):
+                    self._expose()
+
+    def _expose(self) -> None:
+        faults = self.faults
+        self._sequence += 1
+        if (faults.skip and self._sequence % faults.skip == 0) or not self._queued:
+            return
+        index, data = self._queued.popleft(), self._picture()
+        if len(data) > BUFFER:
+            raise AssertionError("a picture is larger than its buffer")
+        with mmap.mmap(self._memory, BUFFER, offset=index * BUFFER) as memory:
+            memory[: len(data)] = data
+        exposure = self._controls[int(raw.ControlID.EXPOSURE_ABSOLUTE)].value * TICKS_OF_EXPOSURE
+        begun = time.monotonic() - exposure - 0.005
+        stamp = begun + exposure if faults.end_of_frame else begun
+        flags = 0x2000 | (0 if faults.end_of_frame else 0x10000)
+        if faults.realtime_stamps:
+            stamp, flags = time.time(), 0x10000
+        self._done.append((index, len(data), self._sequence, stamp, flags))
+        assert self._ours is not None
+        os.eventfd_write(self._ours, 1)
+
+    def _picture(self) -> bytes:
+        fourcc, width, height = self._format
+        grey = picture(self._sequence, width, height)
+        if fourcc == "GREY":
+            return b"".join(bytes(line) + bytes(16) for line in grey)
+        if fourcc == "YUYV":
+            lines = np.full((height, 2 * width), 128, np.uint8)
+            lines[:, ::2] = grey
+            return lines.tobytes()
+        if self.faults.garbage:
+            return os.urandom(5000)
+        data: bytes = simplejpeg.encode_jpeg(grey[:, :, np.newaxis], 90, colorspace="GRAY")
+        if self.faults.broken:
+            return data[: len(data) // 2]
+        if self.faults.extraneous:
+            return data[:-2] + bytes(40) + data[-2:]
+        return data
+
+
+def level(number: int) -> int:
+    """Grey level of the left half of a picture."""
+    return 40 + 10 * (number % 18)
+
+
+def picture(number: int, width: int, height: int) -> "np.ndarray[Any, np.dtype[np.uint8]]":
+    """Its left half tells which it is, and its upper right quarter is black."""
+    found = np.full((height, width), 250, np.uint8)
+    found[:, : width // 2] = level(number)
+    found[: height // 2, width // 2 :] = 0
+    return found
+
+
+if __name__ == "__main__":
+    from fishd.camera.main import main
+
+    V4l2Camera(Path(sys.argv.pop(1))).plug_in()
+    main()
