@@ -17,8 +17,8 @@ LEVEL = math.radians(0.5)
 """It is level when its tilt is no more [rad]."""
 _CLEARER = 1.3
 """Motion is upright when it is so much more its own mirror image that way."""
-_EDGE = 0.03
-"""Motion is cut off when its mean along an edge is more than this share of its strongest."""
+_EDGE = 0.1
+"""Motion is cut off when a tenth of an edge shows more than this share of the strongest."""
 
 
 class Place(NamedTuple):
@@ -142,4 +142,4 @@ def _cut_off(energy: Floats) -> list[str]:
         "the left edge": energy[:, :2],
         "the right edge": energy[:, -2:],
     }
-    return [name for name, edge in edges.items() if float(edge.mean()) > limit]
+    return [name for name, edge in edges.items() if float(np.quantile(edge, 0.9)) > limit]

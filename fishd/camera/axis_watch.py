@@ -32,6 +32,10 @@ class AxisWatch:
         self._frames: deque[tuple[float, Pixels]] = deque(maxlen=round(SPAN / APART))
         self._next = now() + AGAIN
 
+    def __len__(self) -> int:
+        """How many frames it would look at."""
+        return len(self._frames)
+
     def add(self, frame: Frame) -> None:
         """Take a frame; another size, or an earlier time, begins anew."""
         if self._frames:

@@ -85,7 +85,7 @@ def _print(found: "Latency", clocks: float, settings: "CameraSettings") -> None:
     error = f"± {found.error * 1e3:.1f} ms"
     echo_rows(
         [
-            ("delay", f"{found.whole * 1e3:.1f} {error}, from an exposure until its frame is there"),
+            ("delay", f"{found.whole * 1e3:.1f} {error}, from exposure until the frame is there"),
             ("time stamps", f"{found.stamps * 1e3:+.1f} {error} late"),
             ("arrival", f"{found.arrival * 1e3:.1f} ms after its time stamp, 99 % within "
              f"{found.latest * 1e3:.1f} ms"),
@@ -114,9 +114,7 @@ def _advice(found: "Latency", settings: "CameraSettings") -> list[str]:
         else:
             key = f"{settings.source}.delay"
             delay = getattr(settings, settings.source).delay + found.stamps
-            lines.append(
-                f"write into the settings of the camera: {key}={delay:.4f}"
-            )
+            lines.append(f"write into the settings of the camera: {key}={delay:.4f}")
     else:
         lines.append("its time stamps are right: nothing to set in the camera")
     lines.append(f"write into those of a training: camera.stack.delay={stack_delay(found):.3f}")

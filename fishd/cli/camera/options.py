@@ -34,9 +34,7 @@ png_option = click.option(
 def check_png(path: Path | None) -> None:
     """Refuse a picture of another kind, before there is anything to draw."""
     if path is not None and path.suffix.lower() != ".png":
-        raise click.UsageError(
-            f"'{path}' is not valid for --png: a name ending in .png is needed"
-        )
+        raise click.UsageError(f"'{path}' is not valid for --png: a name ending in .png is needed")
 
 
 class Watcher:

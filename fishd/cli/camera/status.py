@@ -13,15 +13,24 @@ if TYPE_CHECKING:
     from fishd.camera.messages import CameraState
 
 
+TIMEOUT = 2.0
+"""How long to wait for an answer [s]."""
+
+
 @click.command()
 @camera_option
 @json_option
 def status(address: str | None, as_json: bool) -> None:
     """Show what the camera says of itself: its state and since when, rate, age and losses."""
-    from fishd.camera.client import CameraClient
+    import zmq
 
-    with CameraClient(address) as client:
-        found = client.state
+    from fishd.camera.requests import CameraRequests, find_camera
+
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        found = CameraRequests(address or find_camera(), context, TIMEOUT).status()
+    finally:
+        context.destroy(linger=0)
     if as_json:
         print_json(found)
     else:

@@ -29,12 +29,8 @@ REDRAW = 0.2
 @camera_option
 @png_option
 @click.option("--follow", is_flag=True, help="Go on until Ctrl-C; axis and numbers are renewed.")
-@click.option(
-    "--axis", is_flag=True, help="Look for some seconds first, to find the axis."
-)
-@click.option(
-    "--whole", is_flag=True, help="The camera's whole picture, not what frames show."
-)
+@click.option("--axis", is_flag=True, help="Look for some seconds first, to find the axis.")
+@click.option("--whole", is_flag=True, help="The camera's whole picture, not what frames show.")
 def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole: bool) -> None:
     """Show the camera's picture in the terminal: what frames show, with the axis of motion.
 
@@ -101,9 +97,7 @@ def _find_axis(client: "CameraClient", watch: "AxisWatch") -> None:
     _pass(client, watch, LOOK)
     watch.find()
     if watch.axis is None:
-        raise FishdError(
-            "no axis is found, as nothing moves: let the fish swim, or omit --axis"
-        )
+        raise FishdError("no axis is found, as nothing moves: let the fish swim, or omit --axis")
 
 
 def _take(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:

@@ -110,9 +110,7 @@ def record(
     if black_box and run:
         raise click.UsageError("--black-box names its files itself: leave RUN out")
     if black_box and with_camera:
-        raise click.UsageError(
-            "a black box keeps no frames: they would fill it within hours"
-        )
+        raise click.UsageError("a black box keeps no frames: they would fill it within hours")
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
         box = BlackBox(made(folder or runs_folder()), keep, begin)
