@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fishd.camera.axis import Axis, Floats, Motion, find_axis
+from fishd.camera.axis import Axis, Floats, Motion, find_axis, likeness
 from fishd.camera.settings import CameraSettings, Square
 
 NEAR = 0.5
@@ -98,7 +98,7 @@ def _turn(motion: Motion) -> int:
     """By how many degrees the picture must be turned clockwise for the head to be at the left."""
     energy = motion.energy
     upright = find_axis(np.ascontiguousarray(energy.T))
-    if _likeness(energy.T, upright) > _CLEARER * _likeness(energy, motion.axis):
+    if likeness(energy.T, upright) > _CLEARER * likeness(energy, motion.axis):
         return 270 if _behind(energy.T) else 90
     return 0 if _behind(energy) else 180
 
@@ -110,17 +110,6 @@ def _behind(energy: Floats) -> bool:
     middle = 0.5 * (moving[0] + moving[-1])
     centre = float(strength @ np.arange(len(strength)) / strength.sum())
     return centre >= float(middle)
-
-
-def _likeness(energy: Floats, axis: Axis) -> float:
-    """How much motion is its own mirror image about an axis: 0 to 1."""
-    height, width = energy.shape
-    rows = np.arange(height)[:, None]
-    mirrored = np.rint(2.0 * axis.rows(height, width)[None, :] - rows).astype(int)
-    inside = (mirrored >= 0) & (mirrored < height)
-    columns = np.broadcast_to(np.arange(width), (height, width))
-    image = np.where(inside, energy[np.clip(mirrored, 0, height - 1), columns], 0.0)
-    return float((image * energy).sum() / (energy * energy).sum())
 
 
 def _place(energy: Floats) -> Place:

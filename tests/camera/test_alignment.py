@@ -79,11 +79,15 @@ def test_a_fish_that_lies_otherwise_is_turned_with_its_head_to_the_left(
 def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
     found = judged(pictures()[:, 33:51, :56])
     assert not found.good
-    assert found.advice[0].startswith("the motion is cut off at the upper edge and the lower edge and the right")
+    assert found.advice[0].startswith(
+        "the motion is cut off at the upper edge and the lower edge and the right"
+    )
 
 
 def test_of_a_simulated_camera_its_own_settings_are_named() -> None:
-    settings = CameraSettings(simulated=replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05))
+    settings = CameraSettings(
+        simulated=replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05)
+    )
     found = judged(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
     assert found.settings["simulated.off_axis"] == pytest.approx(0.0, abs=0.3)
     assert found.settings["simulated.tilt"] == pytest.approx(0.0, abs=0.015)

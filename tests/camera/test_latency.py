@@ -21,8 +21,10 @@ def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
 
 @pytest.mark.parametrize("late", [-0.01, 0.0, 0.04])
 @pytest.mark.parametrize(
-    ("camera", "within"), [(DEFAULT, 1.5e-3), (WEB, 1.5e-3), (BAD, 3e-3)], ids=["default", "web", "bad"]
-)  # fmt: skip
+    ("camera", "within"),
+    [(DEFAULT, 1.5e-3), (WEB, 1.5e-3), (BAD, 3e-3)],
+    ids=["default", "web", "bad"],
+)
 def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_are(
     camera: SimulatedCameraSettings, within: float, late: float
 ) -> None:
@@ -65,7 +67,7 @@ def test_frames_of_another_swim_are_refused() -> None:
     pixels = [frame.pixels for frame in frames]
     random.Random(1).shuffle(pixels)
     mixed = [frame._replace(pixels=one) for frame, one in zip(frames, pixels, strict=True)]
-    with pytest.raises(NoDelay, match="agree by .* only: is it the same fish"):
+    with pytest.raises(NoDelay, match=r"agree by .* only: is it the same fish"):
         find_latency(mixed, felt(ticks))
 
 

@@ -3,6 +3,7 @@
 import math
 import os
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,10 +66,11 @@ def align(
     from fishd.camera.client import CameraClient
 
     check_png(png)
-    fish = fish_of(endpoint)
-    if swim and fish is None:
-        raise NoDaemon("no fishd is running, so no fish can be let swim; leave --swim out")
-    with CameraClient(address, fish=fish if swim else None) as client:
+    with ExitStack() as stack:
+        fish = fish_of(endpoint, stack)
+        if swim and fish is None:
+            raise NoDaemon("no fishd is running, so no fish can be let swim; leave --swim out")
+        client = stack.enter_context(CameraClient(address, fish=fish if swim else None))
         settings = client.settings()
         try:
             if swim:

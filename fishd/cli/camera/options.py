@@ -67,14 +67,16 @@ def rig_of(fish: Fish, seconds: float) -> Iterator[LiveRig]:
         yield rig
 
 
-def fish_of(endpoint: str | None) -> Fish | None:
-    """The fishd that runs; None where there is none and none was named."""
+def fish_of(endpoint: str | None, stack: ExitStack) -> Fish | None:
+    """The fishd that runs, until `stack` is closed; None where there is none and none was named."""
+    fish = stack.enter_context(Fish(endpoint))
     try:
-        return Fish(endpoint)
+        fish.status()
     except NoDaemon:
         if endpoint:
             raise
         return None
+    return fish
 
 
 def refuse_lockstep(virtual: bool) -> None:

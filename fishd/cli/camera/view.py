@@ -97,7 +97,7 @@ def _find_axis(client: "CameraClient", watch: "AxisWatch") -> None:
     _pass(client, watch, LOOK)
     watch.find()
     if watch.axis is None:
-        raise FishdError("no axis is found, as nothing moves: let the fish swim, or omit --axis")
+        raise FishdError("no axis is found, as no tail moves: let the fish swim, or omit --axis")
 
 
 def _take(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:

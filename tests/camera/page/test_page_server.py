@@ -138,6 +138,8 @@ def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone(
         server.show(News(FACTS, b"again"))
         while (await news_of(sock))[1] != b"again":
             pass
+        for each in (*socks, sock):
+            await each.close()
 
     run(test)
 
@@ -175,7 +177,7 @@ def test_what_a_page_says_changes_nothing(message: bytes) -> None:
 def test_a_port_that_is_taken_is_one_line() -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
-        with pytest.raises(StartupError, match="cannot serve a page at .*; name another port"):
+        with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another port"):
             async with PageServer("127.0.0.1", port):
                 pass
 
