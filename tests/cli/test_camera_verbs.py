@@ -16,7 +16,16 @@ import pytest
 from playwright.sync_api import expect
 from rigs.browser import needs_browser, opened
 from rigs.camera_process import CameraProcess, running_camera
-from rigs.processes import FISHCTL, PATIENCE, Daemon, Process, fishctl, one_line, running
+from rigs.processes import (
+    FISHCTL,
+    PATIENCE,
+    Daemon,
+    Process,
+    fishctl,
+    one_line,
+    running,
+    wait_until,
+)
 
 from fishd.client import Fish
 
@@ -161,7 +170,10 @@ def test_a_view_is_written_with_the_axis_once_that_is_looked_for(
     assert width_of(tmp_path / "whole.png") >= 84
 
 
-def test_no_axis_is_found_while_the_fish_rests() -> None:
+def test_no_axis_is_found_while_the_fish_rests(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        ticks = fish.ticks()
+        wait_until(lambda: abs(float(next(ticks).alpha)) < 1e-4)  # type: ignore[arg-type]
     complaint = one_line(fishctl("camera", "view", "--axis"))
     assert complaint.startswith("fishctl: no axis is found, as no tail moves: let the fish swim")
 

@@ -28,7 +28,8 @@ def status(address: str | None, as_json: bool) -> None:
 
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
-        found = CameraRequests(address or find_camera(), context, TIMEOUT).status()
+        requests = CameraRequests(address or find_camera(), context, TIMEOUT)
+        found = requests.status()
     finally:
         context.destroy(linger=0)
     if as_json:
