@@ -18,6 +18,7 @@ NAMES = (
     "sweep",
     "identification",
     "estimators",
+    "camera",
 )
 
 if __name__ == "__main__":
