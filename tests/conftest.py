@@ -30,7 +30,7 @@ STOLEN = 0.03
 
 SLOW = re.compile(
     r"subprocess|multiprocessing|asyncio|time\.sleep|SystemClock|running\("
-    r"|operator_rig|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
+    r"|operator_rig|camera_process|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
 )
 """A module of tests that mentions one of these starts processes, waits, or loads torch."""
 

@@ -35,7 +35,7 @@ def open_source(settings: CameraSettings) -> Source:
     return SimulatedSource(settings.simulated, settings.picture.size)
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(NAME, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
     "--config",
     "path",

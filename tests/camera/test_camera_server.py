@@ -16,6 +16,7 @@ from fishd.camera.settings import load
 from fishd.camera.sources.base import Shot, Sink, Source, Timeline
 
 Stopping = Callable[[float], bool]
+pytestmark = pytest.mark.slow
 
 
 class FailsOnce:
@@ -64,7 +65,10 @@ def serving(folder: Path, source: Source) -> Iterator[CameraClient]:
             thread.join(PATIENCE)
 
 
-def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(tmp_path: Path) -> None:
+def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "AGAIN", 3.0)
     with serving(tmp_path, FailsOnce()) as client:
         problem = "a camera cannot be used: ZeroDivisionError: in a library"
         assert client.status().problem == problem

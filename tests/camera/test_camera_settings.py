@@ -1,5 +1,6 @@
 """The settings of `fishd-camera`: what is wrong is said in one line, with its place."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,13 @@ def test_a_wrong_file_is_named_with_its_line(tmp_path: Path) -> None:
 def test_help_and_version_are_quick_and_whole() -> None:
     assert "Publish the frames" in call(*COMMAND, "--help").stdout
     assert call(*COMMAND, "--version").stdout.startswith("fishd-camera, version ")
+
+
+@pytest.mark.parametrize("module", ["cv2", "simplejpeg", "linuxpy"])
+def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: str) -> None:
+    blocked = f"import sys\nsys.modules[{module!r}] = None\n"
+    (tmp_path / "sitecustomize.py").write_text(blocked)
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    said = one_line(call(*COMMAND, "--set", "source=v4l2", env=env))
+    assert module in said
+    assert said.endswith("install the extra: pip install 'fishd[camera]'\n")

@@ -10,7 +10,7 @@ def history_of(*times: float, late: float = 0.0, **settings: float) -> FrameHist
     """Frames of one pixel each, whose level is their number."""
     history = FrameHistory(StackSettings(**settings))
     for number, time in enumerate(times):
-        pixels = np.full((1, 1), number, np.uint8)
+        pixels = np.full((1, 1), number % 256, np.uint8)
         history.add(Frame(time, time + late, pixels))
     return history
 
@@ -59,3 +59,16 @@ def test_nothing_is_shown_before_there_are_enough_frames() -> None:
 def test_a_frame_that_is_not_newer_than_the_others_is_dropped() -> None:
     history = history_of(0.0, 0.1, 0.05, 0.1, 0.2)
     assert shown(history, 0.2) == [4, 1, 1, 0]
+
+
+@pytest.mark.parametrize("rate", [20, 100, 1000])
+def test_a_stack_is_found_however_many_frames_there_are_a_second(rate: int) -> None:
+    history = history_of(*(k / rate for k in range(10 * rate)), delay=0.1, oldest=0.06)
+    expected = [round((9.8 - 0.05 * k) * rate) % 256 for k in range(4)]
+    assert shown(history, 9.9) == expected
+
+
+def test_frames_that_no_tick_can_want_any_more_are_forgotten() -> None:
+    history = history_of(*(k * 1e-3 for k in range(20_000)))
+    assert shown(history, 19.99) is not None
+    assert shown(history, 15.0) is None

@@ -1,5 +1,10 @@
 """A video file as a camera, through OpenCV."""
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 from pathlib import Path
 
@@ -60,6 +65,31 @@ def test_a_file_that_is_no_video_is_said(tmp_path: Path, content: bytes) -> None
     file.write_bytes(content)
     with running_camera(tmp_path, "source=stream", f"stream.url={file}") as camera:
         assert camera.is_in("unusable").problem == f"{file}: it is no video"
+
+
+@contextmanager
+def serving(folder: Path, port: int = 0) -> Iterator[int]:
+    """The files of a folder, over HTTP; gives the port."""
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        try:
+            yield server.server_port
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_network_camera_that_goes_and_comes_back_is_followed(tmp_path: Path, video: Path) -> None:
+    with serving(video.parent) as port:
+        url = f"http://127.0.0.1:{port}/{video.name}"
+        with running_camera(tmp_path, "source=stream", f"stream.url={url}") as camera:
+            first = camera.until(lambda state: state.seq > 3)
+            assert "times are those of arrival" in first.degraded[0]
+            state = camera.is_in("stalled")
+            assert "it is opened anew" in state.problem
+            camera.until(lambda state: state.session != first.session)
 
 
 def test_a_network_camera_that_is_not_there_is_looked_for_and_its_password_kept(

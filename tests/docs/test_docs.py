@@ -10,6 +10,7 @@ import pytest
 import yaml
 from rigs.documents import DOCS, FENCE, ROOT, code_of, first_cells, prose_of, text_of
 
+from fishd.camera.main import camera
 from fishd.cli.doctor import checks
 from fishd.cli.doctor.base import Context
 from fishd.cli.main import fishctl
@@ -102,7 +103,7 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
 
 
 @each_document
-@pytest.mark.parametrize("program", [fishctl, fishd], ids=["fishctl", "fishd"])
+@pytest.mark.parametrize("program", [fishctl, fishd, camera], ids=lambda each: each.name)
 def test_each_verb_and_option_of_a_command_exists(document: Path, program: click.Command) -> None:
     lines = command_lines(document, program.name or "")
     problems = [found for words in lines if (found := complaint(program, words))]

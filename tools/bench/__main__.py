@@ -13,6 +13,7 @@ NAMES = (
     "policy",
     "remote",
     "learning",
+    "pictures",
     "chatter",
     "measurement",
     "sweep",

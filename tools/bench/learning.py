@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from bench.learning_curves import learning_curves
 from bench.policy import policy_file
-from bench.trainings import Trained, rig, settings_of, several
+from bench.trainings import Row, Trained, rig, settings_of, several
 from common.report import DOCS, Options, Report, progress, spread, table
 from fishd.config import Config
 from fishd.controllers import registry
@@ -49,16 +49,16 @@ def efficiency(options: Namespace) -> str:
     plain = settings_of(None, MILESTONES[-1])
     blind = replace(plain, ppo=replace(plain.ppo, symmetric=False))
     rows = {
-        "Φ = 0.42 rad": (rig(), plain),
-        "Φ = 0.42 rad, without the mirror": (rig(), blind),
-        "Φ = 0.42 rad, as in the paper": (
+        "Φ = 0.42 rad": Row(rig(), plain),
+        "Φ = 0.42 rad, without the mirror": Row(rig(), blind),
+        "Φ = 0.42 rad, as in the paper": Row(
             rig(),
             settings_of("learning-paper.yaml", MILESTONES[-1]),
         ),
-        "Φ = 0.2 rad": (rig(0.2), plain),
-        "Φ = 0.8 rad": (rig(0.8), plain),
+        "Φ = 0.2 rad": Row(rig(0.2), plain),
+        "Φ = 0.8 rad": Row(rig(0.8), plain),
     }
-    found = several(rows, options.seeds, options.jobs)
+    found = several(rows, range(options.seeds), options.jobs)
     picture = {
         row: [([p.steps for p in one.points], [p.efficiency for p in one.points]) for one in runs]
         for row, runs in found.items()
@@ -70,7 +70,7 @@ def efficiency(options: Namespace) -> str:
     for row, runs in found.items():
         learned.append([row, *curve_of(runs, lambda one, k: one.points[k].efficiency)])
         best.append([row, *curve_of(runs, lambda one, k: one.best[k])])
-        config = rows[row][0]
+        config = rows[row].config
         grid = best_on_grid(config)
         limit = grid.thrust / best_square_wave(config.plant, config.amplitude_limit).thrust
         ends = [one.points[-1] for one in runs]
@@ -111,10 +111,10 @@ def transfer(options: Namespace) -> str:
     """Policies of randomised and of plain trainings, on fish that they have never met."""
     several_fish = settings_of("learning-transfer.yaml")
     rows = {
-        "`learning-transfer.yaml`, best": (rig(), several_fish),
-        "default settings, best": (rig(), settings_of(None, 8000)),
+        "`learning-transfer.yaml`, best": Row(rig(), several_fish),
+        "default settings, best": Row(rig(), settings_of(None, 8000)),
     }
-    found = several(rows, options.seeds, options.jobs, others=True)
+    found = several(rows, range(options.seeds), options.jobs, others=True)
     lines = []
     for row, runs in found.items():
         for label, off in (

@@ -1,7 +1,10 @@
 """Trainings for `learning`: many at a time, and what their policies do on other fish."""
 
 import itertools
+import math
 import tempfile
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +12,7 @@ import joblib
 from msgspec.structs import replace
 
 from common.report import DOCS, progress
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config, load
 from fishd.learning import settings as training
 from fishd.learning.env.evaluation import Evaluation, judge
@@ -24,6 +28,15 @@ OFF = 0.15
 """By this share each of four parameters of a fish is off, up or down."""
 
 
+class Row(NamedTuple):
+    """What is trained with several seeds."""
+
+    config: Config
+    settings: TrainingSettings
+    camera: SimulatedCameraSettings = SimulatedCameraSettings()
+    """What the fish is seen with, where the settings ask for pictures."""
+
+
 class Trained(NamedTuple):
     """One training."""
 
@@ -34,6 +47,18 @@ class Trained(NamedTuple):
     """Efficiencies of its best policy on fish that are off, if those were asked for."""
     others_last: list[float]
     """The same of its last policy."""
+    cost: float
+    """Seconds of the processor for 1000 steps, evaluations included."""
+
+    def steps_to(self, efficiency: float) -> float:
+        """After which an evaluation found that efficiency for the first time; inf if none did."""
+        reached = zip(self.points, self.best, strict=True)
+        return next((point.steps for point, best in reached if best >= efficiency), math.inf)
+
+    @property
+    def exported(self) -> Evaluation:
+        """The evaluation of its best policy."""
+        return max(self.points, key=lambda point: point.efficiency)
 
 
 def rig(amplitude: float = 0.42) -> Config:
@@ -48,22 +73,27 @@ def settings_of(name: str | None, steps: int | None = None) -> TrainingSettings:
     return replace(chosen, steps=steps or chosen.steps)
 
 
-def trained(config: Config, settings: TrainingSettings, seed: int, others: bool) -> Trained:
+def trained(row: Row, seed: int, others: bool) -> Trained:
     """Train once; in a process of its own."""
-    fish = replace(config, simulation=replace(config.simulation, seed=seed))
+    fish = replace(row.config, simulation=replace(row.config.simulation, seed=seed))
     with tempfile.TemporaryDirectory() as temporary:
         job = Job(
-            config=fish, settings=replace(settings, seed=seed), folder=Path(temporary) / "run"
+            config=fish,
+            settings=replace(row.settings, seed=seed),
+            folder=Path(temporary) / "run",
+            camera=replace(row.camera, seed=seed),
         )
+        begun = time.process_time()
         outcome = train(job)
+        cost = 1000.0 * (time.process_time() - begun) / outcome.steps
         points = read_evaluations(job.folder)
         so_far = best_so_far(points)
         if not others:
-            return Trained(points, so_far, [], [])
+            return Trained(points, so_far, [], [], cost)
         assert outcome.best
         assert outcome.checkpoint
-        best, last = (swum(path, config) for path in (outcome.best, outcome.checkpoint))
-        return Trained(points, so_far, best, last)
+        best, last = (swum(path, row.config) for path in (outcome.best, outcome.checkpoint))
+        return Trained(points, so_far, best, last, cost)
 
 
 def swum(checkpoint: Path, config: Config) -> list[float]:
@@ -83,13 +113,13 @@ def swum(checkpoint: Path, config: Config) -> list[float]:
 
 
 def several(
-    rows: dict[str, tuple[Config, TrainingSettings]], seeds: int, jobs: int, others: bool = False
+    rows: Mapping[str, Row], seeds: Sequence[int], jobs: int, others: bool = False
 ) -> dict[str, list[Trained]]:
     """All seeds of all rows, in parallel."""
-    tasks = [(row, seed) for row in rows for seed in range(seeds)]
+    tasks = [(row, seed) for row in rows for seed in seeds]
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator")
-        work = parallel(joblib.delayed(trained)(*rows[row], seed, others) for row, seed in tasks)
+        work = parallel(joblib.delayed(trained)(rows[row], seed, others) for row, seed in tasks)
         found: dict[str, list[Trained]] = {row: [] for row in rows}
         for (row, seed), result in zip(tasks, work, strict=True):
             found[row].append(result)

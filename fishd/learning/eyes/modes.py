@@ -46,15 +46,14 @@ class ModesEye(Eye):
         commands = np.linalg.qr(lags - lags.mean(axis=0))[0]
         explained = commands.T @ odd
         patterns = np.linalg.svd(explained, full_matrices=False)[2][: self._modes]
-        scale = (odd @ patterns.T).std(axis=0)
-        patterns = patterns / scale[:, None]
+        patterns /= (odd @ patterns[0]).std()
         self.constants = {
             "patterns": patterns.astype(np.float32),
             "zero": (patterns @ mean.ravel()).astype(np.float32),
         }
 
     def glimpse(self, frame: Pixels) -> Array:
-        """Amplitude over its deviation in the babble, of each pattern."""
+        """Amplitude of each pattern, over the deviation of the strongest in the babble."""
         patterns = self.constants["patterns"]
         found: Array = patterns @ lit(frame).ravel() - self.constants["zero"]
         return found

@@ -1,0 +1,98 @@
+"""`fishctl learn ppo --see camera` with a true fishd, and a true fishd-camera above its fish."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from rigs.camera_process import CameraProcess, running_camera
+from rigs.processes import Daemon, fishctl, running, sets
+from rigs.swimming import rows, while_it_trains
+
+if find_spec("torch") is None:
+    pytest.skip("learning needs torch", allow_module_level=True)
+
+BRIEF = """
+see: camera
+steps: 320
+camera: {babble: 128}
+ppo: {n_steps: 64}
+evaluation: {every: 0}
+"""
+
+
+class Rig(NamedTuple):
+    daemon: Daemon
+    camera: CameraProcess
+    words: tuple[str, ...]
+    """Of a training on it."""
+    folder: Path
+
+
+@contextmanager
+def rig_of(folder: Path, *settings: str) -> Iterator[Rig]:
+    file = folder / "brief.yaml"
+    file.write_text(BRIEF, encoding="utf-8")
+    run = folder / "run"
+    with running(folder, *sets(*settings)) as daemon:
+        fishd = f"simulated.fishd={daemon.endpoint}"
+        with running_camera(folder, fishd) as camera:
+            on = ("--on", "robot", "--endpoint", daemon.endpoint, "--camera", camera.endpoint)
+            words = ("learn", "ppo", *on, "--settings", str(file), "--folder", str(run))
+            yield Rig(daemon, camera, words, run)
+
+
+@pytest.fixture
+def lockstep(tmp_path: Path) -> Iterator[Rig]:
+    agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
+    with rig_of(tmp_path, "lockstep=true", "start.controller=remote", agent) as rig:
+        yield rig
+
+
+def test_it_learns_from_the_frames_of_each_tick_in_lockstep(lockstep: Rig) -> None:
+    done = fishctl(*lockstep.words)
+    assert done.returncode == 0, done.stderr
+    assert "from pictures with the eye modes" in done.stdout
+    table = rows(lockstep.folder / "progress.csv")
+    assert [row["steps"] for row in table] == ["192", "256", "320"]
+    assert {row["lost"] for row in table} == {"0"}
+
+
+def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(tmp_path: Path) -> None:
+    with rig_of(tmp_path, "tick=0.05", "start.controller=hold") as rig:
+        begun = rig.folder / "progress.csv"
+        done = while_it_trains(
+            lambda: begun.exists() and rows(begun),
+            lambda: rig.camera.process.send_signal(signal.SIGKILL),
+            *rig.words,
+            "--steps",
+            "100000",
+        )
+        assert done.returncode == 1
+        assert f"camera at {rig.camera.endpoint}" in done.stderr
+        assert "; to go on: fishctl learn ppo --resume" in done.stderr
+        assert rig.daemon.status().mode == "idle"
+
+
+def test_without_a_camera_nothing_begins(tmp_path: Path) -> None:
+    with rig_of(tmp_path) as rig:
+        rig.camera.process.kill()
+        rig.camera.process.wait()
+        done = fishctl(*rig.words)
+        assert done.returncode == 1
+        assert "start one with 'fishd-camera'" in done.stderr
+        assert not rig.folder.exists()
+
+
+def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
+    with rig_of(tmp_path) as rig:
+        file = tmp_path / "brief.yaml"
+        file.write_text(f"{BRIEF}\n", encoding="utf-8")
+        text = BRIEF.replace("babble: 128", "babble: 128, stack: {size: 42}")
+        file.write_text(text, encoding="utf-8")
+        done = fishctl(*rig.words)
+        assert done.returncode == 1
+        assert "shows 84 x 84 pixels, and camera.stack.size is 42: make them equal" in done.stderr

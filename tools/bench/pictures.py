@@ -1,0 +1,177 @@
+"""What learning from pictures comes to: steps until it swims, for each eye; its optimum; speed.
+
+Trainings are those of `fishctl learn ppo --see camera`, in a temporary folder, with seeds that no
+setting was chosen with. Efficiency is thrust over that of the best square wave of the same fish.
+
+    steps     control steps until 97 %, babble included; draws docs/camera-learning.png
+    optimum   what was learned at four amplitudes, from pictures and from forces
+    speed     the environment with pictures, on one core
+"""
+
+import math
+import statistics
+import time
+from argparse import Namespace
+
+import joblib
+import numpy as np
+from msgspec.structs import replace
+
+from bench.learning_curves import learning_curves
+from bench.trainings import Row, Trained, rig, settings_of, several
+from common.report import DOCS, Options, Report, progress, table
+from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.config import Config
+from fishd.lab.compare.contestants import best_on_grid
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.eyes.making import make
+from fishd.learning.settings import TrainingSettings
+from fishd.virtual.plant.optimum import best_square_wave
+
+DOCUMENT = "camera.md"
+FIGURE = DOCS / "camera-learning.png"
+ENOUGH = 0.97
+UNUSED = 200
+"""The first seed; none from here on was used to choose a setting."""
+LONGEST = 4096
+"""Control steps of a training."""
+AMPLITUDES = (0.2, 0.31, 0.42, 0.8)
+"""[rad]"""
+
+MODES = replace(settings_of(None, LONGEST), see="camera")
+CNN = settings_of("learning-cnn.yaml", LONGEST)
+PAPER = settings_of("learning-camera-paper.yaml", 15_360)
+FORCE = settings_of(None, LONGEST)
+
+
+def steps(options: Namespace) -> str:
+    """Control steps until 97 %, for each eye, and the curves."""
+    blind = replace(CNN, ppo=replace(CNN.ppo, symmetric=False))
+    rows = {
+        "`modes`, rig default": Row(rig(), MODES),
+        "`modes`, rig web": Row(rig(), MODES, WEB),
+        "`cnn`, rig default": Row(rig(), CNN),
+        "`cnn`, rig web": Row(rig(), CNN, WEB),
+        "`cnn`, default, without the mirror": Row(rig(), blind),
+        "force": Row(rig(), FORCE),
+    }
+    found = several(rows, range(UNUSED, UNUSED + options.seeds), options.jobs)
+    few = range(UNUSED, UNUSED + max(1, round(0.3 * options.seeds)))
+    paper = {"as in the paper": Row(rig(), PAPER)}
+    found |= several(paper, few, options.jobs)
+    if options.write:
+        shown = ("`modes`, rig default", "`cnn`, rig default", "as in the paper", "force")
+        learning_curves(
+            FIGURE, {name.replace("`", ""): curves(found[name]) for name in shown}, ENOUGH
+        )
+    lines = [[name, *summary(runs)] for name, runs in found.items()]
+    heads = (
+        "what it sees with | steps to 97 %, median | lowest – highest | seeds that reach it | "
+        "best at the end (%) | processor (s for 1000 steps)"
+    )
+    return table(heads, lines)
+
+
+def curves(runs: list[Trained]) -> list[tuple[list[int], list[float]]]:
+    """Steps and best efficiency so far, of each seed."""
+    return [([point.steps for point in one.points], one.best) for one in runs]
+
+
+def summary(runs: list[Trained]) -> list[str]:
+    """The cells of a row."""
+    reached = sorted(one.steps_to(ENOUGH) for one in runs)
+    ends = sorted(100.0 * one.best[-1] for one in runs)
+    return [
+        number(statistics.median_low(reached)),
+        f"{number(reached[0])} – {number(reached[-1])}",
+        f"{sum(math.isfinite(one) for one in reached)} of {len(reached)}",
+        f"{statistics.median(ends):.1f} [{ends[0]:.1f} – {ends[-1]:.1f}]",
+        f"{statistics.median(one.cost for one in runs):.1f}",
+    ]
+
+
+def number(steps: float) -> str:
+    """Steps, or that there was no such step."""
+    return f"{steps:.0f}" if math.isfinite(steps) else "never"
+
+
+def optimum(options: Namespace) -> str:
+    """Frequency and thrust of the best policies, from forces and from pictures."""
+    longer = 8064
+    kinds = {
+        "force": replace(FORCE, steps=longer),
+        "`modes`": replace(MODES, steps=longer),
+        "`cnn`": replace(CNN, steps=longer),
+    }
+    rows = {
+        f"{amplitude} {name}": Row(rig(amplitude), settings)
+        for amplitude in AMPLITUDES
+        for name, settings in kinds.items()
+    }
+    seeds = range(UNUSED, UNUSED + max(1, options.seeds // 2))
+    found = several(rows, seeds, options.jobs)
+    lines = []
+    for amplitude in AMPLITUDES:
+        config = rig(amplitude)
+        grid, best = best_on_grid(config), best_square_wave(config.plant, amplitude)
+        cells = [f"{amplitude}", f"{grid.frequency:.2f} / {100.0 * grid.thrust / best.thrust:.1f}"]
+        for name in kinds:
+            ends = [one.exported for one in found[f"{amplitude} {name}"]]
+            frequency = statistics.median(end.frequency for end in ends)
+            share = statistics.median(100.0 * end.efficiency for end in ends)
+            low, high = (pick(end.frequency for end in ends) for pick in (min, max))
+            cells.append(f"{frequency:.2f} [{low:.2f} – {high:.2f}] / {share:.1f}")
+        lines.append(cells)
+    heads = " | ".join(("Φ (rad)", "best on the grid of ticks", *kinds))
+    return (
+        f"Frequency (Hz), median [lowest – highest] of {len(seeds)} seeds, and efficiency (%), of "
+        f"the best policy of {longer} steps:\n\n{table(heads, lines)}"
+    )
+
+
+def speed(options: Namespace) -> str:
+    """Steps of the environment with pictures, per second, on one core."""
+    config = rig()
+    lines = []
+    for name, camera in (("default", DEFAULT), ("web", WEB)):
+        for settings in (MODES, CNN):
+            lines.append([settings.camera.eye, name, f"{rate(settings, camera, config):.0f}"])
+    return table("eye | rig | steps/s, best of five", lines)
+
+
+def rate(settings: TrainingSettings, camera: SimulatedCameraSettings, config: Config) -> float:
+    """Steps a second."""
+    eye = make(settings)
+    assert eye
+    link = SimulatedLink(config, camera=Camera(camera, settings.camera.stack))
+    env = SwimEnv(link, config, settings.seen, eye)
+    env.reset(seed=0)
+    env.babble(0, settings.camera.babble)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 1)).astype(np.float32)
+    rates = []
+    for _ in range(5):
+        begun = time.process_time()
+        for action in actions:
+            if env.step(action)[3]:
+                env.reset()
+        rates.append(len(actions) / (time.process_time() - begun))
+    return max(rates)
+
+
+PARTS = {"steps": steps, "optimum": optimum, "speed": speed}
+OPTIONS: Options = {
+    "part": {"choices": (*PARTS, "all")},
+    "--seeds": {"type": int, "default": 10, "help": "trainings of each row; default 10"},
+    "--jobs": {"type": int, "default": joblib.cpu_count(), "help": "processes"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """The parts that are asked for."""
+    sections = {}
+    for part in PARTS if options.part == "all" else (options.part,):
+        begun = time.perf_counter()
+        sections[f"bench pictures {part}"] = PARTS[part](options)
+        progress(part, f"{time.perf_counter() - begun:.0f} s")
+    return Report(sections, sections)
