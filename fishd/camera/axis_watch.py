@@ -1,5 +1,6 @@
 """Follows the axis of motion while frames come: known once the tail has moved for a while."""
 
+import random
 import time
 from collections import deque
 from collections.abc import Callable
@@ -11,8 +12,9 @@ from fishd.camera.frames import Frame, Pixels
 
 SPAN = 20.0
 """It is found in the frames of so long [s]."""
-APART = 0.045
-"""Frames nearer to one another are left out [s]."""
+APART = (0.02, 0.08)
+"""The time from one frame to the next that is kept is at least a random one between these [s]: at
+even distances, a beat would be seen in the same few phases again and again."""
 AGAIN = 3.0
 """It is looked for so often at most, as that takes a tenth of a second [s]."""
 _NONE = np.zeros((1, 1), np.uint8)
@@ -29,7 +31,9 @@ class AxisWatch:
         self.moving = False
         """Did anything move when it was looked for last?"""
         self._now = now
-        self._frames: deque[tuple[float, Pixels]] = deque(maxlen=round(SPAN / APART))
+        self._frames: deque[tuple[float, Pixels]] = deque(maxlen=round(SPAN / APART[0]))
+        self._random = random.Random(0)
+        self._apart = 0.0
         self._next = now() + AGAIN
 
     def __len__(self) -> int:
@@ -43,8 +47,9 @@ class AxisWatch:
             if pixels.shape != frame.pixels.shape or frame.time < before:
                 self._frames.clear()
                 self.axis, self.moving = None, False
-            elif frame.time - before < APART:
+            elif frame.time - before < self._apart:
                 return
+            self._apart = self._random.uniform(*APART)
         self._frames.append((frame.time, frame.pixels))
         while frame.time - self._frames[0][0] > SPAN:
             self._frames.popleft()

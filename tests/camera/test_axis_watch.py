@@ -7,7 +7,7 @@ from rigs.filmed_swim import filmed, swum
 
 from fishd.camera.axis_watch import AGAIN, FEWEST, AxisWatch
 from fishd.camera.frames import Frame
-from fishd.camera.simulated.settings import DEFAULT
+from fishd.camera.simulated.settings import DEFAULT, WEB
 
 CAMERA = replace(DEFAULT, off_axis=3.0, tilt=0.05)
 
@@ -48,6 +48,18 @@ def test_it_is_found_once_the_tail_has_moved_for_some_seconds_and_kept_while_it_
     assert watch.axis.offset == pytest.approx(found.offset, abs=0.1)
 
 
+@pytest.mark.parametrize("rate", [30.0, 60.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rate_that_goes_with_the_beat_does_no_harm(rate: float, seed: int) -> None:
+    clock = Clock()
+    watch = AxisWatch(clock)
+    camera = replace(WEB, off_axis=3.0, tilt=0.05, rate=rate, seed=seed)
+    shown(watch, clock, filmed(swum(20.0, controller="swing"), camera))
+    assert watch.axis
+    assert watch.axis.offset == pytest.approx(3.0, abs=0.15)
+    assert watch.axis.tilt == pytest.approx(0.05, abs=0.006)
+
+
 def test_few_frames_are_not_looked_at() -> None:
     clock = Clock()
     watch = AxisWatch(clock)
@@ -55,7 +67,7 @@ def test_few_frames_are_not_looked_at() -> None:
     assert shown(watch, clock, swims) == 0
 
 
-def test_a_fast_camera_is_looked_at_20_times_a_second() -> None:
+def test_of_a_fast_camera_some_20_frames_a_second_are_kept() -> None:
     clock = Clock()
     watch = AxisWatch(clock)
     frames = [Frame(0.001 * k, 0.001 * k, np.zeros((16, 16), np.uint8)) for k in range(1000)]

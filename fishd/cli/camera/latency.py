@@ -117,7 +117,8 @@ def _advice(found: "Latency", settings: "CameraSettings") -> list[str]:
             lines.append(f"write into the settings of the camera: {key}={delay:.4f}")
     else:
         lines.append("its time stamps are right: nothing to set in the camera")
-    lines.append(f"write into those of a training: camera.stack.delay={stack_delay(found):.3f}")
+    spaced = f"camera.stack.delay={stack_delay(found):.3f}"
+    lines.append(f"for frames of even distance, write into the settings of a training: {spaced}")
     return lines
 
 

@@ -12,11 +12,11 @@ from fishd.client import Fish
 from fishd.core.errors import FishdError, NoDaemon
 from fishd.core.interruption import interrupted_once
 from fishd.core.signals import Event, Tick
-from fishd.lab.rig import LiveRig
 
 if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
     from fishd.camera.frames import Frame
+    from fishd.lab.rig import LiveRig
 
 camera_option = click.option(
     "--camera",
@@ -58,8 +58,10 @@ class Watcher:
 
 
 @contextmanager
-def rig_of(fish: Fish, seconds: float) -> Iterator[LiveRig]:
+def rig_of(fish: Fish, seconds: float) -> Iterator["LiveRig"]:
     """The fish of a running fishd, at rest again afterwards; says that it swims."""
+    from fishd.lab.rig import LiveRig
+
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())
         rig = stack.enter_context(LiveRig(fish))
