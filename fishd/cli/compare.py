@@ -68,6 +68,19 @@ class _Outcome(NamedTuple):
 )
 @fish_options
 @endpoint_option
+@click.option(
+    "--camera",
+    metavar="FILE|ENDPOINT",
+    help="For policies that see pictures: in simulation, the YAML file of a simulated camera, such "
+    "as config/camera-web.yaml; on a robot, where its fishd-camera takes requests. [default: a "
+    "good simulated one; $FISHD_CAMERA, else that of this machine]",
+)
+@click.option(
+    "--agent",
+    metavar="ADDRESS",
+    help="For policies that see pictures, on a robot elsewhere: where its fishd reaches this "
+    "program. [default: any free port of this machine]",
+)
 @json_option
 @click.option(
     "--plot",
@@ -85,6 +98,8 @@ def compare(
     file: Path | None,
     overrides: tuple[str, ...],
     endpoint: str | None,
+    camera: str | None,
+    agent: str | None,
     as_json: bool,
     picture: Path | None,
 ) -> int:
@@ -96,26 +111,28 @@ def compare(
 
     In simulation thrust is the true one, and efficiency that over the thrust of the best square
     wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
-    rest, and shows what was measured. ± is the 95 % interval of the mean thrust of all runs, from
-    how they differ and, on a robot, from the error of each measurement. |φ_c|/Φ is the mean size
-    of the command, square its mean size over its rms: square wave 1, sine 0.900, triangle 0.866.
+    rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
+    simulated camera, on a robot by a running fishd-camera. ± is the 95 % interval of the mean
+    thrust of all runs, from how they differ and, on a robot, from the error of each measurement.
+    |φ_c|/Φ is the mean size of the command, square its mean size over its rms: square wave 1, sine
+    0.900, triangle 0.866.
     Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
     in mode fault; the others swim all the same.
     """
     of_simulation = {
         "--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides,
     }  # fmt: skip
-    refuse_other(on, of_simulation, {"--for": live_seconds})
+    refuse_other(on, of_simulation, {"--for": live_seconds, "--agent": agent})
     if picture:
         from fishd.lab import drawing
 
         drawing.check(picture)
     if on == "robot":
         length = SECONDS if live_seconds is None else live_seconds
-        outcome = _on_robot(contestants, length, runs, endpoint)
+        outcome = _on_robot(contestants, length, runs, endpoint, camera, agent)
     else:
         lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
-        outcome = _in_simulation(contestants, file, overrides, *lengths, runs)
+        outcome = _in_simulation(contestants, file, overrides, *lengths, runs, camera)
     status = _report(outcome, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
@@ -131,31 +148,43 @@ def _in_simulation(
     seconds: float,
     settle: float,
     runs: int,
+    camera: str | None,
 ) -> _Outcome:
+    from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import parse, refusal
 
-    config = load(file, overrides)
+    config, seen = load(file, overrides), cameras.load(camera).simulated
     chosen = [parse(text) for text in texts] or _all(config)
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
     able = [one for one in chosen if one not in (out for out, _ in left_out)]
     swum = able or chosen
     with showing(len(swum) * runs * seconds, "s swum") as bar:
-        found = comparison.compare(config, swum, seconds, settle, runs, bar.at)
+        found = comparison.compare(config, swum, seconds, settle, runs, bar.at, seen)
     return _Outcome(*found, left_out, config.amplitude_limit)
 
 
-def _on_robot(texts: tuple[str, ...], seconds: float, runs: int, endpoint: str | None) -> _Outcome:
+def _on_robot(
+    texts: tuple[str, ...],
+    seconds: float,
+    runs: int,
+    endpoint: str | None,
+    camera: str | None,
+    agent: str | None,
+) -> _Outcome:
     from fishd.lab.compare.contestants import absolute, parse
     from fishd.lab.compare.live import LiveComparison
-    from fishd.lab.rig import LiveRig
+    from fishd.lab.compare.piloted_rig import PilotedRig
 
     ended, status = "", 0
     chosen = [absolute(parse(text)) for text in texts]
     with interrupted_once(), Fish(endpoint) as fish:  # whatever ends it leaves the fish at rest
         chosen = chosen or _all(adopt(fish.config()))
         unit = fish.status().force_unit
-        with LiveRig(fish) as rig, showing(len(chosen) * runs * seconds, "s") as bar:
+        with (
+            PilotedRig(fish, camera, agent) as rig,
+            showing(len(chosen) * runs * seconds, "s") as bar,
+        ):
             live = LiveComparison(rig, chosen)
             try:
                 live.swim(seconds, runs, bar.at)

@@ -81,6 +81,13 @@ def complete_contestant(
     return _matching([*names, *library.names()], incomplete, files=True)
 
 
+def complete_policy(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Named policies, and files."""
+    from fishd.controllers.policy import library
+
+    return _matching(library.names(), incomplete, files=True)
+
+
 def complete_value(field: Field, incomplete: str) -> list[CompletionItem]:
     """Values of a parameter: choices, named policies, files; nothing for numbers."""
     if field.kind == "choice":

@@ -26,6 +26,7 @@ VERBS = {
             "release", "release", "Last resort without the daemon: neutral, then no pulses."
         ),
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
+        "agent": Verb("agent", "agent", "Let a policy swim a fish from outside, as with pictures."),
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
     "Experiment": {

@@ -15,7 +15,10 @@ from fishd.core.errors import PolicyError
 from fishd.core.protocol import PolicyInfo
 from fishd.core.schema import names_file
 
-HEAD = ("name", "Φ [rad]", "tick", "trained in", "steps", "efficiency", "created", "folder")
+HEAD = (
+    *("name", "sees", "Φ [rad]", "tick", "trained in", "steps", "efficiency", "created"),
+    "folder",
+)
 WIDEST = 40
 """Longer cells are cut, but for the last."""
 
@@ -24,8 +27,10 @@ WIDEST = 40
 @daemon_options
 @click.pass_context
 def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
-    """List the policies that have a name, for 'fishctl set-controller ppo --policy NAME'.
+    """List the policies that have a name.
 
+    One that sees forces swims with 'fishctl set-controller ppo --policy NAME', one that sees
+    pictures with 'fishctl agent NAME'.
     Efficiency is the thrust over that of the best square wave, as last evaluated in the training.
     """
     if ctx.invoked_subcommand:
@@ -90,6 +95,7 @@ def _row(info: PolicyInfo) -> tuple[str, ...]:
     efficiency = past["efficiency"]
     cells = (
         info.name,
+        info.sees or "–",
         f"{card['amplitude']:g}",
         f"{card['tick'] * 1e3:g} ms",
         past["on"],

@@ -92,6 +92,8 @@ class PolicyInfo(Struct, frozen=True, kw_only=True):
     """Why it cannot be used, in one line; empty where it can."""
     card: dict[str, Any] | None
     """What the file says about itself, as JSON; None where it is not a policy file."""
+    sees: str = ""
+    """What it is shown of the fish: `forces`, `pictures` or `forces, pictures`."""
 
 
 class NoArguments(Struct, frozen=True, forbid_unknown_fields=True):

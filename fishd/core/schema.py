@@ -335,17 +335,22 @@ def _field_at(target: type[Struct], path: tuple[str, ...]) -> inspect.Field:
 
 def _struct_at(target: type[Struct], path: tuple[str, ...]) -> type[Struct]:
     for key in path:
-        target = next(part for name, part in _sections(target, in_lists=True) if name == key)
+        target = next(part for name, part in _sections(target, everywhere=True) if name == key)
     return target
 
 
 def _sections(
-    target: type[Struct], *, in_lists: bool = False
+    target: type[Struct], *, everywhere: bool = False
 ) -> Iterator[tuple[str, type[Struct]]]:
-    """The fields of a struct that are structs themselves, or lists of them where wanted."""
+    """The fields of a struct that are structs themselves.
+
+    everywhere: also those that may be null, and lists of structs
+    """
     for field in _info(target).fields:
         kind = field.type.type if isinstance(field.type, inspect.Metadata) else field.type
-        if in_lists and isinstance(kind, inspect.VarTupleType):
+        if everywhere:
+            kind = _unwrapped(kind)[0]
+        if everywhere and isinstance(kind, inspect.VarTupleType):
             kind = kind.item_type
         if isinstance(kind, inspect.StructType):
             yield field.name, kind.cls

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import torch
 from msgspec import Struct
 from msgspec.structs import replace
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -11,16 +12,21 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from fishd.camera.frames import Stack
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers.policy.card import Card
-from fishd.controllers.policy.file import PolicyFile
-from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.file import FRAMES, INPUT, PolicyFile
+from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation, in_simulation
 from fishd.learning.env.perception import Perception
+from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.eyes.making import babble
+from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
@@ -29,7 +35,11 @@ from fishd.virtual.plant.parameters import PlantParameters
 
 TOLERANCE = 1e-5
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ."""
+TOLERANCE_OF_PICTURES = 1e-4
+"""The same where thousands of pixels are summed, which each library does in an order of its own."""
 _PROBES = 1000
+_STACKS = 100
+"""Of noise, and of a tail."""
 
 
 class Exported(Struct, frozen=True):
@@ -52,6 +62,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would give other
     outputs than the policy.
     """
+    torch.set_num_threads(1)  # for single pictures, more only get in each other's way
     card = checkpoints.read_card(checkpoint)
     policy, perception = checkpoints.load_policy(checkpoint)
     found = _evaluated(checkpoint, card, policy, perception)
@@ -62,7 +73,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
             "another checkpoint, or export it all the same with --force"
         )
     card = _completed(card, found, note)
-    size = _write(target, card, policy)
+    size = _write(target, card, policy, perception)
     return Exported(target, checkpoint, card, found, size)
 
 
@@ -83,6 +94,11 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
             f"{path}: the environment of this model, {type(vec_env).__name__}, is not a SwimEnv "
             "alone, so the inputs of the network are not known"
         )
+    if env.eye:
+        raise PolicyError(
+            f"{path}: a model that sees pictures is not exported from Python; train it with "
+            "'fishctl learn ppo --see camera'"
+        )
     if not isinstance(policy, ActorCriticPolicy) or not isinstance(
         policy.features_extractor, FlattenExtractor
     ):
@@ -97,14 +113,16 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     )
     card = replace(card, provenance=past)
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
-    _write(path, _completed(card, in_simulation(env.config, decide, EvaluationSettings())), policy)
+    found = in_simulation(env.config, decide, EvaluationSettings())
+    _write(path, _completed(card, found), policy, env.perception)
     return path
 
 
-def _write(target: Path, card: Card, policy: ActorCriticPolicy) -> int:
+def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perception) -> int:
     """Write the file atomically; its size [bytes]. Raises `PolicyError`."""
-    content = to_onnx(layers_of(policy), activation_of(policy), card)
-    _verify(PolicyFile(target, content, card), policy)
+    sight = _sight(policy, perception)
+    content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
+    _verify(PolicyFile(target, content, card), policy, perception)
     if not target.name or (target.exists() and not target.is_file()):
         raise PolicyError(f"{target}: exists already, and is not a regular file")
     try:
@@ -113,6 +131,42 @@ def _write(target: Path, card: Card, policy: ActorCriticPolicy) -> int:
     except OSError as error:
         raise PolicyError(f"{target}: cannot be written: {error.strerror}") from None
     return len(content)
+
+
+def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
+    """How frames become what the first layer is given; None where no frames are seen."""
+    from onnx import TensorProto, helper
+
+    eye = perception.eye
+    if eye is None:
+        return None
+    nodes = [helper.make_node("Cast", [FRAMES], ["grey"], to=TensorProto.FLOAT)]
+    more, constants = eye.nodes("grey", "eye")
+    nodes += more
+    parts, width = ["eye"], eye.outputs
+    others = [INPUT] if perception.features else []
+    extractor = policy.features_extractor
+    mirrored = isinstance(extractor, PictureExtractor) and extractor.mirrored
+    if isinstance(extractor, PictureExtractor):
+        parts, picture = ["features"], "eye"
+        width = extractor.single - len(perception.features)
+        if mirrored:
+            ends = {"begin": [-1], "end": [np.iinfo(np.int64).min], "rows": [2], "back": [-1]}
+            constants |= {f"flip_{name}": np.array(value) for name, value in ends.items()}
+            nodes.append(
+                helper.make_node("Slice", ["eye", *(f"flip_{name}" for name in ends)], ["mirror"])
+            )
+            nodes.append(helper.make_node("Concat", ["eye", "mirror"], ["pair"], axis=0))
+            picture = "pair"
+        more, weights = network_nodes(extractor.network, picture, "features")
+        nodes += more
+        constants |= weights
+    if others and mirrored:
+        nodes.append(helper.make_node("Neg", [INPUT], ["negated"]))
+        nodes.append(helper.make_node("Concat", [INPUT, "negated"], ["numbers"], axis=0))
+        others = ["numbers"]
+    nodes.append(helper.make_node("Concat", [*parts, *others], ["given"], axis=1))
+    return Sight(nodes, constants, "given", width + len(perception.features), mirrored)
 
 
 def _evaluated(
@@ -130,7 +184,19 @@ def _evaluated(
     config = replace(config, tick=card.tick, amplitude_limit=card.amplitude, plant=plant)
     decide = DeterministicPolicy(policy, perception, card.amplitude)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
-    return in_simulation(config, decide, settings.evaluation)
+    camera = _camera(checkpoint.parent, card)
+    return in_simulation(config, decide, settings.evaluation, camera)
+
+
+def _camera(run: Path, card: Card) -> Camera | None:
+    """That of a run, where it has one, else a good one; None for a policy that sees no pictures."""
+    if card.pictures is None:
+        return None
+    try:
+        seen = runs.read_camera(run)
+    except FishdError:
+        seen = SimulatedCameraSettings()
+    return Camera(seen, card.pictures)
 
 
 def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
@@ -144,18 +210,41 @@ def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
     return replace(card, provenance=past)
 
 
-def _verify(file: PolicyFile, policy: ActorCriticPolicy) -> None:
+def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception) -> None:
     """Compare the file, run as on the robot, with the policy; raises `PolicyError`."""
     network = Network(file)
-    shape = (_PROBES, len(file.card.observation))
-    probes = np.random.default_rng(0).normal(0.0, 1.5, shape).astype(np.float32)
-    wanted, _ = policy.predict(probes, deterministic=True)
+    random = np.random.default_rng(0)
+    stacks = _stacks(file.card)
+    number = len(stacks) or _PROBES
+    rows = random.normal(0.0, 1.5, (number, len(file.card.observation))).astype(np.float32)
     worst = 0.0
-    for probe, action in zip(probes, wanted, strict=True):
-        network.row[:] = probe
-        worst = max(worst, abs(network.run() - float(action[0])))
-    if not worst <= TOLERANCE:
+    for index, row in enumerate(rows):
+        network.row[:] = row
+        seen = row
+        if perception.eye:
+            network.frames[:] = stacks[index]
+            seen = np.concatenate((perception.eye.see(stacks[index]), row))
+        wanted, _ = policy.predict(seen, deterministic=True)
+        worst = max(worst, abs(network.run() - float(wanted[0])))
+    if not worst <= (TOLERANCE_OF_PICTURES if perception.eye else TOLERANCE):
         raise PolicyError(
             f"with this onnxruntime, the outputs of the file differ from those of the policy, by "
             f"up to {worst:.2g} of Φ; install another version of it"
         )
+
+
+def _stacks(card: Card) -> list[Stack]:
+    """Stacks of noise, and of a simulated fish that moves at random; none without pictures."""
+    if card.pictures is None:
+        return []
+    random = np.random.default_rng(1)
+    noise = random.integers(0, 256, (_STACKS, *card.pictures.shape), np.uint8)
+    found = [tuple(stack) for stack in noise]
+    config = replace(Config(), tick=card.tick, amplitude_limit=card.amplitude)
+    link = SimulatedLink(config, camera=Camera(SimulatedCameraSettings(), card.pictures))
+    link.reset()
+    for angle in babble(0, _STACKS, card.amplitude).tolist():
+        link.step(angle)
+        if (stack := link.look()) is not None:
+            found.append(stack)
+    return found

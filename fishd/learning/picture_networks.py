@@ -6,9 +6,12 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor, NatureCNN
 from torch import nn
+
+from fishd.learning.eyes.base import Nodes
 
 PictureKind = Literal["cnn", "nature"]
 Shape = tuple[int, int, int]
@@ -18,7 +21,8 @@ SMALL = 64
 LARGE = 512
 """What that of the paper does."""
 
-_HALF = math.sqrt(0.5)
+HALF = math.sqrt(0.5)
+"""Gives an untrained network's output the same spread as without symmetry."""
 
 
 def small_network(shape: Shape) -> nn.Sequential:
@@ -44,6 +48,38 @@ def nature_network(shape: Shape) -> nn.Sequential:
     return nn.Sequential(*whole.cnn, *whole.linear)
 
 
+def network_nodes(network: nn.Sequential, picture: str, out: str) -> Nodes:
+    """A network of convolutions and layers as operators of ONNX.
+
+    picture: name of what it looks at, shape (batch, channels, height, width)
+    out: name of what it gives, shape (batch, width)
+    """
+    from onnx import helper
+
+    nodes: list[Any] = []
+    constants: dict[str, NDArray[Any]] = {}
+    value = picture
+    for number, part in enumerate(network):
+        after = out if number == len(network) - 1 else f"seen_{number}"
+        given = [value]
+        if isinstance(part, nn.Conv2d | nn.Linear):
+            for name, tensor in (("weight", part.weight), ("bias", part.bias)):
+                assert tensor is not None
+                given.append(f"seeing_{name}_{number}")
+                constants[given[-1]] = tensor.detach().numpy().astype(np.float32)
+        if isinstance(part, nn.Conv2d):
+            node = helper.make_node("Conv", given, [after], strides=list(part.stride))
+        elif isinstance(part, nn.Linear):
+            node = helper.make_node("Gemm", given, [after], transB=1)
+        else:
+            node = helper.make_node(
+                "Relu" if isinstance(part, nn.ReLU) else "Flatten", given, [after]
+            )
+        nodes.append(node)
+        value = after
+    return nodes, constants
+
+
 class PictureExtractor(BaseFeaturesExtractor):
     """A picture, compressed, and the numbers beside it.
 
@@ -63,14 +99,14 @@ class PictureExtractor(BaseFeaturesExtractor):
         self.single = compressed + others
         """How many numbers it gives for one picture."""
         super().__init__(observation_space, self.single * (2 if mirrored else 1))
-        self._shape, self._mirrored = shape, mirrored
+        self._shape, self.mirrored = shape, mirrored
         self.network = small_network(shape) if kind == "cnn" else nature_network(shape)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (batch, features_dim)."""
         picture = observations[:, : self._levels].reshape(-1, *self._shape)
         others = observations[:, self._levels :]
-        if not self._mirrored:
+        if not self.mirrored:
             return torch.cat((self.network(picture), others), dim=1)
         both = self.network(torch.cat((picture, picture.flip(2))))
         seen, mirrored = both.chunk(2)
@@ -83,7 +119,7 @@ class PairExtractor(MlpExtractor):
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """f(x) − f(mirrored x), over √2."""
         seen, mirrored = self.policy_net(_stacked(features)).chunk(2)
-        odd: torch.Tensor = _HALF * (seen - mirrored)
+        odd: torch.Tensor = HALF * (seen - mirrored)
         return odd
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,5 @@
 """PPO of stable-baselines3 as fishd trains it, and its policy as plain layers."""
 
-import math
 from collections.abc import Generator
 from typing import Any, Literal, cast
 
@@ -21,11 +20,8 @@ from fishd.core.signals import Observation
 from fishd.learning.env.environment import spaces
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
-from fishd.learning.picture_networks import PictureExtractor, SymmetricPicturePolicy
+from fishd.learning.picture_networks import HALF, PictureExtractor, SymmetricPicturePolicy
 from fishd.learning.settings import PpoSettings, TrainingSettings
-
-_HALF = math.sqrt(0.5)
-"""Gives an untrained network's output the same spread as without symmetry."""
 
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Weights, shape (outputs, inputs), and biases of each layer."""
@@ -37,7 +33,7 @@ class SymmetricExtractor(MlpExtractor):
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """f(x) − f(−x), over √2."""
         odd: torch.Tensor = self.policy_net(features) - self.policy_net(-features)
-        return _HALF * odd
+        return HALF * odd
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
         """The mean of f(x) and f(−x)."""
@@ -77,7 +73,7 @@ def plain_layers(layers: Layers) -> Layers:
     for weight, bias in inner:
         zero = np.zeros_like(weight)
         doubled.append((np.block([[weight, zero], [zero, weight]]), np.tile(bias, 2)))
-    return [*doubled, (np.float32(_HALF) * np.hstack((last, -last)), last_bias)]
+    return [*doubled, (np.float32(HALF) * np.hstack((last, -last)), last_bias)]
 
 
 _ACTIVATIONS: dict[Literal["tanh", "relu"], type[torch.nn.Module]] = {
@@ -178,7 +174,11 @@ def learning_rate(ppo: PpoSettings, steps: int) -> float:
 
 
 def layers_of(policy: ActorCriticPolicy) -> Layers:
-    """The deterministic policy, from its inputs to the mean of the action."""
+    """The deterministic policy, from its inputs to the mean of the action.
+
+    From a picture's features, where it looks at one; of a `SymmetricPicturePolicy` the last layer
+    is given what the layers before make of the fish, and behind it what of its mirror image.
+    """
     hidden = [part for part in policy.mlp_extractor.policy_net if isinstance(part, Linear)]
     last = cast(Linear, policy.action_net)
     layers = [
@@ -188,6 +188,9 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
         )
         for linear in (*hidden, last)
     ]
+    if isinstance(policy, SymmetricPicturePolicy):
+        *inner, (weight, bias) = layers
+        return [*inner, (np.float32(HALF) * np.hstack((weight, -weight)), bias)]
     return plain_layers(layers) if isinstance(policy, SymmetricPolicy) else layers
 
 

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from fishd.camera.frames import StackSettings
-from fishd.controllers.policy.card import FeatureName
+from fishd.controllers.policy.card import COMMANDS, FeatureName
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
@@ -170,12 +170,8 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """What the environment shows beside pictures: with `see: camera`, no forces."""
         names = self.environment.observation
         if self.see == "camera":
-            names = tuple(name for name in names if name in _COMMANDS)
+            names = tuple(name for name in names if name in COMMANDS)
         return replace(self.environment, observation=names)
-
-
-_COMMANDS = ("instruction_angle", "previous_angle")
-"""What the agent knows without any sensor."""
 
 
 def load(path: str | os.PathLike[str] | None) -> TrainingSettings:

@@ -41,14 +41,16 @@ def test_without_a_daemon_the_policies_of_this_machine_are_listed(nobody: Path) 
     assert "fishctl: no fishd is running; these policies are found from here" in done.stderr
     head, *rows = done.stdout.splitlines()
     assert head.split() == [
-        "name", "Φ", "[rad]", "tick", "trained", "in", "steps", "efficiency", "created", "folder"
-    ]  # fmt: skip
+        *("name", "sees", "Φ", "[rad]", "tick", "trained", "in", "steps", "efficiency", "created"),
+        "folder",
+    ]
     assert rows[0].split() == [
-        "flip", "0.42", "50", "ms", "simulation", "8000", "98.7%", "2026-11-21", str(nobody)
-    ]  # fmt: skip
-    assert rows[1].split() == ["torch", *["–"] * 6, str(nobody)]
+        *("flip", "forces", "0.42", "50", "ms", "simulation", "8000", "98.7%", "2026-11-21"),
+        str(nobody),
+    ]
+    assert rows[1].split() == ["torch", *["–"] * 7, str(nobody)]
     assert rows[2].startswith("    not here: this is a zip archive as torch writes")
-    assert rows[3].startswith("wide   0.8")
+    assert rows[3].startswith("wide   forces  0.8")
     assert len(rows) == 4
 
 

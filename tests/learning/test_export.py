@@ -98,7 +98,7 @@ def test_a_file_that_would_say_something_else_is_never_put_in_place(
 
     whole = exporting.to_onnx
     monkeypatch.setattr(  # relu where the policy was trained with tanh
-        exporting, "to_onnx", lambda layers, activation, card: whole(layers, "relu", card)
+        exporting, "to_onnx", lambda layers, _, card, sight: whole(layers, "relu", card, sight)
     )
     assert trained.best
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):

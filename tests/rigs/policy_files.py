@@ -11,9 +11,17 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from fishd.controllers.policy import file
-from fishd.controllers.policy.card import KEY, Card, Feature, FeatureName, Provenance, encode
+from fishd.controllers.policy.card import (
+    KEY,
+    Card,
+    Feature,
+    FeatureName,
+    Provenance,
+    StackSettings,
+    encode,
+)
 from fishd.controllers.policy.checksum import sealed
-from fishd.controllers.policy.network import Layer, to_onnx
+from fishd.controllers.policy.network import Layer, Sight, to_onnx
 from fishd.core.errors import PolicyError
 
 PROVENANCE = Provenance(
@@ -63,6 +71,54 @@ def answer(layers: Sequence[Layer], activation: str, inputs: NDArray[Any]) -> fl
         if number < len(layers) - 1:
             value = np.tanh(value) if activation == "tanh" else np.maximum(value, 0.0)
     return float(np.clip(value.item(), -1.0, 1.0))
+
+
+def seeing_card(
+    *features: tuple[FeatureName, float], pictures: StackSettings | None = None, tick: float = 0.05
+) -> Card:
+    """By default it sees two frames of 32 x 32 pixels, and nothing else."""
+    return Card(
+        observation=tuple(Feature(*f) for f in features),
+        pictures=pictures or StackSettings(size=32, frames=2, delay=0.02),
+        tick=tick,
+        amplitude=0.42,
+        provenance=PROVENANCE,
+    )
+
+
+def of_pixels(weights: NDArray[Any], about: Card, *others: float) -> bytes:
+    """A policy that is a weighted sum of all grey levels, and of its other numbers behind them.
+
+    weights: shape (frames, size, size)
+    """
+    pixels = weights.size
+    nodes = [
+        helper.make_node("Cast", [file.FRAMES], ["grey"], to=TensorProto.FLOAT),
+        helper.make_node("Reshape", ["grey", "row"], ["pixels"]),
+    ]
+    out = "pixels"
+    if about.observation:
+        nodes.append(helper.make_node("Concat", ["pixels", file.INPUT], ["all"], axis=1))
+        out = "all"
+    layer = np.array([[*weights.ravel(), *others]]), np.zeros(1)
+    sight = Sight(nodes, {"row": np.array([1, pixels])}, out, pixels + len(others))
+    return to_onnx([layer], "tanh", about, sight)
+
+
+def velocity_follower(gain: float = 4.0, about: Card | None = None) -> bytes:
+    """A policy that sees where the tail goes, and sends it further: it swims.
+
+    The tail is dark, so the upper half of a frame becomes lighter as the tail goes to higher rows.
+
+    gain: Φ for each grey level by which the halves differ more than in the frame before
+    """
+    found = about or seeing_card()
+    assert found.pictures
+    size = found.pictures.size
+    halves = np.where(np.arange(size) < size / 2, 1.0, -1.0)[:, None] * np.full(size, 2.0 / size**2)
+    weights = np.zeros(found.pictures.shape)
+    weights[:2] = gain * halves, -gain * halves
+    return of_pixels(weights, found)
 
 
 FLIP = to_onnx(linear(-100.0, bias=1.0), "tanh", card())

@@ -8,6 +8,7 @@ VERBS = {
     "Verbs": {
         "ppo": Verb("learn.ppo", "ppo", "Train a policy, in simulation or on the robot."),
         "export": Verb("learn.export", "export", "Write a trained policy to one .onnx file."),
+        "look": Verb("learn.look", "look", "Show what a policy that sees pictures looks at."),
     }
 }
 

@@ -42,4 +42,7 @@ def export(run: Path, target: Path | None, newest: bool, force: bool, note: str)
     else:
         click.echo(f"it swims with {summary(found.evaluation)}")
     path = shlex.quote(str(found.path))
-    click.echo(f"to let it swim: fishctl set-controller ppo --policy {path}")
+    if found.card.pictures:
+        click.echo(f"it sees {found.card.sees}; to let it swim: fishctl agent {path}")
+    else:
+        click.echo(f"to let it swim: fishctl set-controller ppo --policy {path}")

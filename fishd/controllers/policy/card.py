@@ -1,7 +1,7 @@
 """The card of a policy file, and how an observation becomes the network's input.
 
 The card travels inside the ONNX file, so that a network is never run without its normalisation, at
-another tick or for another amplitude than it was trained for.
+another tick, for another amplitude or on other pictures than it was trained for.
 """
 
 from operator import attrgetter
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from fishd.core.errors import PolicyError
 from fishd.core.files import SETTINGS
-from fishd.core.schema import Problem, convert, nested_too_deeply, spelled
+from fishd.core.schema import Problem, convert, nested_too_deeply, note, spelled, unit
 from fishd.core.signals import Observation
 
 KEY = "fishd.card"
 """Key of the card in the metadata of an ONNX file."""
 
-FORMAT = 2
+FORMAT = 3
 """Version of the card; a file with another one is refused."""
 
 LONGEST = SETTINGS
@@ -31,6 +31,9 @@ SAME_TICK = 1e-9
 
 FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle"]
 """Fields of `Observation` that a policy may see."""
+
+COMMANDS = ("instruction_angle", "previous_angle")
+"""Those that are known without any sensor."""
 
 _TOO_DEEP = "its card is JSON that is nested too deeply"
 
@@ -44,6 +47,32 @@ class Feature(Struct, frozen=True, forbid_unknown_fields=True):
     name: FeatureName
     scale: Positive
     """The value that the network sees as 1, in the unit of the observation's field."""
+
+
+class StackSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which frames a policy is shown in a tick; part of a policy that sees."""
+
+    size: Annotated[int, unit("px", "Height and width of a frame.", ge=16, le=256)] = 84
+    frames: Annotated[int, note("Frames in the stack, newest first.", ge=1, le=8)] = 4
+    interval: Annotated[float, unit("s", "Time between two of them.", ge=1e-3, le=1)] = 0.05
+    delay: Annotated[
+        float,
+        unit(
+            "s",
+            "The stack ends so long before the tick: as a camera delivers its frames late, frames "
+            "of even distance are then to be had.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
+    oldest: Annotated[
+        float, unit("s", "A frame may be so much older than it should be.", ge=1e-3, le=2)
+    ] = 0.15
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of a stack: frames, height, width."""
+        return self.frames, self.size, self.size
 
 
 class Layout:
@@ -99,12 +128,22 @@ class Card(Struct, frozen=True, kw_only=True):
 
     format: int = FORMAT
     observation: tuple[Feature, ...]
-    """The inputs of the network, in order."""
+    """The numbers that the network is given, in order."""
+    pictures: StackSettings | None = None
+    """The frames that it is given; None where it sees none."""
     tick: Positive
     """Period of the loop that it was trained in [s]."""
     amplitude: Positive
     """Φ: an output of ±1 is an instruction angle of ±Φ [rad]."""
     provenance: Provenance
+
+    @property
+    def sees(self) -> str:
+        """What it is shown of the fish, in a word or two; the command is no sight of it."""
+        forces = any(feature.name not in COMMANDS for feature in self.observation)
+        if self.pictures is None:
+            return "forces"
+        return "forces, pictures" if forces else "pictures"
 
     def check_fit(self, tick: float, amplitude: float) -> None:
         """Raises `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad]."""
@@ -150,6 +189,6 @@ def decode(text: str) -> Card:
         card = convert(data, Card)
     except Problem as problem:
         raise PolicyError(f"its card: {'.'.join(problem.path)}: {problem}") from None
-    if not card.observation:
-        raise PolicyError("its card names no observation")
+    if not card.observation and card.pictures is None:
+        raise PolicyError("its card names neither an observation nor pictures")
     return card

@@ -100,23 +100,16 @@ class Ppo(Controller[PpoParameters]):
 
 
 def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
-    from fishd.controllers.policy import file
+    from fishd.controllers.policy import opening
     from fishd.controllers.policy.runtime import Network
 
     try:
-        path = library.find(parameters.policy)
-        policy = file.read(path)
-        try:
-            policy.card.check_fit(limits.tick, limits.amplitude)
-            if limits.scaled and any(
-                seen.name == "fin_velocity" for seen in policy.card.observation
-            ):
-                raise PolicyError(
-                    "it was trained to see fin_velocity as estimator.kind: lateral_force gives it, "
-                    "and fishd runs with observer"
-                )
-        except PolicyError as error:
-            raise PolicyError(f"{path}: {error}") from None
+        policy = opening.read(parameters.policy, limits)
+        if policy.card.pictures:
+            raise PolicyError(
+                f"{policy.path}: it sees pictures, which this loop does not have; let it swim with "
+                f"'fishctl agent {parameters.policy}', or in simulation with 'fishctl compare'"
+            )
         return policy.card, Network(policy)
     except PolicyError as error:
         raise ParameterError(f"policy: {error}", ("policy",)) from None

@@ -20,7 +20,7 @@ from fishd.core.text import named, quoted
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
 
-INPUT, OUTPUT = "observation", "action"
+INPUT, FRAMES, OUTPUT = "observation", "frames", "action"
 LARGEST = 16 * 2**20
 """Longer files are not read: a policy has some ten thousand weights [bytes]."""
 MISSING = (
@@ -68,7 +68,7 @@ def _checked(content: bytes, model: "ModelProto") -> Card:
         checksum.check(content, model)
     card = decode(text)
     checksum.check(content, model)
-    _check_ends(model.graph, len(card.observation))
+    _check_ends(model.graph, card)
     _check_numbers(model.graph)
     operators.check(model)
     return card
@@ -121,21 +121,41 @@ def _card(model: "ModelProto") -> str:
     return str(cards[0])
 
 
-def _check_ends(graph: "GraphProto", features: int) -> None:
+def _check_ends(graph: "GraphProto", card: Card) -> None:
     given = {tensor.name for tensor in graph.initializer}
     inputs = [value for value in graph.input if value.name not in given]
-    wanted = f"one float32 {{}} of shape [1, {{}}] named '{{}}' is needed; {EXPORT}"
-    for what, found, name, width in (
-        ("inputs", inputs, INPUT, features),
-        ("outputs", list(graph.output), OUTPUT, 1),
-    ):
-        if [_form(value) for value in found] != [(name, "float32", (1, width))]:
-            shown = ", ".join(_spelled(value) for value in found) or "none"
-            raise PolicyError(f"its {what}: {shown}; {wanted.format(what[:-1], width, name)}")
+    _check_values("inputs", inputs, inputs_of(card))
+    _check_values("outputs", list(graph.output), [(OUTPUT, "float32", (1, 1))])
 
 
-def _form(value: "ValueInfoProto") -> tuple[str, str, tuple[int | str, ...]]:
-    """Name, type and dimensions; a dimension that is left open is its name, or `?`."""
+_Form = tuple[str, str, tuple[int | str, ...]]
+"""Name, type and dimensions; a dimension that is left open is its name, or `?`."""
+
+
+def inputs_of(card: Card) -> list[_Form]:
+    """What the network of a policy is given: frames where it sees any, then its other numbers."""
+    found: list[_Form] = []
+    if card.pictures:
+        found.append((FRAMES, "uint8", (1, *card.pictures.shape)))
+    if card.observation:
+        found.append((INPUT, "float32", (1, len(card.observation))))
+    return found
+
+
+def _check_values(what: str, found: "list[ValueInfoProto]", wanted: list[_Form]) -> None:
+    forms = [_form(value) for value in found]
+    if len(forms) == len(wanted) and set(forms) == set(wanted):
+        return
+    shown = ", ".join(map(_spelled, forms)) or "none"
+    needed = " and ".join(
+        f"one {kind} {what[:-1]} of shape [{', '.join(map(str, dims))}] named '{name}'"
+        for name, kind, dims in wanted
+    )
+    verb = "is" if len(wanted) == 1 else "are"
+    raise PolicyError(f"its {what}: {shown}; {needed} {verb} needed; {EXPORT}")
+
+
+def _form(value: "ValueInfoProto") -> _Form:
     from onnx import TensorProto
 
     tensor = value.type.tensor_type
@@ -150,8 +170,8 @@ def _form(value: "ValueInfoProto") -> tuple[str, str, tuple[int | str, ...]]:
     return value.name, "float32" if kind == "float" else kind, dims
 
 
-def _spelled(value: "ValueInfoProto") -> str:
-    name, kind, dims = _form(value)
+def _spelled(form: _Form) -> str:
+    name, kind, dims = form
     return f"{kind} of shape [{quoted(', '.join(map(str, dims)))}] named '{quoted(name)}'"
 
 

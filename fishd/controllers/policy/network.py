@@ -1,7 +1,7 @@
-"""Writes a policy file: a network of plain layers and its card, as one ONNX model."""
+"""Writes a policy file: a network and its card, as one ONNX model."""
 
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,43 +20,50 @@ OPSET, IR_VERSION = 13, 7
 _OPERATORS = {"tanh": "Tanh", "relu": "Relu"}
 
 
-def to_onnx(layers: Sequence[Layer], activation: Literal["tanh", "relu"], card: Card) -> bytes:
+class Sight(NamedTuple):
+    """How the inputs of a policy that sees become what its first layer is given."""
+
+    nodes: Sequence[Any]
+    """Operators, from `frames` and `observation` to `out`."""
+    constants: Mapping[str, NDArray[Any]]
+    out: str
+    width: int
+    """`out` is float32 of shape (1, width); with its mirror image, (2, width)."""
+    mirrored: bool = False
+    """The mirror image is beside it; the last layer is given what came of both, side by side."""
+
+
+def to_onnx(
+    layers: Sequence[Layer],
+    activation: Literal["tanh", "relu"],
+    card: Card,
+    sight: Sight | None = None,
+) -> bytes:
     """The file: layers with the activation between them, and the last output clipped to [-1, 1].
 
-    Input `observation` (float32, 1 × features), output `action` (float32, 1 × 1). Raises
-    `PolicyError` where the layers do not fit one another or the card, or are not finite.
+    Inputs `frames` (uint8, 1 × frames × size × size; where the card has pictures) and `observation`
+    (float32, 1 × features; where it has any), output `action` (float32, 1 × 1).
+
+    sight: needed for a card with pictures
+
+    Raises `PolicyError` where the layers do not fit one another or the card, or are not finite.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    if not layers:
-        raise PolicyError("a policy needs at least one layer")
-    nodes, weights, value, width = [], [], file.INPUT, len(card.observation)
-    for number, (weight, bias) in enumerate(layers):
-        if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
-            raise PolicyError(
-                f"layer {number}: weights {weight.shape} and biases {bias.shape} do not fit "
-                f"{width} inputs"
-            )
-        width = weight.shape[0]
-        names = [f"weight_{number}", f"bias_{number}"]
-        for name, array in zip(names, (weight, bias), strict=True):
-            weights.append(numpy_helper.from_array(array.astype(np.float32), name))
-        linear, active = f"linear_{number}", f"active_{number}"
-        nodes.append(helper.make_node("Gemm", [value, *names], [linear], transB=1))
-        nodes.append(helper.make_node(_OPERATORS[activation], [linear], [active]))
-        value = active
-    nodes[-1] = helper.make_node(
-        "Clip", [f"linear_{len(layers) - 1}", "low", "high"], [file.OUTPUT]
-    )
-    for name, bound in (("low", -1.0), ("high", 1.0)):
-        weights.append(numpy_helper.from_array(np.array(bound, np.float32), name))
+    kinds = {"uint8": TensorProto.UINT8, "float32": TensorProto.FLOAT}
+    sight = sight or Sight([], {}, file.INPUT, len(card.observation))
+    nodes, constants = list(sight.nodes), dict(sight.constants)
+    width = _add_layers(nodes, constants, layers, activation, sight)
     graph = helper.make_graph(
         nodes,
         "policy",
-        [helper.make_tensor_value_info(file.INPUT, TensorProto.FLOAT, [1, len(card.observation)])],
+        [
+            helper.make_tensor_value_info(name, kinds[kind], dims)
+            for name, kind, dims in file.inputs_of(card)
+        ],
         [helper.make_tensor_value_info(file.OUTPUT, TensorProto.FLOAT, [1, width])],
-        weights,
+        [numpy_helper.from_array(array, name) for name, array in constants.items()],
     )
     model = helper.make_model(
         graph,
@@ -68,5 +75,46 @@ def to_onnx(layers: Sequence[Layer], activation: Literal["tanh", "relu"], card: 
     helper.set_model_props(model, {KEY: encode(card)})
     onnx.checker.check_model(model)
     content = sealed(model)
+    if len(content) > file.LARGEST:
+        raise PolicyError(
+            f"this policy takes {len(content) / 2**20:.0f} MB, and {file.LARGEST // 2**20} are the "
+            "most; train one on smaller frames"
+        )
     file.parse(content)
     return content
+
+
+def _add_layers(
+    nodes: list[Any],
+    constants: dict[str, NDArray[Any]],
+    layers: Sequence[Layer],
+    activation: Literal["tanh", "relu"],
+    sight: Sight,
+) -> int:
+    """Add operators and constants of the layers; how many numbers the last one gives."""
+    from onnx import helper
+
+    if not layers:
+        raise PolicyError("a policy needs at least one layer")
+    value, width, last = sight.out, sight.width, len(layers) - 1
+    for number, (weight, bias) in enumerate(layers):
+        if number == last and sight.mirrored:
+            constants["beside"] = np.array([1, 2 * width])
+            nodes.append(helper.make_node("Reshape", [value, "beside"], ["both"]))
+            value, width = "both", 2 * width
+        if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
+            raise PolicyError(
+                f"layer {number}: weights {weight.shape} and biases {bias.shape} do not fit "
+                f"{width} inputs"
+            )
+        width = weight.shape[0]
+        names = [f"weight_{number}", f"bias_{number}"]
+        for name, array in zip(names, (weight, bias), strict=True):
+            constants[name] = array.astype(np.float32)
+        linear, active = f"linear_{number}", f"active_{number}"
+        nodes.append(helper.make_node("Gemm", [value, *names], [linear], transB=1))
+        nodes.append(helper.make_node(_OPERATORS[activation], [linear], [active]))
+        value = active
+    nodes[-1] = helper.make_node("Clip", [f"linear_{last}", "low", "high"], [file.OUTPUT])
+    constants |= {"low": np.array(-1.0, np.float32), "high": np.array(1.0, np.float32)}
+    return width

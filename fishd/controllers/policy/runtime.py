@@ -4,12 +4,13 @@ import contextlib
 import math
 import os
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.controllers.policy.file import INPUT, MISSING, OUTPUT, PolicyFile
+from fishd.controllers.policy.file import FRAMES, INPUT, MISSING, OUTPUT, PolicyFile
 from fishd.core.errors import PolicyError
 from fishd.core.text import named
 
@@ -45,54 +46,63 @@ def preload() -> None:
 
 
 class Network:
-    """The network, ready to run: write to `row`, `run`, read `output`."""
+    """The network, ready to run: write to `frames` and `row`, `run`, read what it gives."""
 
     def __init__(self, policy: PolicyFile) -> None:
         """Loads and warms it up; raises `PolicyError` where it does not run."""
-        self.row: NDArray[np.float32]
-        """The input, shape (features,)."""
-        inputs = np.zeros((1, len(policy.card.observation)), np.float32)
-        self.row = inputs[0]
+        card = policy.card
+        pictures = card.pictures.shape if card.pictures else (0, 0, 0)
+        frames = np.zeros((1, *pictures), np.uint8)
+        inputs = np.zeros((1, len(card.observation)), np.float32)
+        self.frames: NDArray[np.uint8] = frames[0]
+        """The pictures, shape (frames, size, size), newest first; of none where it sees none."""
+        self.row: NDArray[np.float32] = inputs[0]
+        """The other numbers, shape (features,)."""
         self._output = np.zeros((1, 1), np.float32)
         try:
             self._session = _session(policy.content)
-            self._binding = self._bound(inputs)
-            self._try(policy.card.tick)
+            self._binding = self._bound({FRAMES: frames, INPUT: inputs})
+            self._try(card.tick)
         except PolicyError as error:
             raise PolicyError(f"{policy.path}: {error}") from None
         except Exception as error:  # onnxruntime has a class of its own for each kind of error
             raise PolicyError(f"{policy.path}: onnxruntime cannot run it: {named(error)}") from None
 
     def run(self) -> float:
-        """The output for what is in `row`."""
+        """The output for what is in `frames` and `row`."""
         self._session.run_with_iobinding(self._binding)
         return float(self._output[0, 0])
 
-    def _bound(self, inputs: NDArray[np.float32]) -> Any:
-        """Input and output in fixed places, which takes half the time of an ordinary run."""
+    def _bound(self, inputs: Mapping[str, NDArray[Any]]) -> Any:
+        """Inputs and output in fixed places, which takes half the time of an ordinary run."""
         value = load().OrtValue.ortvalue_from_numpy
         binding = self._session.io_binding()
-        binding.bind_ortvalue_input(INPUT, value(inputs))
+        for name, array in inputs.items():
+            if array.size:
+                binding.bind_ortvalue_input(name, value(array))
         binding.bind_ortvalue_output(OUTPUT, value(self._output))
         return binding
 
     def _try(self, tick: float) -> None:
         """Raise `PolicyError` where an output is not finite, or all of several runs are too slow.
 
-        Inputs of every size are tried. The time is the processor's in this thread, so a busy
-        machine refuses nothing; tick: [s]
+        Inputs of every size are tried, and pictures of every contrast. The time is the processor's
+        in this thread, so a busy machine refuses nothing; tick: [s]
         """
-        probes = np.random.default_rng(0).normal(size=(_PROBES, len(self.row)))
+        random = np.random.default_rng(0)
+        probes = random.normal(size=(_PROBES, len(self.row)))
         sizes = np.geomspace(1e-3, _LARGEST_PROBE, _PROBES)
         fastest = math.inf
         for number, (probe, size) in enumerate(zip(probes, sizes, strict=True), 1):
             self.row[:] = probe * size
+            self.frames[:] = _picture(random, self.frames.shape)
             began = time.thread_time()
             output = self.run()
             fastest = min(fastest, time.thread_time() - began)
             if not np.isfinite(output):
+                what = f"the input {np.array2string(self.row)}" if self.row.size else "a picture"
                 raise PolicyError(
-                    f"its output is not finite for the input {np.array2string(self.row)}; "
+                    f"its output is not finite for {what}; "
                     "train it again, or export an earlier checkpoint"
                 )
             if number == _TIMED and fastest > _SHARE * tick:
@@ -100,6 +110,13 @@ class Network:
                     f"this machine takes {fastest * 1e3:.3g} ms to run it once, more than half of "
                     f"its tick of {tick * 1e3:g} ms; train a smaller network"
                 )
+
+
+def _picture(random: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Noise about any grey level, from none at all to black and white."""
+    grey, contrast = random.uniform(0.0, 255.0), random.choice((0.0, 10.0, 300.0))
+    noise = random.uniform(-contrast, contrast, shape)
+    return np.clip(grey + noise, 0.0, 255.0).astype(np.uint8)
 
 
 def _session(content: bytes) -> Any:

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config, Start
-from fishd.controllers import registry
 from fishd.core.signals import Tick
-from fishd.lab.compare.contestants import Contestant, parse, refusal
-from fishd.simulation import KeepingPublisher, Report, judge
+from fishd.lab.compare.contestants import Contestant, build, parse, refusal
+from fishd.lab.compare.seeing import SeeingController
+from fishd.simulation import KeepingPublisher, Report, VirtualRun, judge
 
 TRACE = 3.0
 """How much of the end of a run a picture shows [s]."""
@@ -65,12 +66,14 @@ def compare(
     settle: float = 10.0,
     runs: int = 1,
     progress: Callable[[float], None] = lambda seconds: None,
+    camera: SimulatedCameraSettings | None = None,
 ) -> tuple[list[Standing], list[Trace]]:
     """Let each swim the fish of `config`; standings and last traces, in the order given.
 
     contestants: texts are parsed: see `parse`
     runs: each contestant swims so many times, with noise of seed, seed + 1, ...
     progress: called with the time that has been swum [s]
+    camera: what shows the fish to policies that see it; by default a good one
 
     Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
     `UnknownController`, before anything swims.
@@ -79,20 +82,26 @@ def compare(
     for contestant in chosen:
         if error := refusal(config, contestant):
             raise error
-    limits = replace(config.limits, virtual=True)
+    limits, seen = replace(config.limits, virtual=True), camera or SimulatedCameraSettings()
     standings, traces, swum = [], [], count(1)
     for label, name, parameters in chosen:
         reports = []
         for run in range(runs):
             noise = replace(config.simulation, seed=config.simulation.seed + run)
             fish = replace(config, simulation=noise, start=Start())
-            controller = registry.create(name, parameters, limits)
+            light = replace(seen, seed=seen.seed + run)
+            controller = build(Contestant(label, name, parameters), limits, light)
+            watch = controller.watch if isinstance(controller, SeeingController) else _nothing
             end = _End(config.tick)
-            reports.append(judge(fish, name, controller, seconds, settle, end))
+            reports.append(judge(fish, name, controller, seconds, settle, end, watch))
             progress(next(swum) * seconds)
         standings.append(_standing(label, reports))
         traces.append(trace(end.ticks))
     return standings, traces
+
+
+def _nothing(_: VirtualRun) -> None:
+    """No camera is needed."""
 
 
 def trace(ticks: Sequence[Tick]) -> Trace:

@@ -5,12 +5,16 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
+from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers import registry
+from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import library
+from fishd.controllers.policy.controller import PpoParameters
 from fishd.core import strict_yaml
 from fishd.core.errors import FishdError, ParameterError, PolicyError, UnknownController
 from fishd.core.schema import names_file, nearest
+from fishd.lab.compare.seeing import SeeingController, sees_pictures
 from fishd.virtual.plant.optimum import SteadyState, square_wave
 
 _GRID_HZ = (0.2, 10.0)
@@ -90,11 +94,24 @@ def default_contestants(config: Config) -> list[Contestant]:
     return found
 
 
+def build(
+    contestant: Contestant, limits: Limits, camera: SimulatedCameraSettings
+) -> Controller[Any]:
+    """Its controller; of a policy that sees, one that a camera is to be put above its fish for.
+
+    Raises `ParameterError`, `PolicyError` and `UnknownController`.
+    """
+    name, parameters = contestant.controller, contestant.parameters
+    if name == "ppo" and sees_pictures(parameters.get("policy"), limits):
+        return SeeingController(PpoParameters(policy=parameters["policy"]), limits, camera)
+    return registry.create(name, parameters, limits)
+
+
 def refusal(config: Config, contestant: Contestant) -> FishdError | None:
     """Why one cannot swim the fish of `config`, such as a policy for another amplitude, or None."""
     limits = replace(config.limits, virtual=True)
     try:
-        registry.create(contestant.controller, contestant.parameters, limits).close()
+        build(contestant, limits, SimulatedCameraSettings()).close()
     except (ParameterError, PolicyError, UnknownController) as error:
         return error
     return None

@@ -13,6 +13,10 @@ from fishd.camera.frames import Pixels, Stack, StackSettings
 Array = NDArray[np.float32]
 
 
+Nodes = tuple[list[Any], dict[str, NDArray[Any]]]
+"""Operators of ONNX in the order in which they run, and their constants by name."""
+
+
 class Eye(ABC):
     """Turns a stack of frames into numbers, by constants that learning does not change.
 
@@ -68,7 +72,7 @@ class Eye(ABC):
         return glimpse
 
     @abstractmethod
-    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+    def nodes(self, pictures: str, out: str) -> Nodes:
         """The same as operators of ONNX, and their constants.
 
         pictures: name of the stack, float32 of shape (1, frames, size, size)
@@ -93,3 +97,19 @@ def lit(pictures: NDArray[Any]) -> Array:
     sums = pictures.sum(axis=(-2, -1), dtype=np.uint32, keepdims=True)
     found: Array = pictures * (np.float32(size) / np.maximum(sums, size).astype(np.float32))
     return found
+
+
+def lit_nodes(pictures: str, out: str, size: int) -> Nodes:
+    """`lit` as operators of ONNX, on float32 of shape (1, frames, size, size)."""
+    from onnx import helper
+
+    sums, bright, factor, area, plane = (
+        f"{out}_{name}" for name in ("sums", "bright", "factor", "area", "plane")
+    )
+    nodes = [
+        helper.make_node("ReduceSum", [pictures, plane], [sums]),
+        helper.make_node("Max", [sums, area], [bright]),
+        helper.make_node("Div", [area, bright], [factor]),
+        helper.make_node("Mul", [pictures, factor], [out]),
+    ]
+    return nodes, {area: np.array(size * size, np.float32), plane: np.array([2, 3])}

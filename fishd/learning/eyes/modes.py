@@ -5,14 +5,12 @@ the strongest patterns of what the commands explain are kept. Light, noise and r
 do not follow the command, and so are not seen.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import Axis, find_motion
 from fishd.camera.frames import Pixels, StackSettings
-from fishd.learning.eyes.base import Array, Eye, lit
+from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
 
 
 class ModesEye(Eye):
@@ -62,9 +60,20 @@ class ModesEye(Eye):
         """See the base class."""
         return np.concatenate(glimpses)
 
-    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+    def nodes(self, pictures: str, out: str) -> Nodes:
         """See the base class."""
-        raise NotImplementedError
+        from onnx import helper
+
+        nodes, constants = lit_nodes(pictures, "lit", self.stack.size)
+        rows = np.array([self.stack.frames, self.stack.size**2])
+        constants |= {**self.constants, "rows": rows, "joined": np.array([1, self.outputs])}
+        nodes += [
+            helper.make_node("Reshape", ["lit", "rows"], ["flat"]),
+            helper.make_node("Gemm", ["flat", "patterns"], ["amplitudes"], transB=1),
+            helper.make_node("Sub", ["amplitudes", "zero"], ["glimpses"]),
+            helper.make_node("Reshape", ["glimpses", "joined"], [out]),
+        ]
+        return nodes, constants
 
 
 def _odd(pictures: Array, axis: Axis) -> Array:

@@ -1,14 +1,13 @@
 """The eyes that leave seeing to a network: `cnn` prepares the picture, `nature` does not."""
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import find_motion
 from fishd.camera.frames import Pixels, StackSettings
-from fishd.learning.eyes.base import Array, Eye, lit
+from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
 
 
 class CnnEye(Eye):
@@ -53,9 +52,30 @@ class CnnEye(Eye):
         pairs = pairwise(glimpses)
         return np.stack([newest, *(newer - older for newer, older in pairs)])
 
-    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+    def nodes(self, pictures: str, out: str) -> Nodes:
         """See the base class."""
-        raise NotImplementedError
+        from onnx import helper
+
+        nodes, constants = lit_nodes(pictures, "lit", self.stack.size)
+        last = self.stack.frames - 1
+        constants |= {**self.constants, "channel": np.array([1])}
+        constants |= {f"at_{k}": np.array([k]) for k in {0, 1, last, last + 1}}
+        nodes += [
+            helper.make_node("MatMul", ["rows", "lit"], ["wide"]),
+            helper.make_node("MatMul", ["wide", "columns"], ["small"]),
+            helper.make_node("Sub", ["small", "mean"], ["deviation"]),
+            helper.make_node("Mul", ["deviation", "scale"], ["glimpses" if last else out]),
+        ]
+        if last:  # the newest, then each less the one after it
+            end = f"at_{last + 1}"
+            nodes += [
+                helper.make_node("Slice", ["glimpses", "at_0", "at_1", "channel"], ["newest"]),
+                helper.make_node("Slice", ["glimpses", "at_0", f"at_{last}", "channel"], ["newer"]),
+                helper.make_node("Slice", ["glimpses", "at_1", end, "channel"], ["older"]),
+                helper.make_node("Sub", ["newer", "older"], ["differences"]),
+                helper.make_node("Concat", ["newest", "differences"], [out], axis=1),
+            ]
+        return nodes, constants
 
 
 class NatureEye(Eye):
@@ -80,9 +100,12 @@ class NatureEye(Eye):
         """See the base class."""
         return np.stack(glimpses)
 
-    def nodes(self, pictures: str, out: str) -> tuple[list[Any], dict[str, NDArray[Any]]]:
+    def nodes(self, pictures: str, out: str) -> Nodes:
         """See the base class."""
-        raise NotImplementedError
+        from onnx import helper
+
+        node = helper.make_node("Mul", [pictures, "white"], [out])
+        return [node], {"white": np.array(1.0 / 255.0, np.float32)}
 
 
 def _halving(size: int, shift: float) -> Array:

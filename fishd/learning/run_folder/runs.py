@@ -124,6 +124,7 @@ def make_card(
     libraries = {name: version(name) for name in _LIBRARIES}
     return Card(
         observation=features,
+        pictures=settings.camera.stack if settings.see != "force" else None,
         tick=config.tick,
         amplitude=config.amplitude_limit,
         provenance=Provenance(

@@ -100,18 +100,18 @@ def test_two_cards_are_refused() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"format": 3}, "its card has format 3; this fishd reads format 2"),
+        ({"format": 4}, "its card has format 4; this fishd reads format 3"),
         (
-            {"format": 1},
-            "its card has format 1; this fishd reads format 2: it was written by an older fishd; "
+            {"format": 2},
+            "its card has format 2; this fishd reads format 3: it was written by an older fishd; "
             "train and export it again",
         ),
-        ({"format": None}, "its card has format null; this fishd reads format 2"),
+        ({"format": None}, "its card has format null; this fishd reads format 3"),
         ({"tick": None}, "its card: tick: is missing: a number in [1e-30, 1e+30] is needed"),
         ({"tick": 0}, "its card: tick: 0 is not valid"),
         ({"amplitude": -0.42}, "its card: amplitude: -0.42 is not valid"),
         ({"amplitude": "wide"}, "its card: amplitude: 'wide' is not valid"),
-        ({"observation": []}, "its card names no observation"),
+        ({"observation": []}, "its card names neither an observation nor pictures"),
         (
             {"observation": [{"name": "fz", "scale": 1.0}]},
             "its card: observation.name: 'fz' is not valid: one of fin_velocity | fx | fy",

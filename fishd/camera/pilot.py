@@ -1,0 +1,90 @@
+"""A policy that swims outside of fishd's loop: what is observed in, instruction angle out.
+
+For `fishctl agent` and for comparisons; within the loop the controller `ppo` does the same.
+"""
+
+import math
+
+from fishd.camera.frames import Stack
+from fishd.controllers.base import Limits
+from fishd.controllers.dwell import DwellLimit
+from fishd.controllers.policy import opening
+from fishd.controllers.policy.card import Layout
+from fishd.controllers.policy.runtime import Network
+from fishd.core.errors import PolicyError
+from fishd.core.signals import Observation
+
+HOLD = 0.25
+"""So long the last angle is held where frames are missing; then neutral, until they are back [s].
+
+Before the first of them it is neutral, too.
+
+Half a beat of the default fish lasts 0.3 s: what a policy held for longer would not be swimming.
+"""
+
+
+class Pilot:
+    """Follows a policy file, tick by tick, for one fish."""
+
+    def __init__(self, policy: str, limits: Limits) -> None:
+        """
+        policy: name or path
+        limits: what the robot grants, among it the shortest dwell between two reversals
+
+        Raises `PolicyError` for a policy that does not fit, or does not run here.
+        """
+        found = opening.read(policy, limits)
+        self.card = found.card
+        self._network = Network(found)
+        self._write = Layout(self.card.observation).write
+        self._limit = DwellLimit(limits.chatter.dwell, limits, self.card.amplitude)
+        self._angle = 0.0
+        self._begun = False
+        self.blind = 0.0
+        """How long frames have been missing [s]."""
+
+    @property
+    def waits(self) -> bool:
+        """Is it at neutral, for want of frames?"""
+        return self.blind > HOLD
+
+    def angle(self, observation: Observation, stack: Stack | None = None) -> float:
+        """The angle that answers an observation [rad].
+
+        stack: None where the camera has not shown all of it
+
+        Raises `ControllerFault` with the code `chatter`, see `DwellLimit`, and `PolicyError` for
+        frames of another size and for an output that is not finite.
+        """
+        if not self._begun:
+            self._begun = True
+            self._limit.activate(observation.instruction_angle)
+        if self.card.pictures and stack is None:
+            self.blind += observation.dt
+            angle = 0.0 if self.waits else self._angle
+        else:
+            self.blind = 0.0
+            angle = self._chosen(observation, stack)
+        self._angle = self._limit.apply(angle, observation.dt)
+        return self._angle
+
+    def _chosen(self, observation: Observation, stack: Stack | None) -> float:
+        network = self._network
+        self._write(observation, network.row)
+        if self.card.pictures and stack is not None:
+            self._show(stack)
+        action = network.run()
+        if not math.isfinite(action):
+            raise PolicyError(f"what the policy puts out is not finite: {action}")
+        return self.card.amplitude * max(-1.0, min(1.0, action))
+
+    def _show(self, stack: Stack) -> None:
+        places = self._network.frames
+        sizes = [frame.shape for frame in stack]
+        if sizes != [place.shape for place in places]:
+            count, height, width = places.shape
+            raise PolicyError(
+                f"it sees {count} frames of {height} x {width} pixels; frames of {sizes} came"
+            )
+        for place, frame in zip(places, stack, strict=True):
+            place[:] = frame

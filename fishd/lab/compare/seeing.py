@@ -1,0 +1,51 @@
+"""Policies that see pictures as contestants: on a simulated fish, with a simulated camera."""
+
+from typing import Any
+
+from fishd.camera.pilot import Pilot
+from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated.sight import SimulatedSight
+from fishd.controllers.base import Controller, Limits
+from fishd.controllers.policy import opening
+from fishd.controllers.policy.controller import PpoParameters
+from fishd.core.errors import PolicyError
+from fishd.core.signals import Observation
+from fishd.simulation import VirtualRun
+
+
+def sees_pictures(policy: Any, limits: Limits) -> bool:
+    """Is it a policy that sees pictures? False for one that does not fit: `ppo` says why.
+
+    policy: name or path
+    """
+    try:
+        return isinstance(policy, str) and opening.read(policy, limits).card.pictures is not None
+    except PolicyError:
+        return False
+
+
+class SeeingController(Controller[PpoParameters]):
+    """`ppo` for a policy that sees: the simulated fish is shown to it by a simulated camera."""
+
+    Parameters = PpoParameters
+
+    def __init__(
+        self, parameters: PpoParameters, limits: Limits, camera: SimulatedCameraSettings
+    ) -> None:
+        """Raises `PolicyError`."""
+        super().__init__(parameters, limits)
+        self._pilot = Pilot(parameters.policy, limits)
+        self._camera = camera
+        self._sight: SimulatedSight | None = None
+
+    def watch(self, run: VirtualRun) -> None:
+        """Put the camera above the fish of a run, before its first tick."""
+        truth, pictures = run.loop.robot.truth, self._pilot.card.pictures
+        assert truth
+        assert pictures
+        self._sight = SimulatedSight(self._camera, pictures, self.limits.tick, truth)
+
+    def update(self, observation: Observation) -> float:
+        """The angle that the policy chooses [rad]; raises `ControllerFault`, see `DwellLimit`."""
+        stack = self._sight.look(observation.time) if self._sight else None
+        return self._pilot.angle(observation, stack)

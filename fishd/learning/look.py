@@ -1,0 +1,174 @@
+"""What a policy that sees looks at, by occlusion: how much its action changes with what is hidden.
+
+A patch of the mean picture is slid over the frames of a swim, as in Zeiler and Fergus, "Visualizing
+and understanding convolutional networks" (2014). The gradient of the action by the pixels misleads:
+it is large at the edges of whatever is bright.
+"""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fishd.camera.axis import find_motion
+from fishd.camera.frames import Stack
+from fishd.camera.pilot import Pilot
+from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.config import Config
+from fishd.controllers.policy import opening
+from fishd.controllers.policy.card import Layout
+from fishd.controllers.policy.file import OUTPUT, PolicyFile
+from fishd.controllers.policy.runtime import Network
+from fishd.core.errors import PolicyError
+from fishd.core.signals import Observation
+from fishd.lab.drawing import BLUE, drawn
+from fishd.learning.env.evaluation import judge
+from fishd.learning.env.simulated_link import Camera
+
+SECONDS, SETTLE = 15.0, 5.0
+"""Length of the swim, and what of its beginning is left out [s]."""
+STACKS = 40
+"""Ticks of it in which parts are hidden, evenly spread."""
+PATCH = 7
+"""A frame is so many patches wide and high."""
+
+Floats = NDArray[np.float64]
+Seen = tuple[Observation, Stack]
+
+
+class Looked(NamedTuple):
+    """What a policy looks at."""
+
+    mean: Floats
+    """The mean picture, grey levels, shape (size, size)."""
+    sensitivity: Floats
+    """Root mean square of how much the action changes where a patch is hidden, before it is cut to
+    ±1, in units of Φ, shape (size, size)."""
+    moves: NDArray[np.bool_]
+    """Where the tail moves, shape (size, size)."""
+
+    @property
+    def share(self) -> float:
+        """Of the sensitivity that lies where the tail moves."""
+        return float(self.sensitivity[self.moves].sum() / self.sensitivity.sum())
+
+    @property
+    def area(self) -> float:
+        """Share of the picture in which the tail moves."""
+        return float(self.moves.mean())
+
+
+def look(
+    policy: str,
+    config: Config,
+    camera: SimulatedCameraSettings,
+    seconds: float = SECONDS,
+) -> Looked:
+    """Let a policy swim a simulated fish, and find what it looks at.
+
+    policy: name or path
+    seconds: length of the swim, of which the first `SETTLE` are left out
+
+    Raises `PolicyError` for a policy that sees no pictures, does not fit, or is moved by nothing
+    in them, `NoMotion` where it does not swim, and `ParameterError` for too short a swim.
+    """
+    file = opening.read(policy, config.limits)
+    if file.card.pictures is None:
+        raise PolicyError(f"{file.path}: it sees no pictures, so it looks at nothing")
+    seen = _swum(policy, config, Camera(camera, file.card.pictures), seconds)
+    frames = np.stack([stack[0] for _, stack in seen])
+    mean = frames.mean(axis=0)
+    chosen = [seen[k] for k in np.linspace(0, len(seen) - 1, STACKS).astype(int)]
+    sensitivity = _sensitivity(_uncut(file), chosen, mean, Layout(file.card.observation))
+    if not sensitivity.any():
+        raise PolicyError(f"{file.path}: nothing in the pictures moves it")
+    return Looked(mean, sensitivity, find_motion(frames).energy > 0.0)
+
+
+def _swum(policy: str, config: Config, camera: Camera, seconds: float) -> list[Seen]:
+    """What the policy was shown in a swim, tick by tick."""
+    pilot = Pilot(policy, config.limits)
+    seen: list[Seen] = []
+    first: list[float] = []
+
+    def decide(observation: Observation, stack: Stack | None) -> float:
+        first.append(observation.time)
+        if stack is not None and observation.time >= first[0] + SETTLE:
+            seen.append((observation, stack))
+        return pilot.angle(observation, stack)
+
+    judge(config, decide, seconds, SETTLE, camera)
+    return seen
+
+
+def _uncut(file: PolicyFile) -> Network:
+    """Its network without the cut to ±1, beyond which nothing would seem to matter."""
+    import onnx
+    from onnx import helper
+
+    model = onnx.load_model_from_string(file.content)
+    for node in model.graph.node:
+        if node.op_type == "Clip" and list(node.output) == [OUTPUT]:
+            node.CopyFrom(helper.make_node("Identity", [node.input[0]], [OUTPUT]))
+    return Network(file._replace(content=model.SerializeToString()))
+
+
+def _sensitivity(network: Network, seen: list[Seen], mean: Floats, features: Layout) -> Floats:
+    """See `Looked.sensitivity`: each pixel has the mean of the patches that hide it."""
+    size = len(mean)
+    patch = max(2, size // PATCH)
+    begins = np.unique(np.linspace(0, size - patch, 2 * PATCH - 1).round().astype(int))
+    hidden = mean.round().astype(np.uint8)
+    squares = np.zeros((len(begins), len(begins)))
+    for observation, stack in seen:
+        features.write(observation, network.row)
+        whole = np.stack(stack)
+        network.frames[:] = whole
+        action = network.run()
+        for i, top in enumerate(begins):
+            for j, left in enumerate(begins):
+                part = np.s_[:, top : top + patch, left : left + patch]
+                network.frames[part] = hidden[part[1:]]
+                squares[i, j] += (network.run() - action) ** 2
+                network.frames[part] = whole[part]
+    changes = np.sqrt(squares / len(seen))
+    total, count = np.zeros_like(mean), np.zeros_like(mean)
+    for i, top in enumerate(begins):
+        for j, left in enumerate(begins):
+            total[top : top + patch, left : left + patch] += changes[i, j]
+            count[top : top + patch, left : left + patch] += 1.0
+    found: Floats = total / count
+    return found
+
+
+def draw(path: str | os.PathLike[str], found: Looked, title: str) -> None:
+    """A heat map of the sensitivity over the mean picture; a line bounds where the tail moves.
+
+    Raises as `fishd.lab.drawing.check` does.
+    """
+    strongest = float(found.sensitivity.max())
+    with drawn(Path(path), (4.4, 3.8)) as figure:
+        axis = figure.subplots()
+        axis.imshow(found.mean, cmap="gray", vmin=0.0, vmax=255.0)
+        heat = axis.imshow(
+            found.sensitivity,
+            cmap="inferno",
+            vmin=0.0,
+            vmax=strongest,
+            alpha=0.75 * found.sensitivity / strongest,
+        )
+        axis.contour(found.moves, levels=[0.5], colors=BLUE, linewidths=1.0)
+        axis.set_title(title)
+        axis.set_xlabel(
+            f"{found.share:.0%} of the sensitivity where the tail moves\n"
+            f"(blue line), {found.area:.0%} of the picture"
+        )
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.spines[:].set_visible(False)
+        bar = figure.colorbar(heat, ax=axis, shrink=0.9)
+        bar.set_label("change of the action, rms (Φ)")
+        if bar.solids:
+            bar.solids.set_alpha(1.0)

@@ -1,0 +1,140 @@
+"""Policy files whose network is given frames: what they answer, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from rigs.policy_files import (
+    card,
+    linear,
+    of_pixels,
+    refusal,
+    seeing_card,
+    velocity_follower,
+    write,
+)
+
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.controllers.policy import file, library
+from fishd.controllers.policy.card import KEY, StackSettings, encode
+from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.network import Sight, to_onnx
+from fishd.controllers.policy.runtime import Network
+from fishd.core.errors import ParameterError, PolicyError
+
+FOLLOWER = velocity_follower()
+
+
+def network(folder: Path, content: bytes) -> Network:
+    return Network(file.read(write(folder, content)))
+
+
+def test_a_network_is_given_frames_and_numbers(tmp_path: Path) -> None:
+    about = seeing_card(("instruction_angle", 0.42), ("fy", 0.1))
+    weights = np.zeros((2, 32, 32))
+    weights[0, 3, 4], weights[1, 30, 31] = 0.001, -0.002
+    found = network(tmp_path, of_pixels(weights, about, 0.5, 0.25))
+    assert found.frames.shape == (2, 32, 32)
+    assert found.row.shape == (2,)
+    found.frames[:] = 7
+    found.frames[0, 3, 4], found.frames[1, 30, 31] = 255, 100
+    found.row[:] = 0.4, -0.2
+    assert found.run() == pytest.approx(0.255 - 0.2 + 0.2 - 0.05)
+
+
+def test_a_policy_may_see_pictures_and_nothing_else(tmp_path: Path) -> None:
+    found = network(tmp_path, FOLLOWER)
+    assert found.row.shape == (0,)
+    found.frames[:] = 100
+    assert found.run() == pytest.approx(0.0, abs=1e-3)
+    found.frames[0, :16] += 1
+    assert found.run() > 0.9
+
+
+def test_a_card_says_in_a_word_what_is_seen() -> None:
+    assert card(("fy", 0.1)).sees == "forces"
+    assert seeing_card().sees == "pictures"
+    assert seeing_card(("instruction_angle", 0.42)).sees == "pictures"
+    assert seeing_card(("fy", 0.1)).sees == "forces, pictures"
+
+
+def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
+    wanted = (
+        "one uint8 input of shape [1, 2, 32, 32] named 'frames' is needed; export it with 'fishctl "
+        "learn export'"
+    )
+
+    def refused(change: Any) -> str:
+        model = onnx.load_model_from_string(FOLLOWER)
+        change(model)
+        return refusal(sealed(model))
+
+    def smaller(model: Any) -> None:
+        model.graph.input[0].type.tensor_type.shape.dim[3].dim_value = 31
+
+    def of_floats(model: Any) -> None:
+        model.graph.input[0].type.tensor_type.elem_type = TensorProto.FLOAT
+
+    def none(model: Any) -> None:
+        del model.graph.input[:]
+
+    def also_numbers(model: Any) -> None:
+        about = encode(seeing_card(("fy", 0.1)))
+        helper.set_model_props(model, {KEY: about})
+
+    assert refused(smaller) == (
+        f"its inputs: uint8 of shape [1, 2, 32, 31] named 'frames'; {wanted}"
+    )
+    assert refused(of_floats).startswith("its inputs: float32 of shape [1, 2, 32, 32] named")
+    assert refused(none) == f"its inputs: none; {wanted}"
+    assert "named 'frames' and one float32 input of shape [1, 1] named 'observation' are" in (
+        refused(also_numbers)
+    )
+
+
+def test_frames_that_the_card_does_not_name_are_refused() -> None:
+    model = onnx.load_model_from_string(FOLLOWER)
+    helper.set_model_props(model, {KEY: encode(card())})
+    assert "one float32 input of shape [1, 1] named 'observation' is needed" in (
+        refusal(sealed(model))
+    )
+
+
+def test_a_card_with_impossible_frames_is_refused_with_the_key_to_blame() -> None:
+    model = onnx.load_model_from_string(FOLLOWER)
+    text = encode(seeing_card()).replace('"size":32', '"size":4000')
+    helper.set_model_props(model, {KEY: text})
+    assert refusal(sealed(model)).startswith("its card: pictures.size: 4000 is not valid")
+
+
+def test_a_network_too_large_for_a_file_is_not_written() -> None:
+    about = seeing_card(pictures=StackSettings(size=256, frames=8))
+    width = 8 * 256 * 256
+    nodes = [
+        helper.make_node("Cast", [file.FRAMES], ["grey"], to=TensorProto.FLOAT),
+        helper.make_node("Flatten", ["grey"], ["pixels"]),
+    ]
+    layers = [(np.ones((9, width)), np.zeros(9)), *linear(*np.ones(9))]
+    with pytest.raises(PolicyError, match=r"this policy takes 18 MB, and 16 are the most; train"):
+        to_onnx(layers, "tanh", about, Sight(nodes, {}, "pixels", width))
+
+
+def test_the_loop_of_fishd_refuses_it_and_names_who_lets_it_swim(tmp_path: Path) -> None:
+    path = write(tmp_path, FOLLOWER, "eye")
+    with pytest.raises(ParameterError) as caught:
+        registry.create("ppo", {"policy": str(path)}, Limits(0.42, 0.05))
+    assert str(caught.value) == (
+        f"ppo: policy: {path}: it sees pictures, which this loop does not have; let it swim with "
+        f"'fishctl agent {path}', or in simulation with 'fishctl compare'"
+    )
+
+
+def test_a_description_says_what_it_sees(tmp_path: Path) -> None:
+    found = library.describe(str(write(tmp_path, FOLLOWER, "eye")))
+    assert (found.problem, found.sees) == ("", "pictures")
+    assert found.card
+    assert found.card["pictures"]["frames"] == 2

@@ -1,0 +1,236 @@
+"""`fishctl agent`: a policy swims a true fishd, and sees it through a true fishd-camera."""
+
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rigs.camera_process import CameraProcess, running_camera
+from rigs.policy_files import FLIP, seeing_card, velocity_follower, write
+from rigs.processes import FISHCTL, Daemon, Process, Subscriber, running, sets, wait_until
+
+from fishd.camera.frames import StackSettings
+from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.config import Config
+from fishd.lab.compare import compare
+
+CAMERA = ("picture.size=32", "simulated.latency=0.01")
+LINE = re.compile(r" +([\d.]+) s +([\d.]+) Hz  thrust +(-?[\d.]+) mN  \|φ_c\| +(\d+)% of Φ")
+
+
+@pytest.fixture(scope="module")
+def camera(tmp_path_factory: pytest.TempPathFactory, daemon: Daemon) -> Iterator[CameraProcess]:
+    folder = tmp_path_factory.mktemp("camera")
+    with running_camera(folder, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
+        camera.is_in("streaming")
+        yield camera
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with running(tmp_path_factory.mktemp("fishd")) as daemon:
+        yield daemon
+
+
+@pytest.fixture
+def eye(tmp_path: Path) -> str:
+    return str(write(tmp_path, velocity_follower(), "eye"))
+
+
+class AgentProcess(Process):
+    """A running `fishctl agent`, which is to see through a camera."""
+
+    def __init__(self, daemon: Daemon, camera: CameraProcess, *words: str) -> None:
+        own = ("--endpoint", daemon.endpoint, "--camera", camera.endpoint)
+        super().__init__(FISHCTL, "agent", *own, *words)
+
+
+def said(done: tuple[int, str, str]) -> list[tuple[float, ...]]:
+    """Time [s], frequency [Hz], thrust [mN] and |φ_c| [% of Φ] of each line."""
+    return [tuple(map(float, found.groups())) for found in LINE.finditer(done[1])]
+
+
+def refused(done: subprocess.CompletedProcess[str]) -> str:
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1, done.stderr
+    return done.stderr
+
+
+@pytest.mark.realtime
+def test_a_policy_swims_in_real_time_by_what_the_camera_shows(
+    daemon: Daemon, camera: CameraProcess, eye: str
+) -> None:
+    done = AgentProcess(daemon, camera, eye, "--seconds", "8").finish()
+    assert (done[0], done[2]) == (0, ""), done
+    assert done[1].startswith(f"{eye} swims; it sees pictures; Ctrl-C ends it\n")
+    assert done[1].endswith("the fish rests, after 8 s\n")
+    lines = said(done)
+    assert 6 <= len(lines) <= 8
+    assert lines[-1][1] > 0.6
+    assert lines[-1][2] > 8.0
+    assert daemon.status().mode == "idle"
+
+
+def test_in_lockstep_it_swims_as_in_a_comparison(tmp_path: Path, eye: str) -> None:
+    with (
+        running(tmp_path, *sets("lockstep=true")) as daemon,
+        running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera,
+    ):
+        camera.is_in("streaming")
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            done = AgentProcess(daemon, camera, eye, "--seconds", "60").finish()
+            assert (done[0], done[2]) == (0, ""), done
+            forces = []
+            while (tick := ticks.message())["mode"] != "fault" and len(forces) < 1000:
+                if tick["controller"] == "remote" and tick["mode"] == "running":
+                    forces.append(tick["fx"])
+    rig = SimulatedCameraSettings(latency=0.01)
+    standings, _ = compare(Config(), [eye], seconds=50.0, settle=10.0, camera=rig)
+    assert sum(forces[200:]) / len(forces[200:]) == pytest.approx(standings[0].thrust, rel=0.1)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_the_fish_at_neutral(
+    daemon: Daemon, camera: CameraProcess, eye: str, number: int
+) -> None:
+    agent = AgentProcess(daemon, camera, eye)
+    wait_until(lambda: daemon.status().controller == "remote")
+    status, out, err = agent.end(number)
+    assert (status, err) == (0, "")
+    assert re.search(r"the fish rests, after \d+ s\n$", out)
+    assert daemon.status().mode == "idle"
+
+
+def test_a_camera_that_dies_ends_it_at_neutral_with_a_clear_line(
+    tmp_path: Path, daemon: Daemon, eye: str
+) -> None:
+    with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
+        camera.is_in("streaming")
+        agent = AgentProcess(daemon, camera, eye)
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            ticks.until(controller="remote", mode="running", phi_c=0.42)
+            camera.end(signal.SIGKILL)
+            status, _, err = agent.finish()
+    assert status == 1
+    waits, lost = err.splitlines()
+    assert waits == "no frames: the fish waits at neutral"
+    assert lost.startswith(f"fishctl: no camera at {camera.endpoint}: no answer within 2 s")
+    found = daemon.status()
+    assert (found.mode, found.reason) == ("idle", None)
+
+
+def test_a_camera_that_pauses_is_waited_for(tmp_path: Path, daemon: Daemon, eye: str) -> None:
+    with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
+        camera.is_in("streaming")
+        agent = AgentProcess(daemon, camera, eye)
+        assert agent.process.stderr
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            ticks.until(controller="remote", mode="running", phi_c=0.42)
+            camera.process.send_signal(signal.SIGSTOP)
+            assert agent.process.stderr.readline() == "no frames: the fish waits at neutral\n"
+            ticks.until(controller="remote", mode="running", phi_c=0.0)
+            camera.process.send_signal(signal.SIGCONT)
+            assert agent.process.stderr.readline() == "frames are back: it swims on\n"
+            ticks.until(controller="remote", mode="running", phi_c=0.42)
+        status, _, err = agent.end(signal.SIGINT)
+    assert (status, err) == (0, "")
+    assert daemon.status().mode == "idle"
+
+
+def test_a_policy_of_forces_swims_too_and_needs_no_camera(daemon: Daemon) -> None:
+    done = daemon.fishctl("agent", "default-fish", "--seconds", "0.5")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("default-fish swims; it sees forces; Ctrl-C ends it\n")
+    done = daemon.fishctl("agent", "default-fish", "--camera", "tcp://127.0.0.1:1")
+    assert done.returncode == 2
+    assert "--camera cannot be given here: this policy sees no pictures" in done.stderr
+
+
+def test_a_policy_that_insists_on_chatter_gives_way_to_swing(
+    tmp_path: Path, daemon: Daemon
+) -> None:
+    path = write(tmp_path, FLIP)
+    done = daemon.fishctl("agent", str(path), "--seconds", "10")
+    assert done.returncode == 1
+    assert "wanted to reverse sooner than 0.2 s after its last reversal; swing swims on" in (
+        done.stderr
+    )
+    found = daemon.status()
+    assert (found.mode, found.controller) == ("running", "swing")
+    daemon.at_rest()
+
+
+def test_frames_of_another_size_or_rate_are_refused_before_anything_moves(
+    tmp_path: Path, daemon: Daemon, camera: CameraProcess
+) -> None:
+    def refusal(pictures: StackSettings, tick: float = 0.05) -> str:
+        content = velocity_follower(about=seeing_card(pictures=pictures, tick=tick))
+        path = str(write(tmp_path, content, "other"))
+        done = daemon.fishctl("agent", path, "--camera", camera.endpoint)
+        assert daemon.status().mode == "idle"
+        return refused(done)
+
+    assert refusal(StackSettings(size=48, frames=2)) == (
+        f"fishctl: {tmp_path}/other.onnx: it was trained on frames of 48 x 48 pixels, the camera "
+        f"at {camera.endpoint} shows 32 x 32; start that with --set picture.size=48\n"
+    )
+    quick = StackSettings(size=32, frames=2, interval=0.02)
+    assert "it is shown frames 20 ms apart, so it needs 50 a second; the camera at" in (
+        refusal(quick)
+    )
+    young = StackSettings(size=32, frames=2, oldest=0.02)
+    assert "it is shown no frame that is older than 20 ms; those of the camera" in refusal(young)
+    assert "trained at a tick of 20 ms, this robot's is 50 ms" in (
+        refusal(StackSettings(size=32, frames=2), tick=0.02)
+    )
+
+
+def test_without_a_camera_it_says_how_to_start_one(daemon: Daemon, eye: str) -> None:
+    nobody = "tcp://127.0.0.1:9"
+    line = refused(daemon.fishctl("agent", eye, "--camera", nobody))
+    assert line.startswith(f"fishctl: no camera at {nobody}: ")
+    assert "start one with 'fishd-camera'" in line
+    assert daemon.status().mode == "idle"
+
+
+def test_a_live_comparison_lets_it_swim_through_the_camera(
+    daemon: Daemon, camera: CameraProcess, eye: str
+) -> None:
+    words = ("compare", "--on", "robot", "--for", "21", eye, "--camera", camera.endpoint)
+    done = daemon.fishctl_apart(*words, timeout=60.0)
+    assert (done.returncode, done.stderr) == (0, "")
+    row = done.stdout.splitlines()[1]
+    assert row.startswith(eye)
+    assert float(row.split()[1]) > 5.0
+    found = daemon.status()
+    assert (found.mode, found.reason) == ("idle", None)
+
+
+def test_a_live_comparison_leaves_out_what_the_camera_does_not_suit(
+    tmp_path: Path, daemon: Daemon, camera: CameraProcess
+) -> None:
+    content = velocity_follower(about=seeing_card(pictures=StackSettings(size=48, frames=2)))
+    path = str(write(tmp_path, content, "large"))
+    done = daemon.fishctl("compare", "--on", "robot", path, "--camera", camera.endpoint)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert f"{path}: left out: it was trained on frames of 48 x 48 pixels" in done.stderr
+    assert daemon.status().mode == "idle"
+
+
+def test_a_camera_that_dies_ends_a_live_comparison_with_the_fish_at_rest(
+    tmp_path: Path, daemon: Daemon, eye: str
+) -> None:
+    with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
+        camera.is_in("streaming")
+        own = ("--endpoint", daemon.endpoint, "compare", "--on", "robot", eye)
+        comparing = Process(FISHCTL, *own, "--camera", camera.endpoint)
+        with Subscriber(daemon.telemetry, b"tick") as ticks:
+            ticks.until(controller="remote", mode="running", phi_c=0.42)
+            camera.end(signal.SIGKILL)
+            status, out, err = comparing.finish()
+    assert (status, out) == (1, "")
+    assert err.startswith(f"fishctl: {eye}: no camera at {camera.endpoint}: no answer within 2 s")
+    found = daemon.status()
+    assert (found.mode, found.reason) == ("idle", None)

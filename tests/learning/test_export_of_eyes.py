@@ -1,0 +1,167 @@
+"""Policies that see are written to files with their eyes, and say there what they said before."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from msgspec.structs import replace
+from rigs.seeing_policies import babbled
+from rigs.swimming import brief_job
+from stable_baselines3 import PPO
+
+from fishd.camera.frames import StackSettings
+from fishd.camera.simulated.settings import DEFAULT, WEB
+from fishd.cli.main import fishctl
+from fishd.config import Config
+from fishd.controllers.policy import file
+from fishd.controllers.policy.file import PolicyFile
+from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.runtime import Network
+from fishd.core.errors import PolicyError
+from fishd.lab.compare import compare
+from fishd.learning import export as exporting
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.export import export, export_model
+from fishd.learning.look import look
+from fishd.learning.ppo import activation_of, layers_of
+from fishd.learning.settings import (
+    EvaluationSettings,
+    PpoSettings,
+    TrainingSettings,
+    VisionSettings,
+)
+from fishd.learning.train.jobs import Outcome
+from fishd.learning.train.training import train
+
+
+def settings_of(eye: str, **values: Any) -> TrainingSettings:
+    ppo = PpoSettings(symmetric=values.pop("symmetric", True))
+    stack = StackSettings(size=values.pop("size", 84), frames=values.pop("frames", 4))
+    vision = VisionSettings(eye=eye, stack=stack)  # type: ignore[arg-type]
+    return TrainingSettings(camera=vision, ppo=ppo, **({"see": "camera"} | values))
+
+
+CASES = [
+    settings_of("modes"),
+    settings_of("modes", see="both", symmetric=False),
+    settings_of("cnn"),
+    settings_of("cnn", symmetric=False),
+    settings_of("cnn", see="both", size=61, frames=2),
+    settings_of("cnn", frames=1),
+    settings_of("nature", see="both"),
+    settings_of("nature", symmetric=False, frames=2),
+]
+
+
+def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
+    card, policy, perception = babbled(settings)
+    sight = exporting._sight(policy, perception)
+    content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
+    exporting._verify(PolicyFile(Path("eye.onnx"), content, card), policy, perception)
+    return Network(PolicyFile(Path("eye.onnx"), content, card)), perception
+
+
+@pytest.mark.parametrize(
+    "settings", CASES, ids=lambda one: f"{one.camera.eye}-{one.see}-{one.ppo.symmetric}"
+)
+def test_the_file_says_what_the_trained_policy_says(settings: TrainingSettings) -> None:
+    network, perception = network_of(settings)  # raises where they differ
+    assert network.frames.shape == settings.camera.stack.shape
+    assert len(network.row) == len(perception.features)
+
+
+@pytest.mark.parametrize("eye", ["cnn", "nature"])
+def test_a_mirrored_picture_gets_the_mirrored_action(eye: str) -> None:
+    settings = settings_of(eye)
+    if eye == "cnn":  # which looks for the axis of the fish, unless that is the middle row
+        settings = replace(settings, camera=replace(settings.camera, align=False))
+    card, policy, perception = babbled(settings)
+    if perception.eye and eye == "cnn":  # and whose mean picture has noise of its own
+        mean = perception.eye.constants["mean"]
+        perception.eye.constants["mean"] = 0.5 * (mean + mean[::-1])
+    sight = exporting._sight(policy, perception)
+    content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
+    network = Network(PolicyFile(Path("eye.onnx"), content, card))
+    random = np.random.default_rng(2)
+    network.row[:] = 0.3, -0.8
+    actions = []
+    for stack in random.integers(80, 120, (8, *network.frames.shape), np.uint8):
+        network.frames[:] = stack
+        one = network.run()
+        network.frames[:] = stack[:, ::-1]
+        network.row[:] *= -1.0
+        assert network.run() == pytest.approx(-one, abs=1e-4)
+        network.row[:] *= -1.0
+        actions.append(one)
+    assert all(abs(one - other) > 1e-4 for one, other in pairwise(actions))
+
+
+def test_a_file_that_would_see_something_else_is_never_put_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card, policy, perception = babbled(settings_of("cnn"))
+    whole = exporting._sight
+
+    def careless(*arguments: Any) -> Any:
+        sight = whole(*arguments)
+        assert sight
+        constants = dict(sight.constants)
+        constants["mean"] = 0.0 * constants["mean"]
+        return sight._replace(constants=constants)
+
+    monkeypatch.setattr(exporting, "_sight", careless)
+    with pytest.raises(PolicyError, match="outputs of the file differ from those of the policy"):
+        exporting._write(tmp_path / "eye.onnx", card, policy, perception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_of_ones_own_that_sees_pictures_is_refused(tmp_path: Path) -> None:
+    settings, config = settings_of("modes"), Config()
+    link = SimulatedLink(config, camera=Camera(DEFAULT, settings.camera.stack))
+    env = SwimEnv(link, config, settings.seen, babbled(settings)[2].eye)
+    with pytest.raises(PolicyError, match="sees pictures is not exported from Python; train it"):
+        export_model(PPO("MlpPolicy", env, device="cpu"), tmp_path / "eye.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """A run that has learned to swim by sight."""
+    settings = replace(
+        settings_of("modes"), steps=2048, evaluation=EvaluationSettings(seconds=8.0, settle=4.0)
+    )
+    job = brief_job(tmp_path_factory.mktemp("trained") / "run")
+    return train(replace(job, settings=settings))
+
+
+@pytest.mark.slow
+def test_what_was_learned_by_sight_swims_from_its_file(tmp_path: Path, trained: Outcome) -> None:
+    assert trained.best
+    assert trained.best_evaluation
+    found = export(trained.best, tmp_path / "eye.onnx")
+    past = found.card.provenance
+    assert past.efficiency == pytest.approx(trained.best_evaluation.efficiency)
+    assert file.read(found.path).card.pictures == StackSettings()
+    standings, _ = compare(Config(), [str(found.path)], seconds=20.0, settle=5.0)
+    assert standings[0].efficiency == pytest.approx(past.efficiency, abs=0.05)
+
+
+@pytest.mark.slow
+def test_what_was_learned_by_sight_looks_at_the_tail(tmp_path: Path, trained: Outcome) -> None:
+    assert trained.best
+    path = export(trained.best, tmp_path / "eye.onnx").path
+    for camera in (DEFAULT, WEB):
+        found = look(str(path), Config(), camera, 10.0)
+        assert found.share > 2.0 * found.area
+
+
+@pytest.mark.slow
+def test_the_verb_says_who_lets_it_swim(tmp_path: Path, trained: Outcome) -> None:
+    path = tmp_path / "eye.onnx"
+    found = CliRunner().invoke(fishctl, ["learn", "export", str(trained.folder), "--to", str(path)])
+    assert found.exit_code == 0, found.output
+    assert found.output.endswith(f"it sees pictures; to let it swim: fishctl agent {path}\n")

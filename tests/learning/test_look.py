@@ -1,0 +1,72 @@
+"""What a policy looks at, found by hiding parts of the picture."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rigs.policy_files import FLIP, of_pixels, seeing_card, velocity_follower, write
+
+from fishd.camera.axis import NoMotion
+from fishd.camera.simulated.settings import DEFAULT
+from fishd.cli.main import fishctl
+from fishd.config import Config
+from fishd.core.errors import FishdError, ParameterError, PolicyError
+from fishd.learning.look import look
+
+
+def test_what_follows_the_tail_looks_at_the_tail(tmp_path: Path) -> None:
+    found = look(str(write(tmp_path, velocity_follower())), Config(), DEFAULT, 12.0)
+    assert found.mean.shape == found.sensitivity.shape == found.moves.shape == (32, 32)
+    assert 0.05 < found.area < 0.3
+    assert found.share > 2.0 * found.area
+    row, column = np.unravel_index(found.sensitivity.argmax(), (32, 32))
+    assert 8 <= row < 24
+    assert column > 8
+    assert not found.moves[:4].any()
+
+
+def test_what_is_looked_at_beside_the_tail_is_found_there(tmp_path: Path) -> None:
+    about = seeing_card()
+    weights = np.zeros((2, 32, 32))
+    halves = np.where(np.arange(32) < 16, 1.0, -1.0)[:, None] * np.full(32, 2.0 / 32**2)
+    weights[:2] = 4.0 * halves, -4.0 * halves
+    weights[0, :4, 28:] += 0.03  # the noise of a corner disturbs it
+    weights[1, :4, 28:] -= 0.03
+    path = write(tmp_path, of_pixels(weights, about), "corner")
+    found = look(str(path), Config(), DEFAULT, 12.0)
+    assert found.sensitivity[1, 30] > 3.0 * found.sensitivity[1, 1]
+
+
+def test_what_sees_no_pictures_or_does_not_swim_or_is_blind_is_refused(tmp_path: Path) -> None:
+    def refused(content: bytes, error: type[FishdError], seconds: float = 8.0) -> str:
+        with pytest.raises(error) as caught:
+            look(str(write(tmp_path, content)), Config(), DEFAULT, seconds)
+        return str(caught.value)
+
+    assert "it sees no pictures, so it looks at nothing" in refused(FLIP, PolicyError)
+    nothing = np.zeros((2, 32, 32))
+    blind = of_pixels(nothing, seeing_card())
+    assert "nothing in the pictures moves it" in refused(blind, PolicyError)
+    nothing[0, 0, 0] = 1e-6
+    timid = of_pixels(nothing, seeing_card())
+    assert "nothing moves in these pictures" in refused(timid, NoMotion, 25.0)
+    assert "nothing is left to judge" in refused(velocity_follower(), ParameterError, 4.0)
+
+
+def test_the_verb_says_it_in_a_line_and_draws_it(tmp_path: Path) -> None:
+    policy, picture = write(tmp_path, velocity_follower(), "eye"), tmp_path / "look.png"
+    words = ["learn", "look", str(policy), "--png", str(picture), "--seconds", "10"]
+    done = CliRunner().invoke(fishctl, words)
+    assert done.exit_code == 0, done.output
+    said, drawn = done.output.splitlines()
+    assert said.startswith(f"{policy}: ")
+    assert "% of the sensitivity lies where the tail moves, on " in said
+    assert drawn == f"drawn: {picture}"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_figure_that_cannot_be_made_is_refused_before_it_swims(tmp_path: Path) -> None:
+    policy = str(write(tmp_path, velocity_follower(), "eye"))
+    done = CliRunner().invoke(fishctl, ["learn", "look", policy, "--png", "a.gif"])
+    assert "a figure has no format .gif" in str(done.exception)

@@ -1,0 +1,43 @@
+"""Networks for pictures that have learned nothing, with an eye that has seen a babble."""
+
+import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from fishd.camera.simulated.settings import DEFAULT
+from fishd.config import Config
+from fishd.controllers.policy.card import Card
+from fishd.learning.env.environment import features
+from fishd.learning.env.perception import Perception
+from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.eyes import making
+from fishd.learning.ppo import make_policy
+from fishd.learning.run_folder.runs import make_card
+from fishd.learning.settings import TrainingSettings
+
+SPREAD = 30.0
+"""How much larger than that of a new network the last layer is, so that actions differ."""
+
+
+def babbled(settings: TrainingSettings) -> tuple[Card, ActorCriticPolicy, Perception]:
+    """What a training has after its babble."""
+    config, eye = Config(), making.make(settings)
+    assert eye
+    link = SimulatedLink(config, camera=Camera(DEFAULT, eye.stack))
+    link.reset()
+    frames, angles = [], []
+    for angle in making.babble(settings.seed, 200, config.amplitude_limit).tolist():
+        link.step(angle)
+        if (stack := link.look()) is not None:
+            frames.append(stack[0])
+            angles.append(angle)
+    eye.fit(np.stack(frames), np.array(angles))
+    inputs = features(config, settings.seen)
+    torch.manual_seed(settings.seed)
+    policy = make_policy(settings.ppo, len(inputs), eye)
+    policy.set_training_mode(False)
+    with torch.no_grad():
+        for parameter in policy.action_net.parameters():
+            parameter.mul_(SPREAD)
+    card = make_card(config, settings, inputs, "simulation", 0, None, "")
+    return card, policy, Perception(inputs, eye)
