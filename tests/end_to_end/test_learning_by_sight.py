@@ -95,4 +95,4 @@ def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
         file.write_text(text, encoding="utf-8")
         done = fishctl(*rig.words)
         assert done.returncode == 1
-        assert "shows 84 x 84 pixels, and camera.stack.size is 42: make them equal" in done.stderr
+        assert "shows 84 x 84; start that with --set picture.size=42" in done.stderr

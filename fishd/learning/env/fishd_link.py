@@ -6,18 +6,21 @@ from typing import Any
 
 import msgspec
 
-from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.client import CameraLost
 from fishd.camera.frames import Stack, StackSettings
+from fishd.camera.live_sight import LiveSight
 from fishd.client import Fish
 from fishd.client.agent import Agent
 from fishd.config import Config
 from fishd.controllers.remote.messages import Observed
-from fishd.core.errors import FishError, NoDaemon, Refused
+from fishd.core.errors import FishError, NoDaemon, PolicyError, Refused
 from fishd.core.signals import Observation, Status
 from fishd.learning.env.link import LinkLost, StepResult
 
 PATIENCE = 10.0
 """How long the fish may take to begin, or to go on [s]."""
+GIVE_UP = 2.0
+"""After so long without frames the camera counts as lost [s]."""
 SILENCE = 1.0
 """After so long without an observation, fishd is asked for its status [s]."""
 
@@ -63,11 +66,11 @@ class FishdLink:
         camera: where that camera takes requests; None: as for `CameraClient`
 
         Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop,
-        `CameraLost` when no camera answers, and `FishError` when the address cannot be bound or the
-        frames have another size.
+        `CameraLost` when no camera answers, `PolicyError` where its frames do not suit `stack`, and
+        `FishError` when the address cannot be bound.
         """
         self._fish = Fish(endpoint)
-        self._camera: CameraClient | None = None
+        self._sight: LiveSight | None = None
         try:
             status = self._fish.status()
             if status.reason:
@@ -76,16 +79,20 @@ class FishdLink:
                     f"fishd is in mode {status.mode}: {status.reason.message}; "
                     "when that is mended, leave it with 'fishctl clear-fault'",
                 )
-            self._camera = _camera(camera, self._fish, stack) if stack else None
+            if stack:
+                self._sight = LiveSight(camera, self._fish, stack)
+                self._sight.await_frames()
             self._agent = _agent(address, status)
-        except FishError:
-            self._close_camera()
+        except BaseException:
+            self._close_sight()
             self._fish.close()
             raise
         self._deadline = deadline
         self._begun = self._paused = self._closed = False
         self._known = status
         """Status of fishd when control was acquired."""
+        self._seen = time.monotonic()
+        """When the camera last showed a whole stack [s, monotonic]."""
         self._taken = 0.0
         """When the latest observation came [s, monotonic]."""
         self.tick = status.tick
@@ -131,13 +138,23 @@ class FishdLink:
         return StepResult(found, max(self._agent.lost, 0 if applied else 1))
 
     def look(self) -> Stack | None:
-        """What the camera shows; in lockstep, once it has come so far. Raises `LinkLost`."""
-        if self._camera is None:
+        """What the camera shows; in lockstep, once it has come so far.
+
+        After `GIVE_UP` without, it raises `LinkLost`, with the fish at neutral.
+        """
+        if self._sight is None:
             return None
         try:
-            return self._camera.stack_at(self._asked().time)
-        except CameraLost as error:
+            stack = self._sight.look(self._asked().time)
+        except (CameraLost, PolicyError) as error:
             raise LinkLost(str(error)) from None
+        now = time.monotonic()
+        if stack is not None:
+            self._seen = now
+        elif now - self._seen > GIVE_UP:
+            self.pause(PATIENCE)  # to find out why takes longer than fishd waits
+            raise LinkLost(str(self._sight.lost()))
+        return stack
 
     def pause(self, seconds: float) -> None:
         """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""
@@ -147,6 +164,7 @@ class FishdLink:
 
     def resume(self) -> Observation:
         """End the pause; an observation from after it. Raises `LinkLost`."""
+        self._seen = time.monotonic()
         self._paused = False
         self._asked()
         self._agent.resume()
@@ -162,12 +180,12 @@ class FishdLink:
                 if self._is_ours(self._fish.status()):
                     self._fish.stop()
         self._agent.close()
-        self._close_camera()
+        self._close_sight()
         self._fish.close()
 
-    def _close_camera(self) -> None:
-        if self._camera:
-            self._camera.close()
+    def _close_sight(self) -> None:
+        if self._sight:
+            self._sight.close()
 
     def _check_open(self) -> None:
         if self._closed:
@@ -254,18 +272,6 @@ class FishdLink:
 
 def _waits_for_an_agent(status: Status) -> bool:
     return status.mode == "running" and status.controller == "remote"
-
-
-def _camera(endpoint: str | None, fish: Fish, stack: StackSettings) -> CameraClient:
-    camera = CameraClient(endpoint, fish=fish, stack=stack)
-    size = camera.settings().picture.size
-    if size != stack.size:
-        camera.close()
-        raise FishError(
-            f"the camera at {camera.endpoint} shows {size} x {size} pixels, and camera.stack.size "
-            f"is {stack.size}: make them equal"
-        )
-    return camera
 
 
 def _agent(address: str | None, status: Status) -> Agent:
