@@ -12,6 +12,7 @@ from fishd.camera.frames import Frame, FrameHistory, Stack, StackSettings
 from fishd.camera.messages import (
     BadMessage,
     CameraState,
+    FrameHeader,
     PublishedFrame,
     PublishedView,
     Until,
@@ -129,8 +130,12 @@ class CameraClient:
 
         They are in `history`, too. Raises `FishError` where a clock cannot be asked.
         """
+        return [frame for _, frame in self.poll_with_headers(seconds)]
+
+    def poll_with_headers(self, seconds: float = 0.0) -> list[tuple[FrameHeader, Frame]]:
+        """The same, each with what the camera said of it."""
         deadline = time.monotonic() + seconds
-        found: list[Frame] = []
+        found: list[tuple[FrameHeader, Frame]] = []
         while not found and self._socket.poll(milliseconds_until(deadline)):
             found = self._take_all()
             if self._until_moved:
@@ -236,8 +241,8 @@ class CameraClient:
                 f"{self.state.frames}; can this machine reach that address?"
             )
 
-    def _take_all(self) -> list[Frame]:
-        found: list[Frame] = []
+    def _take_all(self) -> list[tuple[FrameHeader, Frame]]:
+        found: list[tuple[FrameHeader, Frame]] = []
         self._until_moved = False
         for _ in range(WAITING):
             try:
@@ -249,7 +254,7 @@ class CameraClient:
                 self._complaint = str(error)
                 continue
             if isinstance(message, PublishedFrame):
-                found.append(self._take(message))
+                found.append((message.header, self._take(message)))
             elif isinstance(message, PublishedView):
                 self.view = message
             elif isinstance(message, Until):

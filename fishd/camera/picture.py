@@ -35,7 +35,7 @@ def frame(picture: Pixels, settings: PictureSettings) -> Pixels:
 
 def scaled(picture: Pixels, width: int, height: int) -> Pixels:
     """The picture in another size [px]: averaged over areas, or with larger pixels."""
-    if picture.shape == (height, width):
+    if picture.shape[:2] == (height, width):
         return picture
     smaller = width <= picture.shape[1] and height <= picture.shape[0]
     way = cv2.INTER_AREA if smaller else cv2.INTER_NEAREST

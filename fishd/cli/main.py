@@ -46,6 +46,9 @@ VERBS = {
         "rerun": Verb("recording.rerun", "rerun", "Let a controller choose again, offline."),
         "recover": Verb("recording.recover", "recover", "Finish a recording that was cut off."),
     },
+    "Camera": {
+        "camera": Verb("camera", "camera", "Look through the camera, set it up, record it."),
+    },
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Call the present force zero."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),

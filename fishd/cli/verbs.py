@@ -9,7 +9,9 @@ import click
 from fishd.core.console import complain
 
 _EXTRAS = {
+    "aiohttp": "camera",
     "bayes_opt": "lab",
+    "cv2": "camera",
     "distributed": "cluster",
     "gymnasium": "learn",
     "joblib": "lab",
@@ -21,6 +23,7 @@ _EXTRAS = {
     "plotly": "lab",
     "pyarrow": "lab",
     "scipy": "lab",
+    "simplejpeg": "camera",
     "sklearn": "lab",
     "stable_baselines3": "learn",
     "tensorboard": "learn",

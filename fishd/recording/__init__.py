@@ -1,11 +1,12 @@
 """Recordings of a fish: MCAP files, written, read, exported and replayed (extra: record).
 
 ticks = fishd.recording.read("run.mcap")      # a pandas DataFrame, one row a tick
-run = fishd.recording.open_run("run.mcap")    # its ticks, events, gaps and configuration
+run = fishd.recording.open_run("run.mcap")    # its ticks, events, gaps, frames, configuration
 """
 
+from fishd.recording.images import RecordedFrame
 from fishd.recording.reader import Entry, Run, open_run, read
 from fishd.recording.summary import Gap, Summary
 from fishd.recording.writer import RunWriter
 
-__all__ = ["Entry", "Gap", "Run", "RunWriter", "Summary", "open_run", "read"]
+__all__ = ["Entry", "Gap", "RecordedFrame", "Run", "RunWriter", "Summary", "open_run", "read"]

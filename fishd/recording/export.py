@@ -1,9 +1,11 @@
 """Writes a recording as tables for other programs: CSV or Parquet, ticks and events."""
 
+import itertools
 from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
 import pandas
 import pyarrow
 import pyarrow.parquet
@@ -11,6 +13,7 @@ import pyarrow.parquet
 from fishd.core.errors import RecordingError
 from fishd.core.files import write_atomically
 from fishd.recording.folder import check_new
+from fishd.recording.images import RecordedFrame
 from fishd.recording.reader import Run
 
 Format = Literal["csv", "parquet"]
@@ -18,6 +21,9 @@ Format = Literal["csv", "parquet"]
 
 def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> list[Path]:
     """Write `NAME.csv` and `NAME-events.csv`, or the same as Parquet; their paths.
+
+    Where a camera was recorded, also `NAME-frames.npy`, all its frames as one array of shape
+    (number, height, width), and `NAME-frames.csv`, a row for each.
 
     Ticks have a column a field, in its unit, and every bit of its value. The Parquet files carry
     configuration and provenance as the metadata `fishd` of their schema, in JSON.
@@ -27,7 +33,10 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
     """
     tables = {folder / f"{run.name}.{form}": run.frame()}
     tables[folder / f"{run.name}-events.{form}"] = _events(run)
-    check_new(tables, replace=replace)
+    pictures = folder / f"{run.name}-frames.npy"
+    if run.frame_heads:
+        tables[folder / f"{run.name}-frames.{form}"] = _frames(run)
+    check_new([*tables, *([pictures] if run.frame_heads else [])], replace=replace)
     about = msgspec.json.encode({"about": run.about, "configs": run.configs})
     for path, table in tables.items():
         try:
@@ -37,6 +46,9 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
                 _write_parquet(path, table, about)
         except OSError as error:
             raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+    if run.frame_heads:
+        _write_pictures(pictures, run)
+        return [*tables, pictures]
     return list(tables)
 
 
@@ -46,6 +58,40 @@ def _events(run: Run) -> pandas.DataFrame:
         for event in run.events
     ]
     return pandas.DataFrame(rows, columns=["t", "level", "kind", "message", "data"])
+
+
+def _frames(run: Run) -> pandas.DataFrame:
+    return pandas.DataFrame([msgspec.structs.asdict(head) for head in run.frame_heads])
+
+
+def _write_pictures(path: Path, run: Run) -> None:
+    """One after the other, as hours of them may be longer than the memory of this machine."""
+    frames = run.frames()
+    first = next(frames)
+    shape = (len(run.frame_heads), *first.pixels.shape)
+    part = path.with_name(path.name + ".part")
+    try:
+        array = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+        for number, frame in enumerate(itertools.chain([first], frames)):
+            if frame.pixels.shape != first.pixels.shape:
+                raise RecordingError(
+                    f"{run.path}: frames of {_size(first)} and of {_size(frame)}: one array cannot "
+                    "hold both; in Python, fishd.recording.open_run(...).frames() gives them"
+                )
+            array[number] = frame.pixels
+        array.flush()
+        part.replace(path)
+    except OSError as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _size(frame: RecordedFrame) -> str:
+    height, width = frame.pixels.shape
+    return f"{width} x {height} px"
 
 
 def _write_parquet(path: Path, frame: pandas.DataFrame, about: bytes) -> None:

@@ -15,6 +15,8 @@ from fishd.core.errors import ConfigError, RecordingError
 from fishd.core.frames import frame
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording import images
+from fishd.recording.images import FrameHead, RecordedFrame
 from fishd.recording.mcap_file import Damaged, records
 from fishd.recording.part_file import PART, SUFFIX
 from fishd.recording.schemas import CHANNELS
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TOPICS = dict(enumerate(CHANNELS, start=1))
+TOPICS = dict(enumerate((*CHANNELS, images.TOPIC), start=1))
 """Topics of channels as `RunWriter` numbers them, for a file in which that part is damaged."""
 
 
@@ -63,7 +65,9 @@ class Run:
         self._damages: list[int] = []
         """How many ticks come before each damaged part that was skipped."""
         self.entries: list[Entry] = []
-        """All messages in the order in which they came."""
+        """All messages of fishd in the order in which they came."""
+        self.frame_heads: list[FrameHead] = []
+        """The frames of a camera without their pictures, in the order in which they came."""
         self._scan()
 
     @property
@@ -149,7 +153,28 @@ class Run:
             tally.measures_in(about.get("force_unit", "N"))
         for message in self.messages():
             tally.add(message)
+        for head in self.frame_heads:
+            tally.frame(head)
         return tally
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """The frames of a camera, in the order in which they came, read as they are asked for.
+
+        Raises `RecordingError`, and `MissingPackage` without OpenCV (extra: camera).
+        """
+        for payload in self._images():
+            try:
+                yield images.decoded(payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: {error}") from None
+
+    def _images(self) -> Iterator[bytes]:
+        topics = dict(TOPICS)
+        for record in records(self.path):
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message) and topics.get(record.channel_id) == images.TOPIC:
+                yield record.data
 
     def frame(self) -> "DataFrame":
         """The ticks as a table: `fishd.core.frames.frame`."""
@@ -161,7 +186,10 @@ class Run:
         for record in records(self.path):
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
-                if (topic := topics.get(record.channel_id, "")) in CHANNELS:
+                topic = topics.get(record.channel_id, "")
+                if topic == images.TOPIC:
+                    self._take_frame(record.data)
+                elif topic in CHANNELS:
                     self.entries.append(Entry(topic, record.data))
                     ticks += topic == "tick"
             elif isinstance(record, Damaged):
@@ -177,6 +205,14 @@ class Run:
                     self._damages.append(ticks)
         if not self.about and not (self.is_damaged and self.entries):
             raise RecordingError(f"{self.path} is an MCAP file, but no recording of fishd")
+
+    def _take_frame(self, payload: bytes) -> None:
+        try:
+            self.frame_heads.append(images.decode_head(payload))
+        except msgspec.DecodeError as error:
+            raise RecordingError(
+                f"{self.path}: a frame of the camera cannot be read: {error}"
+            ) from None
 
     def _take_metadata(self, name: str, data: dict[str, str]) -> None:
         if name == "fishd.run":

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import msgspec
 import zmq
@@ -16,6 +16,9 @@ from fishd.core.signals import Status
 from fishd.recording.schemas import CHANNELS
 from fishd.recording.summary import TickHead
 from fishd.recording.writer import RunWriter
+
+if TYPE_CHECKING:
+    from fishd.recording.camera_tap import CameraTap
 
 DRAIN = 0.2
 """Messages are taken from their queue this often, so as to wake up seldom [s]."""
@@ -55,6 +58,7 @@ class Recorder:
         tell: Callable[[str], None],
         progress: Callable[[RunWriter], None] = lambda writer: None,
         due: Callable[[RunWriter], bool] = lambda writer: False,
+        camera: "CameraTap | None" = None,
     ) -> None:
         """
         endpoint: control socket of fishd; None looks for that of this machine
@@ -62,11 +66,13 @@ class Recorder:
         tell: gets a line where something happens that its reader should know
         progress: called once a second
         due: is it time to close this recording and begin the next one?
+        camera: what brings the frames of a camera; it is closed with the recorder
         """
         self._endpoint = endpoint
         self._open_writer = open_writer
         self._tell, self._progress, self._due = tell, progress, due
         self._telemetry = Telemetry()
+        self._camera = camera
         self._writer: RunWriter | None = None
         self._described: Description | None = None
         self._seq = 0
@@ -83,13 +89,13 @@ class Recorder:
             self._telemetry.connect(self._described.status.telemetry)
             self._open()
         except BaseException:
-            self._telemetry.close()
+            self._close()
             raise
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         """Finish the file, also after an error; raises `RecordingError`."""
-        self._telemetry.close()
+        self._close()
         if self._refused > 1:
             self._tell(f"messages that are none of fishd's, left out: {self._refused}")
         self.writer.close(self.reason if error is None else text.named(error))
@@ -123,6 +129,8 @@ class Recorder:
             for topic, payload in self._telemetry.messages():
                 self._take(topic, payload)
                 heard = now
+            if self._camera:
+                self._take_frames(self._camera)
             if now - flushed >= FLUSH - DRAIN / 2:
                 flushed = now
                 sync = now - synced >= SYNC
@@ -138,6 +146,21 @@ class Recorder:
             if now - heard >= SILENCE:
                 heard = now
                 self._look_for_fishd()
+
+    def _take_frames(self, camera: "CameraTap") -> None:
+        news, frames = camera.take()
+        for line in news:
+            self._tell(line)
+            with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
+                fish.mark(text.line(line))
+        for head, pixels in frames:
+            if lost := self.writer.frame(head, pixels):
+                self._tell(f"just before frame {head.seq}, frames were lost: {lost}")
+
+    def _close(self) -> None:
+        self._telemetry.close()
+        if self._camera:
+            self._camera.close()
 
     def _open(self) -> None:
         assert self._described
@@ -160,6 +183,8 @@ class Recorder:
                 self._tell("fishd is heard again: the recording goes on")
             self._gone = False
             self._seq = message.seq
+            if self._camera:
+                self._camera.heard(message.t, message.time)
             for gap in self.writer.gaps[known:]:
                 self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
         elif isinstance(message, Status):

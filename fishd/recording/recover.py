@@ -6,6 +6,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
+from fishd.recording import images
 from fishd.recording.mcap_file import records
 from fishd.recording.part_file import PART, SUFFIX, PartFile, is_being_written
 from fishd.recording.reader import TOPICS, Run, open_run
@@ -55,7 +56,10 @@ def _copy(run: Run, file: PartFile) -> None:
     def channel_of(number: int) -> int:
         if number not in channels:  # where its record is damaged
             topic = TOPICS[number]
-            name, schema = schema_name(CHANNELS[topic]), json_schema(CHANNELS[topic])
+            if topic in CHANNELS:
+                name, schema = schema_name(CHANNELS[topic]), json_schema(CHANNELS[topic])
+            else:
+                name, schema = images.SCHEMA, images.json_schema()
             found = writer.register_schema(name, "jsonschema", schema)
             channels[number] = writer.register_channel(topic, "json", found)
         return channels[number]

@@ -6,6 +6,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording.images import FrameHead
 
 
 class Gap(NamedTuple):
@@ -50,6 +51,13 @@ class Summary(Struct, frozen=True):
     """Ticks in mode running, by controller."""
     force_unit: str = "N"
     """Unit of its forces: `N` only where all are in newtons, else that of the others."""
+    frames: int = 0
+    """Frames of a camera."""
+    frame_gaps: int = 0
+    """How often frames are missing, or the camera began anew."""
+    frames_lost: int = 0
+    """How many frames are known to be missing: that the camera took but nobody got, and that did
+    not arrive."""
 
     @property
     def duration(self) -> float:
@@ -69,6 +77,7 @@ class TickHead(Struct, frozen=True, gc=False):
     thrust: float
     frequency: float
     thrust_error: float | UnsetType = UNSET
+    time: float = 0.0
 
 
 class Tally:
@@ -85,6 +94,8 @@ class Tally:
         self._thrust = self._error = 0.0
         self._swimming: dict[str, int] = {}
         self._force_unit = "N"
+        self._frames = self._frame_gaps = self._frames_lost = 0
+        self._last_frame: FrameHead | None = None
 
     def measures_in(self, force_unit: str) -> None:
         """Take note of the unit of the forces from now on."""
@@ -135,6 +146,23 @@ class Tally:
         self._events += 1
         self._marks += event.kind == "mark"
 
+    def frame(self, frame: FrameHead) -> int:
+        """Add a frame of a camera; returns how many are missing before it, 0 where none are.
+
+        Of a camera that began anew nobody knows what is missing; that counts as one gap.
+        """
+        last, self._last_frame = self._last_frame, frame
+        self._frames += 1
+        if last is None:
+            return 0
+        if frame.session != last.session:
+            self._frame_gaps += 1
+            return 0
+        lost = max(0, frame.seq - last.seq - 1) + max(0, frame.dropped - last.dropped)
+        self._frames_lost += lost
+        self._frame_gaps += lost > 0
+        return lost
+
     @property
     def restarts(self) -> int:
         """How often another fishd took the place of the one before."""
@@ -167,6 +195,9 @@ class Tally:
             thrust_error=error,
             swimming=dict(self._swimming),
             force_unit=self._force_unit,
+            frames=self._frames,
+            frame_gaps=self._frame_gaps,
+            frames_lost=self._frames_lost,
         )
 
 

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import Any, Self
 
 import msgspec
+import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from fishd.config import Config, to_yaml
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording import images
+from fishd.recording.images import FrameHead
 from fishd.recording.part_file import SUFFIX, PartFile
 from fishd.recording.provenance import Source, provenance
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
@@ -145,6 +149,21 @@ class RunWriter:
         """Record a status."""
         self._add("status", status.t, status.seq, self._encode(status))
         self.tally.status(status)
+
+    def frame(self, head: FrameHead, pixels: NDArray[np.uint8]) -> int:
+        """Record a frame of a camera; returns how many are missing before it.
+
+        pixels: shape (height, width)
+        Raises `MissingPackage` without OpenCV (extra: camera).
+        """
+        payload = images.encoded(head, pixels)
+        if images.TOPIC not in self._channels:
+            schema = self._writer.register_schema(images.SCHEMA, "jsonschema", images.json_schema())
+            self._channels[images.TOPIC] = self._writer.register_channel(
+                images.TOPIC, "json", schema
+            )
+        self._add(images.TOPIC, head.t, head.seq, payload)
+        return self.tally.frame(head)
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
         """Record a message of telemetry to the byte, and return what it says.

@@ -38,6 +38,15 @@ def test_a_tail_that_rests_has_no_axis() -> None:
         find_motion(swinging(WEB, amplitude=0.0))
 
 
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seconds", [2, 3, 5])
+def test_light_that_moves_on_the_water_has_no_axis(seconds: int, seed: int) -> None:
+    painter = TailPainter(replace(WEB, seed=seed), 84)
+    times = np.arange(0.0, seconds, 1 / 30)
+    with pytest.raises(NoMotion, match="let the fish swim"):
+        find_motion(np.stack([painter.paint(0.0, 0.0, time) for time in times]))
+
+
 def test_few_pictures_are_refused() -> None:
     with pytest.raises(NoMotion, match="9 pictures are too few"):
         find_motion(swinging(DEFAULT)[:9])

@@ -33,7 +33,8 @@ def test_verbs_stand_below_headings_that_say_what_one_wants() -> None:
     lines = CliRunner().invoke(fishctl, ["--help"]).stdout.splitlines()
     headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
     assert headings == [
-        "Options:", "Watch:", "Swim and stop:", "Experiment:", "Record:", "Calibrate:",
+        "Options:", "Watch:", "Swim and stop:", "Experiment:", "Record:", "Camera:",
+        "Calibrate:",
         "Simulate and learn:", "Check and configure:",
     ]  # fmt: skip
     assert "explain" not in "\n".join(lines)

@@ -102,3 +102,15 @@ def test_training_without_the_extra_names_it_in_one_line(
     assert not (tmp_path / "run").exists()
     shown = call(FISHCTL, "learn", "ppo", "--help", env=env)
     assert (shown.returncode, "--resume" in shown.stdout) == (0, True)
+
+
+@pytest.mark.parametrize(("module", "verb"), [("aiohttp", ("page",)), ("mcap", ("record", "run"))])
+def test_a_verb_about_a_camera_names_the_extra_that_it_needs(
+    tmp_path: Path, module: str, verb: tuple[str, ...]
+) -> None:
+    found = call(FISHCTL, "camera", *verb, env=without(tmp_path, module))
+    extra = "camera" if module == "aiohttp" else "record"
+    assert (found.returncode, found.stdout) == (1, "")
+    assert re.fullmatch(
+        rf"fishctl: {module} is not installed; [^\n]*'.\[{extra}\]'\n", found.stderr
+    )

@@ -19,6 +19,7 @@ NAMES = (
     "sweep",
     "identification",
     "estimators",
+    "camera",
 )
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -21,6 +22,10 @@ from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import made, named, new_path, runs_folder
 from fishd.recording.recorder import Recorder
 
+if TYPE_CHECKING:
+    from fishd.recording.camera_tap import CameraTap
+
+F = TypeVar("F", bound=Callable[..., Any])
 UNITS = {"MB": 10**6, "GB": 10**9}
 LEAST = 10**7
 """A black box is no smaller than this [bytes]."""
@@ -44,19 +49,34 @@ class Size(click.ParamType[int]):
         return size
 
 
+def recording_options(function: F) -> F:
+    """RUN, and the options of every verb that records."""
+    for decorate in (
+        click.option(
+            "--for",
+            "seconds",
+            type=FiniteRange(min=0, min_open=True),
+            metavar="SECONDS",
+            help="End by itself after this time; by default Ctrl-C ends it.",
+        ),
+        click.option("--note", default="", help="What for."),
+        click.option("--subject", default="", help="Which fish, such as its number."),
+        click.option("--operator", default="", help="Who records; default: this user."),
+        folder_option,
+        endpoint_option,
+        click.argument("run", required=False),
+    ):
+        function = decorate(function)
+    return function
+
+
 @click.command()
-@click.argument("run", required=False)
-@endpoint_option
-@folder_option
-@click.option("--operator", default="", help="Who records; default: this user.")
-@click.option("--subject", default="", help="Which fish, such as its number.")
-@click.option("--note", default="", help="What for.")
+@recording_options
 @click.option(
-    "--for",
-    "seconds",
-    type=FiniteRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="End by itself after this time; by default Ctrl-C ends it.",
+    "--camera",
+    "with_camera",
+    is_flag=True,
+    help="The frames of the camera, too; 'fishctl camera record' can name another camera.",
 )
 @click.option(
     "--black-box",
@@ -78,6 +98,7 @@ def record(
     subject: str,
     note: str,
     seconds: float | None,
+    with_camera: bool,
     black_box: bool,
     keep: int,
 ) -> None:
@@ -88,17 +109,42 @@ def record(
     """
     if black_box and run:
         raise click.UsageError("--black-box names its files itself: leave RUN out")
-    place = made(folder or runs_folder())
-    stopping = _Signals()
+    if black_box and with_camera:
+        raise click.UsageError("a black box keeps no frames: they would fill it within hours")
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
-    recorder_of = partial(Recorder, endpoint, tell=_tell)
     if black_box:
-        box = BlackBox(place, keep, begin)
-        _record_for_ever(partial(recorder_of, box.open, due=box.due), stopping, seconds)
+        box = BlackBox(made(folder or runs_folder()), keep, begin)
+        open_recorder = partial(Recorder, endpoint, box.open, tell=_tell, due=box.due)
+        _record_for_ever(open_recorder, _Signals(), seconds)
         return
+    if not with_camera:
+        record_one(run, endpoint, folder, begin, seconds)
+        return
+    from fishd.recording.camera_tap import CameraTap
+
+    with CameraTap(None, endpoint) as camera:
+        record_one(run, endpoint, folder, begin, seconds, camera)
+
+
+def record_one(
+    run: str | None,
+    endpoint: str | None,
+    folder: Path | None,
+    begin: Callable[[Path], RunWriter],
+    seconds: float | None,
+    camera: "CameraTap | None" = None,
+) -> None:
+    """Record until a signal, or for so long [s].
+
+    begin: opens the recording at a path
+    """
+    stopping = _Signals()
+    place = made(folder or runs_folder())
     progress = _draw if sys.stdout.isatty() else lambda writer: None
     path = named(run, place) if run else new_path(place)
-    recorder = recorder_of(partial(begin, path), progress=progress)
+    recorder = Recorder(
+        endpoint, partial(begin, path), tell=_tell, progress=progress, camera=camera
+    )
     try:
         with recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it")
@@ -170,11 +216,13 @@ def _end_line() -> None:
 
 def _amount(writer: RunWriter) -> str:
     summary = writer.summary
+    frames = counted(summary.frames, "frame")
     return ", ".join(
         (
             f"{summary.duration:.1f} s",
             counted(summary.ticks, "tick"),
             f"{summary.lost} lost",
+            *([frames, f"{summary.frames_lost} lost"] if summary.frames else []),
             counted(summary.events, "event"),
             f"{writer.size / 1e3:.0f} kB",
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from fishd.cli.options import FiniteRange
-from fishd.cli.output import echo
+from fishd.cli.output import counted, echo
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.core.addresses import control_address, find_control
 from fishd.core.interruption import interrupted_once
@@ -52,6 +52,8 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
     ):
         seconds = recorded.summary.duration / speed
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
+        if recorded.frame_heads:
+            echo(f"its {counted(len(recorded.frame_heads), 'frame')} of a camera are left out")
         found = find_control() == player.control
         endpoint = "" if found else f"--endpoint {shlex.quote(player.control)} "
         echo(f"watch it with: fishctl {endpoint}watch")

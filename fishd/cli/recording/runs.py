@@ -106,8 +106,17 @@ def _remarks(glance: Glance) -> list[str]:
         *([state] if state != "finished" else []),
         *([damage(glance.damaged)] if glance.damaged is not None else []),
         *([counted(restarts, "restart")] if restarts else []),
+        *([_frames(glance.summary)] if glance.summary.frames else []),
         *(glance.about[key] for key in ("subject", "note") if glance.about.get(key)),
     ]
+
+
+def _frames(summary: Summary) -> str:
+    found = counted(summary.frames, "frame")
+    if summary.frames_lost:
+        return f"{found}, {summary.frames_lost} lost"
+    gaps = counted(summary.frame_gaps, "gap")
+    return f"{found}, {gaps}" if summary.frame_gaps else found
 
 
 def _state(glance: Glance) -> str:

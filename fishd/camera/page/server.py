@@ -1,0 +1,228 @@
+"""Serves the page: three files, and a WebSocket that sends pictures and facts.
+
+It takes no request that changes anything. Who asks by a name that is none of this machine's is
+refused, and so is a page from elsewhere that opens the WebSocket: else any page on the web that
+somebody looks at here could read what the camera sees.
+"""
+
+import asyncio
+import ipaddress
+import socket
+from collections.abc import Awaitable, Callable
+from importlib import resources
+from urllib.parse import urlsplit
+
+from aiohttp import WSMsgType, web
+
+from fishd.camera.page.feed import News
+from fishd.core.errors import StartupError
+
+MOST_VIEWERS = 16
+"""Pages that are served at a time."""
+MOST_CONNECTIONS = 64
+"""Beyond them, new ones are closed."""
+GREETING = 10.0
+"""A connection that has asked for nothing within so long is closed [s]."""
+HEARTBEAT = 10.0
+"""A page that does not answer within half of this is gone [s]."""
+_FILES = {
+    "/": ("page.html", "text/html"),
+    "/page.js": ("page.js", "text/javascript"),
+    "/page.css": ("page.css", "text/css"),
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class PageServer:
+    """The page of one camera; an asynchronous context manager. All of it runs in one loop."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """host: address to listen at; port: 0 takes any"""
+        self._host, self._port = host, port
+        self._viewers: set[_Viewer] = set()
+        self._facts = b"{}"
+        self._picture: bytes | None = None
+        self._silent: set[asyncio.BaseProtocol] = set()
+        """Connections that have asked for nothing yet."""
+        self._names = {socket.gethostname().lower(), "localhost"}
+        self._names |= {f"{name}.local" for name in self._names}
+
+    async def __aenter__(self) -> "PageServer":
+        """Listen; raises `StartupError`."""
+        app = web.Application(middlewares=[self._guard], client_max_size=1024)
+        for path, (name, kind) in _FILES.items():
+            app.router.add_get(path, _file(name, kind))
+        app.router.add_get("/live", self._live)
+        self._runner = web.AppRunner(
+            app, access_log=None, handle_signals=False, keepalive_timeout=GREETING
+        )
+        await self._runner.setup()
+        loop = asyncio.get_running_loop()
+        try:
+            self._server = await loop.create_server(self._connected, self._host, self._port)
+        except OSError as error:
+            await self._runner.cleanup()
+            raise StartupError(
+                f"cannot serve a page at {self._host}:{self._port}: "
+                f"{error.strerror or error}; name another port with --port"
+            ) from None
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._server.close()
+        for viewer in tuple(self._viewers):
+            viewer.end()
+        await self._runner.cleanup()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        host, port = self._server.sockets[0].getsockname()[:2]
+        return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+    def show(self, news: News) -> None:
+        """Let every page show this."""
+        self._facts = news.facts
+        if news.jpeg is not None:
+            self._picture = news.jpeg
+        for viewer in self._viewers:
+            viewer.show(news)
+
+    def _connected(self) -> asyncio.Protocol:
+        """What talks to a client that has just connected."""
+        server = self._runner.server
+        assert server
+        if len(server.connections) >= MOST_CONNECTIONS:
+            return _Refusal()
+        handler = server()
+        self._silent.add(handler)
+        asyncio.get_running_loop().call_later(GREETING, self._close_if_silent, handler)
+        return handler
+
+    def _close_if_silent(self, handler: web.RequestHandler) -> None:
+        if handler in self._silent:
+            self._silent.discard(handler)
+            if handler.transport is not None:
+                handler.transport.close()
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        self._silent.discard(request.protocol)
+        try:
+            if not self._is_ours(request.host):
+                raise web.HTTPForbidden(text="this machine has another name\n")
+            response = await handler(request)
+        except web.HTTPException as error:
+            error.headers.update(_HEADERS)
+            raise
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
+
+    def _is_ours(self, host: str) -> bool:
+        """Is a host, with or without a port, an address, or a name of this machine?"""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return name in self._names
+        return True
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != request.host.lower():
+            raise web.HTTPForbidden(text="a page from elsewhere\n")
+        if len(self._viewers) >= MOST_VIEWERS:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_VIEWERS} pages are open already\n")
+        sock = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=1024, compress=False)
+        viewer = _Viewer(sock, News(self._facts, self._picture))
+        self._viewers.add(viewer)
+        try:
+            await sock.prepare(request)
+            await viewer.serve()
+        finally:
+            self._viewers.discard(viewer)
+        return sock
+
+
+class _Viewer:
+    """One page; what it is too slow for it does not get."""
+
+    def __init__(self, sock: web.WebSocketResponse, first: News) -> None:
+        self._sock = sock
+        self._news: News | None = first
+        self._waiting = asyncio.Event()
+        self._waiting.set()
+        self._ended = False
+
+    def show(self, news: News) -> None:
+        """Send this next; a picture that still waits gives way to a newer one."""
+        waits = self._news
+        if news.jpeg is None and waits is not None:
+            news = News(news.facts, waits.jpeg)
+        self._news = news
+        self._waiting.set()
+
+    def end(self) -> None:
+        """Say goodbye."""
+        self._ended = True
+        self._waiting.set()
+
+    async def serve(self) -> None:
+        """Send until the page is gone, or the server ends."""
+        listening = asyncio.create_task(self._listen())
+        try:
+            while not self._ended and not self._sock.closed:
+                await self._waiting.wait()
+                self._waiting.clear()
+                news, self._news = self._news, None
+                if news is not None and not self._sock.closed:
+                    await self._sock.send_bytes(_joined(news))
+        except ConnectionError:
+            pass
+        finally:
+            listening.cancel()
+        await self._sock.close()
+
+    async def _listen(self) -> None:
+        """Notice that the page is gone; nothing that it says is wanted."""
+        async for message in self._sock:
+            if message.type is WSMsgType.ERROR:
+                break
+        self.end()
+
+
+class _Refusal(asyncio.Protocol):
+    """Closes the connection."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        transport.close()
+
+
+def _joined(news: News) -> bytes:
+    """One message, so that a picture and its axis belong together: length of the facts, these, and
+    the JPEG.
+    """
+    return len(news.facts).to_bytes(4, "big") + news.facts + (news.jpeg or b"")
+
+
+def _file(name: str, kind: str) -> Handler:
+    content = resources.files(__package__).joinpath(name).read_bytes()
+
+    async def give(_: web.Request) -> web.StreamResponse:
+        return web.Response(body=content, content_type=kind, charset="utf-8")
+
+    return give

@@ -1,0 +1,28 @@
+"""The verbs about a camera above the tail, loaded when they are called (extra: camera)."""
+
+import click
+
+from fishd.cli.verbs import Verb, Verbs
+
+VERBS = {
+    "Look": {
+        "status": Verb("camera.status", "status", "Show what the camera says of itself."),
+        "view": Verb("camera.view", "view", "Show its picture in the terminal, or write a PNG."),
+        "page": Verb("camera.page", "page", "Show its picture live on a web page."),
+    },
+    "Set up": {
+        "align": Verb("camera.align", "align", "Find the axis of motion, and say how to turn it."),
+        "latency": Verb("camera.latency", "latency", "Measure how old its pictures are."),
+    },
+    "Record": {
+        "record": Verb("camera.record", "record", "Record its frames together with the fish."),
+    },
+}
+
+
+@click.group(cls=Verbs, verbs=VERBS)
+def camera() -> None:
+    """Look through the camera above the tail, set it up, and record its frames.
+
+    They talk to a running fishd-camera.
+    """

@@ -1,0 +1,188 @@
+"""The verb that finds the axis of motion, and says how to turn the camera."""
+
+import math
+import os
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fishd.cli.camera.options import (
+    Watcher,
+    camera_option,
+    check_png,
+    fish_of,
+    png_option,
+    refuse_lockstep,
+    rig_of,
+)
+from fishd.cli.lab_progress import showing
+from fishd.cli.options import FiniteRange, endpoint_option, json_option
+from fishd.cli.output import echo, echo_rows, print_json
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError, NoDaemon
+
+if TYPE_CHECKING:
+    from fishd.camera.alignment import Alignment
+    from fishd.camera.client import CameraClient
+    from fishd.camera.frames import Frame
+    from fishd.client import Fish
+
+LET_IT_SWIM = "let it swim, with 'fishctl set-controller swing', or add --swim"
+
+
+@click.command()
+@camera_option
+@endpoint_option
+@png_option
+@click.option(
+    "--for",
+    "seconds",
+    type=FiniteRange(min=2.0, max=600.0),
+    default=10.0,
+    show_default=True,
+    help="How long to look [s].",
+)
+@click.option("--swim", is_flag=True, help="Let the fish swim meanwhile; it rests afterwards.")
+@json_option
+def align(
+    address: str | None,
+    endpoint: str | None,
+    png: Path | None,
+    seconds: float,
+    swim: bool,
+    as_json: bool,
+) -> int:
+    """Find the axis of motion in frames, and say how to turn the camera, or what to set.
+
+    The fish must swim. Frames should show its axis along their middle row, its head to the left:
+    what a policy learns on one side is then worth as much on the other. The picture shows what
+    moves, and the axis. Exit status: 0 where an axis was found, however it lies.
+    """
+    from fishd.camera.alignment import judge
+    from fishd.camera.axis import find_motion
+    from fishd.camera.client import CameraClient
+
+    check_png(png)
+    with ExitStack() as stack:
+        fish = fish_of(endpoint, stack)
+        if swim and fish is None:
+            raise NoDaemon("no fishd is running, so no fish can be let swim; leave --swim out")
+        client = stack.enter_context(CameraClient(address, fish=fish if swim else None))
+        settings = client.settings()
+        try:
+            if swim:
+                assert fish
+                frames = _while_it_swims(client, fish, seconds)
+            else:
+                _refuse_rest(client, fish, settings.source)
+                frames = _collected(client, seconds)
+        except KeyboardInterrupt:
+            echo("fishctl: interrupted: no axis is found", err=True)
+            return INTERRUPTED
+        import numpy as np
+
+        motion = find_motion(np.stack([frame.pixels for frame in frames]))
+        state = client.status()
+    found = judge(motion, (state.picture_height, state.picture_width), settings)
+    if as_json:
+        print_json(_as_json(found, len(frames)))
+    else:
+        _print(found, len(frames))
+    _draw(found, png, as_json)
+    return 0
+
+
+def _collected(client: "CameraClient", seconds: float) -> list["Frame"]:
+    """The frames of so long, on the camera's clock; raises `CameraLost`."""
+    frames: list[Frame] = []
+    with showing(seconds, "s") as bar:
+        for frame in client.frames():
+            frames.append(frame)
+            passed = frame.time - frames[0].time
+            if passed < 0.0:
+                raise FishdError("the camera was started again meanwhile: try again")
+            bar.at(passed)
+            if passed >= seconds:
+                return frames
+    return frames
+
+
+def _while_it_swims(client: "CameraClient", fish: "Fish", seconds: float) -> list["Frame"]:
+    refuse_lockstep(client.state.virtual)
+    with rig_of(fish, seconds) as rig, showing(seconds, "s") as bar:
+        watcher = Watcher(client, bar.at)
+        rig.listener = watcher
+        rig.swim("swing", {}, seconds)
+    if not watcher.frames:
+        client.check()
+        raise FishdError(f"no frame has come from {client.state.frames} while it swam")
+    return watcher.frames
+
+
+def _refuse_rest(client: "CameraClient", fish: "Fish | None", source: str) -> None:
+    """Raise `FishdError` where the fish is known to rest."""
+    if fish is not None and source != "stream" and not client.state.virtual:
+        mode = fish.status().mode
+        if mode != "running":
+            raise FishdError(f"the fish rests (mode {mode}), so nothing moves: {LET_IT_SWIM}")
+
+
+def _print(found: "Alignment", frames: int) -> None:
+    axis, place = found.motion.axis, found.place
+    side = "below" if axis.offset >= 0.0 else "above"
+    slope = "down" if axis.tilt >= 0.0 else "up"
+    echo_rows(
+        [
+            ("offset", f"{abs(axis.offset):.1f} px {side} the middle row"),
+            ("tilt", f"{abs(math.degrees(axis.tilt)):.1f}°, {slope} to the right"),
+            (
+                "motion",
+                f"rows {place.top} to {place.bottom}, columns {place.left} to {place.right} of "
+                f"{found.motion.energy.shape[1]}",
+            ),
+            ("from", f"{frames} frames"),
+        ]
+    )
+    if found.good:
+        echo("well aligned")
+    for line in found.advice:
+        echo(line)
+    if found.settings:
+        echo("write into the settings of the camera:")
+        for key, value in found.settings.items():
+            echo(f"  {key}={value}")
+        words = " ".join(f"--set {key}={value}" for key, value in found.settings.items())
+        echo(f"or try: fishd-camera {words}")
+
+
+def _as_json(found: "Alignment", frames: int) -> dict[str, Any]:
+    axis = found.motion.axis
+    return {
+        "offset": axis.offset,
+        "tilt": axis.tilt,
+        "motion": found.place._asdict(),
+        "frames": frames,
+        "good": found.good,
+        "advice": found.advice,
+        "settings": found.settings,
+    }
+
+
+def _draw(found: "Alignment", png: Path | None, as_json: bool) -> None:
+    from fishd.camera import drawing
+
+    energy, axis = found.motion.energy, found.motion.axis
+    colours = drawing.with_axis(drawing.motion_colours(energy), axis, len(energy))
+    if png:
+        large = drawing.enlarged(drawing.motion_colours(energy))
+        drawing.write_png(png, drawing.with_axis(large, axis, len(energy)))
+        echo(f"{png}: what moves, and the axis", err=as_json)
+    if not as_json and sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
+        from rich.console import Console
+
+        from fishd.cli.camera.terminal import TerminalPicture
+
+        Console().print(TerminalPicture(colours))

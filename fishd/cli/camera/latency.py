@@ -1,0 +1,137 @@
+"""The verb that measures how old a camera's pictures are, against the lateral force."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of
+from fishd.cli.lab_progress import showing
+from fishd.cli.options import FiniteRange, endpoint_option, json_option
+from fishd.cli.output import echo, echo_rows, print_json
+from fishd.client import Fish
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError
+
+if TYPE_CHECKING:
+    from fishd.camera.latency import Force, Latency
+    from fishd.camera.settings import CameraSettings
+    from fishd.core.signals import Tick
+
+
+@click.command()
+@camera_option
+@endpoint_option
+@click.option(
+    "--for",
+    "seconds",
+    type=FiniteRange(min=15.0, max=600.0),
+    default=40.0,
+    show_default=True,
+    help="How long the fish swims [s].",
+)
+@json_option
+def latency(address: str | None, endpoint: str | None, seconds: float, as_json: bool) -> int:
+    """Measure the delay of the whole camera path, from light to frame, against the lateral force.
+
+    The fish swims many frequencies (controller excitation) and rests afterwards. The forces tell
+    where its tail is, without any parameter of the fish; the frames show it later: that is the
+    delay, with its 95 % interval.
+    """
+    from fishd.camera.client import CameraClient
+    from fishd.camera.latency import find_latency
+
+    with Fish(endpoint) as fish, CameraClient(address, fish=fish) as client:
+        refuse_lockstep(client.state.virtual)
+        next(client.frames())  # before the fish moves
+        settings = client.settings()
+        try:
+            with rig_of(fish, seconds) as rig, showing(seconds, "s") as bar:
+                watcher = Watcher(client, bar.at)
+                rig.listener = watcher
+                rig.swim("excitation", {}, seconds)
+        except KeyboardInterrupt:
+            echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
+            return INTERRUPTED
+        clocks = client.offset().uncertainty
+    found = find_latency(watcher.frames, forces_of(watcher.ticks, rig.tick))
+    if as_json:
+        print_json(_as_json(found, clocks, settings))
+    else:
+        _print(found, clocks, settings)
+    return 0
+
+
+def forces_of(ticks: list["Tick"], period: float) -> list["Force"]:
+    """The window of each tick's mean force, on the clock of fishd.
+
+    period: of the loop [s]; a window reaches back to the one before, but no further than that
+    """
+    from fishd.camera.latency import Force
+
+    if ticks and not ticks[-1].time:
+        raise FishdError(
+            "this fishd does not tell the times of its ticks: it is older than this fishctl"
+        )
+    forces: list[Force] = []
+    for tick in ticks:
+        between = period / max(1, tick.samples)
+        end = tick.time - 1e-3 * tick.age_ms + 0.5 * between
+        forces.append(Force(forces[-1].end if forces else end - period, end, tick.fy))
+    return forces
+
+
+def _print(found: "Latency", clocks: float, settings: "CameraSettings") -> None:
+    error = f"± {found.error * 1e3:.1f} ms"
+    echo_rows(
+        [
+            ("delay", f"{found.whole * 1e3:.1f} {error}, from exposure until the frame is there"),
+            ("time stamps", f"{found.stamps * 1e3:+.1f} {error} late"),
+            ("arrival", f"{found.arrival * 1e3:.1f} ms after its time stamp, 99 % within "
+             f"{found.latest * 1e3:.1f} ms"),
+            ("agreement", f"{found.agreement:.1%} of the force's motion, in {found.frames} frames"),
+        ]
+    )  # fmt: skip
+    if clocks > 1e-3:
+        echo(f"careful: the clocks of camera and fishd are known to ± {clocks * 1e3:.1f} ms only")
+    for line in _advice(found, settings):
+        echo(line)
+
+
+def stack_delay(found: "Latency") -> float:
+    """What `camera.stack.delay` of a training should be: almost every frame is there by then [s].
+
+    In steps of 5 ms, as the interval of the delay is hardly smaller.
+    """
+    return math.ceil((found.stamps + found.latest) / 5e-3 - 1e-6) * 5e-3
+
+
+def _advice(found: "Latency", settings: "CameraSettings") -> list[str]:
+    lines = []
+    if abs(found.stamps) > max(found.error, 1e-3):
+        if settings.source == "simulated":
+            lines.append("the stamps of a simulated camera are exact: this is an error of the fit")
+        else:
+            key = f"{settings.source}.delay"
+            delay = getattr(settings, settings.source).delay + found.stamps
+            lines.append(f"write into the settings of the camera: {key}={delay:.4f}")
+    else:
+        lines.append("its time stamps are right: nothing to set in the camera")
+    spaced = f"camera.stack.delay={stack_delay(found):.3f}"
+    lines.append(f"for frames of even distance, write into the settings of a training: {spaced}")
+    return lines
+
+
+def _as_json(found: "Latency", clocks: float, settings: "CameraSettings") -> dict[str, Any]:
+    return {
+        "delay": found.whole,
+        "error": found.error,
+        "stamps": found.stamps,
+        "arrival": found.arrival,
+        "latest": found.latest,
+        "agreement": found.agreement,
+        "frames": found.frames,
+        "clocks": clocks,
+        "stack_delay": stack_delay(found),
+        "advice": _advice(found, settings),
+    }

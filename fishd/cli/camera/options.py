@@ -1,0 +1,90 @@
+"""What the verbs about a camera share: which camera, where a picture goes, and who swims."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fishd.cli.output import echo
+from fishd.client import Fish
+from fishd.core.errors import FishdError, NoDaemon
+from fishd.core.interruption import interrupted_once
+from fishd.core.signals import Event, Tick
+
+if TYPE_CHECKING:
+    from fishd.camera.client import CameraClient
+    from fishd.camera.frames import Frame
+    from fishd.lab.rig import LiveRig
+
+camera_option = click.option(
+    "--camera",
+    "address",
+    metavar="ADDRESS",
+    help="Where the camera takes requests; default: $FISHD_CAMERA, else the one of this machine.",
+)
+png_option = click.option(
+    "--png",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write the picture into this file.",
+)
+
+
+def check_png(path: Path | None) -> None:
+    """Refuse a picture of another kind, before there is anything to draw."""
+    if path is not None and path.suffix.lower() != ".png":
+        raise click.UsageError(f"'{path}' is not valid for --png: a name ending in .png is needed")
+
+
+class Watcher:
+    """Collects the frames that come while a fish swims, and its ticks."""
+
+    def __init__(self, client: "CameraClient", passed: Callable[[float], None]) -> None:
+        """passed: gets how long it has swum so far [s]"""
+        self.frames: list[Frame] = []
+        self.ticks: list[Tick] = []
+        self._client = client
+        self._passed = passed
+
+    def tick(self, tick: Tick) -> None:
+        """Take what has come meanwhile."""
+        self.ticks.append(tick)
+        self.frames += self._client.poll()
+        self._passed(tick.time - self.ticks[0].time)
+
+    def event(self, event: Event) -> None:
+        """Nothing is needed of it."""
+
+
+@contextmanager
+def rig_of(fish: Fish, seconds: float) -> Iterator["LiveRig"]:
+    """The fish of a running fishd, at rest again afterwards; says that it swims."""
+    from fishd.lab.rig import LiveRig
+
+    with ExitStack() as stack:
+        stack.enter_context(interrupted_once())
+        rig = stack.enter_context(LiveRig(fish))
+        echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
+        yield rig
+
+
+def fish_of(endpoint: str | None, stack: ExitStack) -> Fish | None:
+    """The fishd that runs, until `stack` is closed; None where there is none and none was named."""
+    fish = stack.enter_context(Fish(endpoint))
+    try:
+        fish.status()
+    except NoDaemon:
+        if endpoint:
+            raise
+        return None
+    return fish
+
+
+def refuse_lockstep(virtual: bool) -> None:
+    """Raise `FishdError` where time stands still unless an agent lets it pass."""
+    if virtual:
+        raise FishdError(
+            "this fishd is in lockstep: its fish swims only while an agent lets it; let it run "
+            "with lockstep: false"
+        )

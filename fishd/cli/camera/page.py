@@ -1,0 +1,69 @@
+"""The verb that serves a web page with the camera's picture."""
+
+import asyncio
+import threading
+from contextlib import suppress
+
+import click
+
+from fishd.cli.camera.options import camera_option
+from fishd.cli.output import echo
+from fishd.core.interruption import on_signal
+
+PORT = 9876
+
+
+@click.command()
+@camera_option
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=PORT,
+    show_default=True,
+    help="Port of the page; 0: any.",
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Address to serve it at. Whoever reaches another one than that of this machine sees what "
+    "the camera sees.",
+)
+def page(address: str | None, port: int, host: str) -> None:
+    """Show what the camera sees on a web page, live, with the axis of motion, until Ctrl-C.
+
+    It needs nothing from the internet, and takes no request that changes anything.
+    """
+    with suppress(KeyboardInterrupt):
+        asyncio.run(_serve(address, host, port))
+
+
+async def _serve(address: str | None, host: str, port: int) -> None:
+    from fishd.camera.page.feed import Feed, News
+    from fishd.camera.page.server import PageServer
+
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+    failures: list[BaseException] = []
+    async with PageServer(host, port) as server:
+
+        def tell(news: News) -> None:
+            loop.call_soon_threadsafe(server.show, news)
+
+        def follow() -> None:
+            try:
+                feed.run()
+            except BaseException as error:
+                failures.append(error)
+                loop.call_soon_threadsafe(ended.set)
+
+        feed = Feed(address, tell)
+        thread = threading.Thread(target=follow, name="camera", daemon=True)
+        with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
+            thread.start()
+            echo(f"the camera is at {server.url}; Ctrl-C ends it")
+            await ended.wait()
+        feed.stop()
+        await asyncio.to_thread(thread.join)
+    if failures:
+        raise failures[0]

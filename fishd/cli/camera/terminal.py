@@ -1,0 +1,53 @@
+"""Pictures in a terminal: two pixels a character, or shades of grey where there are no colours."""
+
+import numpy as np
+from rich.color import Color
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.segment import Segment
+from rich.style import Style
+
+from fishd.camera.drawing import Colours
+from fishd.camera.picture import scaled
+
+_SHADES = " ░▒▓█"
+_STEP = 8
+"""Colours are told apart in steps of so many levels, so that few escape sequences are written."""
+
+
+class TerminalPicture:
+    """A picture that fits the room that it is given."""
+
+    def __init__(self, colours: Colours) -> None:
+        self._colours = colours
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Lines of characters, each one pixel wide and two high."""
+        height, width = self._colours.shape[:2]
+        room = 2 * max(1, (options.height or console.height) - 4)
+        scale = min(1.0, options.max_width / width, room / height)
+        columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
+        small = scaled(self._colours, columns, rows)
+        plain = console.color_system is None or console.no_color
+        for upper, lower in zip(small[::2], small[1::2], strict=True):
+            yield from _shades(upper, lower) if plain else _blocks(upper, lower)
+            yield Segment.line()
+
+
+def _blocks(upper: Colours, lower: Colours) -> RenderResult:
+    """Upper halves in the colour of the character, lower ones in that behind it."""
+    pairs = np.concatenate([upper, lower], axis=1) // _STEP * _STEP
+    begin = 0
+    changes = np.flatnonzero((pairs[1:] != pairs[:-1]).any(axis=1)) + 1
+    for end in [*changes.tolist(), len(pairs)]:
+        red, green, blue, red_below, green_below, blue_below = pairs[begin].tolist()
+        style = Style(
+            color=Color.from_rgb(red, green, blue),
+            bgcolor=Color.from_rgb(red_below, green_below, blue_below),
+        )
+        yield Segment("▀" * (end - begin), style)
+        begin = end
+
+
+def _shades(upper: Colours, lower: Colours) -> RenderResult:
+    levels = (upper.astype(np.uint16) + lower).mean(axis=1) / 2.0
+    yield Segment("".join(_SHADES[int(level * len(_SHADES) / 256.0)] for level in levels))

@@ -1,0 +1,159 @@
+"""The verb that shows a camera's picture in the terminal, or writes it into a file."""
+
+import os
+import signal
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fishd.cli.camera.options import camera_option, check_png, png_option
+from fishd.cli.output import echo
+from fishd.core.errors import FishdError
+
+if TYPE_CHECKING:
+    from fishd.camera.axis_watch import AxisWatch
+    from fishd.camera.client import CameraClient
+    from fishd.camera.drawing import Colours
+
+LOOK = 8.0
+"""How long to look for an axis [s]."""
+REDRAW = 0.2
+"""Least time from one drawing to the next [s]."""
+
+
+@click.command()
+@camera_option
+@png_option
+@click.option("--follow", is_flag=True, help="Go on until Ctrl-C; axis and numbers are renewed.")
+@click.option("--axis", is_flag=True, help="Look for some seconds first, to find the axis.")
+@click.option("--whole", is_flag=True, help="The camera's whole picture, not what frames show.")
+def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole: bool) -> None:
+    """Show the camera's picture in the terminal: what frames show, with the axis of motion.
+
+    With --follow and --axis the axis of motion is drawn in, once the tail has moved for some
+    seconds. Where standard output is not a terminal, a line is printed instead, with --follow one
+    a second.
+    """
+    from fishd.camera.axis_watch import AxisWatch
+    from fishd.camera.client import CameraClient
+
+    check_png(png)
+    if png and follow:
+        raise click.UsageError("--png writes one picture, --follow shows all: one of the two")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too must restore the terminal
+    with CameraClient(address, views=whole) as client:
+        watch = AxisWatch()
+        if follow:
+            with suppress(KeyboardInterrupt):
+                _follow(client, watch, whole)
+            return
+        _await(client, watch, whole)
+        if axis:
+            _find_axis(client, watch)
+        if png:
+            _write(client, watch, whole, png)
+        elif _can_draw():
+            from rich.console import Console
+
+            from fishd.cli.camera.terminal import TerminalPicture
+
+            console = Console()
+            console.print(TerminalPicture(_picture(client, watch, whole)))
+            echo(facts(client, watch))
+        else:
+            echo(facts(client, watch))
+
+
+def facts(client: "CameraClient", watch: "AxisWatch") -> str:
+    """The latest frame in one line: its number, age, rate, losses, and the axis."""
+    assert client.latest
+    header = client.latest.header
+    parts = [f"frame {header.seq}"]
+    if client.state.rate:
+        parts.append(f"{client.state.rate:.1f} a second")
+    parts.append(f"{(header.available - header.time) * 1e3:.0f} ms old when it came")
+    if header.dropped or client.missed:
+        parts.append(f"lost: {header.dropped + client.missed}")
+    if watch.axis:
+        parts.append(f"axis {watch.axis.offset:+.1f} px, {watch.axis.tilt * 57.29578:+.1f}°")
+    return ", ".join(parts)
+
+
+def _await(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
+    """Until there is a picture; raises `CameraLost`."""
+    pictures = client.views() if whole else client.frames()
+    next(pictures)
+    while client.latest is None:
+        _take(client, watch, 0.1)
+        client.check()
+
+
+def _find_axis(client: "CameraClient", watch: "AxisWatch") -> None:
+    """Look for `LOOK`; raises `FishdError` where nothing moves."""
+    _pass(client, watch, LOOK)
+    watch.find()
+    if watch.axis is None:
+        raise FishdError("no axis is found, as no tail moves: let the fish swim, or omit --axis")
+
+
+def _take(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
+    for frame in client.poll(seconds):
+        watch.add(frame)
+
+
+def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
+    _await(client, watch, whole)
+    if not _can_draw():
+        while True:
+            echo(facts(client, watch))
+            _pass(client, watch, 1.0)
+    from rich.console import Group
+    from rich.live import Live
+    from rich.text import Text
+
+    from fishd.cli.camera.terminal import TerminalPicture
+
+    with Live(screen=True, auto_refresh=False) as live:
+        while True:
+            drawn = TerminalPicture(_picture(client, watch, whole))
+            live.update(Group(drawn, Text(facts(client, watch), no_wrap=True)), refresh=True)
+            _pass(client, watch, REDRAW)
+
+
+def _pass(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
+    """Take what comes in so long [s]; raises `CameraLost` when nothing comes any more."""
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0.0:
+        _take(client, watch, left)
+    client.check()
+    if watch.due:
+        watch.find()
+
+
+def _picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
+    from fishd.camera import drawing
+
+    assert client.latest
+    pixels = client.latest.pixels
+    if whole:
+        if client.view is None:
+            raise FishdError("the camera sends no views: publish.view_rate of its settings is 0")
+        colours, crop = drawing.whole_picture(client.view), client.view.header.crop
+        return drawing.with_axis(colours, watch.axis, len(pixels), crop)
+    return drawing.with_axis(drawing.coloured(pixels), watch.axis, len(pixels))
+
+
+def _write(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Path) -> None:
+    from fishd.camera import drawing
+
+    colours = _picture(client, watch, whole)
+    drawing.write_png(png, colours if whole else drawing.enlarged(colours))
+    echo(f"{png}: {facts(client, watch)}")
+
+
+def _can_draw() -> bool:
+    return sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")

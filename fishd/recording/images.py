@@ -1,0 +1,137 @@
+"""Frames of a camera in a recording: PNG in the message that Foxglove and Lichtblick show.
+
+The schema is foxglove.CompressedImage, as JSON; beside its fields stand those of fishd, which
+viewers pass over. PNG loses nothing, so that what was recorded can be learned from.
+"""
+
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from fishd.core.errors import MissingPackage, RecordingError
+from fishd.core.schema import fields_of, note, unit
+
+TOPIC = "camera"
+SCHEMA = "foxglove.CompressedImage"
+_COMPRESSION = 1
+"""Of PNG: noise cannot be compressed further, however long one tries."""
+
+
+class Timestamp(Struct, frozen=True, gc=False):
+    """Unix time, as Foxglove has it."""
+
+    sec: int
+    nsec: int
+
+
+class FrameHead(Struct, frozen=True, gc=False):
+    """A recorded frame without its picture."""
+
+    t: Annotated[float, unit("s", "Middle of the exposure, unix.")]
+    time: Annotated[float, unit("s", "The same on fishd's monotonic clock, as `time` of a tick.")]
+    available: Annotated[float, unit("s", "When it could first be had, on that clock.")]
+    seq: Annotated[int, note("Number of the frame in its session, from 1.")]
+    session: Annotated[str, note("Names one run of the camera on one clock.")]
+    exposure: Annotated[float | None, unit("s", "Its length; null where it is not known.")] = None
+    dropped: Annotated[int, note("Frames that the camera took but nobody got, so far.")] = 0
+
+
+class ImageMessage(FrameHead, frozen=True, kw_only=True, gc=False):
+    """A message of the channel: foxglove.CompressedImage, and the fields of `FrameHead`."""
+
+    timestamp: Annotated[Timestamp, note("`t`.")]
+    frame_id: Annotated[str, note("`camera`.")] = TOPIC
+    data: Annotated[bytes, note("The picture, PNG in base64.")]
+    format: Annotated[str, note("`png`.")] = "png"
+
+
+class RecordedFrame(NamedTuple):
+    """A frame of a recording."""
+
+    t: float
+    """Middle of its exposure [s, unix]."""
+    time: float
+    """The same on the monotonic clock of fishd, as `time` of a tick [s]."""
+    available: float
+    """When it could first be had, on that clock [s]."""
+    seq: int
+    session: str
+    exposure: float | None
+    """[s]"""
+    pixels: NDArray[np.uint8]
+    """Grey levels, shape (height, width)."""
+
+
+def json_schema() -> bytes:
+    """The JSON Schema of the channel, as Foxglove publishes it, with the fields of fishd."""
+    types = {"t": "number", "time": "number", "available": "number", "seq": "integer"}
+    properties: dict[str, Any] = {
+        "timestamp": {
+            "type": "object",
+            "title": "time",
+            "properties": {
+                "sec": {"type": "integer", "minimum": 0},
+                "nsec": {"type": "integer", "minimum": 0, "maximum": 999999999},
+            },
+        },
+        "frame_id": {"type": "string"},
+        "data": {"type": "string", "contentEncoding": "base64"},
+        "format": {"type": "string"},
+    }
+    for field in fields_of(FrameHead):
+        described = f"{field.description} [{field.unit}]" if field.unit else field.description
+        kind = types.get(field.name, "string" if field.name == "session" else "number")
+        properties[field.name] = {"type": kind, "description": described}
+    return msgspec.json.encode({"title": SCHEMA, "type": "object", "properties": properties})
+
+
+def encoded(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
+    """The message of a frame; raises `MissingPackage` without OpenCV (extra: camera)."""
+    _, png = _cv2().imencode(".png", pixels, [_cv2().IMWRITE_PNG_COMPRESSION, _COMPRESSION])
+    nanoseconds = max(0, round(head.t * 1e9))
+    message = ImageMessage(
+        **msgspec.structs.asdict(head),
+        timestamp=Timestamp(*divmod(nanoseconds, 10**9)),
+        data=png.tobytes(),
+    )
+    return msgspec.json.encode(message)
+
+
+decode_head = msgspec.json.Decoder(FrameHead).decode
+"""A message without its picture; raises `msgspec.DecodeError`."""
+
+_decode = msgspec.json.Decoder(ImageMessage).decode
+
+
+def decoded(payload: bytes) -> RecordedFrame:
+    """The frame in a message; raises `RecordingError`, and `MissingPackage` without OpenCV."""
+    cv2 = _cv2()
+    try:
+        message = _decode(payload)
+    except msgspec.DecodeError as error:
+        raise RecordingError(f"a frame that cannot be read: {error}") from None
+    pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if pixels is None:
+        raise RecordingError(f"the picture of frame {message.seq} is no PNG")
+    return RecordedFrame(
+        message.t,
+        message.time,
+        message.available,
+        message.seq,
+        message.session,
+        message.exposure,
+        np.asarray(pixels, np.uint8),
+    )
+
+
+def _cv2() -> Any:
+    try:
+        import cv2
+    except ImportError:
+        raise MissingPackage(
+            "frames of a camera need opencv-python-headless: pip install 'fishd[camera]'"
+        ) from None
+    return cv2

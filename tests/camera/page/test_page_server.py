@@ -1,0 +1,184 @@
+"""The page's server: what it gives, to whom, and to how many."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from typing import Any
+
+import aiohttp
+import msgspec
+import pytest
+
+from fishd.camera.page import server as page_server
+from fishd.camera.page.feed import News
+from fishd.camera.page.server import PageServer
+from fishd.core.errors import StartupError
+
+FACTS = b'{"state":"streaming"}'
+Test = Callable[[PageServer, aiohttp.ClientSession], Coroutine[Any, Any, None]]
+
+
+@asynccontextmanager
+async def served() -> AsyncIterator[tuple[PageServer, aiohttp.ClientSession]]:
+    async with PageServer("127.0.0.1", 0) as server, aiohttp.ClientSession(server.url) as session:
+        yield server, session
+
+
+def run(test: Test) -> None:
+    async def whole() -> None:
+        async with asyncio.timeout(20.0), served() as (server, session):
+            await test(server, session)
+
+    asyncio.run(whole())
+
+
+async def news_of(sock: aiohttp.ClientWebSocketResponse) -> tuple[Any, bytes]:
+    message = await sock.receive_bytes()
+    length = int.from_bytes(message[:4], "big")
+    return msgspec.json.decode(message[4 : 4 + length]), message[4 + length :]
+
+
+def test_the_page_and_its_files_are_given_and_need_nothing_from_elsewhere() -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        for path, kind in (("/", "text/html"), ("/page.js", "text/javascript"),
+                           ("/page.css", "text/css")):  # fmt: skip
+            async with session.get(path) as response:
+                assert (response.status, response.content_type) == (200, kind)
+                assert "default-src 'none'" in response.headers["Content-Security-Policy"]
+                assert "//" not in (await response.text()).replace("// ", "").replace("://$", "")
+
+    run(test)
+
+
+def test_a_page_gets_pictures_with_their_facts() -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        server.show(News(FACTS, b"first"))
+        async with session.ws_connect("/live") as sock:
+            assert await news_of(sock) == ({"state": "streaming"}, b"first")
+            server.show(News(b'{"state":"lost"}', None))
+            assert await news_of(sock) == ({"state": "lost"}, b"")
+
+    run(test)
+
+
+def test_a_page_that_is_slow_gets_the_newest_picture_and_not_all_of_them() -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        async with session.ws_connect("/live", max_msg_size=0) as sock:
+            picture = bytes(2**20)
+            for number in range(200):
+                server.show(News(msgspec.json.encode({"seq": number}), picture))
+                await asyncio.sleep(0)
+            seen = []
+            while not seen or seen[-1] < 199:
+                facts, _ = await news_of(sock)
+                seen.append(facts.get("seq", -1))
+        assert len(seen) < 100
+        assert seen == sorted(seen)
+
+    run(test)
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH"])
+@pytest.mark.parametrize("path", ["/", "/live", "/page.js"])
+def test_nothing_can_be_changed(method: str, path: str) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        async with session.request(method, path, data=b"x") as response:
+            assert response.status == 405
+
+    run(test)
+
+
+@pytest.mark.parametrize("path", ["/none", "/page.html", "/../server.py", "/%2e%2e/server.py"])
+def test_no_other_file_is_given(path: str) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        async with session.get(path) as response:
+            assert response.status == 404
+            assert "nosniff" in response.headers["X-Content-Type-Options"]
+
+    run(test)
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [("localhost", 200), ("127.0.0.1:9876", 200), ("[::1]:9876", 200), ("192.168.0.7", 200),
+     ("evil.example", 403), ("localhost.evil.example:9876", 403), ("[::1", 403), ("a@b:c", 403)],
+)  # fmt: skip
+def test_who_asks_by_the_name_of_another_machine_is_refused(host: str, status: int) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        async with session.get("/", headers={"Host": host}) as response:
+            assert response.status == status
+
+    run(test)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
+def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        server.show(News(FACTS, b"secret"))
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await session.ws_connect("/live", origin=origin)
+        assert refused.value.status == 403
+
+    run(test)
+
+
+def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        socks = [await session.ws_connect("/live") for _ in range(page_server.MOST_VIEWERS)]
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await session.ws_connect("/live")
+        assert refused.value.status == 503
+        await socks[0].close()
+        while True:
+            try:
+                sock = await session.ws_connect("/live")
+                break
+            except aiohttp.WSServerHandshakeError:
+                await asyncio.sleep(0.02)
+        server.show(News(FACTS, b"again"))
+        while (await news_of(sock))[1] != b"again":
+            pass
+        for each in (*socks, sock):
+            await each.close()
+
+    run(test)
+
+
+def test_a_flood_of_connections_is_bounded_and_ends_by_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(page_server, "GREETING", 0.3)
+
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        port = int(server.url.rsplit(":", 1)[1].strip("/"))
+        links = [await asyncio.open_connection("127.0.0.1", port) for _ in range(100)]
+        for reader, writer in links:  # the later ones at once, the others as they say nothing
+            assert await reader.read() == b""
+            writer.close()
+        async with session.get("/") as response:
+            assert response.status == 200
+
+    run(test)
+
+
+@pytest.mark.parametrize("message", [b"x" * 2000, b"\xff", b""])
+def test_what_a_page_says_changes_nothing(message: bytes) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        async with session.ws_connect("/live") as sock:
+            await sock.send_bytes(message)
+        async with session.ws_connect("/live") as other:
+            server.show(News(FACTS, b"still"))
+            while (await news_of(other))[1] != b"still":
+                pass
+
+    run(test)
+
+
+def test_a_port_that_is_taken_is_one_line() -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        port = int(server.url.rsplit(":", 1)[1].strip("/"))
+        with pytest.raises(StartupError, match=r"cannot serve a page at .*; name another port"):
+            async with PageServer("127.0.0.1", port):
+                pass
+
+    run(test)

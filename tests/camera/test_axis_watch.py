@@ -1,0 +1,85 @@
+"""The axis, followed while frames come."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from rigs.filmed_swim import filmed, swum
+
+from fishd.camera.axis_watch import AGAIN, FEWEST, AxisWatch
+from fishd.camera.frames import Frame
+from fishd.camera.simulated.settings import DEFAULT, WEB
+
+CAMERA = replace(DEFAULT, off_axis=3.0, tilt=0.05)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def shown(watch: AxisWatch, clock: Clock, frames: list[Frame]) -> int:
+    """How often it has looked for the axis."""
+    looked = 0
+    for frame in frames:
+        clock.now = frame.time
+        watch.add(frame)
+        if watch.due:
+            watch.find()
+            looked += 1
+    return looked
+
+
+def test_it_is_found_once_the_tail_has_moved_for_some_seconds_and_kept_while_it_rests() -> None:
+    clock = Clock()
+    watch = AxisWatch(clock)
+    swims = filmed(swum(12.0, controller="swing"), CAMERA)
+    looked = shown(watch, clock, swims)
+    assert 2 <= looked <= 12.0 / AGAIN
+    assert watch.moving
+    assert watch.axis
+    assert watch.axis.offset == pytest.approx(3.0, abs=0.2)
+    assert watch.axis.tilt == pytest.approx(0.05, abs=0.01)
+    found = watch.axis
+    rests = filmed(swum(40.0, controller="hold"), CAMERA)
+    shown(watch, clock, [frame._replace(time=frame.time + 12.0) for frame in rests])
+    assert not watch.moving
+    assert watch.axis.offset == pytest.approx(found.offset, abs=0.1)
+
+
+@pytest.mark.parametrize("rate", [30.0, 60.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rate_that_goes_with_the_beat_does_no_harm(rate: float, seed: int) -> None:
+    clock = Clock()
+    watch = AxisWatch(clock)
+    camera = replace(WEB, off_axis=3.0, tilt=0.05, rate=rate, seed=seed)
+    shown(watch, clock, filmed(swum(20.0, controller="swing"), camera))
+    assert watch.axis
+    assert watch.axis.offset == pytest.approx(3.0, abs=0.15)
+    assert watch.axis.tilt == pytest.approx(0.05, abs=0.006)
+
+
+def test_few_frames_are_not_looked_at() -> None:
+    clock = Clock()
+    watch = AxisWatch(clock)
+    swims = filmed(swum(12.0, controller="swing"), replace(CAMERA, rate=(FEWEST - 2) / 12.0))
+    assert shown(watch, clock, swims) == 0
+
+
+def test_of_a_fast_camera_some_20_frames_a_second_are_kept() -> None:
+    clock = Clock()
+    watch = AxisWatch(clock)
+    frames = [Frame(0.001 * k, 0.001 * k, np.zeros((16, 16), np.uint8)) for k in range(1000)]
+    shown(watch, clock, frames)
+    assert not watch.due
+    assert len(watch) < 25
+
+
+def test_frames_of_another_size_begin_anew() -> None:
+    clock = Clock()
+    watch = AxisWatch(clock)
+    shown(watch, clock, filmed(swum(12.0, controller="swing"), CAMERA))
+    watch.add(Frame(13.0, 13.0, np.zeros((32, 32), np.uint8)))
+    assert watch.axis is None
+    assert len(watch) == 1

@@ -1,0 +1,89 @@
+"""The delay of a camera, told from its frames and the lateral force."""
+
+import random
+
+import pytest
+from msgspec.structs import replace
+from rigs.filmed_swim import felt, filmed, swum
+
+from fishd.camera.axis import NoMotion
+from fishd.camera.frames import Frame
+from fishd.camera.latency import NoDelay, find_latency
+from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+
+BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)
+
+
+def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
+    """As by a driver whose time stamps are so much later than it says [s]."""
+    return [frame._replace(time=frame.time + late) for frame in frames]
+
+
+@pytest.mark.parametrize("late", [-0.01, 0.0, 0.04])
+@pytest.mark.parametrize(
+    ("camera", "within"),
+    [(DEFAULT, 1.5e-3), (WEB, 1.5e-3), (BAD, 3e-3)],
+    ids=["default", "web", "bad"],
+)
+def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_are(
+    camera: SimulatedCameraSettings, within: float, late: float
+) -> None:
+    ticks = swum(40.0)
+    found = find_latency(stamped_late(filmed(ticks, camera), late), felt(ticks))
+    assert found.stamps == pytest.approx(late, abs=within)
+    assert found.whole == pytest.approx(camera.latency, abs=within + 1e-3)
+    assert abs(found.stamps - late) < 1.5 * found.error
+    assert found.error < 3e-3
+    assert found.agreement > 0.95
+
+
+@pytest.mark.parametrize(
+    "other", ["plant.omega0=9", "plant.lateral_drag=0.1", "plant.servo_delay=0.05",
+              "plant.thrust_coefficient=0.03", "simulation.rotation=0.05"]
+)  # fmt: skip
+def test_no_parameter_of_the_fish_is_needed(other: str) -> None:
+    ticks = swum(40.0, other)
+    found = find_latency(filmed(ticks, WEB), felt(ticks))
+    assert found.stamps == pytest.approx(0.0, abs=3e-3)
+
+
+def test_ticks_that_are_lost_do_no_harm() -> None:
+    ticks = swum(40.0)
+    frames = filmed(ticks, WEB)
+    kept = [tick for tick in ticks if tick.seq % 97]
+    assert find_latency(frames, felt(kept)).stamps == pytest.approx(0.0, abs=3e-3)
+
+
+def test_ninety_nine_of_a_hundred_frames_arrive_within_what_is_said() -> None:
+    ticks = swum(30.0)
+    found = find_latency(filmed(ticks, WEB), felt(ticks))
+    assert 0.055 < found.latest < 0.07
+    assert found.arrival == pytest.approx(0.05, abs=2e-3)
+
+
+def test_frames_of_another_swim_are_refused() -> None:
+    ticks = swum(30.0)
+    frames = filmed(ticks, DEFAULT)
+    pixels = [frame.pixels for frame in frames]
+    random.Random(1).shuffle(pixels)
+    mixed = [frame._replace(pixels=one) for frame, one in zip(frames, pixels, strict=True)]
+    with pytest.raises(NoDelay, match=r"agree by .* only: is it the same fish"):
+        find_latency(mixed, felt(ticks))
+
+
+def test_a_fish_that_rests_tells_no_delay() -> None:
+    ticks = swum(30.0, controller="hold")
+    with pytest.raises(NoMotion, match="nothing moves"):
+        find_latency(filmed(ticks, DEFAULT), felt(ticks))
+
+
+def test_a_short_swim_is_refused() -> None:
+    ticks = swum(5.0)
+    with pytest.raises(NoDelay, match="10 s of swimming are needed"):
+        find_latency(filmed(ticks, DEFAULT), felt(ticks))
+
+
+def test_a_camera_that_sends_few_frames_is_refused() -> None:
+    ticks = swum(20.0)
+    with pytest.raises(NoDelay, match="19 frames are too few"):
+        find_latency(filmed(ticks, replace(DEFAULT, rate=1.0)), felt(ticks))

@@ -1,0 +1,291 @@
+"""`fishctl camera` on a true fishd-camera above a true fishd."""
+
+import json
+import os
+import pty
+import re
+import select
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+from playwright.sync_api import expect
+from rigs.browser import needs_browser, opened
+from rigs.camera_process import CameraProcess, running_camera
+from rigs.processes import (
+    FISHCTL,
+    PATIENCE,
+    Daemon,
+    Process,
+    fishctl,
+    one_line,
+    running,
+    wait_until,
+)
+
+from fishd.client import Fish
+
+OFF, TILT, LATENCY = 3.0, 0.04, 0.05
+CAMERA = (
+    "simulated.rate=30", f"simulated.latency={LATENCY}", "simulated.jitter=0.003",
+    f"simulated.off_axis={OFF}", f"simulated.tilt={TILT}", "simulated.noise=6",
+    "simulated.caustics=12",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with running(tmp_path_factory.mktemp("fishd")) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def camera(
+    daemon_of_all: Daemon, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[CameraProcess]:
+    folder = tmp_path_factory.mktemp("camera")
+    with running_camera(folder, f"simulated.fishd={daemon_of_all.endpoint}", *CAMERA) as camera:
+        camera.until(lambda state: state.seq > 30)
+        yield camera
+
+
+@pytest.fixture
+def daemon(daemon_of_all: Daemon, camera: CameraProcess) -> Daemon:
+    """At rest."""
+    return daemon_of_all.at_rest()
+
+
+@pytest.fixture
+def swimming(daemon: Daemon) -> Daemon:
+    with Fish(daemon.endpoint) as fish:
+        fish.set_controller("swing")
+    return daemon
+
+
+@pytest.fixture(autouse=True)
+def _addresses(daemon: Daemon, camera: CameraProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FISHD_ENDPOINT", daemon.endpoint)
+    monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
+
+
+def said(*words: str | Path) -> str:
+    """What a verb says that succeeds."""
+    done = fishctl("camera", *map(str, words))
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def as_json(*words: str) -> Any:
+    return json.loads(said(*words, "--json"))
+
+
+def width_of(picture: Path) -> int:
+    found = cv2.imread(str(picture))
+    assert found is not None
+    return found.shape[1]
+
+
+def in_terminal(columns: int, *words: str, seconds: float = 0.0) -> str:
+    """What a verb draws on a terminal; ended by Ctrl-C after so long."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        environment = os.environ | {
+            "TERM": "xterm-256color",
+            "COLUMNS": str(columns),
+            "LINES": "30",
+        }
+        os.execve(FISHCTL, ["fishctl", "camera", *words], environment)
+    drawn, begun = b"", time.monotonic()
+    while time.monotonic() - begun < PATIENCE:
+        if seconds and drawn and time.monotonic() - begun > seconds:
+            os.write(terminal, b"\x03")
+            seconds = 0.0
+        if select.select([terminal], [], [], 0.1)[0]:
+            try:
+                drawn += os.read(terminal, 65536)
+            except OSError:  # it has ended
+                break
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    return drawn.decode(errors="replace")
+
+
+def test_status_says_how_the_camera_is(camera: CameraProcess, daemon: Daemon) -> None:
+    shown = said("status")
+    assert re.search(
+        rf"^camera +a simulated camera above the fish at {daemon.endpoint}$", shown, re.M
+    )
+    assert re.search(r"^state +streaming for 0:\d\d:\d\d$", shown, re.M)
+    assert re.search(r"^rate +(29|30|31)\.\d frames a second$", shown, re.M)
+    assert re.search(r"^age +\d+\.\d ms when it can be had, exposed for 10\.0 ms$", shown, re.M)
+    assert re.search(rf"^process +fishd-camera .*, pid {camera.process.pid}, up 0:", shown, re.M)
+    assert as_json("status")["session"] == camera.status().session
+
+
+def test_without_a_camera_a_verb_says_so_in_one_line(tmp_path: Path) -> None:
+    nowhere = f"ipc://{tmp_path}/nobody"
+    for verb in ("status", "record", "page"):
+        done = fishctl("camera", verb, "--camera", nowhere)
+        assert re.match(
+            rf"fishctl: no camera at {nowhere}: .*start one with 'fishd-camera', or name another "
+            r"with --camera or \$FISHD_CAMERA\n",
+            one_line(done),
+        ), verb
+
+
+def test_a_view_without_a_terminal_is_a_line() -> None:
+    line = said("view")
+    assert re.fullmatch(r"frame \d+, (29|30|31)\.\d a second, \d+ ms old when it came\n", line)
+
+
+def test_a_view_in_a_terminal_is_a_picture_that_fits_its_width() -> None:
+    for columns in (40, 100):
+        lines = re.sub(r"\x1b\[[0-9;]*m", "", in_terminal(columns, "view")).splitlines()
+        rows = [line for line in lines if line.startswith("▀")]
+        assert 10 < len(rows) <= 28
+        assert max(map(len, rows)) <= columns
+        assert {len(row) for row in rows} == {len(rows[0])}
+        assert lines[-1].startswith("frame ")
+
+
+def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemon) -> None:
+    drawn = in_terminal(100, "view", "--follow", seconds=3.0)
+    assert len(set(re.findall(r"frame (\d+),", drawn))) > 5
+    assert drawn.count("\x1b[?1049h") == drawn.count("\x1b[?1049l") == 1  # the screen is restored
+
+
+def test_a_view_is_written_with_the_axis_once_that_is_looked_for(
+    swimming: Daemon, tmp_path: Path
+) -> None:
+    line = said("view", "--axis", "--png", tmp_path / "a.png")
+    offset = re.search(r"axis ([+-][\d.]+) px", line)
+    assert offset
+    assert float(offset[1]) == pytest.approx(OFF, abs=1.0)
+    assert width_of(tmp_path / "a.png") == 84 * 7
+    said("view", "--whole", "--png", tmp_path / "whole.png")
+    assert width_of(tmp_path / "whole.png") >= 84
+
+
+def test_no_axis_is_found_while_the_fish_rests(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        ticks = fish.ticks()
+        wait_until(lambda: abs(float(next(ticks).alpha)) < 1e-4)  # type: ignore[arg-type]
+    complaint = one_line(fishctl("camera", "view", "--axis"))
+    assert complaint.startswith("fishctl: no axis is found, as no tail moves: let the fish swim")
+
+
+def test_a_picture_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
+    for verb in ("view", "align"):
+        done = fishctl("camera", verb, "--png", str(tmp_path / "a.jpg"))
+        assert done.returncode == 2
+        assert "a name ending in .png is needed" in one_line(done)
+
+
+def test_alignment_needs_a_fish_that_swims(daemon: Daemon) -> None:
+    complaint = one_line(fishctl("camera", "align"))
+    assert complaint == (
+        "fishctl: the fish rests (mode idle), so nothing moves: let it swim, with 'fishctl "
+        "set-controller swing', or add --swim\n"
+    )
+
+
+def test_a_fish_that_swims_without_moving_has_no_axis(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint) as fish:
+        fish.set_controller("hold")
+    complaint = one_line(fishctl("camera", "align", "--for", "3"))
+    assert "let the fish swim, and see that the camera looks at its tail" in complaint
+
+
+def test_alignment_finds_the_axis_within_a_pixel(swimming: Daemon, tmp_path: Path) -> None:
+    found = as_json("align", "--for", "8", "--png", str(tmp_path / "motion.png"))
+    assert found["offset"] == pytest.approx(OFF, abs=1.0)
+    assert found["tilt"] == pytest.approx(TILT, abs=0.02)
+    assert not found["good"]
+    assert found["settings"]["simulated.off_axis"] == pytest.approx(0.0, abs=1.0)
+    assert width_of(tmp_path / "motion.png") == 84 * 7
+
+
+def test_alignment_lets_the_fish_swim_where_it_is_told_to_and_rest_afterwards(
+    daemon: Daemon,
+) -> None:
+    done = fishctl("camera", "align", "--swim", "--for", "5")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "fishctl: it swims for 5 s; Ctrl-C stops it\n"
+    assert re.search(r"^offset +\d\.\d px below the middle row$", done.stdout, re.M)
+    assert re.search(r"^tilt +\d\.\d°, down to the right$", done.stdout, re.M)
+    assert "or try: fishd-camera --set simulated.off_axis=" in done.stdout
+    assert daemon.status().mode == "idle"
+
+
+def test_ctrl_c_stops_the_fish(daemon: Daemon) -> None:
+    process = Process(FISHCTL, "camera", "latency")
+    with Fish(daemon.endpoint) as fish:
+        deadline = time.monotonic() + PATIENCE
+        while fish.status().mode != "running":
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        status, out, err = process.end(signal.SIGINT)
+        assert (status, out) == (130, "")
+        assert err.splitlines()[-1] == "fishctl: interrupted: the fish rests, nothing is measured"
+        assert fish.status().mode == "idle"
+
+
+@pytest.mark.realtime
+def test_the_latency_of_the_whole_path_is_measured_within_milliseconds(daemon: Daemon) -> None:
+    found = as_json("latency", "--for", "30")
+    assert found["stamps"] == pytest.approx(0.0, abs=3e-3)
+    assert found["arrival"] >= LATENCY - 1e-3
+    assert found["delay"] == pytest.approx(found["arrival"], abs=3e-3)
+    assert found["error"] < 4e-3
+    assert found["stack_delay"] >= found["latest"] - 4e-3
+    assert "camera.stack.delay=" in found["advice"][-1]
+    assert daemon.status().mode == "idle"
+
+
+def test_a_fishd_that_is_in_lockstep_is_not_let_swim(tmp_path: Path) -> None:
+    with (
+        running(tmp_path, "--set", "lockstep=true") as daemon,
+        running_camera(tmp_path, f"simulated.fishd={daemon.endpoint}") as camera,
+    ):
+        camera.until(lambda state: state.virtual or state.state == "waiting")
+        words = ("--endpoint", daemon.endpoint, "--camera", camera.endpoint)
+        complaint = one_line(fishctl("camera", "align", "--swim", "--for", "3", *words))
+    assert "lockstep" in complaint
+
+
+@needs_browser
+def test_the_page_shows_the_view_live_with_the_axis_in_a_true_browser(swimming: Daemon) -> None:
+    process = Process(FISHCTL, "camera", "page", "--port", "0")
+    try:
+        assert process.process.stdout
+        line = process.process.stdout.readline()
+        url = re.fullmatch(r"the camera is at (http://127\.0\.0\.1:\d+/); Ctrl-C ends it\n", line)
+        assert url
+        with opened(url[1]) as (page, complaints):
+            page.wait_for_selector(".pill.streaming")
+            expect(page.locator("#axis")).to_contain_text("px", timeout=PATIENCE * 1e3)
+            before = page.inner_text("#seq")
+            expect(page.locator("#seq")).not_to_have_text(before)
+            row = page.evaluate(RED_ROW)
+            assert row == pytest.approx((83 / 2 + OFF + 0.5) / 84, abs=2 / 84)
+            assert "lost" not in page.inner_text("#state")
+            assert complaints == []
+        process.process.send_signal(signal.SIGINT)
+        assert process.finish() == (0, "", "")
+    finally:
+        process.end()
+
+
+RED_ROW = """() => {
+  const middle = Math.floor(canvas.width / 2);
+  const data = context.getImageData(middle, 0, 1, canvas.height).data;
+  const rows = [];
+  for (let row = 0; row < canvas.height; row++)
+    if (data[4 * row] > 200 && data[4 * row + 2] < 120) rows.push(row);
+  return rows.reduce((sum, row) => sum + row, 0) / rows.length / canvas.height;
+}"""
+"""How far down the axis is in the middle column, as a share of the height."""

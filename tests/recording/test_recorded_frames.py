@@ -1,0 +1,185 @@
+"""Frames of a camera in a recording: what is written is what is read."""
+
+import base64
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas
+import pytest
+from mcap.reader import make_reader
+from msgspec.structs import replace
+from rigs.filmed_swim import filmed, swum
+from rigs.harness import Rig
+
+from fishd.camera.frames import Frame
+from fishd.camera.simulated.settings import DEFAULT
+from fishd.core.errors import RecordingError
+from fishd.core.signals import Tick
+from fishd.recording import RunWriter, open_run
+from fishd.recording.export import export
+from fishd.recording.folder import glance
+from fishd.recording.images import FrameHead
+from fishd.recording.recover import recover
+
+UNIX = 1.7e9
+
+
+@pytest.fixture(scope="module")
+def ticks() -> list[Tick]:
+    return [replace(tick, t=UNIX + tick.time) for tick in swum(5.0, controller="swing")]
+
+
+@pytest.fixture(scope="module")
+def frames(ticks: list[Tick]) -> list[Frame]:
+    return filmed(ticks, replace(DEFAULT, rate=30.0))
+
+
+def head(frame: Frame, seq: int, session: str = "one", dropped: int = 0) -> FrameHead:
+    return FrameHead(UNIX + frame.time, frame.time, frame.available, seq, session, 0.01, dropped)
+
+
+def write(path: Path, ticks: list[Tick], frames: list[Frame], *, close: bool = True) -> Path:
+    """Each frame once it is there, between the ticks, as a recorder gets them."""
+    writer = RunWriter(path)
+    writer.describe(Rig().config)
+    waiting = list(enumerate(frames, start=1))
+    for tick in ticks:
+        writer.tick(tick)
+        while waiting and waiting[0][1].available <= tick.time:
+            seq, frame = waiting.pop(0)
+            writer.frame(head(frame, seq), frame.pixels)
+    for seq, frame in waiting:
+        writer.frame(head(frame, seq), frame.pixels)
+    if close:
+        writer.close()
+        return writer.path
+    writer.flush()
+    return writer.part
+
+
+@pytest.fixture
+def path(tmp_path: Path, ticks: list[Tick], frames: list[Frame]) -> Path:
+    return write(tmp_path / "run.mcap", ticks, frames)
+
+
+def test_every_pixel_and_every_time_is_given_back(
+    path: Path, ticks: list[Tick], frames: list[Frame]
+) -> None:
+    run = open_run(path)
+    found = list(run.frames())
+    assert len(found) == len(frames) == len(run.frame_heads)
+    for number, (frame, sent) in enumerate(zip(found, frames, strict=True), start=1):
+        assert (frame.pixels == sent.pixels).all()
+        assert (frame.time, frame.available) == (sent.time, sent.available)
+        assert (frame.seq, frame.session, frame.exposure) == (number, "one", 0.01)
+    assert run.ticks == ticks
+    assert (run.summary.frames, run.summary.frames_lost) == (len(frames), 0)
+
+
+def test_viewers_find_the_schema_that_they_know(path: Path, frames: list[Frame]) -> None:
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        found = list(reader.iter_messages(topics=["camera"], log_time_order=False))
+    assert len(found) == len(frames)
+    for (schema, channel, message), sent in zip(found, frames, strict=True):
+        assert schema is not None
+        assert (schema.name, schema.encoding) == ("foxglove.CompressedImage", "jsonschema")
+        assert channel.message_encoding == "json"
+        content = json.loads(message.data)
+        described = json.loads(schema.data)
+        assert set(content) == set(described["properties"])
+        assert "anyOf" not in schema.data.decode()
+        stamp = content["timestamp"]
+        assert stamp["sec"] * 10**9 + stamp["nsec"] == message.log_time
+        assert message.log_time * 1e-9 == pytest.approx(UNIX + sent.time, abs=1e-6)
+        assert content["format"] == "png"
+        png = np.frombuffer(base64.b64decode(content["data"]), np.uint8)
+        pixels = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+        assert pixels is not None
+        assert (pixels == sent.pixels).all()
+
+
+def test_an_hour_of_frames_has_the_size_that_the_docs_say(path: Path, tmp_path: Path,
+                                                          ticks: list[Tick],
+                                                          frames: list[Frame]) -> None:  # fmt: skip
+    bare = write(tmp_path / "bare.mcap", ticks, [])
+    each = (path.stat().st_size - bare.stat().st_size) / len(frames)
+    assert 4.0e3 < each < 6.0e3
+
+
+def test_frames_that_are_missing_are_counted_and_a_camera_that_begins_anew_is_a_gap(
+    tmp_path: Path, frames: list[Frame]
+) -> None:
+    with RunWriter(tmp_path / "run") as writer:
+        writer.describe(Rig().config)
+        heads = [
+            head(frames[0], 1), head(frames[1], 2), head(frames[2], 5),
+            head(frames[3], 6, dropped=3), head(frames[4], 1, session="two"),
+        ]  # fmt: skip
+        lost = [writer.frame(each, frames[0].pixels) for each in heads]
+    assert lost == [0, 0, 2, 3, 0]
+    for summary in (open_run(writer.path).summary, glance(writer.path).summary):
+        assert (summary.frames, summary.frames_lost, summary.frame_gaps) == (5, 5, 3)
+
+
+def test_a_recording_that_was_cut_off_is_finished_with_its_frames(
+    tmp_path: Path, ticks: list[Tick], frames: list[Frame]
+) -> None:
+    part = write(tmp_path / "run.mcap", ticks, frames, close=False)
+    copy = tmp_path / "cut.mcap"
+    copy.write_bytes(part.read_bytes()[:-20000])
+    run = recover(copy)
+    found = list(run.frames())
+    assert len(frames) > len(found) > len(frames) / 2
+    assert all((a.pixels == b.pixels).all() for a, b in zip(found, frames, strict=False))
+    assert run.summary.frames == len(found)
+
+
+def test_damaged_bytes_cost_the_frames_of_their_chunk_alone(
+    path: Path, frames: list[Frame]
+) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    run = open_run(path)
+    found = list(run.frames())
+    assert run.is_damaged
+    assert len(frames) - 30 < len(found) < len(frames)
+    assert run.summary.frames_lost == len(frames) - len(found)
+
+
+def test_a_recording_without_a_camera_has_no_frames(tmp_path: Path, ticks: list[Tick]) -> None:
+    run = open_run(write(tmp_path / "run", ticks, []))
+    assert list(run.frames()) == []
+    assert run.summary.frames == 0
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
+    path: Path, frames: list[Frame], tmp_path: Path, form: str
+) -> None:
+    written = export(open_run(path), tmp_path, form)  # type: ignore[arg-type]
+    names = ["", "-events", "-frames"]
+    assert [each.name for each in written] == [
+        *(f"run{name}.{form}" for name in names), "run-frames.npy",
+    ]  # fmt: skip
+    array = np.load(tmp_path / "run-frames.npy", mmap_mode="r")
+    assert array.shape == (len(frames), 84, 84)
+    assert all((one == frame.pixels).all() for one, frame in zip(array, frames, strict=True))
+    table = tmp_path / f"run-frames.{form}"
+    times = pandas.read_csv(table) if form == "csv" else pandas.read_parquet(table)
+    assert list(times.time) == [frame.time for frame in frames]
+    with pytest.raises(RecordingError, match="--force replaces it"):
+        export(open_run(path), tmp_path, form)  # type: ignore[arg-type]
+
+
+def test_frames_of_several_sizes_are_no_array(tmp_path: Path, frames: list[Frame]) -> None:
+    with RunWriter(tmp_path / "run") as writer:
+        writer.describe(Rig().config)
+        writer.frame(head(frames[0], 1), frames[0].pixels)
+        writer.frame(head(frames[1], 2), frames[1].pixels[:40, :40].copy())
+    with pytest.raises(RecordingError, match="frames of 84 x 84 px and of 40 x 40 px"):
+        export(open_run(writer.path), tmp_path, "csv")
+    assert not list(tmp_path.glob("*.part"))

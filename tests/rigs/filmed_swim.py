@@ -1,0 +1,29 @@
+"""A swim in virtual time, filmed by a simulated camera: forces and frames on one clock."""
+
+from itertools import pairwise
+
+from fishd.camera.frames import Frame
+from fishd.camera.latency import Force
+from fishd.camera.simulated.camera import SimulatedCamera, Tail
+from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.cli.camera.latency import forces_of
+from fishd.config import load
+from fishd.core.signals import Tick
+from fishd.lab.rig import VirtualRig
+
+NOISY = ("simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.drift=5e-3")
+
+
+def swum(seconds: float, *overrides: str, controller: str = "excitation") -> list[Tick]:
+    with VirtualRig(load(None, (*NOISY, *overrides))) as rig:
+        return rig.swim(controller, {}, seconds)
+
+
+def filmed(ticks: list[Tick], camera: SimulatedCameraSettings) -> list[Frame]:
+    simulated = SimulatedCamera(camera, 84)
+    tails = [Tail(t.time, float(t.alpha), float(t.alpha_rate)) for t in ticks]  # type: ignore[arg-type]
+    return [frame for pair in pairwise(tails) for frame in simulated.frames(*pair)]
+
+
+def felt(ticks: list[Tick]) -> list[Force]:
+    return forces_of(ticks, 0.05)
