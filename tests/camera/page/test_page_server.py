@@ -128,6 +128,7 @@ def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
     run(test)
 
 
+@pytest.mark.realtime
 def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_that_never_ask() -> None:
     async def whole() -> float:
         async with asyncio.timeout(20.0), PageServer("127.0.0.1", 0) as server:
