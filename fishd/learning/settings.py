@@ -14,6 +14,8 @@ from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
 
+SMALLEST = {"modes": 16, "cnn": 68, "nature": 36}
+"""Size of a frame that leaves something after all convolutions of an eye's network [px]."""
 Share = Annotated[float, Meta(ge=0, lt=1)]
 
 
@@ -223,6 +225,12 @@ def _check(settings: TrainingSettings) -> None:
         raise Problem(
             ("environment", "observation"),
             "an empty list is not valid with see: force; the agent would see nothing",
+        )
+    eye, size = settings.camera.eye, settings.camera.stack.size
+    if settings.see != "force" and size < SMALLEST[eye]:
+        raise Problem(
+            ("camera", "stack", "size"),
+            f"{size} px is not valid with the eye {eye}: {SMALLEST[eye]} px or more are needed",
         )
     babbles = settings.see != "force" and settings.camera.eye != "nature"
     if babbles and settings.steps <= settings.camera.babble:

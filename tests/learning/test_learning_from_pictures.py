@@ -17,6 +17,9 @@ from fishd.config import Config
 from fishd.core.errors import ConfigError
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
+from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes.making import make
+from fishd.learning.ppo import make_policy
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
@@ -58,6 +61,14 @@ def test_two_thousand_steps_teach_it_to_swim_by_sight(
     assert (outcome.ended, outcome.steps) == ("finished", 2048)
     assert outcome.best_evaluation
     assert outcome.best_evaluation.efficiency > 0.9
+
+
+@pytest.mark.parametrize(("eye", "size"), [("cnn", 68), ("nature", 36)])
+def test_a_network_can_be_made_for_the_smallest_frames(eye: str, size: int) -> None:
+    stack = StackSettings(size=size)
+    settings = TrainingSettings(see="camera", camera=VisionSettings(eye=eye, stack=stack))
+    check(settings)
+    assert make_policy(settings.ppo, 2, make(settings))
 
 
 @pytest.mark.parametrize("eye", ["cnn", "nature"])
@@ -194,9 +205,7 @@ def test_another_camera_is_looked_at_anew_with_the_networks_of_the_first(tmp_pat
     assert found.efficiency > 0.9
 
 
-def job_eye(kind: str):  # type: ignore[no-untyped-def]
-    from fishd.learning.eyes.making import make
-
+def job_eye(kind: str) -> Eye | None:
     stack = StackSettings(frames=1)
     return make(TrainingSettings(see="camera", camera=VisionSettings(eye=kind, stack=stack)))
 
@@ -223,6 +232,9 @@ def test_what_cannot_be_is_said(tmp_path: Path) -> None:
         ("environment: {observation: []}", "the agent would see nothing"),
         ("see: camera\ncamera: {babble: 64, memory: 16}", "less than a quarter of babble"),
         ("see: camera\ncamera: {eye: fish}", "camera.eye"),
+        ("see: camera\ncamera: {eye: cnn, stack: {size: 67}}", "68 px or more are needed"),
+        ("see: camera\ncamera: {eye: nature, stack: {size: 35}}", "36 px or more are needed"),
+        ("see: camera\nsteps: 256", "more than the babble, 256 steps, is needed"),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(ConfigError, match=complaint):

@@ -9,20 +9,23 @@ from fishd.camera.axis import find_motion
 from fishd.camera.frames import Pixels, StackSettings
 from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
 
+SHRINK = 4
+"""The eye `cnn` averages over squares of so many pixels' side."""
+
 
 class CnnEye(Eye):
-    """The newest frame and the differences between frames, at half the size, about the axis."""
+    """The newest frame and the differences between frames, shrunk, about the axis."""
 
     def __init__(self, stack: StackSettings, align: bool) -> None:
         super().__init__(stack)
         self._align = align
-        half = stack.size // 2
-        self.shape = (stack.frames, half, half)
-        self.outputs = stack.frames * half * half
+        small = stack.size // SHRINK
+        self.shape = (stack.frames, small, small)
+        self.outputs = stack.frames * small * small
         self.shapes = {
-            "rows": (half, stack.size),
-            "columns": (stack.size, half),
-            "mean": (half, half),
+            "rows": (small, stack.size),
+            "columns": (stack.size, small),
+            "mean": (small, small),
             "scale": (1,),
         }
 
@@ -34,14 +37,14 @@ class CnnEye(Eye):
             motion = find_motion(frames)
             column = round(motion.centre)
             shift = float(motion.axis.rows(size, size)[column]) - 0.5 * (size - 1)
-        rows, columns = _halving(size, shift), _halving(size, 0.0).T.copy()
-        halved = np.stack([rows @ frame @ columns for frame in lit(frames)])
-        mean = halved.mean(axis=0)
+        rows, columns = _shrinking(size, shift), _shrinking(size, 0.0).T.copy()
+        shrunk = np.stack([rows @ frame @ columns for frame in lit(frames)])
+        mean = shrunk.mean(axis=0)
         self.constants = {
             "rows": rows,
             "columns": columns,
             "mean": mean.astype(np.float32),
-            "scale": np.array([1.0 / (halved - mean).std()], np.float32),
+            "scale": np.array([1.0 / (shrunk - mean).std()], np.float32),
         }
 
     def glimpse(self, frame: Pixels) -> Array:
@@ -112,18 +115,17 @@ class NatureEye(Eye):
         return [node], {"white": np.array(1.0 / 255.0, np.float32)}
 
 
-def _halving(size: int, shift: float) -> Array:
-    """Weights, shape (size // 2, size), that average pairs of rows about a shifted middle.
+def _shrinking(size: int, shift: float) -> Array:
+    """Weights, shape (size // SHRINK, size), that average rows about a shifted middle.
 
     shift: of the middle [px]; rows beyond the picture are those of its edge
     """
-    half = size // 2
-    weights = np.zeros((half, size), np.float32)
-    for row in range(half):
-        for each in (2 * row, 2 * row + 1):
-            place = each + shift + 0.5 * (size - 2 * half)
-            below = int(np.floor(place))
-            share = place - below
-            weights[row, min(max(below, 0), size - 1)] += 0.5 * (1.0 - share)
-            weights[row, min(max(below + 1, 0), size - 1)] += 0.5 * share
+    small = size // SHRINK
+    weights = np.zeros((small, size), np.float32)
+    for row in range(small * SHRINK):
+        place = row + shift + 0.5 * (size - SHRINK * small)
+        below = int(np.floor(place))
+        share = place - below
+        weights[row // SHRINK, min(max(below, 0), size - 1)] += (1.0 - share) / SHRINK
+        weights[row // SHRINK, min(max(below + 1, 0), size - 1)] += share / SHRINK
     return weights
