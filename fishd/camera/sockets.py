@@ -102,7 +102,7 @@ def _listening(
 ) -> tuple["zmq.Socket[bytes]", str]:
     """A socket that listens until `stack` is closed, and its address; raises `StartupError`."""
     stack.enter_context(addresses.claimed(address, _RIVAL, _ADVICE))
-    listener = addresses.listen(address, key)
+    listener = addresses.listen(address, key, rival=_RIVAL)
     stack.callback(listener.close)
     served = addresses.served(address, listener)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

@@ -187,11 +187,14 @@ def claimed(
     return unix_sockets.claimed(path, address, rival, advice) if path else nullcontext()
 
 
-def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
+def listen(
+    address: str, key: str, *, group: bool = False, rival: str = "another fishd"
+) -> socket.socket:
     """A listening socket; an ipc address must be `claimed` before.
 
     key: that of the address in the configuration, which messages name
     group: let user and group of this process connect to a Unix socket, and nobody else
+    rival: who most likely listens there already
     Raises `StartupError`.
     """
     server = None
@@ -208,7 +211,9 @@ def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
     except (OSError, ValueError) as error:
         if server:
             server.close()
-        raise StartupError(f"{key}: cannot listen on {address}: {_why(address, error)}") from None
+        raise StartupError(
+            f"{key}: cannot listen on {address}: {_why(address, error, rival)}"
+        ) from None
     return server
 
 
@@ -231,12 +236,12 @@ def served(address: str, server: socket.socket) -> str:
     return f"{address.rpartition(':')[0].replace('*', '0.0.0.0')}:{server.getsockname()[1]}"
 
 
-def _why(address: str, error: Exception) -> str:
+def _why(address: str, error: Exception, rival: str) -> str:
     """Why an address cannot be bound, and what would be right."""
     if not isinstance(error, OSError):
         return str(error)
     if error.errno == errno.EADDRINUSE:
-        return "it is in use, by another fishd perhaps; end that, or choose another address"
+        return f"it is in use, by {rival} perhaps; end that, or choose another address"
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     if unknown and isinstance(where := parse(address), Tcp):
         return (
