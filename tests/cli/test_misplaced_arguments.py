@@ -75,9 +75,9 @@ def test_a_true_camera_cannot_see_a_simulated_fish(eye: str) -> None:
 
 @pytest.mark.parametrize("verb", ["status", "view", "align", "page"])
 def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> None:
-    line = one_line(fishctl("camera", verb, "--camera", "config/camera-web.yaml"))
+    line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml"))
     assert line == (
-        "fishctl: 'config/camera-web.yaml' is a file, for 'fishd-camera --config' and for simulated "
+        "fishctl: 'config/web.yaml' is a file, for 'fishd-camera --config' and for simulated "
         "fish; here the address at which a running fishd-camera takes requests is needed, such as "
         "tcp://127.0.0.1:9875\n"
     )
