@@ -21,6 +21,7 @@ from fishd.core.runtime_folder import runtime_folder
 
 FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
+IN_USE = "it is in use, by another fishd perhaps; end that, or choose another address"
 _SERVICE = Path("/run/fishd/control")
 _BACKLOG = 128
 """Connections that may wait to be accepted."""
@@ -187,14 +188,12 @@ def claimed(
     return unix_sockets.claimed(path, address, rival, advice) if path else nullcontext()
 
 
-def listen(
-    address: str, key: str, *, group: bool = False, rival: str = "another fishd"
-) -> socket.socket:
+def listen(address: str, key: str, *, group: bool = False, in_use: str = IN_USE) -> socket.socket:
     """A listening socket; an ipc address must be `claimed` before.
 
     key: that of the address in the configuration, which messages name
     group: let user and group of this process connect to a Unix socket, and nobody else
-    rival: who most likely listens there already
+    in_use: what to say where somebody listens there already
     Raises `StartupError`.
     """
     server = None
@@ -212,7 +211,7 @@ def listen(
         if server:
             server.close()
         raise StartupError(
-            f"{key}: cannot listen on {address}: {_why(address, error, rival)}"
+            f"{key}: cannot listen on {address}: {_why(address, error, in_use)}"
         ) from None
     return server
 
@@ -236,12 +235,12 @@ def served(address: str, server: socket.socket) -> str:
     return f"{address.rpartition(':')[0].replace('*', '0.0.0.0')}:{server.getsockname()[1]}"
 
 
-def _why(address: str, error: Exception, rival: str) -> str:
+def _why(address: str, error: Exception, in_use: str) -> str:
     """Why an address cannot be bound, and what would be right."""
     if not isinstance(error, OSError):
         return str(error)
     if error.errno == errno.EADDRINUSE:
-        return f"it is in use, by {rival} perhaps; end that, or choose another address"
+        return in_use
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     if unknown and isinstance(where := parse(address), Tcp):
         return (
