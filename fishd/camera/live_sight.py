@@ -1,5 +1,6 @@
 """What a running `fishd-camera` shows a policy; refuses a camera that does not suit it."""
 
+import math
 import time
 from typing import Self
 
@@ -37,8 +38,8 @@ class LiveSight:
         if size != stack.size:
             self.close()
             raise PolicyError(
-                f"it was trained on frames of {stack.size} x {stack.size} pixels, the camera at "
-                f"{self._client.endpoint} shows {size} x {size}; start that with --set "
+                f"frames of {stack.size} x {stack.size} pixels are needed (camera.stack.size), the "
+                f"camera at {self._client.endpoint} shows {size} x {size}; start it with --set "
                 f"picture.size={stack.size}"
             )
 
@@ -106,13 +107,24 @@ class LiveSight:
         camera = f"the camera at {self._client.endpoint}"
         if stack.frames > 1 and 0.0 < state.rate < _SHARE / stack.interval:
             raise PolicyError(
-                f"it is shown frames {stack.interval * 1e3:g} ms apart, so it needs "
-                f"{1.0 / stack.interval:.3g} a second; {camera} gives {state.rate:.3g}"
+                f"{1.0 / stack.interval:.3g} frames a second are needed, as those that are shown "
+                f"are {stack.interval * 1e3:g} ms apart (camera.stack.interval); {camera} gives "
+                f"{state.rate:.3g} a second: a faster camera is needed, or a training with "
+                f"camera.stack.interval: {_rounded_up(_SHARE / state.rate):g}"
             )
-        latest = stack.delay + stack.oldest
-        if state.rate and state.latency is not None and state.latency + 1.0 / state.rate > latest:
+        if not state.rate or state.latency is None:
+            return
+        late = state.latency + 1.0 / state.rate
+        if late > stack.delay + stack.oldest:
             raise PolicyError(
-                f"it is shown no frame that is older than {latest * 1e3:.0f} ms; those of {camera} "
-                f"are there {state.latency * 1e3:.0f} ms after their exposure, "
-                f"{1e3 / state.rate:.0f} ms apart"
+                f"frames no older than {(stack.delay + stack.oldest) * 1e3:.0f} ms are needed "
+                f"(camera.stack.delay + oldest); those of {camera} are there "
+                f"{state.latency * 1e3:.0f} ms after their exposure, {1e3 / state.rate:.0f} ms "
+                "apart: a camera with less latency is needed, or a training with "
+                f"camera.stack.delay: {_rounded_up(max(state.latency, late - stack.oldest)):g}"
             )
+
+
+def _rounded_up(seconds: float) -> float:
+    """To 5 ms."""
+    return round(math.ceil(seconds / 5e-3 - 1e-6) * 5e-3, 3)

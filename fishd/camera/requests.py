@@ -9,7 +9,7 @@ from typing import TypeVar
 import msgspec
 import zmq
 
-from fishd.camera.messages import CameraState
+from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
 from fishd.client.connection import milliseconds_until
 from fishd.core import addresses, protocol, text
@@ -18,6 +18,8 @@ from fishd.core.errors import FishError, Refused
 ENDPOINT_VARIABLE = "FISHD_CAMERA"
 LONGEST = 16 * 2**20
 """Of a message that is received [bytes]."""
+_SECOND_LOOK = 300
+"""How long it takes at most to find out that a silent address is that of frames [ms]."""
 
 T = TypeVar("T")
 
@@ -40,6 +42,7 @@ class CameraRequests:
         """timeout: how long to wait for an answer [s]"""
         self.endpoint = endpoint
         self.timeout = timeout
+        self._context = context
         self._ids = itertools.count(1)
         self._socket = context.socket(zmq.DEALER)
         self._socket.set(zmq.LINGER, 0)
@@ -71,10 +74,24 @@ class CameraRequests:
                         raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
                     if reply.result:
                         return msgspec.json.decode(reply.result, type=kind)
+        if self._publishes():
+            raise CameraLost(
+                f"at {self.endpoint} a camera publishes its frames; requests go to another address "
+                f"of it: its publish.requests, {PublishSettings().requests} by default"
+            )
         raise CameraLost(
             f"no camera at {self.endpoint}: no answer within {self.timeout:g} s; start one with "
             f"'fishd-camera', or name another with --camera or ${ENDPOINT_VARIABLE}"
         )
+
+    def _publishes(self) -> bool:
+        """Do frames go out there? Each subscriber to the state of a camera gets it at once."""
+        with self._context.socket(zmq.SUB) as socket:
+            socket.set(zmq.LINGER, 0)
+            socket.set(zmq.MAXMSGSIZE, LONGEST)
+            socket.subscribe(STATE)
+            connect(socket, self.endpoint)
+            return bool(socket.poll(_SECOND_LOOK)) and socket.recv_multipart()[0] == STATE
 
 
 def reachable(frames: str, endpoint: str) -> str:
@@ -90,6 +107,12 @@ def reachable(frames: str, endpoint: str) -> str:
 
 def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
     """Raises `CameraLost` when the address is none."""
+    if address.endswith((".yaml", ".yml")) and "://" not in address:
+        raise CameraLost(
+            f"'{text.quoted(address)}' is a file, for 'fishd-camera --config' and for simulated "
+            "fish; here the address at which a running fishd-camera takes requests is needed, such "
+            f"as {PublishSettings().requests}"
+        )
     if complaint := addresses.why_not_connected(address):
         raise CameraLost(f"'{address}' is no address of a camera: {complaint}")
     try:

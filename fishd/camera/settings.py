@@ -166,6 +166,23 @@ def load(
         raise ConfigError(problem.located(sources)) from None
 
 
+def simulated(path: str | os.PathLike[str] | None = None) -> SimulatedSettings:
+    """The simulated camera in a file, or the default one.
+
+    Raises `ConfigError` as `load` does, for a file whose source is another, and for an address.
+    """
+    needed = "in simulation a simulated camera is needed, such as config/camera-web.yaml"
+    if path is not None and "://" in str(path):
+        raise ConfigError(
+            f"'{text.quoted(str(path))}' is the address of a running fishd-camera, which sees the "
+            f"fish of a running fishd; {needed}"
+        )
+    settings = load(path)
+    if settings.source != "simulated":
+        raise ConfigError(f"{path}: source is {settings.source}; {needed}")
+    return settings.simulated
+
+
 def without_password(settings: CameraSettings) -> CameraSettings:
     """The same for whoever asks."""
     url = settings.stream.url

@@ -23,6 +23,7 @@ _AT_ONCE = 20
 _TOPICS = 20
 """Subscriptions that are remembered."""
 _RIVAL = "another fishd-camera"
+_IN_USE = "it is in use, by another fishd-camera perhaps; end that, or choose another address"
 _ADVICE = "end it, or give this one another publish.frames and publish.requests"
 
 
@@ -102,7 +103,7 @@ def _listening(
 ) -> tuple["zmq.Socket[bytes]", str]:
     """A socket that listens until `stack` is closed, and its address; raises `StartupError`."""
     stack.enter_context(addresses.claimed(address, _RIVAL, _ADVICE))
-    listener = addresses.listen(address, key)
+    listener = addresses.listen(address, key, in_use=_IN_USE)
     stack.callback(listener.close)
     served = addresses.served(address, listener)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

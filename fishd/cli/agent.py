@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import click
@@ -67,6 +68,8 @@ def agent(
     However this ends, the fish is at neutral. Exit status 1 where the policy does not fit the robot
     or the camera, or one of them is lost.
     """
+    for package in ("onnx", "onnxruntime"):
+        import_module(package)  # one that is missing is named with its extra, see `Verbs`
     from fishd.camera.live_sight import LiveSight
     from fishd.camera.pilot import Pilot
     from fishd.learning.env.fishd_link import FishdLink

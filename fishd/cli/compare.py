@@ -154,8 +154,9 @@ def _in_simulation(
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import parse, refusal
 
-    config, seen = load(file, overrides), cameras.load(camera).simulated
+    config, seen = load(file, overrides), cameras.simulated(camera)
     chosen = [parse(text) for text in texts] or _all(config)
+    _check_seen(camera, chosen)
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
     able = [one for one in chosen if one not in (out for out, _ in left_out)]
     swum = able or chosen
@@ -180,6 +181,7 @@ def _on_robot(
     chosen = [absolute(parse(text)) for text in texts]
     with interrupted_once(), Fish(endpoint) as fish:  # whatever ends it leaves the fish at rest
         chosen = chosen or _all(adopt(fish.config()))
+        _check_seen(camera, chosen)
         unit = fish.status().force_unit
         with (
             PilotedRig(fish, camera, agent) as rig,
@@ -197,6 +199,15 @@ def _on_robot(
     return _Outcome(
         live.standings(), live.traces(), live.left_out, rig.amplitude, unit, ended, status
     )
+
+
+def _check_seen(camera: str | None, chosen: "list[Contestant]") -> None:
+    """Refuse a camera that nobody looks through."""
+    from fishd.lab.compare.seeing import may_see_pictures
+
+    policies = (one.parameters.get("policy") for one in chosen if one.controller == "ppo")
+    if camera is not None and not any(map(may_see_pictures, policies)):
+        raise click.UsageError("--camera cannot be given here: no contestant sees pictures")
 
 
 def _all(config: Config) -> "list[Contestant]":

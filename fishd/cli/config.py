@@ -18,12 +18,37 @@ from fishd.config import (
     service_file,
     to_yaml,
 )
+from fishd.core.errors import ConfigError
+from fishd.core.schema import fields_of
 from fishd.hardware.servo import pulses
+
+
+def _refuse_training(
+    _ctx: click.Context, _param: click.Parameter, overrides: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Say where the settings of a training belong; raises `ConfigError`."""
+    of_fish = {field.name for field in fields_of(Config)}
+    for override in overrides:
+        name = override.partition("=")[0].partition(".")[0].strip()
+        if name not in of_fish and name in _of_training():
+            raise ConfigError(
+                f"--set {override}: --set is about the fish, {name} is a setting of a training: "
+                "write it into a YAML file, for 'fishctl learn ppo --settings FILE'"
+            )
+    return overrides
+
+
+def _of_training() -> tuple[str, ...]:
+    from fishd.learning.settings import TrainingSettings
+
+    return TrainingSettings.__struct_fields__
+
 
 set_option = click.option(
     "--set",
     "overrides",
     multiple=True,
+    callback=_refuse_training,
     metavar="KEY=VALUE",
     shell_complete=complete_key,
     help="Override one key of the configuration, such as plant.omega0=10. Repeatable.",

@@ -21,6 +21,7 @@ from fishd.core.runtime_folder import runtime_folder
 
 FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
+IN_USE = "it is in use, by another fishd perhaps; end that, or choose another address"
 _SERVICE = Path("/run/fishd/control")
 _BACKLOG = 128
 """Connections that may wait to be accepted."""
@@ -187,11 +188,12 @@ def claimed(
     return unix_sockets.claimed(path, address, rival, advice) if path else nullcontext()
 
 
-def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
+def listen(address: str, key: str, *, group: bool = False, in_use: str = IN_USE) -> socket.socket:
     """A listening socket; an ipc address must be `claimed` before.
 
     key: that of the address in the configuration, which messages name
     group: let user and group of this process connect to a Unix socket, and nobody else
+    in_use: what to say where somebody listens there already
     Raises `StartupError`.
     """
     server = None
@@ -208,7 +210,9 @@ def listen(address: str, key: str, *, group: bool = False) -> socket.socket:
     except (OSError, ValueError) as error:
         if server:
             server.close()
-        raise StartupError(f"{key}: cannot listen on {address}: {_why(address, error)}") from None
+        raise StartupError(
+            f"{key}: cannot listen on {address}: {_why(address, error, in_use)}"
+        ) from None
     return server
 
 
@@ -231,12 +235,12 @@ def served(address: str, server: socket.socket) -> str:
     return f"{address.rpartition(':')[0].replace('*', '0.0.0.0')}:{server.getsockname()[1]}"
 
 
-def _why(address: str, error: Exception) -> str:
+def _why(address: str, error: Exception, in_use: str) -> str:
     """Why an address cannot be bound, and what would be right."""
     if not isinstance(error, OSError):
         return str(error)
     if error.errno == errno.EADDRINUSE:
-        return "it is in use, by another fishd perhaps; end that, or choose another address"
+        return in_use
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     if unknown and isinstance(where := parse(address), Tcp):
         return (

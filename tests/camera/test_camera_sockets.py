@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -22,6 +23,7 @@ from fishd.camera.requests import reachable
 from fishd.cli.doctor import service
 from fishd.cli.doctor.base import Context
 from fishd.config import Config
+from fishd.core import addresses
 from fishd.core.errors import Refused
 
 Both = tuple[Daemon, CameraProcess]
@@ -143,6 +145,11 @@ def test_what_is_no_address_is_said(tmp_path: Path) -> None:
         CameraClient("tcp://x")
 
 
+def test_the_address_of_frames_in_place_of_that_for_requests_is_told(camera: CameraProcess) -> None:
+    with pytest.raises(CameraLost, match=r"publishes its frames; requests go to another address"):
+        CameraClient(camera.frames, timeout=0.2)
+
+
 def test_a_camera_of_another_version_is_refused(tmp_path: Path) -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
@@ -193,10 +200,20 @@ def test_the_doctor_says_how_the_camera_is(
 
 
 def test_a_second_camera_at_the_same_address_is_refused(camera: CameraProcess) -> None:
-    addresses = sets(f"publish.requests={camera.endpoint}", f"publish.frames={camera.frames}")
-    done = call(*COMMAND, *addresses)
+    own = sets(f"publish.requests={camera.endpoint}", f"publish.frames={camera.frames}")
+    done = call(*COMMAND, *own)
     assert done.returncode == 1
     assert "another fishd-camera" in done.stderr
+
+
+def test_a_port_that_is_taken_is_that_of_another_camera_perhaps(tmp_path: Path) -> None:
+    taken = addresses.listen("tcp://127.0.0.1:0", "test")
+    with closing(taken):
+        address = addresses.served("tcp://127.0.0.1:0", taken)
+        own = sets(f"publish.frames={address}", f"publish.requests=ipc://{tmp_path}/requests")
+        done = call(*COMMAND, *own)
+    assert done.returncode == 1
+    assert f"{address}: it is in use, by another fishd-camera perhaps; end that" in done.stderr
 
 
 @pytest.mark.realtime

@@ -21,12 +21,14 @@ from rigs.processes import (
     PATIENCE,
     Daemon,
     Process,
+    Subscriber,
     fishctl,
     one_line,
     running,
     wait_until,
 )
 
+from fishd.camera.settings import load
 from fishd.client import Fish
 
 TICK = 0.05
@@ -186,6 +188,19 @@ def test_a_picture_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
         assert "a name ending in .png is needed" in one_line(done)
 
 
+def test_a_picture_that_cannot_be_written_is_refused_before_the_fish_swims(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        done = fishctl("camera", "align", "--swim", "--png", f"{tmp_path}/nowhere/a.png")
+        seen = [ticks.message() for _ in range(3)]
+    assert done.returncode == 2
+    assert f"there is no folder {tmp_path}/nowhere" in one_line(done)
+    assert {tick["mode"] for tick in seen} == {"idle"}
+    looked = fishctl("camera", "view", "--axis", "--png", f"{tmp_path}/nowhere/a.png")
+    assert f"there is no folder {tmp_path}/nowhere" in one_line(looked)
+
+
 def test_alignment_needs_a_fish_that_swims(daemon: Daemon) -> None:
     complaint = one_line(fishctl("camera", "align"))
     assert complaint == (
@@ -211,14 +226,19 @@ def test_alignment_finds_the_axis_within_a_pixel(swimming: Daemon, tmp_path: Pat
 
 
 def test_alignment_lets_the_fish_swim_where_it_is_told_to_and_rest_afterwards(
-    daemon: Daemon,
+    daemon: Daemon, tmp_path: Path
 ) -> None:
     done = fishctl("camera", "align", "--swim", "--for", "5")
     assert done.returncode == 0, done.stderr
     assert done.stderr == "fishctl: it swims for 5 s; Ctrl-C stops it\n"
     assert re.search(r"^offset +\d\.\d px below the middle row$", done.stdout, re.M)
     assert re.search(r"^tilt +\d\.\d°, down to the right$", done.stdout, re.M)
-    assert "or try: fishd-camera --set simulated.off_axis=" in done.stdout
+    pasted = re.search(r"write into the file of the camera:\n(.+)\nor try: (.+)", done.stdout, re.S)
+    assert pasted
+    (tmp_path / "camera.yaml").write_text(pasted[1])
+    off_axis = load(tmp_path / "camera.yaml").simulated.off_axis
+    assert off_axis == pytest.approx(0.0, abs=1.0)
+    assert f"fishd-camera --set simulated.off_axis={off_axis}" in pasted[2]
     assert daemon.status().mode == "idle"
 
 
@@ -258,8 +278,9 @@ def test_the_latency_of_the_whole_path_is_measured_within_milliseconds(daemon: D
     assert found["arrival"] >= LATENCY - 1e-3
     assert found["delay"] == pytest.approx(found["arrival"], abs=3e-3)
     assert found["error"] < 4e-3
-    assert found["stack_delay"] >= found["latest"] - 4e-3
-    assert "camera.stack.delay=" in found["advice"][-1]
+    assert found["latest"] < 0.1
+    assert found["stack_delay"] == 0.0
+    assert found["advice"][-1] == "young enough for learning: nothing to set in a training"
     assert daemon.status().mode == "idle"
 
 

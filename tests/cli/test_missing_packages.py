@@ -104,6 +104,16 @@ def test_training_without_the_extra_names_it_in_one_line(
     assert (shown.returncode, "--resume" in shown.stdout) == (0, True)
 
 
+@pytest.mark.parametrize("module", ["onnx", "onnxruntime"])
+def test_an_agent_names_the_extra_that_policies_need(tmp_path: Path, module: str) -> None:
+    found = call(FISHCTL, "agent", "default-fish", env=without(tmp_path, module))
+    assert (found.returncode, found.stdout) == (1, "")
+    assert found.stderr == (
+        f"fishctl: {module} is not installed; where the sources of fishd are: pip install "
+        "--constraint tools/constraints.txt --editable '.[policy]'\n"
+    )
+
+
 @pytest.mark.parametrize(("module", "verb"), [("aiohttp", ("page",)), ("mcap", ("record", "run"))])
 def test_a_verb_about_a_camera_names_the_extra_that_it_needs(
     tmp_path: Path, module: str, verb: tuple[str, ...]

@@ -46,6 +46,17 @@ def runs(tmp_path: Path) -> Path:
     return folder
 
 
+def test_what_lets_a_fish_in_estop_swim_is_named(daemon: Daemon, runs: Path) -> None:
+    with Fish(daemon.endpoint) as fish:
+        fish.estop()
+        done = daemon.fishctl("record", "run", "--folder", str(runs), "--for", "0.5")
+        fish.clear_fault()
+    assert done.stderr.splitlines()[-1] == (
+        "fishctl: the fish is at rest (mode estop); it swims with: fishctl clear-fault, then "
+        "fishctl set-controller"
+    )
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_finishes_the_file(daemon: Daemon, runs: Path, number: signal.Signals) -> None:
     words = ("run", "--subject", "fish 3", "--operator", "Ada", "--note", "stiff fin")

@@ -107,6 +107,18 @@ def test_a_recording_with_a_camera_does_not_begin_without_one(
     assert not list(runs.iterdir())
 
 
+def test_what_follows_the_option_is_the_camera_only_where_it_is_an_address(
+    daemon: Daemon, camera: CameraProcess, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = daemon.fishctl("record", "--camera", camera.endpoint, "first", "--for", "1")
+    monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
+    alone = daemon.fishctl("record", "--for", "1", "--camera", "second")
+    assert (named.returncode, alone.returncode) == (0, 0), named.stderr + alone.stderr
+    assert all(open_run(runs / f"{name}.mcap").frame_heads for name in ("first", "second"))
+    refused = one_line(daemon.fishctl("record", "third", "--camera", "config/camera.yaml"))
+    assert "'config/camera.yaml' is a file" in refused
+
+
 def test_a_black_box_keeps_no_frames(daemon: Daemon, runs: Path) -> None:
     complaint = one_line(daemon.fishctl("record", "--black-box", "--camera"))
     assert "a black box keeps no frames: they would fill it within hours" in complaint

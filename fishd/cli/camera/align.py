@@ -17,6 +17,7 @@ from fishd.cli.camera.options import (
     png_option,
     refuse_lockstep,
     rig_of,
+    yaml_of,
 )
 from fishd.cli.lab_progress import showing
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
@@ -151,9 +152,8 @@ def _print(found: "Alignment", frames: int) -> None:
     for line in found.advice:
         echo(line)
     if found.settings:
-        echo("write into the settings of the camera:")
-        for key, value in found.settings.items():
-            echo(f"  {key}={value}")
+        echo("write into the file of the camera:")
+        echo(yaml_of(found.settings))
         words = " ".join(f"--set {key}={value}" for key, value in found.settings.items())
         echo(f"or try: fishd-camera {words}")
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of
+from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of, yaml_of
 from fishd.cli.lab_progress import showing
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, echo_rows, print_json
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from fishd.camera.latency import Force, Latency
     from fishd.camera.settings import CameraSettings
     from fishd.core.signals import Tick
+
+OLD = 0.1
+"""Younger frames need no `camera.stack.delay`: what was measured learned as well without [s]."""
 
 
 @click.command()
@@ -94,31 +97,42 @@ def _print(found: "Latency", clocks: float, settings: "CameraSettings") -> None:
     )  # fmt: skip
     if clocks > 1e-3:
         echo(f"careful: the clocks of camera and fishd are known to ± {clocks * 1e3:.1f} ms only")
-    for line in _advice(found, settings):
+    for line in advice(found, settings):
         echo(line)
 
 
 def stack_delay(found: "Latency") -> float:
-    """What `camera.stack.delay` of a training should be: almost every frame is there by then [s].
+    """What `camera.stack.delay` of a training should be [s]; 0 for frames younger than `OLD`.
 
-    In steps of 5 ms, as the interval of the delay is hardly smaller.
+    Almost every frame is there by then. In steps of 5 ms, as the interval of the delay is hardly
+    smaller.
     """
+    if found.stamps + found.latest <= OLD:
+        return 0.0
     return math.ceil((found.stamps + found.latest) / 5e-3 - 1e-6) * 5e-3
 
 
-def _advice(found: "Latency", settings: "CameraSettings") -> list[str]:
+def advice(found: "Latency", settings: "CameraSettings") -> list[str]:
+    """What to write where, or that nothing is to be set; lines of YAML as they are pasted."""
     lines = []
     if abs(found.stamps) > max(found.error, 1e-3):
         if settings.source == "simulated":
             lines.append("the stamps of a simulated camera are exact: this is an error of the fit")
         else:
             key = f"{settings.source}.delay"
-            delay = getattr(settings, settings.source).delay + found.stamps
-            lines.append(f"write into the settings of the camera: {key}={delay:.4f}")
+            delay = round(getattr(settings, settings.source).delay + found.stamps, 4)
+            lines += ["write into the file of the camera:", yaml_of({key: delay})]
+            lines.append(f"or try: fishd-camera --set {key}={delay}")
     else:
         lines.append("its time stamps are right: nothing to set in the camera")
-    spaced = f"camera.stack.delay={stack_delay(found):.3f}"
-    lines.append(f"for frames of even distance, write into the settings of a training: {spaced}")
+    if delay := round(stack_delay(found), 3):
+        lines.append(
+            "frames come late; for frames of even distance, write into the file of a training, for "
+            "--settings:"
+        )
+        lines.append(yaml_of({"camera.stack.delay": delay}))
+    else:
+        lines.append("young enough for learning: nothing to set in a training")
     return lines
 
 
@@ -132,6 +146,6 @@ def _as_json(found: "Latency", clocks: float, settings: "CameraSettings") -> dic
         "agreement": found.agreement,
         "frames": found.frames,
         "clocks": clocks,
-        "stack_delay": stack_delay(found),
-        "advice": _advice(found, settings),
+        "stack_delay": round(stack_delay(found), 3),
+        "advice": advice(found, settings),
     }

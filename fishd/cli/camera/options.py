@@ -1,11 +1,13 @@
 """What the verbs about a camera share: which camera, where a picture goes, and who swims."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
+import yaml
 
 from fishd.cli.output import echo
 from fishd.client import Fish
@@ -32,9 +34,28 @@ png_option = click.option(
 
 
 def check_png(path: Path | None) -> None:
-    """Refuse a picture of another kind, before there is anything to draw."""
-    if path is not None and path.suffix.lower() != ".png":
-        raise click.UsageError(f"'{path}' is not valid for --png: a name ending in .png is needed")
+    """Refuse a picture that cannot be written, before anything moves or is looked at."""
+    if path is None:
+        return
+    refused, folder = f"'{path}' is not valid for --png: ", path.parent
+    if path.suffix.lower() != ".png":
+        raise click.UsageError(f"{refused}a name ending in .png is needed")
+    if not folder.is_dir():
+        raise click.UsageError(f"{refused}there is no folder {folder}")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise click.UsageError(f"{refused}nothing may be written into the folder {folder}")
+
+
+def yaml_of(settings: dict[str, Any]) -> str:
+    """Lines to be pasted into a file of settings; the keys of their sections have dots."""
+    data: dict[str, Any] = {}
+    for key, value in settings.items():
+        *sections, name = key.split(".")
+        inner = data
+        for section in sections:
+            inner = inner.setdefault(section, {})
+        inner[name] = value
+    return yaml.safe_dump(data, sort_keys=False).rstrip()
 
 
 class Watcher:

@@ -26,8 +26,7 @@ def record(
     """Record a running fish and the frames of the camera above it in one file.
 
     RUN is a name in the folder of recordings or a path; by default the date and time. As `fishctl
-    record --camera`, which records the camera of this machine. A camera that is lost meanwhile ends
-    nothing: that is said, and counted.
+    record --camera`. A camera that is lost meanwhile ends nothing: that is said, and counted.
     """
     from fishd.recording.camera_tap import CameraTap
 

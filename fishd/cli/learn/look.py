@@ -20,7 +20,6 @@ from fishd.config import load
 )
 @click.option(
     "--camera",
-    type=click.Path(path_type=Path),
     metavar="FILE",
     help="YAML file of a simulated camera, such as config/camera-web.yaml. [default: a good one]",
 )
@@ -35,7 +34,7 @@ from fishd.config import load
 def look(
     policy: str,
     picture: Path | None,
-    camera: Path | None,
+    camera: str | None,
     seconds: float,
     file: Path | None,
     overrides: tuple[str, ...],
@@ -51,7 +50,7 @@ def look(
 
     if picture:
         drawing.check(picture)
-    config, seen = load(file, overrides), cameras.load(camera).simulated
+    config, seen = load(file, overrides), cameras.simulated(camera)
     found = looking.look(policy, config, seen, seconds)
     click.echo(
         f"{policy}: {found.share:.0%} of the sensitivity lies where the tail moves, on "

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -70,13 +71,25 @@ def recording_options(function: F) -> F:
     return function
 
 
-@click.command()
+class _Record(click.Command):
+    """`--camera` may stand alone: what follows it is its address only where it looks like one."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """A file of settings is no RUN either; it is refused as an address."""
+        words = []
+        for word, after in pairwise([*args, ""]):
+            alone = "://" not in after and not after.endswith((".yaml", ".yml"))
+            words.append("--camera=" if word == "--camera" and alone else word)
+        return super().parse_args(ctx, words)
+
+
+@click.command(cls=_Record)
 @recording_options
 @click.option(
     "--camera",
-    "with_camera",
-    is_flag=True,
-    help="The frames of the camera, too; 'fishctl camera record' can name another camera.",
+    metavar="[ADDRESS]",
+    help="The frames of the camera, too: of the one that takes requests at ADDRESS, else at "
+    "$FISHD_CAMERA, else of this machine.",
 )
 @click.option(
     "--black-box",
@@ -98,7 +111,7 @@ def record(
     subject: str,
     note: str,
     seconds: float | None,
-    with_camera: bool,
+    camera: str | None,
     black_box: bool,
     keep: int,
 ) -> None:
@@ -109,7 +122,7 @@ def record(
     """
     if black_box and run:
         raise click.UsageError("--black-box names its files itself: leave RUN out")
-    if black_box and with_camera:
+    if black_box and camera is not None:
         raise click.UsageError("a black box keeps no frames: they would fill it within hours")
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
@@ -117,13 +130,13 @@ def record(
         open_recorder = partial(Recorder, endpoint, box.open, tell=_tell, due=box.due)
         _record_for_ever(open_recorder, _Signals(), seconds)
         return
-    if not with_camera:
+    if camera is None:
         record_one(run, endpoint, folder, begin, seconds)
         return
     from fishd.recording.camera_tap import CameraTap
 
-    with CameraTap(None, endpoint) as camera:
-        record_one(run, endpoint, folder, begin, seconds, camera)
+    with CameraTap(camera or None, endpoint) as tap:
+        record_one(run, endpoint, folder, begin, seconds, tap)
 
 
 def record_one(
@@ -149,7 +162,11 @@ def record_one(
         with recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it")
             if (mode := recorder.status.mode) != "running":
-                _tell(f"the fish is at rest (mode {mode}); it swims with: fishctl set-controller")
+                first = "fishctl clear-fault, then " if mode in ("fault", "estop") else ""
+                _tell(
+                    f"the fish is at rest (mode {mode}); it swims with: {first}fishctl "
+                    "set-controller"
+                )
             recorder.run(stopping, seconds)
     except RecordingError as error:
         if recorder.began:

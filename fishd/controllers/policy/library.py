@@ -5,6 +5,7 @@ $FISHD_POLICIES, `policies` in the state folder, /etc/fishd/policies, and what c
 """
 
 import os
+import shlex
 from pathlib import Path
 
 from fishd.core.errors import PolicyError
@@ -42,8 +43,20 @@ def find(text: str) -> Path:
         return Path(text).expanduser()
     known = _files()
     if text not in known:
+        if run := of_run(Path(text)):
+            raise PolicyError(f"{text} {run}")
         raise PolicyError(unknown(text, sorted(known)))
     return known[text]
+
+
+def of_run(path: Path) -> str:
+    """What to say of the folder of a training, or of one of its checkpoints; else nothing."""
+    if not (path.is_dir() and any((at / "settings.yaml").is_file() for at in (path, path.parent))):
+        return ""
+    return (
+        "is the folder of a training, no policy file; export it first: fishctl learn export "
+        f"{shlex.quote(str(path))}"
+    )
 
 
 def describe_all(tick: float | None = None, amplitude: float | None = None) -> list[PolicyInfo]:

@@ -41,6 +41,8 @@ def parse(text: str) -> Contestant:
         )
     if name not in registry.names():
         if not (names_file(text, library.SUFFIX) or text in library.names()):
+            if run := library.of_run(Path(text)):
+                raise ParameterError(f"{text} {run}")
             hint = nearest(name, [*registry.names(), *library.names()])
             raise ParameterError(
                 f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"

@@ -6,7 +6,7 @@ from fishd.camera.pilot import Pilot
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.controllers.base import Controller, Limits
-from fishd.controllers.policy import opening
+from fishd.controllers.policy import file, library, opening
 from fishd.controllers.policy.controller import PpoParameters
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
@@ -22,6 +22,17 @@ def sees_pictures(policy: Any, limits: Limits) -> bool:
         return isinstance(policy, str) and opening.read(policy, limits).card.pictures is not None
     except PolicyError:
         return False
+
+
+def may_see_pictures(policy: Any) -> bool:
+    """Is it a policy that sees pictures, or one that cannot be read here?
+
+    policy: name or path
+    """
+    try:
+        return isinstance(policy, str) and file.read(library.find(policy)).card.pictures is not None
+    except PolicyError:
+        return True
 
 
 class SeeingController(Controller[PpoParameters]):

@@ -1,0 +1,89 @@
+"""An argument that belongs elsewhere: the verb says where."""
+
+from pathlib import Path
+
+import pytest
+from rigs.documents import ROOT
+from rigs.policy_files import velocity_follower, write
+from rigs.processes import fishctl, one_line
+
+
+@pytest.mark.parametrize("override", ["camera.eye=cnn", "ppo.n_steps=64", "see=camera"])
+@pytest.mark.parametrize("verb", [("learn", "ppo"), ("compare", "swing")])
+def test_a_setting_of_a_training_is_sent_to_its_file(verb: tuple[str, ...], override: str) -> None:
+    done = fishctl(*verb, "--set", override)
+    name = override.partition("=")[0].partition(".")[0]
+    assert done.returncode == 78
+    assert one_line(done) == (
+        f"fishctl: --set {override}: --set is about the fish, {name} is a setting of a training: "
+        "write it into a YAML file, for 'fishctl learn ppo --settings FILE'\n"
+    )
+
+
+@pytest.mark.parametrize("verb", [("learn", "look"), ("compare",), ("policies", "show")])
+@pytest.mark.parametrize("inner", ["", "/step-256"])
+def test_a_run_folder_in_place_of_a_policy_is_to_be_exported_first(
+    tmp_path: Path, verb: tuple[str, ...], inner: str
+) -> None:
+    (tmp_path / "step-256").mkdir()
+    (tmp_path / "settings.yaml").touch()
+    line = one_line(fishctl(*verb, f"{tmp_path}{inner}"))
+    assert line.endswith(
+        f"{tmp_path}{inner}: is the folder of a training, no policy file; export it first: "
+        f"fishctl learn export {tmp_path}{inner}\n"
+    )
+
+
+def test_the_name_of_a_run_folder_is_known_without_a_slash_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "settings.yaml").touch()
+    monkeypatch.chdir(tmp_path)
+    for verb in (("learn", "look"), ("compare",)):
+        line = one_line(fishctl(*verb, "first"))
+        assert line == (
+            "fishctl: first is the folder of a training, no policy file; export it first: fishctl "
+            "learn export first\n"
+        )
+
+
+@pytest.fixture
+def eye(tmp_path: Path) -> str:
+    return str(write(tmp_path, velocity_follower(), "eye"))
+
+
+def test_an_address_in_place_of_the_file_of_a_simulated_camera_is_refused(eye: str) -> None:
+    for verb in (("learn", "look"), ("compare",)):
+        done = fishctl(*verb, eye, "--camera", "tcp://127.0.0.1:9875")
+        assert one_line(done) == (
+            "fishctl: 'tcp://127.0.0.1:9875' is the address of a running fishd-camera, which sees "
+            "the fish of a running fishd; in simulation a simulated camera is needed, such as "
+            "config/camera-web.yaml\n"
+        )
+        assert done.returncode == 78
+
+
+def test_a_true_camera_cannot_see_a_simulated_fish(eye: str) -> None:
+    file = ROOT / "config" / "camera.yaml"
+    for verb in (("learn", "look"), ("compare",)):
+        assert one_line(fishctl(*verb, eye, "--camera", str(file))) == (
+            f"fishctl: {file}: source is v4l2; in simulation a simulated camera is needed, such as "
+            "config/camera-web.yaml\n"
+        )
+
+
+@pytest.mark.parametrize("verb", ["status", "view", "align", "page"])
+def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> None:
+    line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml"))
+    assert line == (
+        "fishctl: 'config/web.yaml' is a file, for 'fishd-camera --config' and for simulated "
+        "fish; here the address at which a running fishd-camera takes requests is needed, such as "
+        "tcp://127.0.0.1:9875\n"
+    )
+
+
+def test_a_camera_that_no_contestant_looks_through_is_refused() -> None:
+    done = fishctl("compare", "swing", "hold", "--camera", str(ROOT / "config/camera-web.yaml"))
+    assert done.returncode == 2
+    assert "--camera cannot be given here: no contestant sees pictures" in one_line(done)
