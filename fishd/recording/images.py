@@ -94,8 +94,8 @@ def encoded(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
     """The message of a frame; raises `MissingPackage` without OpenCV (extra: camera)."""
     _, png = _cv2().imencode(".png", pixels, [_cv2().IMWRITE_PNG_COMPRESSION, _COMPRESSION])
     nanoseconds = max(0, round(head.t * 1e9))
-    fields: dict[str, Any] = structs.asdict(head)
-    known = {name: UNSET if value is None else value for name, value in fields.items()}
+    fields = structs.asdict(head).items()
+    known: dict[str, Any] = {name: UNSET if it is None else it for name, it in fields}
     message = ImageMessage(
         **known,
         timestamp=Timestamp(*divmod(nanoseconds, 10**9)),
