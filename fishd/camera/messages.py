@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.camera.frames import Pixels
 from fishd.core.errors import FishdError
@@ -20,6 +20,12 @@ FRAME, VIEW, STATE, UNTIL = b"frame", b"view", b"state", b"until"
 """The topics."""
 LARGEST = 256
 """Height and width of a frame [px]."""
+
+EARLIEST = -2.0
+"""No frame is there so long before the middle of its exposure: `delay` of a camera's settings may
+move its time by a second [s]."""
+_POSSIBLE = {"ge": -1e9, "le": 1e9}
+"""Times: 30 years, beyond which nothing could be told from the clock of a machine [s]."""
 
 _Version = Annotated[int, note("Version of these messages: 1.")]
 _Session = Annotated[
@@ -34,6 +40,7 @@ _FrameTime = Annotated[
         "s",
         "Middle of the exposure, on the camera's clock: the monotonic one of its machine; of a "
         "simulated camera that of fishd, which in lockstep is virtual.",
+        **_POSSIBLE,
     ),
 ]
 
@@ -53,7 +60,7 @@ class FrameHeader(Struct, frozen=True, kw_only=True, gc=False):
     time: _FrameTime
     available: Annotated[
         float,
-        unit("s", "When it could first be had, on the same clock."),
+        unit("s", "When it could first be had, on the same clock.", **_POSSIBLE),
     ]
     exposure: Annotated[float | None, unit("s", "Its length; null where it is not known.")] = None
     dropped: Annotated[
@@ -92,7 +99,7 @@ class Until(Struct, frozen=True, kw_only=True, gc=False):
 
     v: _Version = VERSION
     session: _Session
-    until: Annotated[float, unit("s", "On the camera's clock.")]
+    until: Annotated[float, unit("s", "On the camera's clock.", **_POSSIBLE)]
 
 
 Condition = Literal["starting", "waiting", "streaming", "stalled", "unplugged", "unusable", "ended"]
@@ -141,10 +148,11 @@ class CameraState(Struct, frozen=True, kw_only=True):
     picture_height: Annotated[int, unit("px", "Their height.")]
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
     until: Annotated[
-        float | None, unit("s", "That of the latest message `until` of this session.")
+        Annotated[float, Meta(**_POSSIBLE)] | None,
+        unit("s", "That of the latest message `until` of this session."),
     ] = None
     clock: Annotated[
-        float | None,
+        Annotated[float, Meta(**_POSSIBLE)] | None,
         unit("s", "Now, on the camera's clock; null where that is virtual, or not known yet."),
     ] = None
     boot: Annotated[str, note("Names the start of the machine from which that clock counts.")] = ""
@@ -224,6 +232,9 @@ def decode(parts: Sequence[bytes]) -> Message:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadMessage(f"a message of topic {name} that cannot be read: {error}") from None
     if isinstance(header, FrameHeader):
+        age = header.available - header.time
+        if age < EARLIEST:
+            raise BadMessage(f"a frame that was there {-age:g} s before it was exposed")
         size = header.height * header.width
         if len(parts[2]) != size:
             raise BadMessage(

@@ -138,7 +138,11 @@ class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     v4l2: Annotated[V4l2Settings, note("A camera of this machine.")] = V4l2Settings()
     stream: Annotated[StreamSettings, note("A file or a network camera.")] = StreamSettings()
     picture: Annotated[
-        PictureSettings, note("What frames show; a simulated camera heeds `size` only.")
+        PictureSettings,
+        note(
+            "What frames show. The picture of a simulated camera has `size`, and is turned and "
+            "cropped like any other; learning in simulation has no `picture`."
+        ),
     ] = PictureSettings()
     publish: Annotated[PublishSettings, note("Where frames go.")] = PublishSettings()
 

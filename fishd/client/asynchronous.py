@@ -9,7 +9,14 @@ from typing import Any, Self, TypeVar
 import msgspec
 import zmq.asyncio
 
-from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
+from fishd.client.connection import (
+    SECOND_LOOK,
+    TIMEOUT,
+    Connection,
+    dealer,
+    milliseconds_until,
+    subscriber,
+)
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
@@ -151,6 +158,6 @@ class AsyncFish(Connection):
         patience = -1 if kind is Event else int(self.timeout * 1e3)
         decoder = msgspec.json.Decoder(kind)
         with closing(subscriber(self._context, address, topic)) as socket:
-            while await socket.poll(patience):
+            while await socket.poll(patience) or await socket.poll(SECOND_LOOK):
                 yield decoder.decode((await socket.recv_multipart())[1])
         raise self.telemetry_silent()

@@ -19,6 +19,10 @@ T = TypeVar("T")
 
 TIMEOUT = 2.0
 """How long to wait for an answer [s]."""
+SECOND_LOOK = 100
+"""Telemetry that has not come in time is looked for once more, for so long: of a process that was
+itself held up, by SIGSTOP say, it has come, but no thread has read it yet [ms].
+"""
 
 
 class Connection:

@@ -8,7 +8,14 @@ from typing import Any, Self, TypeVar
 import msgspec
 import zmq
 
-from fishd.client.connection import TIMEOUT, Connection, dealer, milliseconds_until, subscriber
+from fishd.client.connection import (
+    SECOND_LOOK,
+    TIMEOUT,
+    Connection,
+    dealer,
+    milliseconds_until,
+    subscriber,
+)
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
@@ -185,7 +192,7 @@ class Fish(Connection):
 
         def messages() -> Iterator[T]:
             with closing(socket):
-                while socket.poll(patience):
+                while socket.poll(patience) or socket.poll(SECOND_LOOK):
                     topic, payload = socket.recv_multipart()
                     yield decoders[topic].decode(payload)
             raise self.telemetry_silent()

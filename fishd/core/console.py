@@ -56,7 +56,7 @@ def run(command: click.Command, name: str) -> int:
     except ConfigError as error:
         complain(name, str(error), os.EX_CONFIG)
     except click.Abort:
-        sys.exit(INTERRUPTED)
+        complain(name, "interrupted", INTERRUPTED)
     return status if isinstance(status, int) else 0
 
 

@@ -17,6 +17,8 @@ FORMATS = (".pdf", ".png", ".svg")
 _MISSING = "a figure needs matplotlib, which is not installed: pip install 'fishd[lab]'"
 BLACK, BLUE, ORANGE, GREEN, PURPLE = "#1a1a1a", "#0072b2", "#d55e00", "#009e73", "#aa4499"
 """Colours that stay apart in grey and for the colour-blind (Okabe and Ito), darkest first."""
+YELLOW = "#e69f00"
+"""Beside ORANGE, for the second of a pair."""
 GREY = "0.55"
 """Of what a curve is compared with."""
 _STYLE: dict[Any, Any] = {

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
 from fishd.camera.frames import Stack
+from fishd.camera.pilot import HOLD
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.learning.env.environment import spaces
@@ -220,7 +221,7 @@ class DeterministicPolicy:
         """amplitude: Φ [rad]"""
         self._perception = perception
         self._amplitude = amplitude
-        self._latest = 0.0
+        self._latest = self._blind = 0.0
         self._policy = policy
         self._layers: Layers = []
         if isinstance(policy.features_extractor, FlattenExtractor):
@@ -228,9 +229,14 @@ class DeterministicPolicy:
         self._tanh = policy.activation_fn is torch.nn.Tanh
 
     def __call__(self, observation: Observation, stack: Stack | None = None) -> float:
-        """The angle that answers an observation [rad]; without the frames it needs, as before."""
+        """The angle that answers an observation [rad].
+
+        Without the frames that it needs, it holds the last one for `HOLD`, then neutral.
+        """
         if stack is None and self._perception.eye:
-            return self._latest
+            self._blind += observation.dt
+            return self._latest if self._blind <= HOLD else 0.0
+        self._blind = 0.0
         values = self._perception.vector(observation, stack)
         action = self._plain(values) if self._layers else self._torch(values)
         self._latest = max(-1.0, min(1.0, action)) * self._amplitude

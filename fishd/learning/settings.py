@@ -64,7 +64,7 @@ class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         ),
     ] = 256
     align: Annotated[
-        bool, note("Look for the axis of motion in the babble; false: the middle row.")
+        bool, note("`modes` and `cnn` look for the axis in the babble; false: the middle row.")
     ] = True
     modes: Annotated[int, note("Patterns that the eye `modes` keeps.", ge=1, le=16)] = 4
     memory: Annotated[
@@ -223,6 +223,13 @@ def _check(settings: TrainingSettings) -> None:
         raise Problem(
             ("environment", "observation"),
             "an empty list is not valid with see: force; the agent would see nothing",
+        )
+    babbles = settings.see != "force" and settings.camera.eye != "nature"
+    if babbles and settings.steps <= settings.camera.babble:
+        raise Problem(
+            ("steps",),
+            f"{settings.steps} is not valid: more than the babble, {settings.camera.babble} steps, "
+            "is needed",
         )
     if settings.camera.memory >= settings.camera.babble // 4:
         raise Problem(

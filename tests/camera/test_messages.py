@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from fishd.camera import messages
 from fishd.camera.messages import BadMessage, FrameHeader, PublishedFrame, Until
@@ -46,6 +47,15 @@ def test_no_topic_begins_like_another() -> None:
             "a frame of 4 x 3 px has 12 bytes, not 5",
         ),
         ([b"frame", b'{"v":1,"width":100000}', b""], "cannot be read"),
+        (messages.frame(replace(HEADER, time=1e300, available=1e300), PIXELS), "`$.time`"),
+        (messages.frame(replace(HEADER, available=-1e300), PIXELS), "`$.available`"),
+        (
+            messages.frame(replace(HEADER, time=1e6), PIXELS),
+            "a frame that was there 999998 s before it was exposed",
+        ),
+        (messages.until(Until(session="s", until=1e300)), "`$.until`"),
+        ([b"until", b'{"v":1,"session":"s","until":1e999}'], "cannot be read"),
+        ([b"until", b'{"v":1,"session":"s","until":NaN}'], "cannot be read"),
     ],
 )
 def test_what_is_no_message_is_refused(parts: list[bytes], why: str) -> None:
@@ -60,6 +70,12 @@ def test_anything_is_a_message_or_refused(parts: list[bytes]) -> None:
     for topic in (parts[0], b"frame", b"view", b"state", b"until"):
         with pytest.raises(BadMessage):
             messages.decode([topic, *parts[1:]])
+
+
+def test_a_frame_whose_time_its_settings_moved_is_still_one() -> None:
+    moved = replace(HEADER, time=HEADER.available + 1.0)
+    found = messages.decode(messages.frame(moved, PIXELS))
+    assert isinstance(found, PublishedFrame)
 
 
 def test_a_field_of_a_later_version_is_ignored() -> None:

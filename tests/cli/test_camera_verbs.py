@@ -29,6 +29,7 @@ from rigs.processes import (
 
 from fishd.client import Fish
 
+TICK = 0.05
 OFF, TILT, LATENCY = 3.0, 0.04, 0.05
 CAMERA = (
     "simulated.rate=30", f"simulated.latency={LATENCY}", "simulated.jitter=0.003",
@@ -219,6 +220,22 @@ def test_alignment_lets_the_fish_swim_where_it_is_told_to_and_rest_afterwards(
     assert re.search(r"^tilt +\d\.\d°, down to the right$", done.stdout, re.M)
     assert "or try: fishd-camera --set simulated.off_axis=" in done.stdout
     assert daemon.status().mode == "idle"
+
+
+def test_a_swim_goes_on_after_the_program_was_itself_held_up(daemon: Daemon) -> None:
+    process = Process(FISHCTL, "camera", "align", "--swim", "--for", "6")
+    with Fish(daemon.endpoint) as fish:
+        wait_until(lambda: fish.status().mode == "running")
+        ticks = fish.ticks()
+        first = next(ticks).seq
+        process.process.send_signal(signal.SIGSTOP)
+        try:
+            wait_until(lambda: next(ticks).seq > first + 3.0 / TICK)
+        finally:
+            process.process.send_signal(signal.SIGCONT)
+        status, out, err = process.finish()
+    assert status == 0, err
+    assert out.startswith("offset")
 
 
 def test_ctrl_c_stops_the_fish(daemon: Daemon) -> None:

@@ -1,8 +1,10 @@
 """What the verbs about recordings refuse and say."""
 
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 from rigs.harness import Rig
@@ -10,6 +12,7 @@ from rigs.processes import fishctl, one_line
 from rigs.recordings import recorded, swum
 
 from fishd.recording import RunWriter
+from fishd.recording.images import FrameHead
 
 
 @pytest.mark.parametrize("length", ["nan", "inf", "-inf", "0"])
@@ -64,6 +67,23 @@ def test_a_damaged_recording_is_listed_as_one_and_recovered(damaged: Path) -> No
     done = fishctl("recover", "run", "--folder", folder)
     assert done.stdout.startswith(f"{folder}/run-recovered.mcap: ")
     assert done.stdout.endswith("; damaged: 10 ticks lost\n")
+
+
+def test_what_is_recovered_is_said_with_its_frames(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run")
+    writer.describe(Rig().config)
+    for tick in swum(0.5).recorder.ticks:
+        writer.tick(tick)
+    for seq in (1, 2, 3):
+        head = FrameHead(tick.t, tick.time, tick.time, seq, "one", 0.01, 0)
+        writer.frame(head, np.zeros((16, 16), np.uint8))
+    writer.flush()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(writer.part.read_bytes())
+    writer.close()
+    done = fishctl("recover", str(cut))
+    assert done.returncode == 0, done.stderr
+    assert re.search(r" s, \d+ ticks, 0 lost, 0 events, 3 frames\n$", done.stdout)
 
 
 def test_where_no_controller_swam_nothing_is_chosen_again(tmp_path: Path) -> None:

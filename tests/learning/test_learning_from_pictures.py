@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -126,14 +127,34 @@ def test_networks_are_not_given_to_another_eye(
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"PK", b"no archive at all"])
+def packed(**constants: list[float]) -> bytes:
+    arrays = {name: np.array(value, np.float32) for name, value in constants.items()}
+    kept = {name: checkpoints.Constant(a.shape, a.tobytes()) for name, a in arrays.items()}
+    return msgspec.msgpack.encode(kept)
+
+
+HOSTILE = msgspec.msgpack.encode({"zero": checkpoints.Constant((10**12,), b"1234")})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"PK",
+        b"\x81" * 10_000,
+        HOSTILE,
+        packed(zero=[1.0]),
+        packed(zero=[0.0] * 4, patterns=[[0.0] * 7056] * 3),
+        packed(zero=[float("nan")] * 4, patterns=[[0.0] * 7056] * 4),
+    ],
+)
 def test_an_eye_that_cannot_be_read_is_told(
     tmp_path: Path, brief: tuple[Job, Outcome], content: bytes
 ) -> None:
     folder = shutil.copytree(brief[0].folder, tmp_path / "run")
-    path = folder / "step-000384" / "eye.npz"
+    path = folder / "step-000384" / "eye.msgpack"
     path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"eye\.npz: .*move this checkpoint away"):
+    with pytest.raises(CheckpointError, match=r"eye\.msgpack: .*move this checkpoint away"):
         checkpoints.load_policy(path.parent)
 
 
@@ -150,8 +171,27 @@ def test_steps_without_a_frame_are_void() -> None:
         SimulatedLink(Config(), camera=camera), Config(), EnvironmentSettings(), job_eye("nature")
     )
     env.reset(seed=0)
-    lost = [env.advance(0.1) for _ in range(100)]
-    assert 0.3 < np.mean(lost) < 0.7
+    action = np.array([0.2], np.float32)
+    steps = [env.step(action) for _ in range(100)]
+    blind = [info["blind"] for *_, info in steps]
+    assert 0.3 < np.mean(blind) < 0.7
+    assert [truncated for *_, truncated, _ in steps] == [bool(one) for one in blind]
+
+
+def test_a_training_whose_camera_is_too_late_says_so(tmp_path: Path) -> None:
+    job = job_of(tmp_path / "run", rig=replace(DEFAULT, rate=5.0))
+    outcome = train(job)
+    assert outcome.ended == "lost"
+    assert "the camera has shown no whole stack of frames for 5 s" in outcome.message
+    assert "give that a larger delay or oldest" in outcome.message
+
+
+def test_another_camera_is_looked_at_anew_with_the_networks_of_the_first(tmp_path: Path) -> None:
+    first = train(job_of(tmp_path / "first", steps=1536))
+    again = job_of(tmp_path / "again", steps=512, rig=WEB)
+    found = train(replace(again, parent=first.best)).best_evaluation
+    assert found
+    assert found.efficiency > 0.9
 
 
 def job_eye(kind: str):  # type: ignore[no-untyped-def]

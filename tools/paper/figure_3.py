@@ -5,7 +5,7 @@ import numpy as np
 from common.report import DOCS
 from fishd.config import Config
 from fishd.lab import drawing
-from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, PURPLE
+from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, YELLOW
 from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
 from fishd.simulation import Report
 from paper.runs import FOLDER, PLANT, Row, Run, column, read, swim_all, write
@@ -112,7 +112,7 @@ def draw() -> None:
         (LOOP, {"marker": "s", "mec": BLUE, "mfc": "none", "ms": 6}),
         (SWING, {"marker": "x", "mec": BLACK, "ms": 5}),
         (LEARNT, {"marker": "o", "mec": ORANGE, "mfc": ORANGE, "ms": 3.5}),
-        (SEEN, {"marker": "D", "mec": PURPLE, "mfc": "none", "ms": 4.5}),
+        (SEEN, {"marker": "D", "mec": YELLOW, "mfc": "none", "ms": 6}),
     )
     panels = (
         ("A", "thrust_mN", "mean thrust (mN)", (0.2, 200)),

@@ -25,6 +25,8 @@ GREETING = 10.0
 """A connection that has asked for nothing within so long is closed [s]."""
 HEARTBEAT = 10.0
 """A page that does not answer within half of this is gone [s]."""
+LEAVING = 0.4
+"""What is under way at the end may take twice so long [s]."""
 _FILES = {
     "/": ("page.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
@@ -64,7 +66,11 @@ class PageServer:
             app.router.add_get(path, _file(name, kind))
         app.router.add_get("/live", self._live)
         self._runner = web.AppRunner(
-            app, access_log=None, handle_signals=False, keepalive_timeout=GREETING
+            app,
+            access_log=None,
+            handle_signals=False,
+            keepalive_timeout=GREETING,
+            shutdown_timeout=LEAVING,
         )
         await self._runner.setup()
         loop = asyncio.get_running_loop()
@@ -79,10 +85,16 @@ class PageServer:
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        """Say goodbye to all pages, and close what does not listen."""
         self._server.close()
         for viewer in tuple(self._viewers):
             viewer.end()
+        server = self._runner.server
+        transports = [each.transport for each in server.connections] if server else []
         await self._runner.cleanup()
+        for transport in transports:
+            if isinstance(transport, asyncio.WriteTransport):
+                transport.abort()  # closed, it would still wait for a page that never reads
 
     @property
     def url(self) -> str:
@@ -132,8 +144,11 @@ class PageServer:
     def _is_ours(self, host: str) -> bool:
         """Is a host, with or without a port, an address, or a name of this machine?"""
         try:
-            name = urlsplit(f"//{host}").hostname or ""
+            parts = urlsplit(f"//{host}")
+            name, _ = parts.hostname or "", parts.port
         except ValueError:
+            return False
+        if "@" in host or parts.netloc != host:
             return False
         try:
             ipaddress.ip_address(name)
@@ -143,11 +158,13 @@ class PageServer:
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != request.host.lower():
+        if origin is not None and _place(origin) != request.host.lower():
             raise web.HTTPForbidden(text="a page from elsewhere\n")
         if len(self._viewers) >= MOST_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"{MOST_VIEWERS} pages are open already\n")
-        sock = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=1024, compress=False)
+        sock = web.WebSocketResponse(
+            timeout=LEAVING, heartbeat=HEARTBEAT, max_msg_size=1024, compress=False
+        )
         viewer = _Viewer(sock, News(self._facts, self._picture))
         self._viewers.add(viewer)
         try:
@@ -217,6 +234,14 @@ def _joined(news: News) -> bytes:
     the JPEG.
     """
     return len(news.facts).to_bytes(4, "big") + news.facts + (news.jpeg or b"")
+
+
+def _place(origin: str) -> str:
+    """Host and port of an origin; empty where it has none."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
 
 
 def _file(name: str, kind: str) -> Handler:

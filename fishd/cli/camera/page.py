@@ -11,6 +11,8 @@ from fishd.cli.output import echo
 from fishd.core.interruption import on_signal
 
 PORT = 9876
+LEAVING = 1.0
+"""A camera that does not answer is waited for no longer at the end [s]."""
 
 
 @click.command()
@@ -48,14 +50,16 @@ async def _serve(address: str | None, host: str, port: int) -> None:
     async with PageServer(host, port) as server:
 
         def tell(news: News) -> None:
-            loop.call_soon_threadsafe(server.show, news)
+            with suppress(RuntimeError):  # the loop has ended meanwhile
+                loop.call_soon_threadsafe(server.show, news)
 
         def follow() -> None:
             try:
                 feed.run()
             except BaseException as error:
                 failures.append(error)
-                loop.call_soon_threadsafe(ended.set)
+                with suppress(RuntimeError):
+                    loop.call_soon_threadsafe(ended.set)
 
         feed = Feed(address, tell)
         thread = threading.Thread(target=follow, name="camera", daemon=True)
@@ -64,6 +68,6 @@ async def _serve(address: str | None, host: str, port: int) -> None:
             echo(f"the camera is at {server.url}; Ctrl-C ends it")
             await ended.wait()
         feed.stop()
-        await asyncio.to_thread(thread.join)
+        await asyncio.to_thread(thread.join, LEAVING)
     if failures:
         raise failures[0]

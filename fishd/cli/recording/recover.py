@@ -24,8 +24,9 @@ def recover(file: str, folder: Path | None) -> None:
     damaged = open_run(path)
     run = finish(path)
     summary = run.summary
+    frames = f", {counted(summary.frames, 'frame')}" if summary.frames else ""
     what = f"; {damage(damaged.damaged)}" if damaged.is_damaged else ""
     echo(
         f"{run.path}: {summary.duration:.1f} s, {counted(summary.ticks, 'tick')}, "
-        f"{summary.lost} lost, {counted(summary.events, 'event')}{what}"
+        f"{summary.lost} lost, {counted(summary.events, 'event')}{frames}{what}"
     )

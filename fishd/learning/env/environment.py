@@ -98,8 +98,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     """One fish that swims for thrust.
 
     `info` of each step holds `thrust` (mean F_x in the tick that followed [N]), `lost` (ticks in
-    which another angle than the action was applied: such an episode is truncated) and `paused`
-    (how long the fish has waited at neutral since the previous step [s], mostly 0).
+    which another angle than the action was applied), `blind` (1 where the camera did not show that
+    tick) and `paused` (how long the fish has waited at neutral since the previous step [s], mostly
+    0). A step with `lost` or `blind` ends its episode: it is truncated.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
@@ -130,11 +131,15 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.latest: Observation
         """The latest observation, once an episode has begun."""
         self.stack: Stack | None = None
-        """The latest stack of frames, once there is one."""
+        """The frames of this tick; None where the camera has not shown them."""
+        self._shown: Stack | None = None
+        """The latest frames, of whichever tick."""
         self.tank_time = 0.0
         """How long the agent has controlled a fish, pauses included [s]."""
         self.lost = 0
-        """Ticks in which another angle than the agent's was applied, or no frame came."""
+        """Ticks in which another angle than the agent's was applied."""
+        self.blind = 0
+        """Ticks that the camera has not shown."""
         self._paused = 0.0
         self._pause_began = 0.0
         self._longest_pause: float | None = None
@@ -174,20 +179,20 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         lost = self.advance(_share(action) * self.link.amplitude)
         self._steps += 1
         reward = self._reward_per_newton * self.latest.fx
-        truncated = self._steps >= self.settings.episode or lost > 0
         info = self._info(lost)
+        truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
         return self._seen(), reward, False, truncated, info
 
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
 
-        A tick without a frame counts as one. Raises `LinkLost`.
+        Raises `LinkLost`.
         """
         before = self.latest.time
         self.latest, lost = self.link.step(angle)
         if self.eye and not self._look():
-            lost = max(lost, 1)
+            self.blind += 1
         self.tank_time += self.latest.time - before
         self.lost += lost
         return lost
@@ -202,14 +207,15 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         seen.
         """
         assert self.eye
-        frames = []
-        angles = babble(seed, ticks, self.link.amplitude)
-        for angle in angles.tolist():
-            if self.stack is None or stop():
+        assert self._shown
+        frames, angles = [], []
+        for angle in babble(seed, ticks, self.link.amplitude).tolist():
+            if stop():
                 return False
             self.advance(angle)
-            frames.append(self.stack[0])
-        self.eye.fit(np.stack(frames), angles)
+            frames.append(self._shown[0])
+            angles.append(self.latest.instruction_angle)  # of a lost tick, another one
+        self.eye.fit(np.stack(frames), np.array(angles))
         return True
 
     def pause(self, seconds: float | None = None) -> None:
@@ -245,11 +251,10 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.link.close()
 
     def _look(self) -> bool:
-        """Take the stack of this tick; False, and the one before is kept, where there is none."""
-        stack = self.link.look()
-        if stack is not None:
-            self.stack = stack
-        return stack is not None
+        """Take the stack of this tick; False where there is none."""
+        self.stack = self.link.look()
+        self._shown = self.stack or self._shown
+        return self.stack is not None
 
     def _await_frames(self) -> None:
         """Stay at neutral until the camera shows a whole stack; raises `LinkLost`."""
@@ -260,17 +265,22 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             self.latest, _ = self.link.step(0.0)
             if self._look():
                 return
-        raise LinkLost(f"the camera has shown nothing for {FIRST_FRAMES:g} s")
+        raise LinkLost(
+            f"the camera has shown no whole stack of frames for {FIRST_FRAMES:g} s: they come too "
+            "seldom or too late for camera.stack; give that a larger delay or oldest, or the "
+            "camera a higher rate"
+        )
 
     def _seen(self) -> Vector:
-        return self.perception.vector(self.latest, self.stack)
+        return self.perception.vector(self.latest, self._shown)
 
     def _check_open(self) -> None:
         if self._closed:
             raise RuntimeError("this environment is closed; make another one")
 
     def _info(self, lost: int) -> dict[str, Any]:
-        return {"thrust": self.latest.fx, "lost": lost, "paused": self._paused}
+        blind = int(self.eye is not None and self.stack is None)
+        return {"thrust": self.latest.fx, "lost": lost, "blind": blind, "paused": self._paused}
 
 
 def _check_agreement(link: Link, config: Config) -> None:

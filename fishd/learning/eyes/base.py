@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,8 @@ class Eye(ABC):
     """How many numbers it gives."""
     network: Literal["cnn", "nature"] = "cnn"
     """Which network looks at that picture."""
-    names: ClassVar[tuple[str, ...]]
-    """Of its constants."""
+    shapes: Mapping[str, tuple[int, ...]]
+    """Of its constants, by name."""
 
     def __init__(self, stack: StackSettings) -> None:
         self.stack = stack
@@ -82,13 +82,16 @@ class Eye(ABC):
     @property
     def is_fitted(self) -> bool:
         """Has it seen a babble, if it needs one?"""
-        return set(self.constants) == set(self.names)
+        return set(self.constants) == set(self.shapes)
 
-    def restore(self, constants: Mapping[str, Any]) -> None:
+    def restore(self, constants: Mapping[str, Array]) -> None:
         """Take over constants that were kept; raises ValueError where they are not those."""
-        if set(constants) != set(self.names):
-            raise ValueError(f"the constants of an eye are {', '.join(self.names)}")
-        self.constants = {name: np.asarray(constants[name], np.float32) for name in self.names}
+        found = {name: array.shape for name, array in constants.items()}
+        if found != self.shapes:
+            raise ValueError(f"constants of shapes {found}; {dict(self.shapes)} are needed")
+        if not all(np.isfinite(array).all() for array in constants.values()):
+            raise ValueError("constants that are not finite numbers")
+        self.constants = dict(constants)
 
 
 def lit(pictures: NDArray[Any]) -> Array:

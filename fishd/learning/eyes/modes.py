@@ -16,8 +16,6 @@ from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
 class ModesEye(Eye):
     """The amplitudes of a few patterns in each frame, newest frame first."""
 
-    names = ("patterns", "zero")
-
     def __init__(self, stack: StackSettings, modes: int, memory: int, align: bool) -> None:
         """
         modes: number of patterns
@@ -27,6 +25,7 @@ class ModesEye(Eye):
         super().__init__(stack)
         self._modes, self._memory, self._align = modes, memory, align
         self.outputs = stack.frames * modes
+        self.shapes = {"patterns": (modes, stack.size**2), "zero": (modes,)}
 
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
         """Find the patterns; see the base class."""
@@ -44,6 +43,8 @@ class ModesEye(Eye):
         commands = np.linalg.qr(lags - lags.mean(axis=0))[0]
         explained = commands.T @ odd
         patterns = np.linalg.svd(explained, full_matrices=False)[2][: self._modes]
+        follow = (odd @ patterns.T).T @ lags.mean(axis=1)  # each on the side of the command,
+        patterns *= np.where(follow < 0.0, -1.0, 1.0)[:, None]  # so that another eye sees alike
         patterns /= (odd @ patterns[0]).std()
         self.constants = {
             "patterns": patterns.astype(np.float32),

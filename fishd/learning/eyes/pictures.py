@@ -13,14 +13,18 @@ from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
 class CnnEye(Eye):
     """The newest frame and the differences between frames, at half the size, about the axis."""
 
-    names = ("rows", "columns", "mean", "scale")
-
     def __init__(self, stack: StackSettings, align: bool) -> None:
         super().__init__(stack)
         self._align = align
         half = stack.size // 2
         self.shape = (stack.frames, half, half)
         self.outputs = stack.frames * half * half
+        self.shapes = {
+            "rows": (half, stack.size),
+            "columns": (stack.size, half),
+            "mean": (half, half),
+            "scale": (1,),
+        }
 
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
         """Find axis, mean picture and contrast; see the base class."""
@@ -81,13 +85,13 @@ class CnnEye(Eye):
 class NatureEye(Eye):
     """The frames as they are, from 0 to 1, as in the paper."""
 
-    names = ()
     network = "nature"
 
     def __init__(self, stack: StackSettings) -> None:
         super().__init__(stack)
         self.shape = (stack.frames, stack.size, stack.size)
         self.outputs = stack.frames * stack.size**2
+        self.shapes = {}
 
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
         """There is nothing to find."""

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import msgspec
 import numpy as np
@@ -32,10 +32,12 @@ from fishd.learning.eyes.base import Eye
 from fishd.learning.ppo import make_policy
 from fishd.learning.settings import TrainingSettings
 
-MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.npz"
+MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.msgpack"
 
 LARGEST_MODEL = 256 * 2**20
 """Of networks and optimiser [bytes]."""
+LARGEST_EYE = 16 * 2**20
+"""Of what an eye has learned to see [bytes]."""
 LARGEST_TEXT = 2**20
 """Of a card, or of a state [bytes]."""
 
@@ -63,6 +65,14 @@ class State(Struct, frozen=True):
     best: Evaluation | None
 
 
+class Constant(Struct, frozen=True):
+    """A constant of an eye."""
+
+    shape: tuple[Annotated[int, Meta(ge=0)], ...]
+    values: bytes
+    """As float32, row by row."""
+
+
 def save(
     folder: Path, kind: str, model: PPO, card: Card, state: State, eye: Eye | None = None
 ) -> Path:
@@ -77,9 +87,8 @@ def save(
     (part / CARD).write_text(msgspec.json.format(encode(card), indent=2) + "\n", encoding="utf-8")
     (part / STATE).write_bytes(msgspec.json.encode(state))
     if eye and eye.is_fitted:
-        constants: dict[str, Any] = eye.constants
-        with (part / EYE).open("wb") as file:
-            np.savez(file, **constants)
+        constants = {name: Constant(a.shape, a.tobytes()) for name, a in eye.constants.items()}
+        (part / EYE).write_bytes(msgspec.msgpack.encode(constants))
     if final.exists():  # a run that was stopped before it learned any more
         _discard(final)
     part.rename(final)
@@ -185,15 +194,20 @@ def load_policy(checkpoint: Path) -> tuple[ActorCriticPolicy, Perception]:
 def load_eye(eye: Eye, checkpoint: Path) -> None:
     """Give an eye the constants of a checkpoint, if it had any; raises `CheckpointError`."""
     path = checkpoint / EYE
-    if not path.exists() or not eye.names:
+    if not path.exists():
         return
     try:
-        content = files.read(path, LARGEST_MODEL, "the constants of an eye")
-        with np.load(io.BytesIO(content), allow_pickle=False) as found:
-            eye.restore(dict(found))
+        content = files.read(path, LARGEST_EYE, "the constants of an eye")
+        found = msgspec.msgpack.decode(content, type=dict[str, Constant])
+        eye.restore(
+            {
+                name: np.frombuffer(one.values, np.float32).reshape(one.shape)
+                for name, one in found.items()
+            }
+        )
     except files.FileProblem as problem:
         raise CheckpointError(f"{path}: {problem}; {_ADVICE}") from None
-    except (ValueError, OSError, BadZipFile, EOFError) as error:
+    except (ValueError, OverflowError, RecursionError) as error:
         raise CheckpointError(f"{path}: cannot be read: {_brief(error)}; {_ADVICE}") from None
 
 

@@ -24,6 +24,7 @@ PROGRESS = {
     "frequency": "rollout/frequency",
     "fullness": "rollout/fullness",
     "lost": "tank/lost",
+    "blind": "tank/blind",
     "paused": "tank/paused",
     "learning_rate": "train/learning_rate",
     "loss": "train/loss",

@@ -23,8 +23,8 @@ class RolloutCallback(BaseCallback):
         self._stop = stop
         self.stopped = False
         """Was the latest rollout stopped early? Then nothing was learned from it."""
-        self._lost = 0
-        """Ticks that the environment had lost until the previous rollout ended."""
+        self._lost = self._blind = 0
+        """Ticks that the environment had lost, and not seen, until the previous rollout ended."""
         self._on_rollout_start()
 
     @property
@@ -44,7 +44,7 @@ class RolloutCallback(BaseCallback):
         self._thrusts.append(info["thrust"])
         self._actions.append(float(self.locals["clipped_actions"][0, 0]))
         self._paused += info["paused"]
-        buffer.void[buffer.pos] = info["lost"] > 0  # the index that this step will be stored at
+        buffer.void[buffer.pos] = info["lost"] + info["blind"] > 0  # where this step is stored
         self._display.step(self._env.tank_time)
         self.stopped = self._stop()
         return not self.stopped
@@ -52,7 +52,14 @@ class RolloutCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         self._env.pause()
         steps = len(self._buffer.void)
+        lost, blind = self._env.lost - self._lost, self._env.blind - self._blind
         if np.count_nonzero(self._buffer.void) > steps // 2:
+            if blind > lost:
+                raise LinkLost(
+                    f"in most of the last {steps} steps the camera has shown no whole stack of "
+                    "frames: they come too seldom or too late for camera.stack; give that a larger "
+                    "delay or oldest, or the camera a higher rate"
+                )
             raise LinkLost(
                 f"in most of the last {steps} steps the agent's action came too late for its tick; "
                 "run it on a faster or less busy machine, nearer to fishd"
@@ -61,7 +68,8 @@ class RolloutCallback(BaseCallback):
         efficiency = thrust / self._env.best_thrust
         frequency = beat_frequency(actions, self._env.link.tick)
         for name, value in (
-            ("tank/lost", self._env.lost - self._lost),
+            ("tank/lost", lost),
+            ("tank/blind", blind),
             ("tank/paused", self._paused),
             ("rollout/reward", float(np.mean(self._rewards))),
             ("rollout/thrust", thrust),
@@ -70,7 +78,7 @@ class RolloutCallback(BaseCallback):
             ("rollout/fullness", float(np.mean(np.abs(actions)))),
         ):
             self.logger.record(name, value)
-        self._lost = self._env.lost
+        self._lost, self._blind = self._env.lost, self._env.blind
         self._display.explored(thrust, efficiency, frequency)
 
     @property

@@ -129,7 +129,6 @@ class RunRecorder:
         """Take over the networks of another run; raises `CheckpointError`."""
         past = self._checked_card(parent).provenance
         checkpoints.load_parameters(self._model, parent, optimiser=False)
-        self._load_eye(parent)
         name = f"{parent.resolve().parent.name}/{parent.name}"
         self._note = f"began with {name}, {past.steps} steps in {past.on}"
 

@@ -1,6 +1,8 @@
 """The page's server: what it gives, to whom, and to how many."""
 
 import asyncio
+import socket
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any
@@ -101,7 +103,9 @@ def test_no_other_file_is_given(path: str) -> None:
 @pytest.mark.parametrize(
     ("host", "status"),
     [("localhost", 200), ("127.0.0.1:9876", 200), ("[::1]:9876", 200), ("192.168.0.7", 200),
-     ("evil.example", 403), ("localhost.evil.example:9876", 403), ("[::1", 403), ("a@b:c", 403)],
+     ("evil.example", 403), ("localhost.evil.example:9876", 403), ("[::1", 403), ("a@b:c", 403),
+     ("evil.example@localhost", 403), ("@localhost", 403), ("localhost/evil.example", 403),
+     ("localhost:evil", 403), ("localhost?x", 403)],
 )  # fmt: skip
 def test_who_asks_by_the_name_of_another_machine_is_refused(host: str, status: int) -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
@@ -111,7 +115,9 @@ def test_who_asks_by_the_name_of_another_machine_is_refused(host: str, status: i
     run(test)
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "http://[evil", "http://]", ""]
+)
 def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
         server.show(News(FACTS, b"secret"))
@@ -120,6 +126,47 @@ def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
         assert refused.value.status == 403
 
     run(test)
+
+
+@pytest.mark.realtime
+def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_that_never_ask() -> None:
+    async def whole() -> float:
+        async with asyncio.timeout(20.0), PageServer("127.0.0.1", 0) as server:
+            host, port = "127.0.0.1", int(server.url.rsplit(":", 1)[1].strip("/"))
+            deaf = socket.socket()
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            deaf.setblocking(False)
+            loop = asyncio.get_running_loop()
+            await loop.sock_connect(deaf, (host, port))
+            await loop.sock_sendall(deaf, UPGRADE.replace(b"HOST", f"{host}:{port}".encode()))
+            slow = [await asyncio.open_connection(host, port) for _ in range(4)]
+            for (_, writer), sent in zip(slow, HALF_ASKED, strict=True):
+                writer.write(sent)
+                await writer.drain()
+            assert (await loop.sock_recv(deaf, 12)).endswith(b" 101")
+            for _ in range(20):  # more than all buffers hold
+                server.show(News(FACTS, bytes(2**20)))
+                await asyncio.sleep(0.01)
+            ending = time.monotonic()
+        ended = time.monotonic() - ending
+        deaf.close()
+        for _, writer in slow:
+            writer.close()
+        return ended
+
+    assert asyncio.run(whole()) < 1.5
+
+
+UPGRADE = (
+    b"GET /live HTTP/1.1\r\nHost: HOST\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+)
+HALF_ASKED = (
+    b"",
+    b"GET / HT",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ",
+    b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nx",
+)
 
 
 def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
