@@ -61,6 +61,11 @@ def judge(motion: Motion, picture: tuple[int, int], settings: CameraSettings) ->
         )
         return Alignment(motion, place, False, tuple(advice), better)
     axis = motion.axis
+    if not motion.sure:
+        advice.append(
+            "the axis lies at the edge of what is looked at, and may be further off or steeper: "
+            "turn or move the camera, then align again"
+        )
     level, near = abs(axis.tilt) <= LEVEL, abs(axis.offset) <= NEAR
     if settings.source == "simulated":
         if not near:
@@ -80,7 +85,8 @@ def judge(motion: Motion, picture: tuple[int, int], settings: CameraSettings) ->
                 value = round(getattr(crop, name), 3)
                 if value != round(getattr(settings.picture.crop, name), 3):
                     better[f"picture.crop.{name}"] = value
-    return Alignment(motion, place, level and near and not edges, tuple(advice), better)
+    good = level and near and motion.sure and not edges
+    return Alignment(motion, place, good, tuple(advice), better)
 
 
 def _centred(axis: Axis, size: int, picture: tuple[int, int], crop: Square) -> Square:

@@ -11,8 +11,10 @@ from fishd.core.errors import FishdError
 
 Floats = NDArray[np.float64]
 
-_STEEPEST = 0.2
+_STEEPEST = 0.44
 """Largest tilt that is looked for [rad]."""
+_FIRST = (0.5, 0.02)
+"""Steps of offset and tilt at first [px, rad]."""
 _SHARE = 0.3
 """The axis lies within this share of the height about the middle row."""
 _MOTION = 1.5
@@ -50,6 +52,8 @@ class Motion(NamedTuple):
     axis: Axis
     centre: float
     """Column about which the motion is centred [px]."""
+    sure: bool = True
+    """False where the axis lies at the edge of what was looked at, so that it may lie beyond."""
 
 
 def find_motion(pictures: NDArray[np.uint8]) -> Motion:
@@ -78,7 +82,7 @@ def find_motion(pictures: NDArray[np.uint8]) -> Motion:
             "let the fish swim, and see that the camera looks at its tail"
         )
     centre = float(energy.sum(axis=0) @ np.arange(energy.shape[1]) / energy.sum())
-    return Motion(energy, axis, centre)
+    return Motion(energy, axis, centre, _is_inside(axis, len(energy)))
 
 
 def likeness(energy: Floats, axis: Axis) -> float:
@@ -97,21 +101,37 @@ def find_axis(energy: Floats) -> Axis:
     height, width = energy.shape
     spectrum = np.fft.rfft(energy, 2 * height, axis=0).T
     folded = np.fft.irfft(spectrum**2, 2 * height * _FINE, axis=1)
-    offsets = np.arange(-_SHARE * height, _SHARE * height + 0.1, 0.5)
-    best, step = Axis(offset=0.0), (0.5, 0.02)
+    best, step = Axis(offset=0.0), _FIRST
+    offsets = np.arange(-_SHARE * height, _SHARE * height + 0.1, step[0])
     tilts = np.arange(-_STEEPEST, _STEEPEST + 1e-9, step[1])
     for _ in range(3):
-        best = max(
-            (Axis(offset=float(offset), tilt=float(tilt)) for offset in offsets for tilt in tilts),
-            key=lambda axis: _folded_at(folded, 2.0 * axis.rows(height, width)),
+        sums = np.stack(
+            [
+                _folded_at(folded, Axis(offset=0.0, tilt=float(tilt)).rows(height, width), offsets)
+                for tilt in tilts
+            ],
+            axis=1,
         )
+        row, column = np.unravel_index(np.argmax(sums), sums.shape)
+        best = Axis(offset=float(offsets[row]), tilt=float(tilts[column]))
         step = (step[0] / 5, step[1] / 5)
         offsets = best.offset + step[0] * np.arange(-5, 6)
         tilts = best.tilt + step[1] * np.arange(-5, 6)
     return best
 
 
-def _folded_at(folded: Floats, rows: Floats) -> float:
-    """Sum over all columns of the self-convolution about a line; rows: twice its row in each."""
-    points = np.clip(np.rint(rows * _FINE).astype(int), 0, folded.shape[1] - 1)
-    return float(folded[np.arange(len(rows)), points].sum())
+def _folded_at(folded: Floats, rows: Floats, offsets: Floats) -> Floats:
+    """Sums over all columns of the self-convolution about a line that is moved by each offset.
+
+    rows: of the line, in each column [px]
+    """
+    twice = 2.0 * (rows[None, :] + offsets[:, None])
+    points = np.clip(np.rint(twice * _FINE).astype(int), 0, folded.shape[1] - 1)
+    sums: Floats = folded[np.arange(len(rows)), points].sum(axis=1)
+    return sums
+
+
+def _is_inside(axis: Axis, height: int) -> bool:
+    """Is it clear of the edges of what was looked at?"""
+    offset, tilt = _SHARE * height - _FIRST[0], _STEEPEST - 0.5 * _FIRST[1]
+    return abs(axis.offset) < offset and abs(axis.tilt) < tilt

@@ -1,14 +1,14 @@
 """`CameraClient`: frames of a running `fishd-camera`, with their times on the clock of fishd."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Self
 
 import zmq
 
 from fishd.camera import messages
-from fishd.camera.clock_offset import ClockOffset, Offset, Reading
-from fishd.camera.frames import Frame, FrameHistory, Stack, StackSettings
+from fishd.camera.clock_offset import ClockOffset, Offset, Reading, clock_of
+from fishd.camera.frames import EQUAL, Frame, FrameHistory, Stack, StackSettings
 from fishd.camera.messages import (
     BadMessage,
     CameraState,
@@ -29,6 +29,7 @@ from fishd.camera.settings import CameraSettings
 from fishd.client import Fish
 from fishd.client.connection import milliseconds_until
 from fishd.core import text
+from fishd.core.errors import FishError
 
 __all__ = ["CameraClient", "CameraLost"]
 
@@ -40,8 +41,6 @@ WAITING = 256
 """Messages that may wait for a client that is busy."""
 _ASK = 0.5
 """In lockstep the camera is asked after so long without a word [s]."""
-_EARLY = 1e-6
-"""Times that differ by less are equal [s]."""
 
 
 class CameraClient:
@@ -93,7 +92,7 @@ class CameraClient:
             self.state = self.status()
             self._session = self.state.session
             self._camera_clock = ClockOffset(self._read_clock)
-            self._fishd_clock = ClockOffset(_clock_of(fish)) if fish else None
+            self._fishd_clock = ClockOffset(clock_of(fish)) if fish else None
             self._subscribe(frames or reachable(self.state.frames, self.endpoint), views)
             self._await_subscription()
         except BaseException:
@@ -128,7 +127,8 @@ class CameraClient:
     def poll(self, seconds: float = 0.0) -> list[Frame]:
         """The frames that have come since the last call; waits so long for the first of them [s].
 
-        They are in `history`, too. Raises `FishError` where a clock cannot be asked.
+        They are in `history`, too. Raises `FishError` where a clock could never be asked; frames
+        whose time is not known since a camera or fishd began anew are left out.
         """
         return [frame for _, frame in self.poll_with_headers(seconds)]
 
@@ -187,10 +187,10 @@ class CameraClient:
     def _await(self, tick: float, patience: float) -> None:
         """Wait until all frames before a tick have come."""
         deadline = time.monotonic() + patience
-        while self._until is None or self._until < tick - _EARLY:
+        while self._until is None or self._until < tick - EQUAL:
             heard = self._heard
             self.poll(min(_ASK, max(0.0, deadline - time.monotonic())) if self._until else 0.02)
-            if self._until is not None and self._until >= tick - _EARLY:
+            if self._until is not None and self._until >= tick - EQUAL:
                 return
             if self._heard > heard and time.monotonic() < deadline:
                 continue
@@ -199,7 +199,7 @@ class CameraClient:
                 return  # this fishd has not ended a tick since the camera knows it
             # What was published before this client had subscribed will not come any more.
             self._until = max(self._until or 0.0, self.state.until)
-            if self._until < tick - _EARLY and time.monotonic() >= deadline:
+            if self._until < tick - EQUAL and time.monotonic() >= deadline:
                 raise CameraLost(
                     f"the camera at {self.endpoint} has no frames for the tick at {tick:.3f} s: it "
                     f"has come to {self._until:.3f} s and is {self.state.state}"
@@ -254,7 +254,8 @@ class CameraClient:
                 self._complaint = str(error)
                 continue
             if isinstance(message, PublishedFrame):
-                found.append((message.header, self._take(message)))
+                if frame := self._take(message):
+                    found.append((message.header, frame))
             elif isinstance(message, PublishedView):
                 self.view = message
             elif isinstance(message, Until):
@@ -265,17 +266,32 @@ class CameraClient:
                 self._follow(message)
         return found
 
-    def _take(self, published: PublishedFrame) -> Frame:
+    def _take(self, published: PublishedFrame) -> Frame | None:
+        """Keep a frame; None where its time on the clock of fishd is not known."""
         header = published.header
         self._enter(header.session)
         if self.latest and self.latest.header.session == header.session:
             self.missed += max(0, header.seq - self.latest.header.seq - 1)
         self.latest = published
+        offset = self._seconds_to_add(header)
+        if offset is None:
+            return None
         self._heard = time.monotonic()
-        offset = 0.0 if header.virtual else self.offset().seconds
         frame = Frame(header.time + offset, header.available + offset, published.pixels)
         self.history.add(frame)
         return frame
+
+    def _seconds_to_add(self, header: FrameHeader) -> float | None:
+        """To its times; raises `FishError` where the clocks have never been known."""
+        if header.virtual:
+            return 0.0
+        try:
+            return self.offset().seconds
+        except FishError as error:
+            if not all(each.known for each in (self._camera_clock, self._fishd_clock) if each):
+                raise
+            self._complaint = str(error)
+            return None
 
     def _follow(self, state: CameraState) -> None:
         self._enter(state.session)
@@ -291,14 +307,10 @@ class CameraClient:
             if self._fishd_clock:
                 self._fishd_clock.forget()
 
-    def _read_clock(self) -> Reading:
-        state = self.status()
-        return Reading(state.clock or 0.0, state.boot)
-
-
-def _clock_of(fish: Fish) -> Callable[[], Reading]:
-    def ask() -> Reading:
-        status = fish.status()
-        return Reading(status.clock, status.boot)
-
-    return ask
+    def _read_clock(self, patience: float | None) -> Reading:
+        state = self._requests.status(patience)
+        if state.clock is None:
+            raise CameraLost(
+                f"the camera at {self.endpoint} does not tell its clock yet: it is {state.state}"
+            )
+        return Reading(state.clock, state.boot)

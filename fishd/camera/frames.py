@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fishd.controllers.policy.card import StackSettings
 
-__all__ = ["Frame", "FrameHistory", "Pixels", "Stack", "StackSettings"]
+__all__ = ["EQUAL", "Frame", "FrameHistory", "Pixels", "Stack", "StackSettings"]
 
 Pixels = NDArray[np.uint8]
 """Grey levels, shape (height, width)."""
@@ -16,6 +16,9 @@ Pixels = NDArray[np.uint8]
 
 Stack = tuple[Pixels, ...]
 """Frames of one size, newest first."""
+
+EQUAL = 1e-6
+"""Times that differ by less are equal [s]."""
 
 
 class Frame(NamedTuple):
@@ -57,10 +60,10 @@ class FrameHistory:
         arrived by the tick. None where one of them is missing, or older than permitted.
         """
         settings = self.settings
-        wanted = tick - settings.delay + _ROUNDING
+        wanted = tick - settings.delay + EQUAL
         chosen: list[Pixels] = []
         for frame in reversed(self._frames):
-            if frame.available > tick + _ROUNDING:
+            if frame.available > tick + EQUAL:
                 continue
             while frame.time <= wanted:
                 if frame.time < wanted - settings.oldest:
@@ -76,5 +79,3 @@ _AHEAD = 2.0
 """Frames may come so much earlier than the tick that they are for [s]."""
 _MOST = 4096
 """Frames that are kept."""
-_ROUNDING = 1e-6
-"""Times of a frame and a tick that differ by less are equal [s]."""

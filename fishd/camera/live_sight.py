@@ -91,9 +91,12 @@ class LiveSight:
         """Why no frames come; it may take a while to find out."""
         try:
             self._client.check()
+            state = self._client.status()
+            self._judge()
         except CameraLost as error:
             return error
-        state = self._client.state
+        except PolicyError as error:
+            return CameraLost(str(error))
         why = f": {state.problem}" if state.problem else ""
         return CameraLost(
             f"the camera at {self._client.endpoint} is {state.state}, but has shown no whole stack "

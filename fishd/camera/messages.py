@@ -20,8 +20,6 @@ FRAME, VIEW, STATE, UNTIL = b"frame", b"view", b"state", b"until"
 """The topics."""
 LARGEST = 256
 """Height and width of a frame [px]."""
-MAX_VIEW = 2**21
-"""Of a view [bytes]."""
 
 EARLIEST = -2.0
 """No frame is there so long before the middle of its exposure: `delay` of a camera's settings may
@@ -109,7 +107,7 @@ CONDITIONS: dict[Condition, str] = {
     "starting": "the process has just begun",
     "waiting": "a simulated camera: there is no fishd, or it does not tick",
     "streaming": "frames come",
-    "stalled": "the camera is there, but no frame has come for a while; it is opened again",
+    "stalled": "the camera is there, but no whole frame has come for a while; it is opened again",
     "unplugged": "there is no such camera, file or stream; it is looked for",
     "unusable": "it is there, but cannot be used as the settings say; it is tried again",
     "ended": "the file is at its end, and is not played again",

@@ -3,6 +3,7 @@
 import os
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 from fishd import __version__
@@ -12,22 +13,33 @@ from fishd.camera.sources.base import Timeline, Trouble
 
 _LATE = 30
 """Frames that count as those of late."""
+_OLD = 2.0
+"""They are not of late any more when none has come for so long, or for three times as long as from
+one to the next [s]."""
 
 
 class _Recent(NamedTuple):
     time: float
     latency: float
+    arrived: float
 
 
 class Monitor:
     """Keeps count; for one thread."""
 
-    def __init__(self, settings: CameraSettings, device: str, frames: str) -> None:
-        """device: what is opened, for people; frames: address of the PUB socket"""
+    def __init__(
+        self,
+        settings: CameraSettings,
+        device: str,
+        frames: str,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """device: what is opened, for people; frames: address of the PUB socket; now: [s]"""
+        self._now = now
         self._settings = settings
         self._device = device
         self._frames = frames
-        self._began = time.monotonic()
+        self._began = now()
         self._recent: deque[_Recent] = deque(maxlen=_LATE)
         self._trouble: Trouble | None = None
         self._exposure: float | None = None
@@ -62,7 +74,7 @@ class Monitor:
         moment, available: its times [s]; exposure: its length [s]; picture: height and width [px]
         """
         self.seq += 1
-        self._recent.append(_Recent(moment, available - moment))
+        self._recent.append(_Recent(moment, available - moment, self._now()))
         self._exposure, self._picture = exposure, picture
         return self._enter("streaming", None)
 
@@ -80,13 +92,14 @@ class Monitor:
 
     def state(self) -> CameraState:
         """All of it, now."""
+        self._forget_old()
         size = self._settings.picture.size
         timeline = self.timeline
         return CameraState(
             t=time.time(),
             version=__version__,
             pid=os.getpid(),
-            uptime=time.monotonic() - self._began,
+            uptime=self._now() - self._began,
             session=self.session,
             source=self._settings.source,
             device=self._device,
@@ -111,6 +124,15 @@ class Monitor:
             boot=timeline.boot,
             frames=self._frames,
         )
+
+    def _forget_old(self) -> None:
+        """Virtual time stands still while no frames come: there, none grow old."""
+        if self.timeline.virtual or not self._recent:
+            return
+        first, last = self._recent[0].arrived, self._recent[-1].arrived
+        usual = (last - first) / max(1, len(self._recent) - 1)
+        if self._now() - last > max(_OLD, 3.0 * usual):
+            self._recent.clear()
 
     def _rate(self) -> float:
         if len(self._recent) < 2:

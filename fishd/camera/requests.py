@@ -50,19 +50,20 @@ class CameraRequests:
         self._socket.set(zmq.MAXMSGSIZE, LONGEST)
         connect(self._socket, endpoint)
 
-    def status(self) -> CameraState:
-        """What the camera says of itself."""
-        return self._call(CameraState, "status")
+    def status(self, timeout: float | None = None) -> CameraState:
+        """What the camera says of itself; timeout: how long to wait [s], None: as for others."""
+        return self._call(CameraState, "status", timeout)
 
     def settings(self) -> CameraSettings:
         """The settings that it was started with, but for a password."""
         return self._call(CameraSettings, "config")
 
-    def _call(self, kind: type[T], op: str) -> T:
+    def _call(self, kind: type[T], op: str, timeout: float | None = None) -> T:
         """Ask; raises `CameraLost` and `Refused`."""
         identity = next(self._ids)
         request = protocol.Request(v=protocol.VERSION, id=identity, op=op)
-        deadline = time.monotonic() + self.timeout
+        patience = self.timeout if timeout is None else timeout
+        deadline = time.monotonic() + patience
         if self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
             self._socket.send(protocol.encode(request))
             while self._socket.poll(milliseconds_until(deadline)):
@@ -80,7 +81,7 @@ class CameraRequests:
                 f"of it: its publish.requests, {PublishSettings().requests} by default"
             )
         raise CameraLost(
-            f"no camera at {self.endpoint}: no answer within {self.timeout:g} s; start one with "
+            f"no camera at {self.endpoint}: no answer within {patience:g} s; start one with "
             f"'fishd-camera', or name another with --camera or ${ENDPOINT_VARIABLE}"
         )
 

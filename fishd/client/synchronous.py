@@ -52,9 +52,13 @@ class Fish(Connection):
         """Disconnect; may be called twice."""
         self._context.destroy(linger=0)
 
-    def status(self) -> Status:
-        """The daemon in one snapshot."""
-        return self._call(Status, "status")
+    def status(self, timeout: float | None = None) -> Status:
+        """The daemon in one snapshot.
+
+        timeout: how long to wait for it [s]; None: as for other requests
+        """
+        patience = 0.0 if timeout is None else timeout - self.timeout
+        return self._call(Status, "status", patience=patience)
 
     def controllers(self) -> list[ControllerInfo]:
         """The controllers that the daemon knows, with their parameters."""
@@ -171,7 +175,7 @@ class Fish(Connection):
         identity, request = self.request(op, args)
         deadline = time.monotonic() + self.timeout + patience
         if not self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
-            raise self.silent()
+            raise self.silent(patience)
         self._socket.send(request)
         while self._socket.poll(milliseconds_until(deadline)):
             result = self.result(self._socket.recv_multipart()[-1], identity, kind)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct, structs
 from numpy.typing import NDArray
 
 from fishd.core.errors import MissingPackage, RecordingError
@@ -16,6 +16,8 @@ from fishd.core.schema import fields_of, note, unit
 
 TOPIC = "camera"
 SCHEMA = "foxglove.CompressedImage"
+_TYPES = {"number": "number", "integer": "integer", "text": "string", "boolean": "boolean"}
+"""Viewers know no type that permits null: what is not known is left out of a message."""
 _COMPRESSION = 1
 """Of PNG: noise cannot be compressed further, however long one tries."""
 
@@ -35,7 +37,9 @@ class FrameHead(Struct, frozen=True, gc=False):
     available: Annotated[float, unit("s", "When it could first be had, on that clock.")]
     seq: Annotated[int, note("Number of the frame in its session, from 1.")]
     session: Annotated[str, note("Names one run of the camera on one clock.")]
-    exposure: Annotated[float | None, unit("s", "Its length; null where it is not known.")] = None
+    exposure: Annotated[float | None, unit("s", "Its length; left out where it is not known.")] = (
+        None
+    )
     dropped: Annotated[int, note("Frames that the camera took but nobody got, so far.")] = 0
 
 
@@ -67,7 +71,6 @@ class RecordedFrame(NamedTuple):
 
 def json_schema() -> bytes:
     """The JSON Schema of the channel, as Foxglove publishes it, with the fields of fishd."""
-    types = {"t": "number", "time": "number", "available": "number", "seq": "integer"}
     properties: dict[str, Any] = {
         "timestamp": {
             "type": "object",
@@ -83,8 +86,7 @@ def json_schema() -> bytes:
     }
     for field in fields_of(FrameHead):
         described = f"{field.description} [{field.unit}]" if field.unit else field.description
-        kind = types.get(field.name, "string" if field.name == "session" else "number")
-        properties[field.name] = {"type": kind, "description": described}
+        properties[field.name] = {"type": _TYPES[field.kind], "description": described}
     return msgspec.json.encode({"title": SCHEMA, "type": "object", "properties": properties})
 
 
@@ -92,8 +94,10 @@ def encoded(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
     """The message of a frame; raises `MissingPackage` without OpenCV (extra: camera)."""
     _, png = _cv2().imencode(".png", pixels, [_cv2().IMWRITE_PNG_COMPRESSION, _COMPRESSION])
     nanoseconds = max(0, round(head.t * 1e9))
+    fields = structs.asdict(head).items()
+    known: dict[str, Any] = {name: UNSET if it is None else it for name, it in fields}
     message = ImageMessage(
-        **msgspec.structs.asdict(head),
+        **known,
         timestamp=Timestamp(*divmod(nanoseconds, 10**9)),
         data=png.tobytes(),
     )

@@ -84,6 +84,13 @@ def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
     )
 
 
+def test_an_axis_at_the_edge_of_what_is_looked_at_is_said_to_be_unsure() -> None:
+    motion = find_motion(pictures())
+    found = judge(motion._replace(sure=False), VGA, V4L2)
+    assert not found.good
+    assert "may be further off or steeper" in found.advice[0]
+
+
 def test_of_a_simulated_camera_its_own_settings_are_named() -> None:
     settings = CameraSettings(
         simulated=replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05)

@@ -33,6 +33,19 @@ def test_the_axis_is_found_within_a_quarter_of_a_pixel(
     assert axis.tilt == pytest.approx(tilt, abs=0.02)
 
 
+@pytest.mark.parametrize("rig", [DEFAULT, WEB, BAD])
+@pytest.mark.parametrize("slope", [0.25, -0.3, math.pi / 8, -math.pi / 8])
+def test_a_steep_axis_is_found_too(rig: SimulatedCameraSettings, slope: float) -> None:
+    motion = find_motion(swinging(replace(rig, tilt=slope)))
+    assert math.tan(motion.axis.tilt) == pytest.approx(slope, abs=0.03)
+    assert motion.sure
+
+
+@pytest.mark.parametrize("off", [-30.0, 30.0])
+def test_an_axis_beyond_what_is_looked_at_is_not_sure(off: float) -> None:
+    assert not find_motion(swinging(replace(DEFAULT, off_axis=off), amplitude=0.1)).sure
+
+
 def test_a_tail_that_rests_has_no_axis() -> None:
     with pytest.raises(NoMotion, match="nothing moves in these pictures but noise; let the fish"):
         find_motion(swinging(WEB, amplitude=0.0))

@@ -3,19 +3,30 @@
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
+import yaml
 from rigs.camera_process import COMMAND
 from rigs.documents import ROOT
 from rigs.processes import call, one_line
 
-from fishd.camera.settings import CameraSettings, load, to_yaml
+from fishd.camera.settings import CameraSettings, SimulatedSettings, load, to_yaml
+from fishd.camera.simulated.settings import WEB
 from fishd.core.errors import ConfigError
 
 
-@pytest.mark.parametrize("name", ["camera.yaml", "camera-simulated.yaml"])
+@pytest.mark.parametrize("name", ["camera.yaml", "camera-simulated.yaml", "camera-web.yaml"])
 def test_the_examples_are_valid(name: str) -> None:
     settings = load(ROOT / "config" / name)
     assert settings.source == ("v4l2" if name == "camera.yaml" else "simulated")
+
+
+def test_the_good_simulated_camera_is_the_default_and_the_bad_one_the_rig_web() -> None:
+    assert load(ROOT / "config/camera-simulated.yaml") == CameraSettings()
+    good = yaml.safe_load((ROOT / "config/camera-simulated.yaml").read_text())["simulated"]
+    assert set(good) == set(SimulatedSettings.__struct_fields__)
+    web = load(ROOT / "config/camera-web.yaml").simulated
+    assert msgspec.structs.asdict(web) == msgspec.structs.asdict(WEB) | {"fishd": None}
 
 
 def test_all_settings_are_read_back(tmp_path: Path) -> None:
@@ -35,6 +46,7 @@ def test_all_settings_are_read_back(tmp_path: Path) -> None:
         ("publish.frames=localhost:9874", "tcp://HOST:PORT or ipc://PATH is needed"),
         ("publish.requests=tcp://127.0.0.1:9874", "is that of frames already"),
         ("simulated.fishd=tcp://127.0.0.1:*", "is not valid"),
+        ("simulated.side_light=101", "a number in [-100, 100] is needed"),
         ("simulated.rate=0", "a number in (0, 1000] 1/s (or null) is needed"),
         ("v4l2.controls.gain=1.5", "a whole number, true or false is needed"),
         ("v4l2.format=H264", "one of GREY | MJPG | YUYV is needed"),

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from fishd.camera.clock_offset import AGAIN, SAME, ClockOffset, Reading
+from fishd.camera.clock_offset import AGAIN, PAUSE, QUICK, ROUNDS, SAME, ClockOffset, Reading
 from fishd.core.clock import boot_id
 from fishd.core.errors import NoDaemon
 
@@ -21,13 +21,16 @@ class Network:
         self._random = random.Random(seed)
         self._range = shortest, longest
         self.rate = 1.0
+        self.ahead, self.boot = AHEAD, "another machine"
+        self.patience: float | None = None
 
-    def ask(self) -> Reading:
+    def ask(self, patience: float | None = None) -> Reading:
         self.asked += 1
+        self.patience = patience
         self.now += self._random.uniform(*self._range)
         if self.down:
             raise NoDaemon("no answer")
-        reading = Reading(AHEAD + self.rate * self.now, "another machine")
+        reading = Reading(self.ahead + self.rate * self.now, self.boot)
         self.now += self._random.uniform(*self._range)
         return reading
 
@@ -42,7 +45,7 @@ def test_an_offset_is_known_as_well_as_it_says(seed: int) -> None:
 def test_on_one_machine_it_is_exactly_zero_and_asked_once() -> None:
     asked = []
 
-    def ask() -> Reading:
+    def ask(_: float | None) -> Reading:
         asked.append(1)
         return Reading(123.0, boot_id())
 
@@ -80,3 +83,57 @@ def test_a_first_answer_that_fails_is_told() -> None:
     network.down = True
     with pytest.raises(NoDaemon):
         ClockOffset(network.ask, lambda: network.now).update()
+
+
+@pytest.mark.parametrize("boot", ["its next start", ""])
+def test_another_start_of_their_machine_begins_anew(boot: str) -> None:
+    network = Network()
+    clock = ClockOffset(network.ask, lambda: network.now)
+    clock.update()
+    network.ahead, network.boot = -50.0, boot
+    network.now += AGAIN + 1.0
+    offset = clock.update()
+    assert abs(offset.seconds + 50.0) <= offset.uncertainty <= 0.05
+
+
+def test_a_machine_that_does_not_name_itself_is_not_taken_for_this_one() -> None:
+    network = Network()
+    network.boot = ""
+    offset = ClockOffset(network.ask, lambda: network.now).update()
+    assert abs(offset.seconds - AHEAD) <= offset.uncertainty
+    assert network.asked == ROUNDS
+
+
+def test_only_the_first_answer_is_waited_for() -> None:
+    network = Network(shortest=1e-3, longest=2e-3)
+    clock = ClockOffset(network.ask, lambda: network.now)
+    clock.update()
+    network.now += AGAIN + 1.0
+    clock.update()
+    assert network.patience == QUICK
+
+
+def test_a_slow_network_is_given_the_time_that_it_takes() -> None:
+    network = Network(shortest=0.1, longest=0.11)
+    clock = ClockOffset(network.ask, lambda: network.now)
+    clock.update()
+    network.now += AGAIN + 1.0
+    clock.update()
+    assert network.patience == pytest.approx(0.8, rel=0.1)
+
+
+def test_beginning_anew_is_tried_in_pauses() -> None:
+    network = Network()
+    clock = ClockOffset(network.ask, lambda: network.now)
+    clock.update()
+    clock.forget()
+    network.down = True
+    asked = network.asked
+    for _ in range(10):
+        with pytest.raises(NoDaemon):
+            clock.update()
+    assert network.asked == asked + 1
+    network.down = False
+    network.now += PAUSE + 0.1
+    offset = clock.update()
+    assert abs(offset.seconds - AHEAD) <= offset.uncertainty

@@ -54,6 +54,15 @@ def test_ticks_that_are_lost_do_no_harm() -> None:
     assert find_latency(frames, felt(kept)).stamps == pytest.approx(0.0, abs=3e-3)
 
 
+def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped() -> None:
+    ticks = swum(5.0)
+    lengths = {
+        round(force.end - force.begin, 3)
+        for force in felt([tick for tick in ticks if tick.seq % 10 > 3])
+    }
+    assert lengths == {0.05}
+
+
 def test_ninety_nine_of_a_hundred_frames_arrive_within_what_is_said() -> None:
     ticks = swum(30.0)
     found = find_latency(filmed(ticks, WEB), felt(ticks))

@@ -1,5 +1,7 @@
 """The simulated camera: what it draws, and when."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -80,6 +82,21 @@ def test_a_camera_in_phase_has_a_frame_there_when_each_tick_begins() -> None:
         [TICK * (tick + 1) for tick in range(20)]
     )
     assert [frame.available - frame.time for frame in frames] == pytest.approx([0.03] * 20)
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.05, 0.1, 0.15, 0.03, 0.12])
+@pytest.mark.parametrize("error", [-1e-12, 1e-12])
+def test_frames_in_phase_are_evenly_apart_whatever_the_rounding_of_a_tick(
+    latency: float, error: float
+) -> None:
+    camera = SimulatedCamera(replace(CLEAR, latency=latency), 84)
+    times = [TICK * tick + error * (tick % 3 - 1) for tick in range(20)]
+    ends = [Tail(time, 0.1, 0.0) for time in times]
+    frames = [frame for pair in pairwise(ends) for frame in camera.frames(*pair)]
+    assert np.diff([frame.time for frame in frames]) == pytest.approx(TICK)
+    there = np.array([frame.available for frame in frames])
+    assert there == pytest.approx(TICK * np.round(there / TICK))
+    assert there - [frame.time for frame in frames] == pytest.approx(latency)
 
 
 def test_a_web_camera_runs_at_its_own_rate_and_late() -> None:

@@ -83,6 +83,21 @@ def test_broken_jpegs_are_counted_and_left_out(good: V4l2Rig, fault: str) -> Non
     good.until(lambda state: state.seq > after.seq + 3)
 
 
+@pytest.mark.parametrize("fault", ["broken", "garbage"])
+def test_a_camera_that_sends_only_broken_frames_does_not_stream_and_is_opened_anew(
+    good: V4l2Rig, fault: str
+) -> None:
+    good.set(**{fault: True})
+    state = good.is_in("stalled")
+    assert "/dev/video7 has sent only broken frames for 2 s (" in state.problem
+    assert "another cable or port" in state.remedy
+    assert (state.rate, state.latency) == (0.0, None)
+    good.until(lambda later: later.broken > state.broken + 3)  # it is open again
+    assert good.status().state == "stalled"
+    good.set()
+    good.is_in("streaming")
+
+
 def test_frames_that_the_kernel_never_got_are_counted(good: V4l2Rig) -> None:
     before = good.status().dropped
     good.set(skip=5)

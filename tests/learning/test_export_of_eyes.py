@@ -50,7 +50,7 @@ CASES = [
     settings_of("modes", see="both", symmetric=False),
     settings_of("cnn"),
     settings_of("cnn", symmetric=False),
-    settings_of("cnn", see="both", size=61, frames=2),
+    settings_of("cnn", see="both", size=70, frames=2),
     settings_of("cnn", frames=1),
     settings_of("nature", see="both"),
     settings_of("nature", symmetric=False, frames=2),

@@ -3,6 +3,7 @@
 import base64
 import json
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -16,8 +17,9 @@ from rigs.harness import Rig
 from fishd.camera.frames import Frame
 from fishd.camera.simulated.settings import DEFAULT
 from fishd.core.errors import RecordingError
+from fishd.core.schema import note
 from fishd.core.signals import Tick
-from fishd.recording import RunWriter, open_run
+from fishd.recording import RunWriter, images, open_run
 from fishd.recording.export import export
 from fishd.recording.folder import glance
 from fishd.recording.images import FrameHead
@@ -183,3 +185,29 @@ def test_frames_of_several_sizes_are_no_array(tmp_path: Path, frames: list[Frame
     with pytest.raises(RecordingError, match="frames of 84 x 84 px and of 40 x 40 px"):
         export(open_run(writer.path), tmp_path, "csv")
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_the_schema_of_frames_has_the_type_of_each_field_and_holds_for_each_message(
+    frames: list[Frame],
+) -> None:
+    types = {
+        name: kind["type"] for name, kind in json.loads(images.json_schema())["properties"].items()
+    }
+    fields = ("t", "time", "available", "exposure", "seq", "dropped", "session")
+    assert [types[name] for name in fields] == ["number"] * 4 + ["integer"] * 2 + ["string"]
+    unknown = replace(head(frames[0], 1), exposure=None)
+    message = json.loads(images.encoded(unknown, frames[0].pixels))
+    assert "exposure" not in message
+    assert None not in message.values()
+    assert images.decoded(images.encoded(unknown, frames[0].pixels)).exposure is None
+
+
+def test_a_field_of_a_type_that_viewers_do_not_know_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Further(FrameHead, frozen=True, kw_only=True):
+        more: Annotated[tuple[int, ...], note("Numbers.")] = ()
+
+    monkeypatch.setattr(images, "FrameHead", Further)
+    with pytest.raises(KeyError, match="list"):
+        images.json_schema()

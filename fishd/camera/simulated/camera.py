@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fishd.camera.frames import Frame
+from fishd.camera.frames import EQUAL, Frame
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter
 
@@ -53,7 +53,8 @@ class SimulatedCamera:
         rate = self._settings.rate
         if rate is None:  # there when a tick begins
             tick = end - begin
-            return [end - math.fmod(self._settings.latency, tick)]
+            ticks = math.floor((self._settings.latency + EQUAL) / tick)
+            return [end - max(0.0, self._settings.latency - ticks * tick)]
         first = math.floor(begin * rate - self._phase) + 1
         last = math.floor(end * rate - self._phase)
         return [(number + self._phase) / rate for number in range(first, last + 1)]

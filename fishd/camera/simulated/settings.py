@@ -33,7 +33,12 @@ class SimulatedCameraSettings(Struct, frozen=True, forbid_unknown_fields=True, k
     ] = 0.0
     side_light: Annotated[
         float,
-        unit("1", "Grey levels by which one side of the axis is lighter than the other.", ge=-100),
+        unit(
+            "1",
+            "Grey levels by which one side of the axis is lighter than the other.",
+            ge=-100,
+            le=100,
+        ),
     ] = 0.0
     off_axis: Annotated[
         float, unit("px", "Axis of the fish from the middle of the frame.", ge=-40, le=40)

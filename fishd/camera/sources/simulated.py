@@ -14,7 +14,8 @@ import msgspec
 import zmq
 from msgspec import UNSET, Struct, UnsetType
 
-from fishd.camera.clock_offset import ClockOffset, Reading
+from fishd.camera.clock_offset import ClockOffset, clock_of
+from fishd.camera.frames import EQUAL
 from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
@@ -33,8 +34,6 @@ SILENCE = 1.0
 """After so long without a tick, fishd is asked whether it is there [s]."""
 ANSWER = 1.0
 """How long fishd may take for an answer [s]."""
-_EQUAL = 1e-6
-"""Times that differ by less are equal [s]."""
 
 
 class TickTruth(Struct, frozen=True, gc=False):
@@ -80,7 +79,7 @@ class Foresight:
             self._fish = TetheredFish(self._swimmer.plant, PlantState(phi=tick.phi))
             if self._swimmer.plant.servo_delay:  # what is under way to the servo is not known
                 self._swim(command, self._swimmer.plant.servo_delay + period)
-        elif tick.time > self._end.time + _EQUAL:  # after slots that fishd has skipped
+        elif tick.time > self._end.time + EQUAL:  # after slots that fishd has skipped
             self._swim(latest.phi_c if latest.servo_on else None, tick.time - self._end.time)
             parts.append((self._end, now))
         self._fish.state = PlantState(tick.phi, tick.alpha, tick.alpha_rate)
@@ -135,7 +134,7 @@ class SimulatedSource:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
             socket = subscriber(context, status.telemetry, b"tick")
-            offset = ClockOffset(lambda: _reading(fish))
+            offset = ClockOffset(clock_of(fish))
             view.ahead = offset.update().seconds
             heard, latest = time.monotonic(), 0
             while not stopping(0.0):
@@ -268,8 +267,3 @@ def _blind(robot: str) -> Trouble:
             "let fishd drive robot: simulated",
         )
     return Trouble("unusable", "this fishd drives a real fish", "use source: v4l2")
-
-
-def _reading(fish: Fish) -> Reading:
-    status = fish.status()
-    return Reading(status.clock, status.boot)

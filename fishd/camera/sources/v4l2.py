@@ -18,7 +18,7 @@ from fishd.core.clock import boot_id
 AGAIN = 1.0
 """Time between two tries to open the camera [s]."""
 STALLED = 2.0
-"""After so long without a frame it is opened anew [s]."""
+"""After so long without a whole frame it is opened anew [s]."""
 _LOOK = 200
 """Longest time between two looks at the rest [ms]."""
 _MONOTONIC, _CLOCK_MASK = 0x2000, 0xE000
@@ -70,7 +70,7 @@ class _Stream:
         """Until told to stop; raises `Trouble` when no frames come, and OSError."""
         waiting = select.poll()
         waiting.register(self._capture.device.fileno(), select.POLLIN)
-        heard = time.monotonic()
+        whole = heard = time.monotonic()
         while not stopping(0.0):
             sink.alive()
             if events := waiting.poll(_LOOK):
@@ -81,7 +81,11 @@ class _Stream:
                         raise self._stalled("reports an error") from None
                     continue
                 heard = time.monotonic()
-                self._use(frame, heard, sink)
+                if broken := self._use(frame, heard, sink):
+                    if heard - whole > STALLED:
+                        raise self._only_broken(broken)
+                else:
+                    whole = heard
             elif time.monotonic() - heard > STALLED:
                 raise self._stalled(f"has sent no frame for {STALLED:g} s")
 
@@ -93,7 +97,17 @@ class _Stream:
             "needs less of the bus",
         )
 
-    def _use(self, frame: Frame, arrived: float, sink: Sink) -> None:
+    def _only_broken(self, why: Broken) -> Trouble:
+        return Trouble(
+            "stalled",
+            f"{self._settings.device} has sent only broken frames for {STALLED:g} s ({why}); it is "
+            "opened anew",
+            "another cable or port, without a hub; a lower v4l2.rate or size; another v4l2.format: "
+            "'v4l2-ctl --list-formats-ext' shows what it sends",
+        )
+
+    def _use(self, frame: Frame, arrived: float, sink: Sink) -> Broken | None:
+        """Pass it on; why it is broken, where it is."""
         number = frame.frame_nb
         if self._number is not None:
             lost = (number - self._number - 1) % 2**32
@@ -107,11 +121,12 @@ class _Stream:
             picture = grey(
                 frame.data, self._settings.format, found.width, found.height, found.bytes_per_line
             )
-        except Broken:
+        except Broken as broken:
             sink.lost(broken=1)
-            return
+            return broken
         moment = self._moment(frame, arrived, sink)
         sink.put(Shot(moment, time.monotonic(), picture, self._exposure))
+        return None
 
     def _moment(self, frame: Frame, arrived: float, sink: Sink) -> float:
         """Middle of the exposure [s, monotonic]."""

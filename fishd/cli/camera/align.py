@@ -165,6 +165,7 @@ def _as_json(found: "Alignment", frames: int) -> dict[str, Any]:
         "tilt": axis.tilt,
         "motion": found.place._asdict(),
         "frames": frames,
+        "sure": found.motion.sure,
         "good": found.good,
         "advice": found.advice,
         "settings": found.settings,

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 OLD = 0.1
 """Younger frames need no `camera.stack.delay`: what was measured learned as well without [s]."""
+_GAP = 1.5
+"""Windows that end further apart than so many periods do not adjoin."""
 
 
 @click.command()
@@ -68,7 +70,7 @@ def latency(address: str | None, endpoint: str | None, seconds: float, as_json: 
 def forces_of(ticks: list["Tick"], period: float) -> list["Force"]:
     """The window of each tick's mean force, on the clock of fishd.
 
-    period: of the loop [s]; a window reaches back to the one before, but no further than that
+    period: of the loop [s]; a window reaches back to the one before, but not over a gap
     """
     from fishd.camera.latency import Force
 
@@ -80,7 +82,8 @@ def forces_of(ticks: list["Tick"], period: float) -> list["Force"]:
     for tick in ticks:
         between = period / max(1, tick.samples)
         end = tick.time - 1e-3 * tick.age_ms + 0.5 * between
-        forces.append(Force(forces[-1].end if forces else end - period, end, tick.fy))
+        adjoins = forces and end - forces[-1].end < _GAP * period
+        forces.append(Force(forces[-1].end if adjoins else end - period, end, tick.fy))
     return forces
 
 

@@ -206,7 +206,7 @@ def _with_camera(job: "Job", camera: str | None) -> "Job":
         return replace(job, camera_endpoint=camera)
     if job.resume:
         return replace(job, camera=runs.read_camera(job.folder))
-    return replace(job, camera=cameras.load(camera).simulated)
+    return replace(job, camera=cameras.simulated(camera))
 
 
 def _train(job: "Job") -> int:

@@ -19,8 +19,8 @@ from fishd.learning.env.link import LinkLost, StepResult
 
 PATIENCE = 10.0
 """How long the fish may take to begin, or to go on [s]."""
-GIVE_UP = 2.0
-"""After so long without frames the camera counts as lost [s]."""
+GIVE_UP = 5.0
+"""After so long without frames the camera counts as lost [s]; one that is restarted is back."""
 SILENCE = 1.0
 """After so long without an observation, fishd is asked for its status [s]."""
 

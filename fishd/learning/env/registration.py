@@ -47,7 +47,7 @@ def swim(
     fish = load(config, overrides)
     chosen = training.load(settings)
     eye = make(chosen)
-    sight = Camera(cameras.load(camera).simulated, chosen.camera.stack) if eye else None
+    sight = Camera(cameras.simulated(camera), chosen.camera.stack) if eye else None
     env = SwimEnv(SimulatedLink(fish, chosen.randomisation, sight), fish, chosen.seen, eye)
     if eye and not eye.is_fitted:
         env.reset(seed=0)
