@@ -46,7 +46,11 @@ class TailPainter:
         self._bend = (LENGTH * size * 0.5 * place * (1.0 + place)).astype(np.float32)
         """Lateral shift for tan α = 1, of each column of the tail [px]."""
         self._half = (size * (THICK + (THIN - THICK) * place)).astype(np.float32)
-        axis = 0.5 * (size - 1) + settings.off_axis + settings.tilt * (columns - 0.5 * (size - 1))
+        axis = (
+            0.5 * (size - 1)
+            + settings.off_axis
+            + math.tan(settings.tilt) * (columns - 0.5 * (size - 1))
+        )
         self._distance = (columns[:, None] - axis[None, :]).astype(np.float32)
         """Of each pixel from the axis, positive below it, shape (size, size) [px]."""
         self._still = self._background()
