@@ -203,6 +203,7 @@ def test_without_a_camera_it_says_how_to_start_one(daemon: Daemon, eye: str) -> 
     assert daemon.status().mode == "idle"
 
 
+@pytest.mark.realtime
 def test_a_live_comparison_lets_it_swim_through_the_camera(
     daemon: Daemon, camera: CameraProcess, eye: str
 ) -> None:
@@ -216,6 +217,7 @@ def test_a_live_comparison_lets_it_swim_through_the_camera(
     assert (found.mode, found.reason) == ("idle", None)
 
 
+@pytest.mark.realtime
 def test_a_live_comparison_leaves_out_what_the_camera_does_not_suit(
     tmp_path: Path, daemon: Daemon, camera: CameraProcess
 ) -> None:
@@ -227,6 +229,7 @@ def test_a_live_comparison_leaves_out_what_the_camera_does_not_suit(
     assert daemon.status().mode == "idle"
 
 
+@pytest.mark.realtime
 def test_a_camera_that_dies_ends_a_live_comparison_with_the_fish_at_rest(
     tmp_path: Path, daemon: Daemon, eye: str
 ) -> None:

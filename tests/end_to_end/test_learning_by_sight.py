@@ -61,6 +61,7 @@ def test_it_learns_from_the_frames_of_each_tick_in_lockstep(lockstep: Rig) -> No
     assert {row["lost"] for row in table} == {"0"}
 
 
+@pytest.mark.realtime
 def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(tmp_path: Path) -> None:
     with rig_of(tmp_path, "tick=0.05", "start.controller=hold") as rig:
         begun = rig.folder / "progress.csv"
@@ -95,4 +96,4 @@ def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
         file.write_text(text, encoding="utf-8")
         done = fishctl(*rig.words)
         assert done.returncode == 1
-        assert "shows 84 x 84; start that with --set picture.size=42" in done.stderr
+        assert "shows 84 x 84; start it with --set picture.size=42" in done.stderr

@@ -59,5 +59,5 @@ def learning_curves(
         axis.minorticks_off()
         axis.set_ylim(_LOWEST, 101)
         axis.set_xlabel("control steps")
-        axis.set_ylabel("efficiency (% of the best square wave)")
+        axis.set_ylabel(f"efficiency (%, from {_LOWEST} % up)")
         figure.legend(loc="outside lower center", ncols=3)

@@ -106,6 +106,7 @@ class FishdLink:
         another reset begins anew.
         """
         self._check_open()
+        self._seen = time.monotonic()
         if self._paused and self._agent.active:
             return self.resume()
         if self._begun and self._is_fresh():
