@@ -75,10 +75,11 @@ class LiveSight:
         Raises `PolicyError` as `await_frames` does, and in lockstep `CameraLost`.
         """
         if self._lockstep:
+            followed = self._client.state.virtual
             try:
                 found = self._client.stack_at(tick)
             except CameraLost:
-                if self._client.state.virtual:
+                if followed:
                     raise
                 return None  # it does not follow this fishd yet, which has not ticked for it
             if not self._judged and self._client.state.seq >= ENOUGH:
