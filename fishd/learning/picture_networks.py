@@ -7,7 +7,6 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor, NatureCNN
 from torch import nn
 
@@ -131,19 +130,3 @@ class PairExtractor(MlpExtractor):
 
 def _stacked(features: torch.Tensor) -> torch.Tensor:
     return torch.cat(features.chunk(2, dim=1))
-
-
-class SymmetricPicturePolicy(ActorCriticPolicy):
-    """`SymmetricPolicy` for pictures: their mirror image is flipped, the other numbers negated."""
-
-    def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = PairExtractor(
-            self.features_dim // 2,
-            net_arch=self.net_arch,
-            activation_fn=self.activation_fn,
-            device=self.device,
-        )
-
-    def _build(self, lr_schedule: object) -> None:
-        super()._build(lr_schedule)  # type: ignore[arg-type]
-        self.action_net.bias.requires_grad_(False)

@@ -21,7 +21,7 @@ from fishd.core.signals import Observation
 from fishd.learning.env.environment import spaces
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
-from fishd.learning.picture_networks import HALF, PictureExtractor, SymmetricPicturePolicy
+from fishd.learning.picture_networks import HALF, PairExtractor, PictureExtractor
 from fishd.learning.settings import PpoSettings, TrainingSettings
 
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
@@ -62,6 +62,18 @@ class SymmetricPolicy(ActorCriticPolicy):
     def _build(self, lr_schedule: object) -> None:
         super()._build(lr_schedule)  # type: ignore[arg-type]
         self.action_net.bias.requires_grad_(False)
+
+
+class SymmetricPicturePolicy(SymmetricPolicy):
+    """The same for pictures: their mirror image is flipped, the other numbers change sign."""
+
+    def _build_mlp_extractor(self) -> None:
+        self.mlp_extractor = PairExtractor(
+            self.features_dim // 2,
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            device=self.device,
+        )
 
 
 def plain_layers(layers: Layers) -> Layers:
