@@ -17,10 +17,22 @@ def laplacian(grid: Grid, phi: Array) -> Array:
     return np.diff(along, axis=0) / grid.dx[:, None] + np.diff(across, axis=1) / grid.dy
 
 
-def test_what_it_solves_is_solved_to_rounding_on_a_stretched_grid() -> None:
-    grid = Grid(edges(0.0, 2.0, (0.8, 1.2), 0.02, 1.1), edges(0.0, 1.0, (0.4, 0.6), 0.02, 1.1))
+@pytest.mark.parametrize("middle", [0.5, 0.4])
+@pytest.mark.parametrize("cell", [0.02, 0.021])
+def test_what_it_solves_is_solved_to_rounding_on_a_stretched_grid(
+    middle: float, cell: float
+) -> None:
+    fine = middle - 0.1, middle + 0.1
+    grid = Grid(edges(0.0, 2.0, (0.8, 1.2), 0.02, 1.1), edges(0.0, 1.0, fine, cell, 1.1))
     phi = np.random.default_rng(1).normal(size=(grid.nx, grid.ny))
     assert Poisson(grid).solve(laplacian(grid, phi)) == pytest.approx(phi, abs=1e-10)
+
+
+@pytest.mark.parametrize("rows", [3, 4, 7, 16])
+def test_even_and_odd_numbers_of_cells_across_are_alike(rows: int) -> None:
+    grid = Grid(np.linspace(0.0, 1.0, 9), np.linspace(0.0, 1.0, rows + 1))
+    phi = np.random.default_rng(2).normal(size=(8, rows))
+    assert Poisson(grid).solve(laplacian(grid, phi)) == pytest.approx(phi, abs=1e-12)
 
 
 def error(cells: int) -> float:
