@@ -20,6 +20,7 @@ NAMES = (
     "identification",
     "estimators",
     "camera",
+    "swimmer",
 )
 
 if __name__ == "__main__":

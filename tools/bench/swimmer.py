@@ -18,8 +18,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import time  # noqa: E402
 from argparse import Namespace  # noqa: E402
 
+from bench.swimmer_cylinder import cylinder  # noqa: E402
 from bench.swimmer_fish import convergence, momentum, speed  # noqa: E402
-from bench.swimmer_flows import beam, cylinder, turek_hron  # noqa: E402
+from bench.swimmer_flag import beam, turek_hron  # noqa: E402
 from common.machine import machine_in_short  # noqa: E402
 from common.report import Options, Report, progress  # noqa: E402
 
