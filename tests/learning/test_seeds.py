@@ -26,7 +26,7 @@ SETTINGS = """\
 steps: {steps}
 checkpoint_every: 128
 ppo: {{n_steps: 64, n_epochs: 2}}
-evaluation: {{seconds: 4.0, settle: 2.0}}
+evaluation: {{every: 1, seconds: 4.0, settle: 2.0}}
 """
 LONG = 1_000_000
 
