@@ -24,7 +24,7 @@ from fishd.learning.train.jobs import Outcome
 
 SETTINGS = """\
 steps: 128
-ppo: {n_steps: 64, n_epochs: 4}
+ppo: {n_steps: 64, n_epochs: 4, log_std_init: 0.7}
 evaluation: {every: 1, seconds: 4.0, settle: 2.0}
 """
 
