@@ -35,7 +35,7 @@ CLEAR = 0.01
 WORSE = 0.8
 """After one beat with a ripple below this share a trial ends."""
 FASTER_RIPPLES = 0.15
-"""Gaits of equal thrust ripple more the faster they are, by some power of their frequency: 0.35 is the
+"""Gaits of equal thrust ripple more the faster they are, by a power of their frequency: 0.35 is the
 median of 80 pairs of gaits of 35 simulated fish, and less is safer for fish that hardly brake."""
 SAME = 0.03
 """Half beats that differ by less than this share are the same gait; the next rung is tried."""
