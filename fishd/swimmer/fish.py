@@ -55,6 +55,8 @@ class Motion(NamedTuple):
     """Its rate [rad/s]."""
     deflection: float
     """Of the tip of the tail from the axis of the front body [m]."""
+    tail_y: float
+    """Of the tip of the tail, in the laboratory [m]."""
     thrust: float
     """Force of the water on the body along −x, per metre of depth [N]."""
     side_force: float
@@ -217,8 +219,9 @@ class Fish:
             sideways=float(mean[1]),
             heading=heading,
             tail_angle=math.atan2(off, reach),
-            tail_rate=(off_rate * reach - reach_rate * off) / (reach**2 + off**2),
+            tail_rate=float(off_rate * reach - reach_rate * off) / (reach**2 + off**2),
             deflection=float((places[-1] - front) @ across),
+            tail_y=float(places[-1, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),
         )
