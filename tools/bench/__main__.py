@@ -21,6 +21,7 @@ NAMES = (
     "estimators",
     "swing",
     "camera",
+    "swimmer",
 )
 
 if __name__ == "__main__":
