@@ -1,0 +1,149 @@
+"""Can this fish be computed, on this grid, with this step? Said before it swims."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from fishd.core.schema import Problem
+from fishd.swimmer.beam import Beam
+from fishd.swimmer.grid import Array
+from fishd.swimmer.settings import (
+    LARGEST_COURANT,
+    LEAST_CELLS_LONG,
+    LEAST_CELLS_THICK,
+    Body,
+    Estimate,
+    SwimmerSettings,
+    half_thickness,
+)
+
+SHARPEST = 0.9
+"""Curvature times half thickness, at most: with 1 the inner side of the bend is folded."""
+FURTHEST = 2.5
+"""The tail turns against the head by at most so much [rad]."""
+_MARGIN = 1.2
+
+
+def build_beam(settings: SwimmerSettings) -> Beam:
+    """The body as a beam in plane strain, its head at the origin."""
+    body, numerics = settings.body, settings.numerics
+    plane = body.young / (1.0 - body.poisson**2)
+
+    def thickness(X: Array) -> Array:
+        return np.array([half_thickness(body, float(x) / body.length) for x in X])
+
+    return Beam(
+        body.length,
+        thickness,
+        lambda X: plane * (2.0 * thickness(X)) ** 3 / 12.0,
+        numerics.segments,
+        0.5 * numerics.cell,
+        density=body.excess_density,
+        viscous_time=body.viscosity / body.young,
+    )
+
+
+def curvature(settings: SwimmerSettings, X: Array) -> Array:
+    """Curvature that the muscles ask for at full activation, at X [1/m]."""
+    body, muscle = settings.body, settings.muscle
+    return np.asarray(muscle.strain * (X / body.length) ** muscle.exponent / body.thickness)
+
+
+def estimate(settings: SwimmerSettings) -> Estimate:
+    """Deflection, frequency and Courant number, from the beam and the water that it takes along.
+
+    A plate from −b to b that moves normally with Σ aₙ Uₙ(x/b), Uₙ the Chebyshev polynomials of the
+    second kind, gives the water around it the energy ½ρπb² Σ aₙ²/(n + 1): thin aerofoil theory
+    without circulation (Katz and Plotkin, Low-Speed Aerodynamics, chapter 5).
+    """
+    beam = build_beam(settings)
+    body, water = settings.body, settings.water
+    force = beam.drive(lambda X: curvature(settings, X))
+    bent = np.zeros(beam.size)
+    bent[2:] = np.linalg.lstsq(beam.K[2:, 2:], force[2:], rcond=None)[0]
+    bent[2:] -= bent[2]
+    places, _ = beam.shape(bent)
+    deflection = abs(float(places[-1, 1]))
+    mass = (water.density + body.excess_density) * beam.share * beam.area
+    moves = beam.motion(np.zeros(beam.slices))[:, 1, 1:]
+    M = moves.T @ (mass[:, None] * moves)
+    half = 0.5 * body.length
+    angle = np.arccos(beam.X / half - 1.0)
+    for n in range(1, 21):
+        share = 2.0 / math.pi * beam.spacing / half * np.sin(n * angle) @ moves
+        M += water.density * math.pi * half**2 / n * np.outer(share, share)
+    squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, beam.K[1:, 1:])).real)
+    omega = math.sqrt(max(float(squares[2]), 0.0))  # after two motions without any bending
+    fastest = 1.5 * omega * deflection
+    courant = fastest * settings.numerics.step / settings.numerics.cell
+    return Estimate(deflection, omega / (2.0 * math.pi), courant)
+
+
+def check(settings: SwimmerSettings) -> None:
+    """Raises `Problem` with the key at fault, what is wrong and what would be right."""
+    body, numerics = settings.body, settings.numerics
+    _check_profile(body)
+    thickest = 2.0 * max(half_thickness(body, share) for share in np.linspace(0.0, 1.0, 201))
+    most = min(body.length / LEAST_CELLS_LONG, thickest / LEAST_CELLS_THICK)
+    if numerics.cell > most:
+        raise Problem(
+            ("swimmer", "numerics", "cell"),
+            f"{numerics.cell:g} m is too coarse for a fish {body.length:g} m long and "
+            f"{thickest:.3g} m thick: at most {most:.3g} m",
+        )
+    _check_tank(settings)
+    _check_bend(settings)
+    found = estimate(settings)
+    if found.courant_number > LARGEST_COURANT:
+        longest = numerics.step * LARGEST_COURANT / found.courant_number
+        raise Problem(
+            ("swimmer", "numerics", "step"),
+            f"{numerics.step:g} s is beyond the limit of stability: the tail would pass "
+            f"{found.courant_number:.2g} cells in a step; at most {longest:.2g} s",
+        )
+
+
+def _check_profile(body: Body) -> None:
+    points = body.profile
+    if points is None:
+        return
+    shares = [share for share, _ in points]
+    rising = all(a < b for a, b in pairwise(shares))
+    if len(points) < 2 or not rising or shares[0] != 0.0 or shares[-1] != 1.0:
+        raise Problem(
+            ("swimmer", "body", "profile"),
+            "needs points [X/L, s] with X/L rising from 0 to 1, such as [[0, 0], [0.3, 1], [1, 0]]",
+        )
+    if min(s for _, s in points) < 0.0 or max(s for _, s in points) <= 0.0:
+        raise Problem(("swimmer", "body", "profile"), "s must be 0 or more, and somewhere above")
+
+
+def _check_tank(settings: SwimmerSettings) -> None:
+    body, water, numerics = settings.body, settings.water, settings.numerics
+    for key, size, share in (
+        ("length", water.length, numerics.fine_length),
+        ("width", water.width, numerics.fine_width),
+    ):
+        needed = share * body.length * _MARGIN
+        if size < needed:
+            raise Problem(
+                ("swimmer", "water", key),
+                f"a tank of {size:g} m is too small for a fish {body.length:g} m long: at least "
+                f"{needed:.3g} m",
+            )
+
+
+def _check_bend(settings: SwimmerSettings) -> None:
+    body, muscle = settings.body, settings.muscle
+    X = np.linspace(0.0, body.length, 401)
+    asked = curvature(settings, X)
+    thickness = np.array([half_thickness(body, float(x) / body.length) for x in X])
+    folding = float((asked * thickness).max()) / SHARPEST
+    turning = float(np.trapezoid(asked, X)) / FURTHEST
+    if max(folding, turning) > 1.0:
+        raise Problem(
+            ("swimmer", "muscle", "strain"),
+            f"{muscle.strain:g} folds the body upon itself: at most "
+            f"{muscle.strain / max(folding, turning):.3g}",
+        )

@@ -1,0 +1,193 @@
+"""Bodies in the flow: the water moves as they do where they are, and no momentum is lost.
+
+Direct forcing on a fixed grid (Fadlun et al., J. Comput. Phys. 161, 2000,
+doi:10.1006/jcph.2000.6484), by the share of the cell around a face that the body covers (Kajishima
+and Takiguchi, Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5), of second order
+(see `covers`). Where the body is, the water of the grid is its mass: the momentum that it has
+there, projected on the motions that the beam can make, gives the motion of the beam. So no force is
+exchanged between two solvers, and light bodies are no harder than heavy ones.
+"""
+
+import numpy as np
+
+from fishd.core.errors import FishdError
+from fishd.swimmer.beam import Beam
+from fishd.swimmer.covers import Covered, circle, gather, impose, paint, slip
+from fishd.swimmer.flow import Flow
+from fishd.swimmer.grid import Array
+
+IMPLICIT = 0.55
+"""Share of the new shape in the elastic forces of a step; 0.5 would let the shortest waves of the
+beam ring for ever."""
+_DIAGONAL = np.arange(3)
+
+
+class LeftTheGrid(FishdError):
+    """The body is where cells are coarse."""
+
+
+class Immersed:
+    """A beam in a flow, a rigid circle, or both."""
+
+    def __init__(self, flow: Flow, density: float, beam: Beam | None = None) -> None:
+        """density: of the water [kg/m³]"""
+        self.flow, self.density, self.beam = flow, density, beam
+        grid = flow.grid
+        self._fixed: tuple[Covered, Covered] | None = None
+        self._freedom = np.ones((grid.nx, grid.ny))
+        self._cell_mass = density * grid.h**2
+        self.fixed_impulse = np.zeros(2)
+        """What the circle took from the water in the latest step [N s]."""
+        if beam:
+            self.velocity = np.zeros((beam.slices, 3))
+            """Of the slices: vx, vy [m/s] and θ̇ [rad/s], at the latest step."""
+            self.force = np.zeros((beam.slices, 3))
+            """Of the slices on the water where they are: force and torque [N, N m], over the
+            latest step."""
+            self.mass = np.zeros((beam.slices, 3, 3))
+            """Of the water where each slice is."""
+            self._before = np.zeros(beam.size)
+
+    def add_circle(self, x: float, y: float, radius: float) -> None:
+        """Put a rigid circle there, where cells are small; lengths in m."""
+        grid = self.flow.grid
+        on_u = circle(grid.x[:, None] - x, grid.yc[None] - y, radius, grid.h)
+        on_v = circle(grid.xc[:, None] - x, grid.y[None] - y, radius, grid.h)
+        self._fixed = on_u, on_v
+        self._freedom = _freedom(on_u.share, on_v.share)
+
+    def step(self, dt: float, forces: Array | None = None) -> None:
+        """One step of `dt` [s]; forces: on the unknowns of the beam, at the middle of the step."""
+        self.flow.predict(dt)
+        if self._fixed:
+            self._hold(*self._fixed)
+        freedom = self._freedom
+        if self.beam:
+            freedom = self._move(self.beam, dt, forces)
+        self.flow.project(dt, freedom)
+
+    def _hold(self, on_u: Covered, on_v: Covered) -> None:
+        """Bring the water to rest where the circle is."""
+        flow = self.flow
+        taken_u = on_u.share * flow.ahead_u - slip(flow.ahead_u, on_u)
+        taken_v = on_v.share * flow.ahead_v - slip(flow.ahead_v, on_v)
+        self.fixed_impulse = self._cell_mass * np.array([taken_u.sum(), taken_v.sum()])
+        flow.ahead_u -= taken_u
+        flow.ahead_v -= taken_v
+
+    def _move(self, beam: Beam, dt: float, forces: Array | None) -> Array:
+        """Find the new motion, and let the water where the beam is have it; returns the freedom."""
+        flow, grid, h = self.flow, self.flow.grid, self.flow.grid.h
+        travel = np.zeros(beam.size)
+        travel[0] = flow.grid_velocity
+        places, angle = beam.shape(beam.q + dt * (1.5 * beam.rate - 0.5 * self._before - travel))
+        i, j = self._box(places, float(beam.half_thickness.max()))
+        faces_u = slice(i.start, i.stop + 1), j
+        faces_v = i, slice(j.start, j.stop + 1)
+        body = places, angle, beam.half_thickness, beam.taper, beam.spacing, h
+        on_u = paint(*body, grid.x[faces_u[0]], grid.yc[j], beam.clamped)
+        on_v = paint(*body, grid.xc[i], grid.y[faces_v[1]], beam.clamped)
+        if self._fixed:
+            _yield(on_u, self._fixed[0], faces_u)
+            _yield(on_v, self._fixed[1], faces_v)
+        around_u, around_v = _around(flow.ahead_u, faces_u), _around(flow.ahead_v, faces_v)
+        self.mass, momentum = gather(
+            places,
+            (on_u, around_u, grid.x[faces_u[0]], grid.yc[j]),
+            (on_v, around_v, grid.xc[i], grid.y[faces_v[1]]),
+            self._cell_mass,
+            h,
+        )
+        moves = beam.motion(angle)
+        rate = self._solve(beam, dt, moves, momentum, forces)
+        self.velocity = moves @ rate
+        self.force = ((self.mass @ self.velocity[:, :, None])[:, :, 0] - momentum) / dt
+        moving = self.velocity, places
+        impose(*moving, on_u, around_u, flow.ahead_u[faces_u], grid.yc[j], h, True)
+        impose(*moving, on_v, around_v, flow.ahead_v[faces_v], grid.xc[i], h, False)
+        beam.q = beam.q + dt * (0.5 * (rate + beam.rate) - travel)
+        self._before, beam.rate = beam.rate, rate
+        share_u, share_v = on_u.share, on_v.share
+        if self._fixed:
+            share_u = share_u + self._fixed[0].share[faces_u]
+            share_v = share_v + self._fixed[1].share[faces_v]
+        freedom = self._freedom.copy()
+        freedom[i, j] = _freedom(share_u, share_v)
+        return freedom
+
+    def _solve(
+        self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None
+    ) -> Array:
+        """Rates of the unknowns at the end of the step, from the momentum of all that moves."""
+        flat = moves.reshape(-1, beam.size)
+        heavy = self.mass.copy()
+        heavy[:, _DIAGONAL, _DIAGONAL] += beam.excess
+        M = flat.T @ (heavy @ moves).reshape(-1, beam.size)
+        driven = flat.T @ (momentum + beam.excess * self.velocity).ravel()
+        reach = 0.5 * IMPLICIT * dt
+        driven -= dt * (beam.K @ (beam.q + reach * beam.rate))
+        if forces is not None:
+            driven += dt * forces
+        system = M + dt * (reach * beam.K + beam.D)
+        rate = np.zeros(beam.size)
+        first = beam.free[0]
+        rate[first:] = np.linalg.solve(system[first:, first:], driven[first:])
+        return rate
+
+    def _box(self, places: Array, half_thickness: float) -> tuple[slice, slice]:
+        """The cells around the body; raises `LeftTheGrid` where they are not all small."""
+        grid = self.flow.grid
+        ranges = []
+        for axis, edges in ((0, grid.x), (1, grid.y)):
+            low = places[:, axis].min() - half_thickness - 2.0 * grid.h
+            high = places[:, axis].max() + half_thickness + 2.0 * grid.h
+            if not (edges[1] < low and high < edges[-2]):
+                raise LeftTheGrid("the body left the water")
+            first, last = np.searchsorted(edges, [low, high])
+            ranges.append(slice(int(first) - 1, int(last)))
+            sizes = np.diff(edges[ranges[-1].start : ranges[-1].stop + 1])
+            if sizes.max() > 1.001 * grid.h:
+                raise LeftTheGrid("the body left the part of the grid with small cells")
+        return ranges[0], ranges[1]
+
+    def state(self) -> dict[str, Array]:
+        """Everything that the next step depends on, by name."""
+        state = self.flow.state()
+        if self.beam:
+            state |= {
+                "q": self.beam.q.copy(),
+                "rate": self.beam.rate.copy(),
+                "rate_before": self._before.copy(),
+                "velocity": self.velocity.copy(),
+            }
+        return state
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Go on from what `state` gave."""
+        self.flow.restore(state)
+        if self.beam:
+            self.beam.q, self.beam.rate = state["q"].copy(), state["rate"].copy()
+            self._before, self.velocity = state["rate_before"].copy(), state["velocity"].copy()
+
+
+def _around(values: Array, faces: tuple[slice, slice]) -> Array:
+    """A copy of these faces and of one more on every side."""
+    i, j = faces
+    return values[i.start - 1 : i.stop + 1, j.start - 1 : j.stop + 1].copy()
+
+
+def _yield(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
+    """Leave to a fixed body what it covers."""
+    np.minimum(covered.share, 1.0 - fixed.share[faces], out=covered.share)
+    loose = fixed.share[faces] == 0.0
+    np.multiply(covered.moment_x, loose, out=covered.moment_x)
+    np.multiply(covered.moment_y, loose, out=covered.moment_y)
+
+
+def _freedom(cover_u: Array, cover_v: Array) -> Array:
+    """0 in cells that are all body.
+
+    A body that bends is longer on one side and shorter on the other: were its inner cells made free
+    of divergence, it could bend the less the shorter the steps are.
+    """
+    return np.asarray(1.0 - cover_u[1:] * cover_u[:-1] * cover_v[:, 1:] * cover_v[:, :-1])
