@@ -93,7 +93,7 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Hyper-parameters of PPO, named as stable-baselines3 names them."""
 
-    n_steps: Annotated[int, note("Steps between two updates.", ge=2, le=1_000_000)] = 128
+    n_steps: Annotated[int, note("Steps between two updates.", ge=2, le=1_000_000)] = 64
     batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 64
     n_epochs: Annotated[int, note("Passes over the steps of an update.", ge=1, le=1000)] = 10
     gamma: Annotated[float, note("Discount factor.", ge=0, le=1)] = 0.95
@@ -111,8 +111,8 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     max_grad_norm: Annotated[float, Meta(gt=0, le=100)] = 0.5
     target_kl: Annotated[float, Meta(gt=0, le=10)] | None = None
     log_std_init: Annotated[
-        float, note("Log of the exploration's deviation, in units of Φ.", ge=-5, le=2)
-    ] = 0.7
+        float, note("Log of the exploration's deviation, in units of Φ.", ge=-5, le=3)
+    ] = 2.5
     symmetric: Annotated[
         bool, note("Build into the networks that left and right are alike; not with F_x seen.")
     ] = True
@@ -126,7 +126,7 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The deterministic evaluations during training."""
 
-    every: Annotated[int, note("An evaluation after so many updates; 0 for none.", ge=0)] = 1
+    every: Annotated[int, note("An evaluation after so many updates; 0 for none.", ge=0)] = 2
     seconds: Annotated[float, unit("s", "Its length.", ge=1, le=3600)] = 20.0
     settle: Annotated[
         float, unit("s", "Time at its beginning that is not judged.", ge=0, le=3600)

@@ -47,7 +47,7 @@ def job_of(
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Outcome]:
-    """A babble and one update; its folder must not be changed."""
+    """A babble and two updates; its folder must not be changed."""
     job = job_of(tmp_path_factory.mktemp("pictures") / "first")
     return job, train(job)
 

@@ -25,8 +25,8 @@ from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluati
 SETTINGS = """\
 steps: {steps}
 checkpoint_every: 128
-ppo: {{n_steps: 64, n_epochs: 2}}
-evaluation: {{seconds: 4.0, settle: 2.0}}
+ppo: {{n_steps: 64, n_epochs: 2, log_std_init: 0.7}}
+evaluation: {{every: 1, seconds: 4.0, settle: 2.0}}
 """
 LONG = 1_000_000
 

@@ -19,6 +19,7 @@ NAMES = (
     "sweep",
     "identification",
     "estimators",
+    "swing",
     "camera",
     "swimmer",
 )
