@@ -194,7 +194,7 @@ def speed(finest: float) -> str:
                 f"fishd, {cell * finest:g} mm, {step * finest:g} ms",
                 f"{one.unknowns}",
                 f"≤ {asked:g} s" + (", ≤ 300 MB" if small else ""),
-                f"{one.best:.2f} s (median {one.median:.2f}, of the processor {one.processor:.2f}), "
+                f"{one.best:.2f} s (median {one.median:.2f}; processor {one.processor:.2f}), "
                 f"{one.memory:.0f} MB",
                 "yes" if met else "**no**",
             ]
