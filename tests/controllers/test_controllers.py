@@ -115,9 +115,15 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"C": 1.5}, r"swing: C: 1\.5 is not valid: a number in \[0, 1\] is needed"),
-        ({"C": math.nan}, r"swing: C: nan is not valid: a number in \[0, 1\] is needed"),
-        ({"C": "0.6"}, r"swing: C: '0\.6' is not valid: a number in \[0, 1\] is needed"),
+        ({"C": 1.5}, r"swing: C: 1\.5 is not valid: a number in \[0, 1\] \(or auto\) is needed"),
+        (
+            {"C": math.nan},
+            r"swing: C: nan is not valid: a number in \[0, 1\] \(or auto\) is needed",
+        ),
+        (
+            {"C": "0.6"},
+            r"swing: C: '0\.6' is not valid: a number in \[0, 1\] \(or auto\) is needed",
+        ),
         ({"amplitude": 24}, r"swing: amplitude: 24 is .* \(degrees\? that is 0\.419 rad\)$"),
         ({"amplitude": 240}, r"swing: amplitude: 240 is not valid: .* rad \(or null\) is needed$"),
         ({"amplitude": -24}, r"swing: amplitude: -24 is not valid: .* rad \(or null\) is needed$"),

@@ -25,7 +25,7 @@ def test_set_parameter_offers_the_parameters_of_the_running_controller(daemon: D
         "plain,C", "plain,amplitude", "plain,longest_half_period"
     ]  # fmt: skip
     assert offered("set-parameter", *to, "C", "0.3", "am") == ["plain,amplitude"]
-    assert offered(*to, "set-parameter", "C", "") == []
+    assert offered(*to, "set-parameter", "C", "") == ["plain,auto"]
 
 
 def test_set_parameter_offers_nothing_without_a_daemon(tmp_path: Path) -> None:
