@@ -59,6 +59,7 @@ class Flow:
         self._started = False
         self._between_x = np.concatenate([grid.dx[:1], np.diff(grid.xc), grid.dx[-1:]])
         self._between_y = np.concatenate([grid.dy[:1], np.diff(grid.yc), grid.dy[-1:]])
+        self._all_free, self._source = np.ones(self.p.shape), np.empty(self.p.shape)
         self.boundary_impulse = 0.0
         """What crossed the boundaries in the latest step: along x, over density [m³/s]."""
 
@@ -112,9 +113,9 @@ class Flow:
         freedom: shape (nx, ny), 0 in cells that are all body, where the motion of the body decides
         """
         grid = self.grid
-        source = _divergence(self.ahead_u, self.ahead_v, grid.dx, grid.dy, 1.0 / dt)
-        if freedom is not None:
-            source *= freedom
+        free = self._all_free if freedom is None else freedom
+        source = self._source
+        _divergence(self.ahead_u, self.ahead_v, grid.dx, grid.dy, 1.0 / dt, free, source)
         change = self._poisson.solve(source)
         before = grid.dy @ (self.p[-1] - self.p[0])
         _correct(
@@ -309,15 +310,14 @@ def _advance_v(  # pragma: no cover
 
 
 @njit(cache=True, fastmath=True)
-def _divergence(
-    u: Array, v: Array, dx: Array, dy: Array, scale: float
-) -> Array:  # pragma: no cover
-    out = np.empty((dx.size, dy.size))
+def _divergence(  # pragma: no cover
+    u: Array, v: Array, dx: Array, dy: Array, scale: float, freedom: Array, out: Array
+) -> None:
     for i in range(dx.size):
         along = scale / dx[i]
         for j in range(dy.size):
-            out[i, j] = (u[i + 1, j] - u[i, j]) * along + (v[i, j + 1] - v[i, j]) * scale / dy[j]
-    return out
+            here = (u[i + 1, j] - u[i, j]) * along + (v[i, j + 1] - v[i, j]) * scale / dy[j]
+            out[i, j] = here * freedom[i, j]
 
 
 @njit(cache=True, fastmath=True)

@@ -34,7 +34,9 @@ class Immersed:
         self.flow, self.density, self.beam = flow, density, beam
         grid = flow.grid
         self._fixed: tuple[Covered, Covered] | None = None
-        self._freedom = np.ones((grid.nx, grid.ny))
+        self._fixed_freedom = np.ones((grid.nx, grid.ny))
+        self._freedom = self._fixed_freedom.copy()
+        self._touched = slice(0, 0), slice(0, 0)
         self._cell_mass = density * grid.h**2
         self.fixed_impulse = np.zeros(2)
         """What the circle took from the water in the latest step [N s]."""
@@ -54,17 +56,17 @@ class Immersed:
         on_u = circle(grid.x[:, None] - x, grid.yc[None] - y, radius, grid.h)
         on_v = circle(grid.xc[:, None] - x, grid.y[None] - y, radius, grid.h)
         self._fixed = on_u, on_v
-        self._freedom = _freedom(on_u.share, on_v.share)
+        self._fixed_freedom = _freedom(on_u.share, on_v.share)
+        self._freedom = self._fixed_freedom.copy()
 
     def step(self, dt: float, forces: Array | None = None) -> None:
         """One step of `dt` [s]; forces: on the unknowns of the beam, at the middle of the step."""
         self.flow.predict(dt)
         if self._fixed:
             self._hold(*self._fixed)
-        freedom = self._freedom
         if self.beam:
-            freedom = self._move(self.beam, dt, forces)
-        self.flow.project(dt, freedom)
+            self._move(self.beam, dt, forces)
+        self.flow.project(dt, self._freedom)
 
     def _hold(self, on_u: Covered, on_v: Covered) -> None:
         """Bring the water to rest where the circle is."""
@@ -75,8 +77,8 @@ class Immersed:
         flow.ahead_u -= taken_u
         flow.ahead_v -= taken_v
 
-    def _move(self, beam: Beam, dt: float, forces: Array | None) -> Array:
-        """Find the new motion, and let the water where the beam is have it; returns the freedom."""
+    def _move(self, beam: Beam, dt: float, forces: Array | None) -> None:
+        """Find the new motion, and let the water where the beam is have it."""
         flow, grid, h = self.flow, self.flow.grid, self.flow.grid.h
         travel = np.zeros(beam.size)
         travel[0] = flow.grid_velocity
@@ -111,9 +113,9 @@ class Immersed:
         if self._fixed:
             share_u = share_u + self._fixed[0].share[faces_u]
             share_v = share_v + self._fixed[1].share[faces_v]
-        freedom = self._freedom.copy()
-        freedom[i, j] = _freedom(share_u, share_v)
-        return freedom
+        self._freedom[self._touched] = self._fixed_freedom[self._touched]
+        self._freedom[i, j] = _freedom(share_u, share_v)
+        self._touched = i, j
 
     def _solve(
         self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None

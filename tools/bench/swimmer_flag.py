@@ -48,8 +48,8 @@ class Case(NamedTuple):
     """Of the flag [kg/m³]."""
     shear_modulus: float
     """[Pa]"""
-    end: float
-    """[s]"""
+    runs: tuple[tuple[float, float], ...]
+    """Cells [m], and how long [s]."""
     step: float
     """With cells of 5 mm [s]."""
     allowed: float
@@ -62,14 +62,14 @@ PROPOSAL = "Turek and Hron 2006"
 FEATFLOW = "Featflow, newer, level 4"
 CASES = {
     "FSI3": Case(
-        2.0, 1000.0, 2e6, 6.0, 4e-4, 0.03,
+        2.0, 1000.0, 2e6, ((5e-3, 6.0), (2.5e-3, 6.0), (5e-3 / 3.0, 4.2)), 4e-4, 0.03,
         {
             PROPOSAL: (Wave(1.48e-3, 34.38e-3), 5.3, "457.3 ± 22.7", "2.2 ± 149.8"),
             FEATFLOW: (Wave(1.47e-3, 34.99e-3), 5.46, "460.5 ± 27.7", "2.5 ± 153.9"),
         },
     ),
     "FSI2": Case(
-        1.0, 10000.0, 0.5e6, 16.0, 8e-4, 0.05,
+        1.0, 10000.0, 0.5e6, ((5e-3, 16.0), (2.5e-3, 16.0)), 8e-4, 0.05,
         {
             PROPOSAL: (Wave(1.23e-3, 80.6e-3), 2.0, "208.8 ± 73.8", "0.9 ± 234.2"),
             FEATFLOW: (Wave(1.30e-3, 81.6e-3), 1.93, "215.1 ± 77.7", "0.6 ± 237.8"),
@@ -118,14 +118,14 @@ def even(value: float) -> Profile:
     return lambda X: np.full_like(X, value)
 
 
-def swing(case: Case, cell: float) -> Swing:
+def swing(case: Case, cell: float, end: float) -> Swing:
     """Let the flag swing, and measure its last five periods."""
     body, dt = flag(case, cell), case.step * cell / 5e-3
     beam, grid = body.beam, body.flow.grid
     assert beam
     profile = grid.yc * (HEIGHT - grid.yc)
     profile *= case.inflow / float(grid.dy @ profile / HEIGHT)
-    steps = round(case.end / dt)
+    steps = round(end / dt)
     history = np.empty((steps, 4))
     for k in range(steps):
         t = (k + 1) * dt
@@ -164,12 +164,13 @@ def turek_hron(finest: float) -> str:
     for name, case in CASES.items():
         for source, (across, frequency, drag, lift) in case.published.items():
             rows.append([name, source, across.text(1e3), f"{frequency:g}", drag, lift, "", ""])
-        for cell in (5e-3 * finest, 2.5e-3 * finest):
-            found = swing(case, cell)
+        for coarse, end in case.runs:
+            cell = coarse * finest
+            found = swing(case, cell, end)
             rows.append(
                 [
                     name,
-                    f"here, cells of {cell * 1e3:g} mm",
+                    f"here, cells of {cell * 1e3:.3g} mm",
                     found.across.text(1e3),
                     f"{found.frequency:.3f}",
                     found.drag.text(digits=1),
