@@ -27,7 +27,10 @@ _CHECKED_EVERY = 20
 _STEER_TIME = 0.4
 """Heading and place are averaged over about so long before the fish is steered [s]."""
 _STEER_RATE = 4.0
-_STEER_REACH = 5.0
+"""So fast the heading is corrected [1/s]."""
+_STEER_REACH = 10.0
+"""Heading that is wanted for each metre off the middle [rad/m], and the largest one [rad]."""
+_STEER_MOST = 0.3
 
 
 class Diverged(FishdError):
@@ -74,6 +77,8 @@ class Work(NamedTuple):
     """By those slices that pushed the fish forwards."""
     sideways: float
     """By the body on the water across the swimming direction."""
+    steering: float
+    """By the torque that keeps the fish on the middle; negative where it brakes."""
 
 
 class Fish:
@@ -114,8 +119,9 @@ class Fish:
         self._inertia = water.density * (
             self.beam.area * body.length**2 / 12.0 + math.pi * (0.5 * body.length) ** 4 / 8.0
         )
-        self._sensed_heading = self._sensed_y = 0.0
-        self._work = np.zeros(4)
+        self._averaged_heading = self._averaged_y = 0.0
+        self._torque = 0.0
+        self._work = np.zeros(5)
         self._hydrodynamic = np.zeros((self.beam.slices, 2))
         self._front = self.beam.share * (FRONT * body.length > self.beam.X)
         self._front /= self._front.sum()
@@ -139,7 +145,8 @@ class Fish:
         """
         self.activation = min(1.0, max(-1.0, activation))
         beam, body, dt = self.beam, self.body, self.dt
-        forces = self.activation * self._drive + self._steer() * self._couple
+        self._torque = self._steer()
+        forces = self.activation * self._drive + self._torque * self._couple
         before = body.velocity
         try:
             body.step(dt, forces)
@@ -166,18 +173,23 @@ class Fish:
         return Diverged(f"the swimmer cannot go on at {self.time:.3f} s: {why}")
 
     def _steer(self) -> float:
-        """A torque that turns the fish back to the middle, without any net force [N m]."""
+        """A torque that turns the fish back to the middle, without any net force [N m].
+
+        It goes by heading and place as averaged over more than a beat, and by how that heading
+        changes. So within a beat it is in step with the yaw and not with its rate: it takes next to
+        no power from the swimming. `Work.steering` counts it.
+        """
         gain = self.settings.steering
         if not gain:
             return 0.0
         places, angle = self.beam.shape(self.beam.q)
+        heading = float(self.beam.share @ angle)
         share = self.dt / _STEER_TIME
-        turning = float(self.beam.share @ self.body.velocity[:, 2])
-        self._sensed_heading += share * (float(self.beam.share @ angle) - self._sensed_heading)
-        self._sensed_y += share * (float(self.beam.share @ places[:, 1]) - self._sensed_y)
-        wanted = _STEER_REACH * self._sensed_y
-        wanted = min(0.3, max(-0.3, wanted))
-        pull = _STEER_RATE * (wanted - self._sensed_heading) - turning
+        changes = (heading - self._averaged_heading) / _STEER_TIME
+        self._averaged_heading += share * (heading - self._averaged_heading)
+        self._averaged_y += share * (float(self.beam.share @ places[:, 1]) - self._averaged_y)
+        wanted = min(_STEER_MOST, max(-_STEER_MOST, _STEER_REACH * self._averaged_y))
+        pull = _STEER_RATE * (wanted - self._averaged_heading) - changes
         return gain * _STEER_RATE * self._inertia * pull
 
     def _account(self, before: Array) -> None:
@@ -194,6 +206,7 @@ class Fish:
                 -float(np.sum(water * velocity)),
                 float(np.maximum(-water[:, 0], 0.0).sum()) * speed,
                 -float(water[:, 1] @ velocity[:, 1]),
+                self._torque * float(self._couple @ beam.rate),
             ]
         )
 
@@ -248,7 +261,7 @@ class Fish:
             "steps": np.array(self._steps),
             "travelled": np.array(self._travelled),
             "activation": np.array(self.activation),
-            "sensed": np.array([self._sensed_heading, self._sensed_y]),
+            "steered": np.array([self._averaged_heading, self._averaged_y]),
             "work": self._work.copy(),
             "hydrodynamic": self._hydrodynamic.copy(),
         }
@@ -259,5 +272,5 @@ class Fish:
         self._steps = int(state["steps"])
         self._travelled = float(state["travelled"])
         self.activation = float(state["activation"])
-        self._sensed_heading, self._sensed_y = map(float, state["sensed"])
+        self._averaged_heading, self._averaged_y = map(float, state["steered"])
         self._work, self._hydrodynamic = state["work"].copy(), state["hydrodynamic"].copy()

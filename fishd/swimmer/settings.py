@@ -91,7 +91,7 @@ class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ] = 2.0
     fine_width: Annotated[
         float, unit("1", "Width of that part, in lengths of the fish.", ge=0.5)
-    ] = 0.9
+    ] = 1.1
     stretch_along: Annotated[
         float, unit("1", "Growth from cell to cell outside, along the tank.", ge=1.0, le=1.2)
     ] = 1.04
