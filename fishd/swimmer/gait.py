@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct
 from scipy.special import stdtrit
 
-from fishd.swimmer.feasibility import build_beam
+from fishd.swimmer.body import build_beam
 from fishd.swimmer.grid import Array
 from fishd.swimmer.settings import SwimmerSettings
 
