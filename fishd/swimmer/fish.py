@@ -35,7 +35,10 @@ class Diverged(FishdError):
 
 
 class Motion(NamedTuple):
-    """How the fish moves at an instant; it swims towards −x, and y is to the right of it."""
+    """How the fish moves at an instant; it swims towards −x, and y is to the right of it.
+
+    Forces are those on a body one metre deep.
+    """
 
     time: float
     """[s]"""
@@ -54,20 +57,22 @@ class Motion(NamedTuple):
     tail_y: float
     """Of the tip of the tail, in the laboratory [m]."""
     thrust: float
-    """Force of the water on the body along −x, per metre of depth [N]."""
+    """Force of the water on the body along −x [N]."""
     side_force: float
-    """Force of the water on the body along y, per metre of depth [N]."""
+    """Force of the water on the body along y [N]."""
 
 
 class Work(NamedTuple):
-    """What was done since the start, per metre of depth [J]."""
+    """What was done since the start, by a body one metre deep [J]."""
 
     muscles: float
-    """By the muscles: on the body, and through it on the water."""
+    """By the muscles: on the body, and through it on the water; less what they take up while
+    stretched."""
     water: float
     """By the body on the water."""
     forwards: float
-    """By those slices that pushed the fish forwards."""
+    """By those slices that pushed the fish forwards: their force times its speed, at each
+    instant."""
     sideways: float
     """By the body on the water across the swimming direction."""
 

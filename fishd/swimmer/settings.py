@@ -23,7 +23,8 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         unit(
             "m",
             "H: half of the body's thickness at X is H·s(X/L); in the paper's formula t(X) it has "
-            "to be the half one.",
+            "to be the half one. It also sets the bend that the muscles ask for, κ = ε₀ (X/L)ⁿ/H: "
+            "with another thickness muscle.strain is another, too.",
             gt=0.0,
             le=2.0,
         ),
@@ -31,8 +32,8 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     profile: Annotated[
         tuple[tuple[float, float], ...] | None,
         Meta(
-            description="s as points [X/L, s], with X/L from 0 to 1, linear in between; null: the "
-            "paper's s = (X/L)(1 − X/L)exp(−X/L)."
+            description="s as points [X/L, s], with X/L from 0 to 1, linear in between, such as "
+            "[[0, 0], [0.3, 0.16], [1, 0]]; null: the paper's s = (X/L)(1 − X/L)exp(−X/L)."
         ),
     ] = None
     young: Annotated[float, unit("Pa", "Young's modulus.", gt=0.0, le=1e12)] = 1e4
