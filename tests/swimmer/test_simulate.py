@@ -71,6 +71,11 @@ def test_a_person_gets_the_same_in_a_few_lines() -> None:
     assert "whole beats" in out
 
 
+def test_a_single_beat_is_one() -> None:
+    words = ("square", "--frequency", "2.5", "--seconds", "1.5", "--settle", "0.5")
+    assert "over 1 whole beat\n" in simulated(*words).stdout
+
+
 def test_a_table_is_a_row_for_each_tick_in_either_form(tmp_path: Path) -> None:
     words = ("sine", "--seconds", "0.3", "--settle", "0.1")
     for name in ("a.csv", "b.npz"):
