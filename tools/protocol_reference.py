@@ -1,4 +1,4 @@
-"""The tables of docs/protocol.md, those of messages in docs/camera.md, and that of faults.
+"""The tables of docs/protocol.md, those of messages in docs/camera.md, faults and tracks.
 
 `tools/protocol_reference.py --write` puts them into the documents; `--check` exits with 1 where one
 is out of date there.
@@ -16,6 +16,7 @@ from fishd.camera import messages
 from fishd.control.faults import FAULTS
 from fishd.core import protocol, signals
 from fishd.core.schema import fields_of
+from fishd.swimmer.track import COLUMNS
 
 TYPES = {
     inspect.FloatType: "float",
@@ -72,6 +73,11 @@ def references() -> Iterator[tuple[str, str, str]]:
         for code, row in FAULTS.items()
     ]
     yield "concepts.md", "faults", table("code | what triggers it | what to do", faults)
+    columns = [
+        [f"`{name}`", "–" if unit == "1" else unit, about]
+        for name, (unit, about) in COLUMNS.items()
+    ]
+    yield "swimmer.md", "columns", table("column | unit | meaning", columns)
 
 
 def _fields(struct: type[Struct]) -> str:

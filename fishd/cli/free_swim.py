@@ -74,15 +74,17 @@ def _kept(swum: "Swum", options: SwimmerOptions) -> str:
 
 
 def _rows(report: "SwimReport") -> list[tuple[str, str]]:
-    beats = f"over {report.beats} whole beats" if report.beats else "no whole beat"
+    plural = "" if report.beats == 1 else "s"
+    beats = f"over {report.beats} whole beat{plural}" if report.beats else "no whole beat"
     error = f" ± {report.speed_error * 1e3:.2f}" if report.speed_error is not None else ""
     anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
     return [
         ("controller", f"{report.controller} {spelled(report.parameters)}{anew}"),
         ("speed", f"{report.speed * 1e3:.2f}{error} mm/s, {beats}"),
+        *_trend(report),
         ("frequency", f"{report.frequency:.3f} Hz"),
         ("heading", f"{report.heading:+.3f} rad"),
-        ("tail", f"{report.tail_amplitude:.3f} lengths from side to side"),
+        ("tail", f"{report.tail_width:.3f} lengths from side to side"),
         (
             "power",
             f"{report.muscle_power:.4g} W/m of the muscles, {report.water_power:.4g} W/m to the "
@@ -97,6 +99,15 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
             f"{report.real_time_factor:.3g} × real time",
         ),
     ]
+
+
+def _trend(report: "SwimReport") -> list[tuple[str, str]]:
+    """That the interval does not hold, where it does not."""
+    if report.speed_trend is None:
+        return []
+    how = "speeding up" if report.speed_trend > 0.0 else "slowing down"
+    share = f"{abs(report.speed_trend):.2%}".replace("%", " %/s")
+    return [("", f"still {how} by {share}: a longer --settle is needed")]
 
 
 def _or_none(value: float | None, form: str) -> str:

@@ -9,6 +9,8 @@ import click
 from fishd.cli.options import F, FiniteRange
 
 EVERY = 5.0
+SETTLE = 8.0
+"""From rest to an even speed a swimmer takes about so long [s]."""
 
 
 class SwimmerOptions(NamedTuple):
@@ -44,7 +46,8 @@ def swimmer_options(function: F) -> F:
         file_option("--save", "write its track, a row for each tick, into this .csv or .npz file."),
         file_option(
             "--resume",
-            "go on from this checkpoint; with the same controller its time counts to --seconds.",
+            "go on from this checkpoint; with the same controller --seconds is the whole swim, "
+            "that before included.",
         ),
         click.option(
             "--checkpoint-every",

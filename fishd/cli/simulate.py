@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.free_swim_options import SwimmerOptions, swimmer_options
+from fishd.cli.free_swim_options import SETTLE, SwimmerOptions, swimmer_options
 from fishd.cli.options import ControllerGroup, json_option
 from fishd.cli.output import echo, echo_rows, print_json, spelled, warn_of_fin
 from fishd.config import Config, load
@@ -29,7 +29,7 @@ def run_options(function: Any) -> Any:
         click.option(
             "--settle",
             type=float,
-            help="Time before figures are taken [s].  [default: 10; 3 of a swimmer]",
+            help="Time before figures are taken [s].  [default: 10; 8 of a swimmer]",
         ),
         click.option(
             "--seconds", type=float, default=60.0, show_default=True, help="Length of each run [s]."
@@ -73,7 +73,7 @@ def _simulate(
     config = load(file, overrides)
     free = config.robot == "swimmer"
     if settle is None:
-        settle = 3.0 if free else 10.0
+        settle = SETTLE if free else 10.0
     with ExitStack() as stack:
         writer, begun = None, _nothing
         if not free:

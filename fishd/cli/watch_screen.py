@@ -126,9 +126,7 @@ class View:
             **({"speed": f"{speed * 1e3:.1f} mm/s"} if isinstance(speed, float) else {}),
             "thrust": thrust_words(known),
             "tail beat": f"{tick.frequency:.2f} Hz",
-            "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
-            "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
-            "missed": f"{tick.missed}",
+            **({} if self.status.robot == "swimmer" else self._timing()),
             "lost": f"{self._lost}",
         }
         table = Table.grid(padding=(0, 3, 0, 0))
@@ -137,6 +135,14 @@ class View:
         table.add_row(*figures, style="dim")
         table.add_row(*figures.values(), style="bold")
         return table
+
+    def _timing(self) -> dict[str, str]:
+        """How late ticks are; in slow motion none is."""
+        return {
+            "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
+            "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
+            "missed": f"{self._ticks[-1].missed}",
+        }
 
     def _quantities(self) -> list[Text]:
         """The controller's own, in one line; no line where it has none."""

@@ -3,6 +3,7 @@
 import logging
 import os
 import socket
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -17,7 +18,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller
 from fishd.controllers.policy import library
 from fishd.core import protocol, text
-from fishd.core.clock import Clock, boot_id
+from fishd.core.clock import Clock, SlowClock, boot_id
 from fishd.core.errors import ParameterError, Refused, UnknownController
 from fishd.core.foreign_code import contained
 from fishd.core.protocol import PolicyInfo, State
@@ -58,7 +59,8 @@ class Operations:
         self._calibrations = calibration_requests
         self._config = config
         self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
-        self._started = clock.monotonic()
+        self._monotonic = time.monotonic if isinstance(clock, SlowClock) else clock.monotonic
+        self._started = self._monotonic()
         self._boot = boot_id()
         self._decisions = 0
         self._calls = BackgroundCalls(protocol.LOADING)
@@ -100,7 +102,7 @@ class Operations:
             t=self._clock.wall(),
             version=__version__,
             pid=os.getpid(),
-            uptime=self._clock.monotonic() - self._started,
+            uptime=self._monotonic() - self._started,
             mode=loop.supervisor.mode.value,
             reason=loop.supervisor.reason,
             controller=loop.active.name,

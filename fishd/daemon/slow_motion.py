@@ -16,6 +16,7 @@ BREATH = 0.002
 SPAN = 100
 """The pace is that of so many ticks."""
 TOO_SLOW = 1.1
+"""A status says so once a second of the fish takes so many times what it should."""
 
 
 class SlowMotion:
@@ -40,6 +41,7 @@ class SlowMotion:
         with suppress(TimeoutError):
             async with asyncio.timeout(max(BREATH, self._due - time.monotonic())):
                 await self.stopping.wait()
+        # A delay of up to a period is made up for; a longer one is forgotten, without a rush.
         self._begin(max(self._due, time.monotonic() - self._period))
 
     def hurry(self) -> None:

@@ -16,9 +16,10 @@ from fishd.core.signals import Reason
 from fishd.simulation.report import count_ticks
 from fishd.simulation.virtual_run import EncodingPublisher, VirtualRun
 from fishd.swimmer import checkpoint
-from fishd.swimmer.checkpoint import Checkpoint
+from fishd.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.swimmer.fish import Diverged
 from fishd.swimmer.gait import Gait, gait
+from fishd.swimmer.grid import Array
 from fishd.swimmer.robot import Swimmer
 from fishd.swimmer.track import Track
 
@@ -69,7 +70,7 @@ def swim(
     name: str,
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
-    settle: float = 10.0,
+    settle: float = 8.0,
     publisher: Publisher | None = None,
     begun: Callable[[VirtualRun], None] = lambda run: None,
     *,
@@ -93,16 +94,24 @@ def swim(
     ticks, first = count_ticks(seconds, settle, config.tick)
     settings = settings_of(config)
     kept: float | None = None
+    kept_rows: Array | None = None
+    if resume:
+        resume.check(settings)
+        if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(given)):
+            kept_rows = resume.track
+            if len(kept_rows) >= ticks:
+                raise CheckpointError(
+                    f"{resume.path}: the checkpoint is of {resume.time:.2f} s already: nothing was "
+                    "swum; more --seconds are needed"
+                )
     with VirtualRun(config, publisher or EncodingPublisher()) as run:
         fish = run.swimmer
         assert fish
         track = Track()
         if resume:
-            resume.check(settings)
             resume.put_into(fish)
             run.loop.applied = fish.command  # which the new controller goes on from
-            if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(given)):
-                track = Track(resume.track)
+            track = Track(kept_rows)
         before = len(track)
         track.begin(fish)
         fish.compile()

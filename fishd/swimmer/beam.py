@@ -20,7 +20,7 @@ class Beam:
     """Unknowns q = (x, y of the head, θ at `segments` + 1 points); slices that move as rigid ones.
 
     Slices are short pieces of the body between two cross-sections: `slices` of them, of length
-    `spacing`. All quantities are for a body of one metre in depth.
+    `spacing`. Forces, moments and masses are those of a body one metre deep.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Beam:
     ) -> None:
         """length: of the midline [m]
 
-        half_thickness: at X [m]; stiffness: EI at X, per metre of depth [N m]
+        half_thickness: at X [m]; stiffness: EI at X [N m²]
         spacing: of the slices, at most [m]
         density: by which the body is heavier than water [kg/m³]
         viscous_time: viscosity over Young's modulus, of a Kelvin–Voigt body [s]

@@ -19,7 +19,7 @@ from fishd.swimmer.grid import Array
 from fishd.swimmer.robot import Swimmer
 from fishd.swimmer.track import COLUMNS, Track
 
-FORMAT = 1
+FORMAT = 2
 LONGEST = 2**30
 """Of a file [bytes]."""
 _STATE = "state."
@@ -77,6 +77,7 @@ def save(
     """Write a checkpoint; a kill meanwhile leaves the one before. Raises OSError."""
     about = {
         "format": FORMAT,
+        "columns": list(COLUMNS),
         "settings": settings,
         "controller": controller,
         "parameters": parameters,
@@ -102,6 +103,10 @@ def load(path: Path) -> Checkpoint:
             raise CheckpointError(
                 f"{path}: it is a checkpoint of format {about['format']}, and this fishd reads "
                 f"format {FORMAT}"
+            )
+        if about["columns"] != list(COLUMNS):
+            raise CheckpointError(
+                f"{path}: it is of another version of fishd, whose track has other columns"
             )
         track = arrays.pop("track")
         if track.ndim != 2 or track.shape[1] != len(COLUMNS):

@@ -141,7 +141,13 @@ def gather(  # pragma: no cover
 ) -> tuple[Array, Array]:
     """Mass matrix, shape (slices, 3, 3), and momentum, (slices, 3), of the water in each slice.
 
-    on_u, on_v: what is covered, velocities there and a face further, places; mass: of a cell [kg/m]
+    They say what `impose` will change, so that the momentum of water and body together is kept.
+    The matrix is not symmetric: a body that turns moves the water of a cell as at the moment of
+    that cell (the column), but what the cell gets acts on the body at its face (the row). So
+    energy is kept only as closely as the grid is fine.
+
+    on_u, on_v: what is covered, velocities there and a face further, places
+    mass: of a cell, one metre deep [kg]
     """
     matrix, momentum = np.zeros((places.shape[0], 3, 3)), np.zeros((places.shape[0], 3))
     (cover, owner, moment_x, moment_y), speed, px, py = on_u

@@ -2,20 +2,18 @@
 
 import math
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from fishd.core.schema import Problem
-from fishd.swimmer.beam import Beam
-from fishd.swimmer.grid import Array
+from fishd.swimmer.body import build_beam, curvature, half_thickness
 from fishd.swimmer.settings import (
     LARGEST_COURANT,
     LEAST_CELLS_LONG,
     LEAST_CELLS_THICK,
     Body,
-    Estimate,
     SwimmerSettings,
-    half_thickness,
 )
 
 SHARPEST = 0.9
@@ -25,29 +23,15 @@ FURTHEST = 2.5
 _MARGIN = 1.2
 
 
-def build_beam(settings: SwimmerSettings) -> Beam:
-    """The body as a beam in plane strain, its head at the origin."""
-    body, numerics = settings.body, settings.numerics
-    plane = body.young / (1.0 - body.poisson**2)
+class Estimate(NamedTuple):
+    """What can be told of a swimmer before it swims."""
 
-    def thickness(X: Array) -> Array:
-        return np.array([half_thickness(body, float(x) / body.length) for x in X])
-
-    return Beam(
-        body.length,
-        thickness,
-        lambda X: plane * (2.0 * thickness(X)) ** 3 / 12.0,
-        numerics.segments,
-        0.5 * numerics.cell,
-        density=body.excess_density,
-        viscous_time=body.viscosity / body.young,
-    )
-
-
-def curvature(settings: SwimmerSettings, X: Array) -> Array:
-    """Curvature that the muscles ask for at full activation, at X [1/m]."""
-    body, muscle = settings.body, settings.muscle
-    return np.asarray(muscle.strain * (X / body.length) ** muscle.exponent / body.thickness)
+    deflection: float
+    """Of the tail at rest with full activation [m]."""
+    frequency: float
+    """Natural frequency in still water, to some 20 % [Hz]."""
+    courant_number: float
+    """Share of a cell that the fastest water passes in a step, to some 30 %."""
 
 
 def estimate(settings: SwimmerSettings) -> Estimate:
@@ -84,7 +68,7 @@ def check(settings: SwimmerSettings) -> None:
     """Raises `Problem` with the key at fault, what is wrong and what would be right."""
     body, numerics = settings.body, settings.numerics
     _check_profile(body)
-    thickest = 2.0 * max(half_thickness(body, share) for share in np.linspace(0.0, 1.0, 201))
+    thickest = 2.0 * float(half_thickness(body, np.linspace(0.0, body.length, 201)).max())
     most = min(body.length / LEAST_CELLS_LONG, thickest / LEAST_CELLS_THICK)
     if numerics.cell > most:
         raise Problem(
@@ -113,7 +97,8 @@ def _check_profile(body: Body) -> None:
     if len(points) < 2 or not rising or shares[0] != 0.0 or shares[-1] != 1.0:
         raise Problem(
             ("swimmer", "body", "profile"),
-            "needs points [X/L, s] with X/L rising from 0 to 1, such as [[0, 0], [0.3, 1], [1, 0]]",
+            "needs points [X/L, s] with X/L rising from 0 to 1, such as "
+            "[[0, 0], [0.3, 0.16], [1, 0]]",
         )
     if min(s for _, s in points) < 0.0 or max(s for _, s in points) <= 0.0:
         raise Problem(("swimmer", "body", "profile"), "s must be 0 or more, and somewhere above")
@@ -138,8 +123,7 @@ def _check_bend(settings: SwimmerSettings) -> None:
     body, muscle = settings.body, settings.muscle
     X = np.linspace(0.0, body.length, 401)
     asked = curvature(settings, X)
-    thickness = np.array([half_thickness(body, float(x) / body.length) for x in X])
-    folding = float((asked * thickness).max()) / SHARPEST
+    folding = float((asked * half_thickness(body, X)).max()) / SHARPEST
     turning = float(np.trapezoid(asked, X)) / FURTHEST
     if max(folding, turning) > 1.0:
         raise Problem(

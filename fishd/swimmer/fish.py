@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fishd.core.errors import FishdError
-from fishd.swimmer.feasibility import build_beam, curvature
+from fishd.swimmer.body import build_beam, curvature
 from fishd.swimmer.flow import Flow
 from fishd.swimmer.grid import Array, Grid, edges
 from fishd.swimmer.immersed import Immersed, LeftTheGrid
@@ -38,7 +38,10 @@ class Diverged(FishdError):
 
 
 class Motion(NamedTuple):
-    """How the fish moves at an instant; it swims towards −x, and y is to the right of it."""
+    """How the fish moves at an instant; it swims towards −x, and y is to the right of it.
+
+    Forces are those on a body one metre deep.
+    """
 
     time: float
     """[s]"""
@@ -48,33 +51,31 @@ class Motion(NamedTuple):
     """[m]"""
     speed: float
     """Forwards: along −x [m/s]."""
-    sideways: float
-    """Along y [m/s]."""
     heading: float
     """Of the front body against −x [rad]."""
     tail_angle: float
     """Of the rear body, seen from the middle of the front body [rad]."""
     tail_rate: float
     """Its rate [rad/s]."""
-    deflection: float
-    """Of the tip of the tail from the axis of the front body [m]."""
     tail_y: float
     """Of the tip of the tail, in the laboratory [m]."""
     thrust: float
-    """Force of the water on the body along −x, per metre of depth [N]."""
+    """Force of the water on the body along −x [N]."""
     side_force: float
-    """Force of the water on the body along y, per metre of depth [N]."""
+    """Force of the water on the body along y [N]."""
 
 
 class Work(NamedTuple):
-    """What was done since the start, per metre of depth [J]."""
+    """What was done since the start, by a body one metre deep [J]."""
 
     muscles: float
-    """By the muscles: on the body, and through it on the water."""
+    """By the muscles: on the body, and through it on the water; less what they take up while
+    stretched."""
     water: float
     """By the body on the water."""
     forwards: float
-    """By those slices that pushed the fish forwards."""
+    """By those slices that pushed the fish forwards: their force times its speed, at each
+    instant."""
     sideways: float
     """By the body on the water across the swimming direction."""
     steering: float
@@ -229,11 +230,9 @@ class Fish:
             x=self._travelled + float(centre[0]),
             y=float(centre[1]),
             speed=-float(mean[0]),
-            sideways=float(mean[1]),
             heading=heading,
             tail_angle=math.atan2(off, reach),
             tail_rate=float(off_rate * reach - reach_rate * off) / (reach**2 + off**2),
-            deflection=float((places[-1] - front) @ across),
             tail_y=float(places[-1, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),

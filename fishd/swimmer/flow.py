@@ -59,7 +59,7 @@ class Flow:
         self._started = False
         self._between_x = np.concatenate([grid.dx[:1], np.diff(grid.xc), grid.dx[-1:]])
         self._between_y = np.concatenate([grid.dy[:1], np.diff(grid.yc), grid.dy[-1:]])
-        self._all_free, self._source = np.ones(self.p.shape), np.empty(self.p.shape)
+        self._even_weight, self._source = np.ones(self.p.shape), np.empty(self.p.shape)
         self.boundary_impulse = 0.0
         """What crossed the boundaries in the latest step: along x, over density [m³/s]."""
 
@@ -101,21 +101,25 @@ class Flow:
         self._flow_out(dt)
 
     def _flow_out(self, dt: float) -> None:
-        """The outlet carries off what arrives there (Orlanski, doi:10.1016/0021-9991(76)90023-1)"""
+        """The outlet carries off what arrives there, with the speed of the tank.
+
+        Simplified from Orlanski, doi:10.1016/0021-9991(76)90023-1, who finds a speed of each wave.
+        """
         speed = max(0.0, float(self.grid.dy @ self.inlet) / float(self.grid.dy.sum()))
         speed = max(speed, -self.grid_velocity)
         share = min(1.0, speed * dt / self.grid.dx[-1])
         self.ahead_u[-1] = self.u[-1] - share * (self.u[-1] - self.u[-2])
 
-    def project(self, dt: float, freedom: Array | None = None) -> None:
+    def project(self, dt: float, divergence_weight: Array | None = None) -> None:
         """Make the predicted velocities free of divergence, and take them over.
 
-        freedom: shape (nx, ny), 0 in cells that are all body, where the motion of the body decides
+        divergence_weight: shape (nx, ny), how much of its divergence each cell loses: 1 in water,
+        0 in cells that are all body, where the motion of the body decides
         """
         grid = self.grid
-        free = self._all_free if freedom is None else freedom
+        weight = self._even_weight if divergence_weight is None else divergence_weight
         source = self._source
-        _divergence(self.ahead_u, self.ahead_v, grid.dx, grid.dy, 1.0 / dt, free, source)
+        _divergence(self.ahead_u, self.ahead_v, grid.dx, grid.dy, 1.0 / dt, weight, source)
         change = self._poisson.solve(source)
         before = grid.dy @ (self.p[-1] - self.p[0])
         _correct(
@@ -311,13 +315,13 @@ def _advance_v(  # pragma: no cover
 
 @njit(cache=True, fastmath=True)
 def _divergence(  # pragma: no cover
-    u: Array, v: Array, dx: Array, dy: Array, scale: float, freedom: Array, out: Array
+    u: Array, v: Array, dx: Array, dy: Array, scale: float, divergence_weight: Array, out: Array
 ) -> None:
     for i in range(dx.size):
         along = scale / dx[i]
         for j in range(dy.size):
             here = (u[i + 1, j] - u[i, j]) * along + (v[i, j + 1] - v[i, j]) * scale / dy[j]
-            out[i, j] = here * freedom[i, j]
+            out[i, j] = here * divergence_weight[i, j]
 
 
 @njit(cache=True, fastmath=True)

@@ -1,4 +1,4 @@
-"""How a fish swims over whole beats: speed with its interval, amplitude, powers and efficiency."""
+"""How a fish swims over whole beats: speed with its interval, width, powers and efficiency."""
 
 import math
 from itertools import pairwise
@@ -7,29 +7,36 @@ import numpy as np
 from msgspec import Struct
 from scipy.special import stdtrit
 
-from fishd.swimmer.feasibility import build_beam
+from fishd.swimmer.body import build_beam
 from fishd.swimmer.grid import Array
 from fishd.swimmer.settings import SwimmerSettings
 
 MOST_GROUPS = 8
 LEAST_BEATS = 2
 """Beats are taken together in so many groups at most, each of so many beats or more."""
+MATTERS = 0.01
+"""A trend of the speed is told where the two halves of the time differ by more than this share."""
 
 
 class Gait(Struct, frozen=True, kw_only=True):
-    """Means over whole beats; forces and powers are those of a fish one metre deep."""
+    """Means over whole beats; powers are per metre of depth."""
 
     beats: int
     """How many whole beats these figures are of; with 0 they are of all the time."""
     speed: float
     """Mean, forwards: along −x [m/s]."""
     speed_error: float | None
-    """Half of its 95 % interval [m/s]; None for fewer than four beats."""
+    """Half of its 95 % interval, if the swim is steady [m/s]; None for fewer than four beats."""
+    speed_trend: float | None
+    """By which share of its speed it becomes faster in a second [1/s].
+
+    None where that is no more than chance, or hardly matters; then the swim is taken as steady.
+    """
     frequency: float
     """Beats per second; 0 without any [Hz]."""
     heading: float
     """Mean, of the front body against −x [rad]."""
-    tail_amplitude: float
+    tail_width: float
     """How far the tip of the tail goes from side to side in the laboratory, over the length."""
     muscle_power: float
     """Of the muscles [W/m]."""
@@ -38,7 +45,7 @@ class Gait(Struct, frozen=True, kw_only=True):
     cost_of_transport: float | None
     """Work of the muscles per mass and distance [J/(kg m)]; None where it does not get on."""
     strouhal: float | None
-    """Frequency times `tail_amplitude` times length over speed; None where it does not get on."""
+    """Frequency times `tail_width` times length over speed; None where it does not get on."""
     froude_efficiency: float | None
     """Thrust power over thrust power and lateral power; None where it does not get on."""
     reynolds: float
@@ -48,12 +55,14 @@ class Gait(Struct, frozen=True, kw_only=True):
 def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     """Judge a track; columns as of `fishd.swimmer.track`, at least two rows.
 
-    A beat begins with the first tick in which φ_c is positive again. The Froude efficiency is that
-    of Borazjani and Sotiropoulos (2008), "Numerical investigation of the hydrodynamics of
-    carangiform swimming in the transitional and inertial flow regimes", J. Exp. Biol. 211,
-    doi:10.1242/jeb.015644: thrust is the force of those parts of the body that are pushed
-    forwards, its power thrust times mean speed, and lateral power what the body does to the
-    water across the swimming direction.
+    A beat begins with the first tick in which φ_c is positive again. The Froude efficiency is in
+    the manner of Borazjani and Sotiropoulos (2008), "Numerical investigation of the hydrodynamics
+    of carangiform swimming in the transitional and inertial flow regimes", J. Exp. Biol. 211,
+    doi:10.1242/jeb.015644, but summed over the slices that push; they take ½(F + |F|) of the whole
+    force of the pressure, and of the whole viscous one. Other definitions give other numbers.
+    Thrust is here the force of those slices of the body that are pushed forwards, its power thrust
+    times speed at each instant, and lateral power what the body does to the water across the
+    swimming direction.
     """
     time, x = track["time"], track["x"]
     begins = _upward_reversals(track["command"])
@@ -64,31 +73,33 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     speed = -float(x[last - 1] - x[first - 1]) / duration
     length, viscosity = settings.body.length, settings.water.viscosity
     frequency = beats / duration
-    amplitude = _tail_amplitude(track, begins if beats else [first, last]) / length
+    width = _tail_width(track, begins if beats else [first, last]) / length
     powers = {
         name: float(track[name][rows].mean())
         for name in ("muscle_power", "water_power", "thrust_power", "lateral_power")
     }
+    moments, means = _grouped(time, x, begins)
     gets_on = beats > 0 and speed > 0.0
     useful, lost = powers["thrust_power"], powers["lateral_power"]
     return Gait(
         beats=beats,
         speed=speed,
-        speed_error=_error(time, x, begins),
+        speed_error=_error(means),
+        speed_trend=_trend(moments, means),
         frequency=frequency,
         heading=float(track["heading"][rows].mean()),
-        tail_amplitude=amplitude,
+        tail_width=width,
         muscle_power=powers["muscle_power"],
         water_power=powers["water_power"],
         cost_of_transport=powers["muscle_power"] / (mass(settings) * speed) if gets_on else None,
-        strouhal=frequency * amplitude * length / speed if gets_on else None,
+        strouhal=frequency * width * length / speed if gets_on else None,
         froude_efficiency=useful / (useful + lost) if gets_on and useful + lost > 0.0 else None,
         reynolds=abs(speed) * length / viscosity if viscosity else 0.0,
     )
 
 
 def mass(settings: SwimmerSettings) -> float:
-    """Of a fish one metre deep [kg/m]."""
+    """Of the fish, per metre of depth [kg/m]."""
     density = settings.water.density + settings.body.excess_density
     return density * build_beam(settings).area
 
@@ -103,7 +114,7 @@ def _upward_reversals(command: Array) -> list[int]:
     return found
 
 
-def _tail_amplitude(track: dict[str, Array], bounds: list[int]) -> float:
+def _tail_width(track: dict[str, Array], bounds: list[int]) -> float:
     """Greatest less least y of the tail in each beat, mean over them [m]; bounds: of the beats."""
     swings = [
         track["tail_highest"][begin:end].max() - track["tail_lowest"][begin:end].min()
@@ -112,8 +123,8 @@ def _tail_amplitude(track: dict[str, Array], bounds: list[int]) -> float:
     return float(np.mean(swings))
 
 
-def _error(time: Array, x: Array, begins: list[int]) -> float | None:
-    """Half of the 95 % interval of the mean speed [m/s].
+def _grouped(time: Array, x: Array, begins: list[int]) -> tuple[Array, Array]:
+    """Middles [s] and mean speeds [m/s] of groups of neighbouring beats.
 
     One beat is like the one before, so neighbours are taken together: the means of a few long
     groups are nearly independent (Ibragimov and Müller, "t-statistic based correlation and
@@ -122,7 +133,34 @@ def _error(time: Array, x: Array, begins: list[int]) -> float | None:
     beats = len(begins) - 1
     groups = min(MOST_GROUPS, beats // LEAST_BEATS)
     if groups < 2:
-        return None
+        return np.empty(0), np.empty(0)
     cuts = np.array(begins)[np.round(np.linspace(0, beats, groups + 1)).astype(int)] - 1
-    means = -np.diff(x[cuts]) / np.diff(time[cuts])
-    return float(stdtrit(groups - 1, 0.975) * means.std(ddof=1) / math.sqrt(groups))
+    return 0.5 * (time[cuts[1:]] + time[cuts[:-1]]), -np.diff(x[cuts]) / np.diff(time[cuts])
+
+
+def _error(means: Array) -> float | None:
+    """Half of the 95 % interval of the mean of groups that are alike [m/s]."""
+    if not len(means):
+        return None
+    return float(stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / math.sqrt(len(means)))
+
+
+def _trend(moments: Array, means: Array) -> float | None:
+    """Growth of the speed, over the speed [1/s], from the line through the means of the groups.
+
+    Beyond chance: its 95 % interval leaves out zero. The scatter is that about the line; the
+    interval of the mean would not do, as a trend itself makes that wider. It matters where it sets
+    the two halves of the time `MATTERS` apart.
+    """
+    groups = len(means)
+    if groups < 3 or not means.mean():
+        return None
+    late = moments - moments.mean()
+    spread = float(late @ late)
+    slope = float(late @ means) / spread
+    rest = means - means.mean() - slope * late
+    error = math.sqrt(float(rest @ rest) / (groups - 2) / spread)
+    relative = slope / abs(float(means.mean()))
+    half = 0.5 * float(moments[-1] - moments[0]) * groups / (groups - 1)
+    beyond_chance = abs(slope) > float(stdtrit(groups - 2, 0.975)) * error
+    return relative if beyond_chance and abs(relative) * half > MATTERS else None

@@ -34,8 +34,8 @@ class Immersed:
         self.flow, self.density, self.beam = flow, density, beam
         grid = flow.grid
         self._fixed: tuple[Covered, Covered] | None = None
-        self._fixed_freedom = np.ones((grid.nx, grid.ny))
-        self._freedom = self._fixed_freedom.copy()
+        self._fixed_weight = np.ones((grid.nx, grid.ny))
+        self._divergence_weight = self._fixed_weight.copy()
         self._touched = slice(0, 0), slice(0, 0)
         self._cell_mass = density * grid.h**2
         self.fixed_impulse = np.zeros(2)
@@ -44,8 +44,8 @@ class Immersed:
             self.velocity = np.zeros((beam.slices, 3))
             """Of the slices: vx, vy [m/s] and θ̇ [rad/s], at the latest step."""
             self.force = np.zeros((beam.slices, 3))
-            """Of the slices on the water where they are: force and torque [N, N m], over the
-            latest step."""
+            """Of the slices on the water where they are: force and torque [N, N m] of a body one
+            metre deep, over the latest step."""
             self.mass = np.zeros((beam.slices, 3, 3))
             """Of the water where each slice is."""
             self._before = np.zeros(beam.size)
@@ -56,8 +56,8 @@ class Immersed:
         on_u = circle(grid.x[:, None] - x, grid.yc[None] - y, radius, grid.h)
         on_v = circle(grid.xc[:, None] - x, grid.y[None] - y, radius, grid.h)
         self._fixed = on_u, on_v
-        self._fixed_freedom = _freedom(on_u.share, on_v.share)
-        self._freedom = self._fixed_freedom.copy()
+        self._fixed_weight = _divergence_weight(on_u.share, on_v.share)
+        self._divergence_weight = self._fixed_weight.copy()
 
     def step(self, dt: float, forces: Array | None = None) -> None:
         """One step of `dt` [s]; forces: on the unknowns of the beam, at the middle of the step."""
@@ -66,7 +66,7 @@ class Immersed:
             self._hold(*self._fixed)
         if self.beam:
             self._move(self.beam, dt, forces)
-        self.flow.project(dt, self._freedom)
+        self.flow.project(dt, self._divergence_weight)
 
     def _hold(self, on_u: Covered, on_v: Covered) -> None:
         """Bring the water to rest where the circle is."""
@@ -90,8 +90,8 @@ class Immersed:
         on_u = paint(*body, grid.x[faces_u[0]], grid.yc[j], beam.clamped)
         on_v = paint(*body, grid.xc[i], grid.y[faces_v[1]], beam.clamped)
         if self._fixed:
-            _yield(on_u, self._fixed[0], faces_u)
-            _yield(on_v, self._fixed[1], faces_v)
+            _leave_to(on_u, self._fixed[0], faces_u)
+            _leave_to(on_v, self._fixed[1], faces_v)
         around_u, around_v = _around(flow.ahead_u, faces_u), _around(flow.ahead_v, faces_v)
         self.mass, momentum = gather(
             places,
@@ -113,8 +113,8 @@ class Immersed:
         if self._fixed:
             share_u = share_u + self._fixed[0].share[faces_u]
             share_v = share_v + self._fixed[1].share[faces_v]
-        self._freedom[self._touched] = self._fixed_freedom[self._touched]
-        self._freedom[i, j] = _freedom(share_u, share_v)
+        self._divergence_weight[self._touched] = self._fixed_weight[self._touched]
+        self._divergence_weight[i, j] = _divergence_weight(share_u, share_v)
         self._touched = i, j
 
     def _solve(
@@ -178,15 +178,15 @@ def _around(values: Array, faces: tuple[slice, slice]) -> Array:
     return values[i.start - 1 : i.stop + 1, j.start - 1 : j.stop + 1].copy()
 
 
-def _yield(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
-    """Leave to a fixed body what it covers."""
+def _leave_to(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
+    """Take from what the beam covers that which a fixed body covers."""
     np.minimum(covered.share, 1.0 - fixed.share[faces], out=covered.share)
     loose = fixed.share[faces] == 0.0
     np.multiply(covered.moment_x, loose, out=covered.moment_x)
     np.multiply(covered.moment_y, loose, out=covered.moment_y)
 
 
-def _freedom(cover_u: Array, cover_v: Array) -> Array:
+def _divergence_weight(cover_u: Array, cover_v: Array) -> Array:
     """0 in cells that are all body.
 
     A body that bends is longer on one side and shorter on the other: were its inner cells made free

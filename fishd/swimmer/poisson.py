@@ -36,6 +36,7 @@ class Poisson:
             self._half = half = (grid.ny + 1) // 2
             order = np.concatenate([np.arange(grid.ny - 1, -1, -2), np.arange(grid.ny - 2, -1, -2)])
             values, to_modes, from_modes = values[order], to_modes[:, order], from_modes[order]
+            # The row in the middle, where there is one, is added to itself by the fold.
             to_modes[half - 1] *= 1.0 if grid.ny % 2 == 0 else 0.5
             to_modes, from_modes = to_modes[:half], from_modes[:, :half]
         self._to_modes = np.ascontiguousarray(to_modes[:, : self._half or None])

@@ -22,7 +22,7 @@ from fishd.virtual.plant.tethered import TrueWindow
 
 
 class Window(NamedTuple):
-    """What truly happened between two reads; forces are those of the water, per metre of depth."""
+    """What truly happened between two reads; forces are of the water, on a fish one metre deep."""
 
     duration: float
     """[s]"""
@@ -74,7 +74,7 @@ class Swimmer:
         self.fish.restore(state)
 
     def read(self, now: float) -> Measurement:
-        """Swim until `now` [s]; forces are means over the way, per metre of depth.
+        """Swim until `now` [s]; forces are means over the way, on a fish one metre deep.
 
         Raises `FishLost` where the fish cannot go on, then and ever after.
         """
@@ -137,7 +137,7 @@ class Swimmer:
 
     @property
     def work(self) -> Work:
-        """What was done since the start, per metre of depth [J]."""
+        """What was done since the start, by a fish one metre deep [J]."""
         return self.fish.work
 
     @property

@@ -1,8 +1,6 @@
 """Section `swimmer` of the configuration: the body, its muscles, the water and the grid."""
 
-import math
-from itertools import pairwise
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 from msgspec import Meta, Struct
 
@@ -25,7 +23,8 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         unit(
             "m",
             "H: half of the body's thickness at X is H·s(X/L); in the paper's formula t(X) it has "
-            "to be the half one.",
+            "to be the half one. It also sets the bend that the muscles ask for, κ = ε₀ (X/L)ⁿ/H: "
+            "with another thickness muscle.strain is another, too.",
             gt=0.0,
             le=2.0,
         ),
@@ -33,8 +32,8 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     profile: Annotated[
         tuple[tuple[float, float], ...] | None,
         Meta(
-            description="s as points [X/L, s], with X/L from 0 to 1, linear in between; null: the "
-            "paper's s = (X/L)(1 − X/L)exp(−X/L)."
+            description="s as points [X/L, s], with X/L from 0 to 1, linear in between, such as "
+            "[[0, 0], [0.3, 0.16], [1, 0]]; null: the paper's s = (X/L)(1 − X/L)exp(−X/L)."
         ),
     ] = None
     young: Annotated[float, unit("Pa", "Young's modulus.", gt=0.0, le=1e12)] = 1e4
@@ -129,25 +128,3 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=1000.0,
         ),
     ] = 5.0
-
-
-class Estimate(NamedTuple):
-    """What can be told of a swimmer before it swims."""
-
-    deflection: float
-    """Of the tail at rest with full activation [m]."""
-    frequency: float
-    """Natural frequency in still water, to some 20 % [Hz]."""
-    courant_number: float
-    """Share of a cell that the fastest water passes in a step, to some 30 %."""
-
-
-def half_thickness(body: Body, share: float) -> float:
-    """Half thickness [m] at X = share · L."""
-    if body.profile is None:
-        return body.thickness * share * (1.0 - share) * math.exp(-share)
-    points = body.profile
-    for (x0, s0), (x1, s1) in pairwise(points):
-        if x0 <= share <= x1:
-            return body.thickness * (s0 + (s1 - s0) * (share - x0) / (x1 - x0))
-    return 0.0

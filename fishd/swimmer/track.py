@@ -18,7 +18,7 @@ COLUMNS = {
     "y": ("m", "centre of mass, in the laboratory"),
     "speed": ("m/s", "forwards, along −x"),
     "heading": ("rad", "of the front body against −x"),
-    "tail_angle": ("rad", "of the tip of the tail, seen from the middle of the front body"),
+    "tail_angle": ("rad", "of the rear body (last fifth), seen from the middle of the front body"),
     "tail_rate": ("rad/s", "its rate, not filtered"),
     "tail_lowest": ("m", "least y of the tip of the tail during the tick, in the laboratory"),
     "tail_highest": ("m", "the greatest"),
@@ -26,9 +26,9 @@ COLUMNS = {
     "activation": ("1", "a, in the last step of the tick"),
     "thrust": ("N/m", "mean force of the water along −x"),
     "side_force": ("N/m", "mean force of the water along y"),
-    "muscle_power": ("W/m", "of the muscles, mean"),
+    "muscle_power": ("W/m", "of the muscles, mean; below 0 while they are stretched"),
     "water_power": ("W/m", "of the body on the water, mean"),
-    "thrust_power": ("W/m", "of what pushes the fish forwards, mean"),
+    "thrust_power": ("W/m", "of those slices that push the fish forwards, mean"),
     "lateral_power": ("W/m", "of the body on the water along y, mean"),
 }
 """Unit and meaning of each column; forces and powers per metre of depth."""
@@ -41,7 +41,7 @@ class Track:
     def __init__(self, rows: Array | None = None) -> None:
         """rows: those there are already, of shape (ticks, columns)"""
         self._rows: list[tuple[float, ...]] = [] if rows is None else list(map(tuple, rows))
-        self._before = Work(0.0, 0.0, 0.0, 0.0)
+        self._before: Work | None = None
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -53,27 +53,33 @@ class Track:
     def add(self, swimmer: Swimmer, command: float) -> None:
         """Add the tick that has just ended; command: φ_c meanwhile [rad]."""
         motion, window, work = swimmer.motion, swimmer.window, swimmer.work
-        powers = [
-            (now - then) / window.duration for now, then in zip(work, self._before, strict=True)
-        ]
+        before = self._before or work
         self._before = work
-        self._rows.append(
-            (
-                motion.time,
-                motion.x,
-                motion.y,
-                motion.speed,
-                motion.heading,
-                motion.tail_angle,
-                motion.tail_rate,
-                *swimmer.tail_reach,
-                command,
-                swimmer.fish.activation,
-                window.thrust,
-                window.side_force,
-                *powers,
-            )
-        )
+        lowest, highest = swimmer.tail_reach
+
+        def power(now: float, then: float) -> float:
+            return (now - then) / window.duration
+
+        row = {
+            "time": motion.time,
+            "x": motion.x,
+            "y": motion.y,
+            "speed": motion.speed,
+            "heading": motion.heading,
+            "tail_angle": motion.tail_angle,
+            "tail_rate": motion.tail_rate,
+            "tail_lowest": lowest,
+            "tail_highest": highest,
+            "command": command,
+            "activation": swimmer.fish.activation,
+            "thrust": window.thrust,
+            "side_force": window.side_force,
+            "muscle_power": power(work.muscles, before.muscles),
+            "water_power": power(work.water, before.water),
+            "thrust_power": power(work.forwards, before.forwards),
+            "lateral_power": power(work.sideways, before.sideways),
+        }
+        self._rows.append(tuple(row[name] for name in COLUMNS))
 
     def rows(self) -> Array:
         """All of them, of shape (ticks, columns)."""

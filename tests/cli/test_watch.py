@@ -241,6 +241,12 @@ def test_late_and_busy_are_the_worst_of_what_is_shown() -> None:
     assert "888 µs" in late[2]
 
 
+def test_in_slow_motion_where_no_tick_is_late_there_is_no_word_of_it() -> None:
+    screen = shown(view_of(map(tick, range(1, 50)), robot="swimmer"))
+    assert "tail beat" in screen[1]
+    assert not re.search("late|busy|missed", screen[1])
+
+
 def test_a_fault_is_explained_in_full_however_narrow_the_screen() -> None:
     message = "no force sample for 0.15 s: is the sensor's cable plugged in at both of its ends?"
     reason = Reason("sensor-stale", message)

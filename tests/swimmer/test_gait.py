@@ -29,7 +29,7 @@ def test_means_are_those_of_whole_beats() -> None:
     assert found.beats == 9  # from the first upward reversal, at 0.2 s, to that at 3.8 s
     assert found.frequency == pytest.approx(1 / PERIOD)
     assert found.speed == pytest.approx(0.1)
-    assert found.tail_amplitude == pytest.approx(0.24)
+    assert found.tail_width == pytest.approx(0.24)
     assert found.strouhal == pytest.approx(2.5 * 0.024 / 0.1)
     assert found.froude_efficiency == pytest.approx(0.25)
     assert found.cost_of_transport == pytest.approx(0.06 / (mass(SETTINGS) * 0.1))
@@ -51,6 +51,45 @@ def test_a_fish_that_does_not_beat_or_get_on_has_no_efficiency() -> None:
                   gait(track(2.0, -0.01), SETTINGS)):  # fmt: skip
         assert still.strouhal is still.froude_efficiency is still.cost_of_transport is None
     assert gait(track(2.0) | {"command": np.zeros(200)}, SETTINGS).beats == 0
+
+
+def rising(by: float, seconds: float = 20.0) -> Array:
+    """Speeds of a fish that is faster by this share after each second, from 0.1 m/s on."""
+    return 0.1 * (1.0 + by * TICK * np.arange(round(seconds / TICK)))
+
+
+def test_a_fish_that_still_speeds_up_is_said_to_and_the_interval_widens_too_little() -> None:
+    found = gait(track(20.0, rising(0.01)), SETTINGS)
+    assert found.speed_trend == pytest.approx(0.01 / 1.1, rel=0.02)
+    assert found.speed_error
+    assert found.speed_error < 0.12 - found.speed
+    slower = gait(track(20.0, rising(-0.01)), SETTINGS)
+    assert slower.speed_trend
+    assert slower.speed_trend < 0.0
+
+
+@pytest.mark.parametrize(
+    "speed",
+    [
+        rising(0.0008),  # hardly matters
+        0.1 + 0.05 * np.sin(2 * np.pi * TICK / PERIOD * np.arange(2000)),
+        0.1 + 0.002 * np.sin(2 * np.pi / 500 * np.arange(2000)),
+    ],
+    ids=["a trend too small to matter", "a ripple within the beat", "speeds up and down"],
+)
+def test_a_fish_whose_halves_agree_is_steady(speed: Array) -> None:
+    assert gait(track(20.0, speed), SETTINGS).speed_trend is None
+
+
+def test_few_beats_tell_no_trend() -> None:
+    assert gait(track(2.2, rising(0.1, 2.2)), SETTINGS).speed_trend is None
+
+
+def test_chance_is_seldom_taken_for_a_trend() -> None:
+    rng = np.random.default_rng(4)
+    tracks = (track(20.0, 0.1 + 0.05 * rng.normal(size=2000)) for _ in range(200))
+    told = sum(gait(each, SETTINGS).speed_trend is not None for each in tracks)
+    assert told <= 20
 
 
 def test_the_interval_covers_the_mean_although_beats_are_alike() -> None:

@@ -51,11 +51,11 @@ def test_the_figures_agree_with_one_another(swum: tuple[dict[str, Any], Path]) -
     assert found["beats"] == 6
     assert 0.0 < found["speed"] < 0.2
     assert 0.0 < found["speed_error"] < found["speed"]
-    assert 0.1 < found["tail_amplitude"] < 0.4
+    assert 0.1 < found["tail_width"] < 0.4
     assert 0.0 < found["froude_efficiency"] < 1.0
     assert 0.0 < found["water_power"] <= found["muscle_power"]
-    amplitude = found["tail_amplitude"] * 0.1
-    assert found["strouhal"] == pytest.approx(2.5 * amplitude / found["speed"])
+    width = found["tail_width"] * 0.1
+    assert found["strouhal"] == pytest.approx(2.5 * width / found["speed"])
     assert list(track) == list(COLUMNS)
     assert len(track["time"]) == found["ticks"] == 400
     assert set(track["activation"]) == {0.0, 1.0, -1.0}
@@ -69,6 +69,11 @@ def test_a_person_gets_the_same_in_a_few_lines() -> None:
     for word in ("speed", "frequency", "heading", "tail", "power", "cost", "Strouhal", "Froude"):
         assert f"\n{word} " in out
     assert "whole beats" in out
+
+
+def test_a_single_beat_is_one() -> None:
+    words = ("square", "--frequency", "2.5", "--seconds", "1.5", "--settle", "0.5")
+    assert "over 1 whole beat\n" in simulated(*words).stdout
 
 
 def test_a_table_is_a_row_for_each_tick_in_either_form(tmp_path: Path) -> None:
@@ -93,6 +98,19 @@ def test_a_swim_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> Non
     whole, rest = table(tmp_path / "whole.npz"), table(tmp_path / "rest.npz")
     for name in COLUMNS:
         assert np.array_equal(whole[name], rest[name]), name
+
+
+def test_a_swim_that_is_as_long_already_leaves_its_files_alone(
+    swum: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    saved = tmp_path / "track.csv"
+    saved.write_text("precious")
+    words = ("square", "--frequency", "2.5", "--seconds", "4", "--settle", "1")
+    files = ("--resume", str(swum[1] / "end"), "--save", str(saved))
+    line = one_line(simulated(*words, *files))
+    told = "the checkpoint is of 4.00 s already: nothing was swum; more --seconds are needed"
+    assert line == f"fishctl: {swum[1]}/end: {told}\n"
+    assert saved.read_text() == "precious"
 
 
 def test_another_controller_swims_on_with_a_track_of_its_own(
@@ -134,6 +152,23 @@ def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes
     (tmp_path / "kept").write_bytes(content)
     line = one_line(simulated("swing", "--resume", str(tmp_path / "kept")))
     assert line == f"fishctl: {tmp_path}/kept: it is no checkpoint of a swimmer\n"
+
+
+def test_a_checkpoint_whose_track_has_other_columns_is_said_to_be_of_another_version(
+    swum: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    arrays = table(swum[1] / "end")
+    about = json.loads(str(arrays["about"]))
+    about["columns"].append("depth")
+    np.savez(tmp_path / "kept.npz", **arrays | {"about": np.array(json.dumps(about))})
+    with pytest.raises(checkpoint.CheckpointError, match="of another version of fishd, whose"):
+        checkpoint.load(tmp_path / "kept.npz")
+
+
+def test_a_swim_that_is_not_steady_is_said_to_need_a_longer_settle() -> None:
+    out = simulated("square", "--frequency", "2.5", "--seconds", "5", "--settle", "2").stdout
+    assert "\n            still slowing down by " in out  # a coarse fish overshoots
+    assert " %/s: a longer --settle is needed\n" in out
 
 
 def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(

@@ -43,6 +43,16 @@ def test_its_status_says_so_and_no_tick_is_late(daemon: Daemon) -> None:
     assert (status.missed, status.overruns, status.reason) == (0, 0, None)
     assert status.speed is not None
     assert "mm/s" in daemon.fishctl("status").stdout
+    timing = daemon.fishctl("status", "--timing").stdout
+    assert "in slow motion no tick is late" in timing
+    assert "0 µs" not in timing
+
+
+def test_it_is_up_for_as_long_as_people_wait(daemon: Daemon) -> None:
+    first = daemon.status()
+    wait_until(lambda: daemon.status().seq > first.seq + 20)
+    last = daemon.status()
+    assert last.uptime - first.uptime == pytest.approx(last.t - first.t, abs=0.05)
 
 
 def test_it_takes_requests_as_every_other_fish(daemon: Daemon) -> None:

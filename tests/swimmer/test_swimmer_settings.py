@@ -8,10 +8,12 @@ from rigs.coarse_swimmer import FILE, OPTIONS
 from rigs.processes import FISHCTL, FISHD, addresses, call, fishctl, one_line, sets
 
 from fishd.config import load
+from fishd.core.errors import ConfigError
 
 CHECKS = f"""
 import sys
 from fishd.config import load
+from fishd.core.errors import ConfigError
 load({str(FILE)!r})
 print([name for name in ("numba", "scipy") if name in sys.modules])
 """
@@ -47,6 +49,13 @@ def test_what_makes_no_sense_is_refused_with_its_key(override: str, complaint: s
     done = fishctl("config", "check", str(FILE), "--set", override)
     assert done.returncode == 78
     assert complaint in one_line(done)
+
+
+def test_the_profile_that_a_complaint_gives_as_an_example_is_accepted() -> None:
+    with pytest.raises(ConfigError, match="rising from 0 to 1") as refusal:
+        load(FILE, ["swimmer.body.profile=[[0, 0]]"])
+    example = str(refusal.value).partition("such as ")[2]
+    assert load(FILE, [f"swimmer.body.profile={example}"]).swimmer.body.profile
 
 
 def test_swing_may_go_by_the_lateral_force_instead() -> None:

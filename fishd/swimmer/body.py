@@ -1,0 +1,37 @@
+"""The body as a beam: how thick it is, how stiff, and how its muscles bend it."""
+
+import numpy as np
+
+from fishd.swimmer.beam import Beam
+from fishd.swimmer.grid import Array
+from fishd.swimmer.settings import Body, SwimmerSettings
+
+
+def half_thickness(body: Body, X: Array) -> Array:
+    """Half thickness at X [m]."""
+    share = X / body.length
+    if body.profile is None:
+        return np.asarray(body.thickness * share * (1.0 - share) * np.exp(-share))
+    shares, values = zip(*body.profile, strict=True)
+    return np.asarray(body.thickness * np.interp(share, shares, values))
+
+
+def curvature(settings: SwimmerSettings, X: Array) -> Array:
+    """Curvature that the muscles ask for at full activation, at X [1/m]."""
+    body, muscle = settings.body, settings.muscle
+    return np.asarray(muscle.strain * (X / body.length) ** muscle.exponent / body.thickness)
+
+
+def build_beam(settings: SwimmerSettings) -> Beam:
+    """The body in plane strain, its head at the origin."""
+    body, numerics = settings.body, settings.numerics
+    plane = body.young / (1.0 - body.poisson**2)
+    return Beam(
+        body.length,
+        lambda X: half_thickness(body, X),
+        lambda X: plane * (2.0 * half_thickness(body, X)) ** 3 / 12.0,
+        numerics.segments,
+        0.5 * numerics.cell,
+        density=body.excess_density,
+        viscous_time=body.viscosity / body.young,
+    )
