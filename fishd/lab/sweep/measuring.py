@@ -18,31 +18,13 @@ from fishd.lab.measurement import measure
 from fishd.lab.parallel import Stop
 from fishd.lab.rig import Rig, is_of_one
 from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.results import Result
 from fishd.recording.writer import RunWriter
 from fishd.simulation import Beats, VirtualRun
 from fishd.virtual.plant.optimum import best_square_wave
 
 SLOWEST = 0.4
 """A controller without a frequency is given the time of so slow a tail beat [Hz]."""
-
-
-class Result(Struct, frozen=True):
-    """What was found at a point; the measured columns of a sweep's table."""
-
-    thrust: float | None = None
-    """Mean over whole tail beats [N]; None where there is `trouble`."""
-    error: float | None = None
-    """Half of its 95 % interval [N]; None where it is not known."""
-    beat_frequency: float = 0.0
-    """Tail beats per second; 0 where the tail does not beat [Hz]."""
-    efficiency: float | None = None
-    """Thrust over that of the best square wave; of a simulated fish."""
-    fin_amplitude: float | None = None
-    """Largest fin angle of a half beat, mean [rad]; of a simulated fish."""
-    seconds: float = 0.0
-    """How long it swam and rested [s]."""
-    trouble: str = ""
-    """Why there is no thrust."""
 
 
 class Lengths(Struct, frozen=True):
