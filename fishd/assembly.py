@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from fishd.config import Config
 from fishd.config.drivers import claims_of
 from fishd.control.estimators.base import Estimator
+from fishd.control.estimators.fin_sensor import FinSensor
 from fishd.control.estimators.lateral_force import LateralForceEstimator
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.estimators.observer import Observer
@@ -23,7 +24,7 @@ from fishd.controllers import registry
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.clock import Clock, SystemClock, VirtualClock
-from fishd.core.errors import SensorError
+from fishd.core.errors import MissingPackage, SensorError
 from fishd.core.signals import Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
@@ -38,6 +39,7 @@ from fishd.virtual.fish import SimulatedFish
 
 if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
     from fishd.hardware.panel import RpiGpioPanel
+    from fishd.swimmer.robot import Swimmer
     from fishd.virtual.pi.virtual_pi import VirtualPi
 
 log = logging.getLogger(__name__)
@@ -58,12 +60,26 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
             release_recipe.remove(str(file))  # of what the file said before
         return SimulatedFish(config.plant, config.simulation, config.tick).robot()
+    if config.robot == "swimmer":
+        return open_swimmer(config).robot()
     stack.enter_context(ownership.owned(parts_of(config)))
     if file:
         release_recipe.remove(str(file))  # of an earlier fishd
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
     return assemble(config, clock, stack, threaded=True, file=file)
+
+
+def open_swimmer(config: Config) -> "Swimmer":
+    """A fish that swims freely; raises `MissingPackage`."""
+    try:
+        from fishd.swimmer.robot import Swimmer
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        raise MissingPackage(
+            f"robot: swimmer needs the package {package}; with pip: pip install 'fishd[swimmer]'"
+        ) from None
+    return Swimmer(config.swimmer, config.plant, config.amplitude_limit, config.tick)
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
@@ -298,6 +314,8 @@ def build_estimator(config: Config) -> Estimator:
     """The one that `estimator.kind` names."""
     if config.estimator.kind == "observer":
         return Observer(config.estimator, config.plant, config.tick)
+    if config.estimator.kind == "sensor":
+        return FinSensor()
     return LateralForceEstimator(config.estimator)
 
 

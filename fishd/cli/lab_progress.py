@@ -26,8 +26,8 @@ class Lines:
         """Say what was done; amount: how much of the total is done by now."""
         echo(line, err=self._err)
 
-    def at(self, amount: float) -> None:
-        """Say how much of the total is done by now."""
+    def at(self, amount: float, found: str = "") -> None:
+        """Say how much of the total is done by now, and what was found so far."""
 
 
 class Bar(Lines):
@@ -47,9 +47,9 @@ class Bar(Lines):
             super().done(line, amount)
         self.at(amount)
 
-    def at(self, amount: float) -> None:
-        """Move the bar."""
-        self._progress.update(self._task, completed=amount)
+    def at(self, amount: float, found: str = "") -> None:
+        """Move the bar; what was found so far stands behind it."""
+        self._progress.update(self._task, completed=amount, description=text.line(found))
 
 
 @contextmanager
@@ -77,6 +77,7 @@ def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
         TextColumn("passed,"),
         TimeRemainingColumn(),
         TextColumn("left"),
+        TextColumn("{task.description}", markup=False),
     )
     # What is printed elsewhere meanwhile is not the bar's to redirect.
     console = Console(stderr=True)

@@ -1,11 +1,14 @@
 """The verb that swims a simulated fish in virtual time."""
 
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fishd.cli.config import fish_options
+from fishd.cli.free_swim_options import SwimmerOptions, swimmer_options
 from fishd.cli.options import ControllerGroup, json_option
 from fishd.cli.output import echo, echo_rows, print_json, spelled, warn_of_fin
 from fishd.config import Config, load
@@ -13,7 +16,7 @@ from fishd.core.errors import MissingPackage
 
 if TYPE_CHECKING:
     from fishd.recording import RunWriter
-    from fishd.simulation import Report
+    from fishd.simulation import Report, VirtualRun
 
 _ROUNDED = "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
 
@@ -46,7 +49,7 @@ def _options(function: Any) -> Any:
         metavar="FILE",
         help="Record the run into this .mcap file, which must not exist.",
     )
-    return run_options(record(function))
+    return run_options(record(swimmer_options(function)))
 
 
 @click.group(cls=ControllerGroup, options=_options)
@@ -64,23 +67,25 @@ def _simulate(
     overrides: tuple[str, ...],
     recording: Path | None,
     as_json: bool,
+    **swimmers: Any,
 ) -> int:
+    of_swimmer = SwimmerOptions(**swimmers)
     from fishd.simulation import simulate as run
 
     config = load(file, overrides)
-    if recording:
-        with _recorder(recording) as writer:
-            report = run(
-                config,
-                name,
-                parameters,
-                seconds,
-                settle,
-                writer,
-                lambda virtual: writer.describe(config, virtual.about()),
-            )
-    else:
-        report = run(config, name, parameters, seconds, settle)
+    with ExitStack() as stack:
+        writer, begun = None, _nothing
+        if config.robot != "swimmer":
+            of_swimmer.refuse()
+        if recording:
+            writer = stack.enter_context(_recorder(recording))
+            begun = partial(_describe, writer, config)
+        if config.robot == "swimmer":
+            from fishd.cli.free_swim import swim
+
+            asked = (config, name, parameters, seconds, settle, writer, begun)
+            return swim(asked, of_swimmer, as_json)
+        report = run(config, name, parameters, seconds, settle, writer, begun)
     if as_json:
         print_json(report)
     else:
@@ -92,6 +97,14 @@ def _simulate(
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
     return 0
+
+
+def _nothing(_: "VirtualRun") -> None:
+    pass
+
+
+def _describe(writer: "RunWriter", config: Config, run: "VirtualRun") -> None:
+    writer.describe(config, run.about())
 
 
 def _recorder(path: Path) -> "RunWriter":

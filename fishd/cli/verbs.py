@@ -17,6 +17,7 @@ _EXTRAS = {
     "joblib": "lab",
     "matplotlib": "lab",
     "mcap": "record",
+    "numba": "swimmer",
     "onnx": "policy",
     "onnxruntime": "policy",
     "pandas": "lab",

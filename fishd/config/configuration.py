@@ -22,6 +22,7 @@ from fishd.core.schema import Problem, convert, leaves, note, unit, without_empt
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 from fishd.hardware.servo.pigpio import PigpioSettings
 from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
+from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -106,10 +107,11 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Meta(description="Name of the fish, in status and telemetry; null: this machine's name."),
     ] = None
     robot: Annotated[
-        Literal["simulated", "pi", "virtual-pi"],
+        Literal["simulated", "pi", "virtual-pi", "swimmer"],
         note(
             "What swims: a simulated fish, the robot on this Raspberry Pi, or a simulated fish "
-            "behind the robot's own drivers (fishctl virtual-pi)."
+            "behind the robot's own drivers (fishctl virtual-pi), or a fish that swims freely in a "
+            "two-dimensional fluid."
         ),
     ] = "simulated"
     tick: Annotated[float, unit("s", "Period of the loop.", ge=0.002, le=0.2)] = 0.05
@@ -164,6 +166,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             "~/.local/state/fishd; in it, a folder for each robot."
         ),
     ] = None
+    swimmer: Annotated[SwimmerSettings, note("The fish that swims freely, with robot swimmer.")] = (
+        SwimmerSettings()
+    )
     virtual_pi: Annotated[VirtualPiSettings, note("The virtual Pi, with robot virtual-pi.")] = (
         VirtualPiSettings()
     )
@@ -179,8 +184,8 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return Limits(
             amplitude=self.amplitude_limit,
             tick=self.tick,
-            scaled=self.estimator.kind == "observer",
-            virtual=self.lockstep,
+            scaled=self.estimator.kind != "lateral_force",
+            virtual=self.lockstep or self.robot == "swimmer",
             chatter=self.chatter,
         )
 
@@ -227,6 +232,8 @@ def _check(config: Config) -> None:
     checks.check_lockstep(config.robot, config.lockstep)
     checks.check_estimator(config.robot, config.estimator.kind, config.plant)
     checks.check_virtual_pi(config.virtual_pi)
+    if config.robot == "swimmer":
+        checks.check_swimmer(config.swimmer, config.tick)
 
 
 def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:

@@ -16,6 +16,7 @@ from fishd.core.unix_sockets import check_length
 from fishd.hardware.driver import Claim
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import PanelSettings, ServoSettings
+from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -122,12 +123,39 @@ def check_lockstep(robot: str, lockstep: bool) -> None:
 
 
 def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
-    """An observer needs a model of the fish that swims."""
+    """An observer needs a model of the fish that swims, and a sensor has to be there."""
+    if (robot, kind) == ("swimmer", "observer"):
+        raise Problem(
+            ("estimator", "kind"),
+            "observer is not valid with robot: swimmer, since it believes in a tethered fish; "
+            "sensor or lateral_force is needed",
+        )
+    if kind == "sensor" and robot != "swimmer":
+        raise Problem(
+            ("estimator", "kind"),
+            f"sensor is not valid with robot: {robot}, which has no sensor of its fin; "
+            "lateral_force or observer is needed",
+        )
     if kind == "observer" and robot == "pi" and plant == PlantParameters():
         raise Problem(
             ("estimator", "kind"),
             "observer needs a model of this fish, and section plant is not given; 'fishctl "
             "identify' writes it",
+        )
+
+
+def check_swimmer(swimmer: SwimmerSettings, tick: float) -> None:
+    """It can be computed; tick: period of the loop [s]."""
+    from fishd.swimmer import feasibility  # of which no other robot has any need
+
+    feasibility.check(swimmer)
+    step = swimmer.numerics.step
+    steps = max(1, round(tick / step))
+    if abs(tick / step - steps) > 1e-6:
+        raise Problem(
+            ("tick",),
+            f"{tick:g} s is no whole number of steps of swimmer.numerics.step, {step:g} s; "
+            f"{steps * step:g} s would be",
         )
 
 

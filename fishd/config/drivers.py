@@ -73,7 +73,7 @@ def check_drivers(
 
     tick: period of the loop [s]
     """
-    if robot == "simulated":  # whose loop may be faster than any hardware
+    if robot in ("simulated", "swimmer"):  # whose loop may be faster than any hardware
         tick = math.inf
     for section, settings in (("force_sensor", sensor), ("servo", servo)):
         driver = driver_of(section, settings.driver)

@@ -92,6 +92,7 @@ class Reporter:
         thrust, error = loop.known_thrust
         extremes = measurement.extremes
         truth = loop.robot.truth() if loop.robot.truth else None
+        course = truth.course if truth else None
         self._publisher.tick(
             Tick(
                 t=self._clock.wall(),
@@ -121,6 +122,10 @@ class Reporter:
                 phi=truth.phi if truth else UNSET,
                 quantities=loop.active.quantities or UNSET,
                 time=observation.time,
+                x=course.x if course else UNSET,
+                y=course.y if course else UNSET,
+                speed=course.speed if course else UNSET,
+                heading=course.heading if course else UNSET,
             )
         )
 

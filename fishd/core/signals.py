@@ -38,6 +38,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """Why these forces are not to be believed, such as a clipped sample; empty where they are."""
     extremes: Extremes | None = None
     """What the means are taken over, as far as the sensor tells."""
+    fin_velocity: float | None = None
+    """Fin angular velocity at the newest sample, where a sensor tells it [rad/s]."""
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -54,8 +56,8 @@ class Observation(Struct, frozen=True, gc=False):
     fy_rate: float
     """Rate of change of the lateral force [N/s]."""
     fin_velocity: float
-    """Fin angular velocity, up to an unknown positive scale; with the observer, in rad/s and when
-    the next instruction acts."""
+    """Fin angular velocity, up to an unknown positive scale; in rad/s with the observer, when the
+    next instruction acts, and from a sensor, now."""
     instruction_angle: float
     """The instruction angle applied since the previous tick [rad]."""
     previous_angle: float
@@ -66,6 +68,19 @@ class Observation(Struct, frozen=True, gc=False):
     """Tail-beat frequency, from the reversals of the instruction angle; 0 when not beating [Hz]."""
 
 
+class Course(Struct, frozen=True, gc=False):
+    """Where a fish that swims freely is, and goes; x is against the way it began to swim."""
+
+    x: float
+    """[m]"""
+    y: float
+    """[m]"""
+    speed: float
+    """Forwards, along −x [m/s]."""
+    heading: float
+    """Of the front body against −x [rad]."""
+
+
 class Truth(Struct, frozen=True, gc=False):
     """The true state of a simulated fish; a real one has none."""
 
@@ -74,7 +89,9 @@ class Truth(Struct, frozen=True, gc=False):
     alpha_rate: float
     """Fin angular velocity [rad/s]."""
     phi: float
-    """Servo wheel angle [rad]."""
+    """Servo wheel angle [rad]; of a swimmer, Φ times the activation of its muscles."""
+    course: Course | None = None
+    """Where a fish goes that swims freely; None for one that is tethered."""
 
 
 class Tick(Struct, frozen=True, gc=False):
@@ -95,7 +112,8 @@ class Tick(Struct, frozen=True, gc=False):
         unit(
             "1",
             "Fin angular velocity as estimated, up to an unknown positive scale; with "
-            "`estimator.kind: observer` in rad/s, and that after the servo's delay.",
+            "`estimator.kind: observer` in rad/s, and that after the servo's delay; with `sensor` "
+            "in rad/s.",
         ),
     ]
     phi_c: Annotated[
@@ -139,8 +157,21 @@ class Tick(Struct, frozen=True, gc=False):
     ] = UNSET
     time: Annotated[
         float,
-        unit("s", "Time of the tick, on fishd's monotonic clock; in lockstep it is virtual."),
+        unit(
+            "s",
+            "Time of the tick, on fishd's monotonic clock; virtual in lockstep and of a swimmer, "
+            "whose second takes several of `t`.",
+        ),
     ] = 0.0
+    x: Annotated[
+        float | UnsetType,
+        unit("m", "Where the fish is; of a swimmer only, as the next three. It swims to −x."),
+    ] = UNSET
+    y: Annotated[float | UnsetType, unit("m", "Across it.")] = UNSET
+    speed: Annotated[float | UnsetType, unit("m/s", "True speed, along −x.")] = UNSET
+    heading: Annotated[
+        float | UnsetType, unit("rad", "True heading of the front body, against −x.")
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -287,7 +318,7 @@ class Status(Struct, frozen=True):
     missed: Annotated[int, note("Slots skipped since start.")]
     overruns: Annotated[int, note("Ticks that took longer than a period, since start.")]
     timing: Annotated[Timing, note("How well the loop keeps its time, since start.")]
-    robot: Annotated[str, note("What is driven: `simulated`, `pi` or `virtual-pi`.")]
+    robot: Annotated[str, note("What is driven: `simulated`, `pi`, `virtual-pi` or `swimmer`.")]
     degraded: Annotated[
         tuple[str, ...], note("What keeps the robot from being as good as it could be.")
     ]

@@ -16,7 +16,12 @@ from fishd.controllers.base import Controller, amplitude_of
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Reason
 from fishd.simulation.beats import Beats
-from fishd.simulation.virtual_run import EncodingPublisher, VirtualRun, check_length
+from fishd.simulation.virtual_run import (
+    EncodingPublisher,
+    VirtualRun,
+    check_length,
+    check_tethered,
+)
 from fishd.virtual.plant.optimum import best_square_wave
 
 
@@ -82,6 +87,20 @@ def simulate(
     return judge(config, name, controller, seconds, settle, publisher, begun)
 
 
+def count_ticks(seconds: float, settle: float, tick: float) -> tuple[int, int]:
+    """How many ticks a run has, and the first that counts; raises `ParameterError`."""
+    check_length("run", seconds)
+    check_length("time to settle", settle)
+    ticks = round(seconds / tick)
+    first = math.ceil(settle / tick - 1e-9) + 1
+    if first >= ticks:
+        raise ParameterError(
+            f"nothing is left to judge: a run of {seconds:g} s must be longer than the "
+            f"{settle:g} s that it may take to settle"
+        )
+    return ticks, first
+
+
 def judge(
     config: Config,
     name: str,
@@ -94,17 +113,10 @@ def judge(
     """As `simulate`, with a controller that is ready-made.
 
     publisher, begun: as for `simulate`
-    Raises `ParameterError` where the lengths do not fit one another.
+    Raises `ParameterError` where the lengths do not fit one another, or the fish swims freely.
     """
-    check_length("run", seconds)
-    check_length("time to settle", settle)
-    ticks = round(seconds / config.tick)
-    first = math.ceil(settle / config.tick - 1e-9) + 1
-    if first >= ticks:
-        raise ParameterError(
-            f"nothing is left to judge: a run of {seconds:g} s must be longer than the "
-            f"{settle:g} s that it may take to settle"
-        )
+    check_tethered(config, "efficiency")
+    ticks, first = count_ticks(seconds, settle, config.tick)
     beats = Beats()
     since = 0.0
     took_over: float | None = None

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 from msgspec.structs import replace
 
 from fishd import __version__
-from fishd.assembly import build_loop, open_in_virtual_time
+from fishd.assembly import build_loop, open_in_virtual_time, open_swimmer
 from fishd.config import Config
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
@@ -18,6 +18,9 @@ from fishd.core.signals import Event, Tick
 from fishd.hardware.base import Robot
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.plant.tethered import TrueWindow
+
+if TYPE_CHECKING:
+    from fishd.swimmer.robot import Swimmer
 
 LONGEST = 1e8
 """Runs are shorter than this [s]: three years."""
@@ -56,11 +59,16 @@ class VirtualRun:
     """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
 
     def __init__(self, config: Config, publisher: Publisher) -> None:
-        """publisher: gets the record of every tick, and every event"""
+        """publisher: gets the record of every tick, and every event
+
+        Raises `MissingPackage`.
+        """
+        self.swimmer: Swimmer | None
+        """The fish itself, where it swims freely."""
         self.config = config
         clock = VirtualClock()
         with ExitStack() as stack:
-            robot, self._take_window = _swimmer(config, stack)
+            robot, self._take_window, self.swimmer = _fish(config, stack)
             self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()
@@ -103,13 +111,27 @@ class VirtualRun:
         return self._take_window()
 
 
-def _swimmer(config: Config, stack: ExitStack) -> tuple[Robot, Callable[[], TrueWindow]]:
-    """What swims, and how to ask what it truly did since the last time."""
+def _fish(
+    config: Config, stack: ExitStack
+) -> tuple[Robot, Callable[[], TrueWindow], "Swimmer | None"]:
+    """What swims, and how to ask what it truly did since the last time; and one that is free."""
+    if config.robot == "swimmer":
+        swimmer = open_swimmer(config)
+        return swimmer.robot(), swimmer.take_window, swimmer
     if config.robot == "virtual-pi":
         robot, pi = open_in_virtual_time(config, stack)
-        return robot, pi.tank.take_window
+        return robot, pi.tank.take_window, None
     fish = SimulatedFish(config.plant, config.simulation, config.tick)
-    return fish.robot(), fish.take_window
+    return fish.robot(), fish.take_window, None
+
+
+def check_tethered(config: Config, what: str) -> None:
+    """Raise `ParameterError` where the fish swims freely; what: that which is about a thrust."""
+    if config.robot == "swimmer":
+        raise ParameterError(
+            f"{what} is about the thrust of a tethered fish, and with robot: swimmer it swims "
+            "freely; robot: simulated is needed, or 'fishctl simulate'"
+        )
 
 
 def check_length(what: str, seconds: float) -> None:

@@ -52,6 +52,8 @@ class Motion(NamedTuple):
     """Its rate [rad/s]."""
     deflection: float
     """Of the tip of the tail from the axis of the front body [m]."""
+    tail_y: float
+    """Of the tip of the tail, in the laboratory [m]."""
     thrust: float
     """Force of the water on the body along −x, per metre of depth [N]."""
     side_force: float
@@ -213,8 +215,9 @@ class Fish:
             sideways=float(mean[1]),
             heading=heading,
             tail_angle=math.atan2(deflection, reach),
-            tail_rate=(across_rate * reach - along_rate * deflection) / squared,
+            tail_rate=float(across_rate * reach - along_rate * deflection) / squared,
             deflection=deflection,
+            tail_y=float(places[-1, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),
         )

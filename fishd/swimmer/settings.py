@@ -118,6 +118,16 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit("s", "Time constant of the filters of what the fish senses.", ge=0.0, le=1.0),
     ] = 0.005
+    slow_motion: Annotated[
+        float,
+        unit(
+            "1",
+            "Live, a second of the fish takes so many seconds, or as many more as this machine "
+            "needs. Runs in virtual time are as fast as they can be.",
+            ge=1.0,
+            le=1000.0,
+        ),
+    ] = 5.0
 
 
 class Estimate(NamedTuple):

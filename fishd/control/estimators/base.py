@@ -14,10 +14,11 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """How fin velocity and thrust are found."""
 
     kind: Annotated[
-        Literal["lateral_force", "observer"],
+        Literal["lateral_force", "observer", "sensor"],
         note(
             "lateral_force integrates F_y and knows nothing of the fish; observer is a Kalman "
-            "filter on the fish of section plant, as fishctl identify finds it."
+            "filter on the fish of section plant, as fishctl identify finds it; sensor takes what "
+            "a swimmer feels: the angular velocity of its tail against its front body."
         ),
     ] = "lateral_force"
     leak: Annotated[

@@ -15,7 +15,7 @@ def read(text: str, limits: Limits) -> PolicyFile:
         if limits.scaled and any(seen.name == "fin_velocity" for seen in policy.card.observation):
             raise PolicyError(
                 "it was trained to see fin_velocity as estimator.kind: lateral_force gives it, and "
-                "fishd runs with observer"
+                "fishd runs with another one"
             )
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None

@@ -1,0 +1,103 @@
+"""Swims a free swimmer for `fishctl simulate`, and prints what it tells."""
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+from fishd.cli.free_swim_options import SwimmerOptions
+from fishd.cli.lab_progress import showing
+from fishd.cli.output import echo, echo_rows, print_json, spelled
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError, MissingPackage, ParameterError
+from fishd.core.interruption import on_signal
+
+if TYPE_CHECKING:
+    from fishd.simulation.free_swim import SwimReport, Swum
+
+
+def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
+    """Swim, and print; the exit status.
+
+    asked: configuration, controller, parameters, seconds, time to settle, publisher, begun
+    Raises `FishdError` and OSError.
+    """
+    try:
+        from fishd.simulation.free_swim import Keeping
+        from fishd.simulation.free_swim import swim as run
+        from fishd.swimmer import checkpoint, track
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        raise MissingPackage(
+            f"robot: swimmer needs the package {package}; with pip: pip install 'fishd[swimmer]'"
+        ) from None
+    if options.save:
+        track.check_name(options.save)
+    if options.checkpoint and not options.checkpoint.absolute().parent.is_dir():
+        raise ParameterError(f"{options.checkpoint}: there is no folder to put it into")
+    keeping = Keeping(options.checkpoint, options.checkpoint_every) if options.checkpoint else None
+    resume = checkpoint.load(options.resume) if options.resume else None
+    interrupted = threading.Event()
+    with on_signal(interrupted.set), showing(asked[3], "s", err=as_json) as bar:
+        swum = run(
+            *asked,
+            progress=lambda passed, speed: bar.at(passed, f"{speed * 1e3:.1f} mm/s"),
+            keeping=keeping,
+            resume=resume,
+            ended=interrupted.is_set,
+        )
+    if options.save and len(swum.track):
+        track.save(swum.track, options.save)
+    if swum.report and as_json:
+        print_json(swum.report)
+    elif swum.report:
+        echo_rows(_rows(swum.report))
+    if swum.trouble:
+        raise FishdError(f"{swum.trouble}; {_kept(swum, options)}")
+    if not swum.complete:
+        echo(f"fishctl: interrupted; {_kept(swum, options)}", err=True)
+        return INTERRUPTED
+    report = swum.report
+    if report and report.fallback:
+        echo(f"fishctl: another controller took over: {report.fallback.message}", err=True)
+    if report and report.reason:
+        echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
+        return 1
+    return 0
+
+
+def _kept(swum: "Swum", options: SwimmerOptions) -> str:
+    """What of the run is left."""
+    if swum.kept is not None:
+        return f"its last checkpoint is of {swum.kept:.2f} s: --resume {options.checkpoint}"
+    if options.resume:
+        return f"its last checkpoint is {options.resume}"
+    return "there is no checkpoint of it" + ("" if options.checkpoint else ": --checkpoint FILE")
+
+
+def _rows(report: "SwimReport") -> list[tuple[str, str]]:
+    beats = f"over {report.beats} whole beats" if report.beats else "no whole beat"
+    error = f" ± {report.speed_error * 1e3:.2f}" if report.speed_error is not None else ""
+    anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
+    return [
+        ("controller", f"{report.controller} {spelled(report.parameters)}{anew}"),
+        ("speed", f"{report.speed * 1e3:.2f}{error} mm/s, {beats}"),
+        ("frequency", f"{report.frequency:.3f} Hz"),
+        ("heading", f"{report.heading:+.3f} rad"),
+        ("tail", f"{report.tail_amplitude:.3f} lengths from side to side"),
+        (
+            "power",
+            f"{report.muscle_power:.4g} W/m of the muscles, {report.water_power:.4g} W/m to the "
+            "water",
+        ),
+        ("cost", _or_none(report.cost_of_transport, "{:.4g} J/(kg m)")),
+        ("Strouhal", _or_none(report.strouhal, "{:.3f}") + f", Reynolds {report.reynolds:.0f}"),
+        ("Froude", _or_none(report.froude_efficiency, "{:.1%}")),
+        (
+            "timing",
+            f"{report.seconds:.2f} s in {report.ticks} ticks, "
+            f"{report.real_time_factor:.3g} × real time",
+        ),
+    ]
+
+
+def _or_none(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)

@@ -1,0 +1,60 @@
+"""Options of `fishctl simulate` that only a free swimmer has: its files."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from fishd.cli.options import F, FiniteRange
+
+EVERY = 5.0
+
+
+class SwimmerOptions(NamedTuple):
+    """What they were given."""
+
+    checkpoint: Path | None
+    checkpoint_every: float
+    resume: Path | None
+    save: Path | None
+
+    def refuse(self) -> None:
+        """Raises `UsageError` where one was given and the fish is no swimmer."""
+        for option, path in (
+            ("--checkpoint", self.checkpoint),
+            ("--resume", self.resume),
+            ("--save", self.save),
+        ):
+            if path is not None:
+                raise click.UsageError(
+                    f"{option} is for robot: swimmer, such as --config config/swimmer.yaml; a "
+                    "tethered fish is soon simulated again, and --record keeps its ticks"
+                )
+
+
+def swimmer_options(function: F) -> F:
+    """`--checkpoint`, `--checkpoint-every`, `--resume` and `--save`."""
+
+    def file_option(name: str, about: str) -> Callable[[F], F]:
+        kind = click.Path(path_type=Path, dir_okay=False)
+        return click.option(name, type=kind, metavar="FILE", help=f"Of a swimmer: {about}")
+
+    decorators: list[Callable[[Any], Any]] = [
+        file_option("--save", "write its track, a row for each tick, into this .csv or .npz file."),
+        file_option(
+            "--resume",
+            "go on from this checkpoint; with the same controller its time counts to --seconds.",
+        ),
+        click.option(
+            "--checkpoint-every",
+            type=FiniteRange(min=0.1),
+            default=EVERY,
+            show_default=True,
+            help="Time of the fish between two checkpoints [s].",
+        ),
+        file_option("--checkpoint", "keep all that --resume needs in this file, at Ctrl-C, too."),
+    ]
+    for decorator in decorators:
+        function = decorator(function)
+    return function

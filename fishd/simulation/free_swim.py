@@ -1,0 +1,180 @@
+"""A swim of the free swimmer in virtual time: its track, what it tells, and its checkpoints."""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+
+from fishd.config import Config
+from fishd.control.reporting import Publisher
+from fishd.controllers import registry
+from fishd.core.signals import Reason
+from fishd.simulation.report import count_ticks
+from fishd.simulation.virtual_run import EncodingPublisher, VirtualRun
+from fishd.swimmer import checkpoint
+from fishd.swimmer.checkpoint import Checkpoint
+from fishd.swimmer.fish import Diverged
+from fishd.swimmer.gait import Gait, gait
+from fishd.swimmer.robot import Swimmer
+from fishd.swimmer.track import Track
+
+
+class SwimReport(Gait, frozen=True, kw_only=True):
+    """The result of a swim: the gait once settled, and how the run went."""
+
+    controller: str
+    parameters: dict[str, Any]
+    seconds: float
+    """Length of the swim, that before a checkpoint included [s]."""
+    resumed: float | None
+    """Time of the checkpoint that it goes on from, where the controller began anew [s]."""
+    ticks: int
+    mode: str
+    """Mode at the end."""
+    reason: Reason | None
+    """Why, when that is fault."""
+    fallback: Reason | None
+    """Why another controller took over, if one did."""
+    real_time_factor: float
+    """Seconds of the fish per second."""
+
+
+class Keeping(Struct, frozen=True):
+    """Where checkpoints go, and how often."""
+
+    path: Path
+    every: float = 5.0
+    """Of the fish's time [s]."""
+
+
+class Swum(NamedTuple):
+    """What is left of a swim."""
+
+    track: Track
+    report: SwimReport | None
+    """None where the swim was ended before there was anything to judge."""
+    trouble: Diverged | None
+    """Why the fish could not go on."""
+    kept: float | None
+    """Time of the latest checkpoint that was written [s]."""
+    complete: bool
+
+
+def swim(
+    config: Config,
+    name: str,
+    parameters: Mapping[str, Any],
+    seconds: float = 60.0,
+    settle: float = 10.0,
+    publisher: Publisher | None = None,
+    begun: Callable[[VirtualRun], None] = lambda run: None,
+    *,
+    progress: Callable[[float, float], None] = lambda passed, speed: None,
+    keeping: Keeping | None = None,
+    resume: Checkpoint | None = None,
+    ended: Callable[[], bool] = lambda: False,
+) -> Swum:
+    """Let a controller swim a free swimmer for `seconds`, and judge it after `settle` seconds.
+
+    publisher, begun: as for `fishd.simulation.simulate`
+    progress: called after every tick with the time [s] and the mean speed since it settled [m/s]
+    keeping: write checkpoints, the last one when it ends
+    resume: go on from there; with the same controller the time before counts
+    ended: asked after every tick whether to end now
+    Raises `UnknownController`, `ParameterError`, `MissingPackage`, `CheckpointError`, and OSError
+    where a checkpoint cannot be written.
+    """
+    controller = registry.create(name, parameters, replace(config.limits, virtual=True))
+    given = msgspec.structs.asdict(controller.parameters)
+    ticks, first = count_ticks(seconds, settle, config.tick)
+    settings = settings_of(config)
+    kept: float | None = None
+    with VirtualRun(config, publisher or EncodingPublisher()) as run:
+        fish = run.swimmer
+        assert fish
+        track = Track()
+        if resume:
+            resume.check(settings)
+            resume.put_into(fish)
+            if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(given)):
+                track = Track(resume.track)
+        before = len(track)
+        track.begin(fish)
+        begun(run)
+        run.loop.set_controller(name, controller)
+        next_kept = fish.fish.time + keeping.every if keeping else float("inf")
+        since = time.perf_counter()
+        watch = _Speed(fish, first - before)
+
+        def keep() -> float | None:
+            if keeping:
+                checkpoint.save(keeping.path, fish, track, settings, name, given)
+                return fish.fish.time
+            return None
+
+        while len(track) < ticks:
+            command = run.loop.applied
+            run.tick()
+            if fish.trouble:
+                break
+            track.add(fish, command)
+            progress(len(track) * config.tick, watch.mean())
+            if fish.fish.time >= next_kept - 1e-9:
+                kept = keep()
+                next_kept += keeping.every if keeping else 0.0
+            if ended():
+                break
+        elapsed = time.perf_counter() - since
+        if not fish.trouble and len(track) > before:
+            kept = keep()
+        loop = run.loop
+        report = None
+        if len(track) > first + 1:
+            columns = {key: values[first:] for key, values in track.columns().items()}
+            report = SwimReport(
+                **msgspec.structs.asdict(gait(columns, config.swimmer)),
+                controller=name,
+                parameters=given,
+                seconds=len(track) * config.tick,
+                resumed=resume.time if resume else None,
+                ticks=len(track),
+                mode=loop.supervisor.mode.value,
+                reason=loop.supervisor.reason,
+                fallback=loop.active.fallback,
+                real_time_factor=(len(track) - before) * config.tick / elapsed,
+            )
+    return Swum(track, report, fish.trouble, kept, len(track) >= ticks)
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """What the motion of a swimmer depends on, as in the configuration."""
+    swimmer = msgspec.to_builtins(config.swimmer)
+    del swimmer["slow_motion"]
+    found = {"tick": config.tick, "swimmer": swimmer}
+    if config.swimmer.muscle.servo:
+        plant = config.plant
+        found["amplitude_limit"] = config.amplitude_limit
+        found["plant"] = {"servo_speed": plant.servo_speed, "servo_lag": plant.servo_lag}
+    return found
+
+
+class _Speed:
+    """Mean speed of a fish from the tick on that counts first."""
+
+    def __init__(self, fish: Swimmer, wait: int) -> None:
+        """wait: so many ticks, or none where that is negative"""
+        self._fish, self._wait = fish, wait
+        self._from = fish.motion
+
+    def mean(self) -> float:
+        """After one more tick; from the start on before the first that counts [m/s]."""
+        self._wait -= 1
+        now = self._fish.motion
+        if self._wait == 0:
+            self._from = now
+        passed = now.time - self._from.time
+        return (self._from.x - now.x) / passed if passed else now.speed
