@@ -56,7 +56,7 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     water across the swimming direction.
     """
     time, x = track["time"], track["x"]
-    begins = _upward_reversals(track["command"])
+    begins = upward_reversals(track["command"])
     beats = max(0, len(begins) - 1)
     first, last = (begins[0], begins[-1]) if beats else (1, len(time))
     rows = slice(first, last)
@@ -93,7 +93,7 @@ def mass(settings: SwimmerSettings) -> float:
     return density * build_beam(settings).area
 
 
-def _upward_reversals(command: Array) -> list[int]:
+def upward_reversals(command: Array) -> list[int]:
     """The rows, but for the first, in which the command has become positive."""
     found, side = [], 0.0
     for index, angle in enumerate(command.tolist()):

@@ -1,16 +1,17 @@
-"""What a sweep shows: a curve of thrust or speed for each controller and setting, and its best point."""
+"""What a sweep shows: a curve for each controller and setting, and its best point."""
 
 import json
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec import Struct
 
 from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import PARAMETER, Point, axis
 from fishd.lab.sweep.peak import Peak, peak
-from fishd.lab.sweep.results import Found
+from fishd.lab.sweep.results import Found, Quantity
 
 _SLIP = 5e-3
 """Half beats this near to whole ticks count as such [ticks]."""
@@ -107,6 +108,12 @@ def best(curve: Curve) -> Best | None:
         error=found.y_error if found else curve.results[index].error,
         at_edge=found.at_edge if found else False,
     )
+
+
+def plain(best: Best, quantity: Quantity) -> dict[str, Any]:
+    """The best as a program reads it: its value has the name of the quantity."""
+    found = msgspec.structs.asdict(best)
+    return {quantity.name if name == "value" else name: each for name, each in found.items()}
 
 
 def whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | None:

@@ -114,7 +114,9 @@ class SweepFolder:
         try:
             before, *rows = tables.read(path)
             if tuple(before) != head:
-                raise ConfigError(f"{path}: {_other(before, quantity.measured)}; give another --folder")
+                raise ConfigError(
+                    f"{path}: {_other(before, quantity.measured)}; give another --folder"
+                )
             complete = [row for row in rows if len(row) == len(head)]
             for row in complete:
                 measured = dict(zip(head, row, strict=True))
