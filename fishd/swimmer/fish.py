@@ -14,6 +14,9 @@ from fishd.swimmer.settings import SwimmerSettings
 
 FRONT = 0.4
 """The front body: this share of the length, which hardly bends; heading and tail refer to it."""
+REAR = 0.8
+"""The rear body begins here. Its middle is what the angle of the tail is told of: the tip, which is
+thin, flutters."""
 FOLLOW_TIME = 0.05
 """The grid takes on the speed of the fish with this time constant [s]."""
 RECENTRE = 2.0
@@ -23,7 +26,7 @@ UNSTABLE = 1.0
 _CHECKED_EVERY = 20
 _STEER_TIME = 0.4
 """Heading and place are averaged over about so long before the fish is steered [s]."""
-_STEER_RATE = 2.0
+_STEER_RATE = 4.0
 _STEER_REACH = 5.0
 
 
@@ -47,7 +50,7 @@ class Motion(NamedTuple):
     heading: float
     """Of the front body against −x [rad]."""
     tail_angle: float
-    """Of the tip of the tail, seen from the middle of the front body [rad]."""
+    """Of the rear body, seen from the middle of the front body [rad]."""
     tail_rate: float
     """Its rate [rad/s]."""
     deflection: float
@@ -116,6 +119,8 @@ class Fish:
         self._hydrodynamic = np.zeros((self.beam.slices, 2))
         self._front = self.beam.share * (FRONT * body.length > self.beam.X)
         self._front /= self._front.sum()
+        self._rear = self.beam.share * (REAR * body.length < self.beam.X)
+        self._rear /= self._rear.sum()
 
     @property
     def time(self) -> float:
@@ -201,12 +206,11 @@ class Fish:
         heading = float(self._front @ angle)
         across = np.array([-math.sin(heading), math.cos(heading)])
         along = np.array([math.cos(heading), math.sin(heading)])
-        arm = places[-1] - front
-        deflection, reach = float(arm @ across), float(arm @ along)
-        relative = velocity[-1, :2] - front_rate[:2]
-        across_rate = float(relative @ across) - front_rate[2] * reach
-        along_rate = float(relative @ along) + front_rate[2] * deflection
-        squared = reach**2 + deflection**2
+        arm = self._rear @ places - front
+        off, reach = float(arm @ across), float(arm @ along)
+        relative = (self._rear @ velocity - front_rate)[:2]
+        off_rate = float(relative @ across) - front_rate[2] * reach
+        reach_rate = float(relative @ along) + front_rate[2] * off
         return Motion(
             time=self.time,
             x=self._travelled + float(centre[0]),
@@ -214,9 +218,9 @@ class Fish:
             speed=-float(mean[0]),
             sideways=float(mean[1]),
             heading=heading,
-            tail_angle=math.atan2(deflection, reach),
-            tail_rate=float(across_rate * reach - along_rate * deflection) / squared,
-            deflection=deflection,
+            tail_angle=math.atan2(off, reach),
+            tail_rate=float(off_rate * reach - reach_rate * off) / (reach**2 + off**2),
+            deflection=float((places[-1] - front) @ across),
             tail_y=float(places[-1, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),

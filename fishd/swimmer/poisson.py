@@ -8,6 +8,7 @@ on a stretched grid, at the price of two matrix products.
 import numpy as np
 from numba import njit
 from scipy.linalg import eigh_tridiagonal
+from threadpoolctl import threadpool_limits
 
 from fishd.swimmer.grid import Array, Grid
 
@@ -17,6 +18,9 @@ class Poisson:
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
+        # For the whole process, and on purpose: these matrices are too small for several threads,
+        # which on a busy machine wait for each other, and made a step ten times longer.
+        threadpool_limits(1, "blas")
         across = np.diff(grid.yc)
         upper = 1.0 / across
         diagonal = np.zeros(grid.ny)

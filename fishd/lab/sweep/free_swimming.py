@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 from msgspec.structs import replace
-from threadpoolctl import threadpool_limits
 
 from fishd.config import Config, Start
 from fishd.control.reporting import Publisher
@@ -17,7 +16,7 @@ from fishd.simulation import VirtualRun
 from fishd.swimmer.gait import gait
 from fishd.swimmer.track import Track
 
-LONGEST = 24.0
+LONGEST = 20.0
 """A fish whose speed still changes is judged all the same after so long [s]."""
 
 
@@ -47,7 +46,7 @@ def swim_freely(
     longest = max(LONGEST, 4.0 * lengths.settle)
     track = Track()
     begins: list[int] = []
-    with threadpool_limits(1), VirtualRun(config, publisher) as run:
+    with VirtualRun(config, publisher) as run:
         fish = run.swimmer
         assert fish
         begun(run)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
-LEAST_TIME = 8.0
+LEAST_TIME = 6.0
 """The beats that are judged take as long at least: a fast wave has many in a moment [s]."""
 STEADY = 0.02
 """The speed is steady where its two halves agree to this share of it, or of a tenth of a length a
