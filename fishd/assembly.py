@@ -61,7 +61,9 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
             release_recipe.remove(str(file))  # of what the file said before
         return SimulatedFish(config.plant, config.simulation, config.tick).robot()
     if config.robot == "swimmer":
-        return open_swimmer(config).robot()
+        swimmer = open_swimmer(config)
+        swimmer.compile()
+        return swimmer.robot()
     stack.enter_context(ownership.owned(parts_of(config)))
     if file:
         release_recipe.remove(str(file))  # of an earlier fishd

@@ -26,6 +26,7 @@ ANY = {
     "text": "a text",
     "boolean": "`true`, `false`",
     "section": "keys and values",
+    "list": "a list",
 }
 """What is permitted where there are no bounds."""
 

@@ -14,7 +14,7 @@ from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.sweep import ON, refuse_other
 from fishd.client import Fish
-from fishd.config import Config, adopt, load
+from fishd.config import Config, adopt, check_tethered, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
 from fishd.core.interruption import interrupted_once
@@ -155,6 +155,7 @@ def _in_simulation(
     from fishd.lab.compare.contestants import parse, refusal
 
     config, seen = load(file, overrides), cameras.simulated(camera)
+    check_tethered(config.robot, "compare")
     chosen = [parse(text) for text in texts] or _all(config)
     _check_seen(camera, chosen)
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]

@@ -92,7 +92,7 @@ def check(file: Path, overrides: tuple[str, ...]) -> None:
     loaded = load(file, overrides)
     echo(f"{file}: good")
     left = pulses.cut(loaded.servo, loaded.amplitude_limit)
-    if left and loaded.robot != "simulated":
+    if left and loaded.has_hardware:
         echo(f"servo.lowest and servo.highest permit {left}, amplitude_limit")
 
 

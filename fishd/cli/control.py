@@ -205,8 +205,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("controller", f"{status.controller} {spelled(status.parameters)}"),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
-        ("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz"),
-        *([("", _ZERO)] if status.thrust_error is None and not status.sensor_lost else []),
+        *_swum(status),
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
@@ -215,6 +214,15 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]
+
+
+def _swum(status: Status) -> list[tuple[str, str]]:
+    if status.speed is not None:
+        return [("speed", f"{status.speed * 1e3:.1f} mm/s at {status.frequency:.2f} Hz")]
+    rows = [("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz")]
+    if status.thrust_error is None and not status.sensor_lost:
+        rows.append(("", _ZERO))
+    return rows
 
 
 def _timing_rows(status: Status) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
-from fishd.config import Config, adopt, load
+from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
@@ -146,6 +146,7 @@ def identify(
         origin = f"an experiment with {_swimmer(on, file, overrides)}"
     else:
         config, tables = load(file, overrides), [find(run, folder) for run in runs]
+        check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
     found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names)
     if as_json:
@@ -181,7 +182,9 @@ def _config(
     Raises `ConfigError`, and `NoDaemon`.
     """
     if on != "robot":
-        return load(file, overrides), None
+        config = load(file, overrides)
+        check_tethered(config.robot, "identify")
+        return config, None
     fish = Fish(endpoint)
     return load(file, overrides) if file else adopt(fish.config(), overrides), fish
 

@@ -8,7 +8,7 @@ import click
 from fishd.cli.config import fish_options
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
-from fishd.config import load
+from fishd.config import check_tethered, load
 from fishd.virtual.plant.parameters import PlantParameters
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def optimum(
     from fishd.lab import optimum as lab
 
     config = load(file, overrides)
+    check_tethered(config.robot, "optimum")
     plant = config.plant
     chosen = amplitudes or (config.amplitude_limit,)
     if control and len(chosen) > 1:

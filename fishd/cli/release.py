@@ -29,7 +29,7 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     config, found = load_service(file, overrides)
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
-    if config.robot != "simulated":
+    if config.has_hardware:
         try:
             done = _end_pulses(config)
         except ServoError as error:

@@ -14,7 +14,7 @@ from fishd.cli.config import set_option
 from fishd.cli.options import ControllerGroup, endpoint_option, json_option
 from fishd.cli.sweep_output import again, conclude, telling
 from fishd.client import Fish
-from fishd.config import Config, load
+from fishd.config import Config, check_tethered, load
 from fishd.controllers.base import Limits
 from fishd.core.errors import ConfigError, FishdError, NoDaemon
 from fishd.core.signals import ControllerInfo
@@ -197,7 +197,9 @@ def _in_simulation(
 def _fish_of(point: "Point", file: Path | None, overrides: tuple[str, ...]) -> Config:
     pairs = [f"{key}={value}" for key, value in point.keys.items()]
     try:
-        return load(file, (*overrides, *pairs))
+        config = load(file, (*overrides, *pairs))
+        check_tethered(config.robot, "sweep")
+        return config
     except ConfigError as error:
         message = str(error)
         for pair in pairs:

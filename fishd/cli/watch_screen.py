@@ -121,7 +121,9 @@ class View:
             thrust=tick.thrust,
             thrust_error=None if tick.thrust_error is UNSET else tick.thrust_error,
         )
+        speed = tick.speed
         figures = {
+            **({"speed": f"{speed * 1e3:.1f} mm/s"} if isinstance(speed, float) else {}),
             "thrust": thrust_words(known),
             "tail beat": f"{tick.frequency:.2f} Hz",
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",

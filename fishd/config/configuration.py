@@ -179,6 +179,11 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     realtime: Annotated[RealtimeSettings, note("Scheduling and memory.")] = RealtimeSettings()
 
     @property
+    def has_hardware(self) -> bool:
+        """Does it have a force sensor and a servo, real or emulated ones?"""
+        return self.robot in ("pi", "virtual-pi")
+
+    @property
     def limits(self) -> Limits:
         """What controllers must respect."""
         return Limits(
@@ -217,6 +222,15 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = 
     except Problem as problem:
         raise ConfigError(problem.located(sources)) from None
     return config
+
+
+def check_tethered(robot: str, what: str) -> None:
+    """Raise `ConfigError` where the fish swims freely; what: that which needs a tethered one."""
+    if robot == "swimmer":
+        raise ConfigError(
+            f"robot: swimmer is not valid for {what}, which is about the thrust of a tethered "
+            "fish; robot: simulated is needed, and what a swimmer does 'fishctl simulate' tells"
+        )
 
 
 def _check(config: Config) -> None:

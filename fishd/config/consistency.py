@@ -114,6 +114,12 @@ def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> N
 
 def check_lockstep(robot: str, lockstep: bool) -> None:
     """Lockstep needs a simulated fish: only its time can stand still."""
+    if lockstep and robot == "swimmer":
+        raise Problem(
+            ("lockstep",),
+            "true is not valid with robot: swimmer, whose time is virtual anyway: its ticks wait "
+            "for an agent of remote; false is needed",
+        )
     if lockstep and robot != "simulated":
         raise Problem(
             ("lockstep",),

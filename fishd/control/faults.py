@@ -41,6 +41,11 @@ FAULTS = {
         "look for a clipped or broken wire of the force sensor, or calibrate it",
         in_a_row=3,
     ),
+    "fish-lost": Fault(
+        "the computation of a swimmer has diverged, or it has left the part of the tank that is "
+        "computed well",
+        "change what the message says, and start fishd again: this fish is gone",
+    ),
     "estimate-error": Fault(
         "the estimator raised an exception",
         "report it, with the log: it is an error in fishd",

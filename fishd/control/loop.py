@@ -22,7 +22,7 @@ from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits
 from fishd.core import text
 from fishd.core.clock import Clock, Slot
-from fishd.core.errors import ControllerFault, SensorError
+from fishd.core.errors import ControllerFault, FishLost, SensorError
 from fishd.core.foreign_code import contained
 from fishd.core.signals import Measurement, Observation
 from fishd.hardware.base import Robot
@@ -208,6 +208,8 @@ class ControlLoop:
             if not math.isfinite(measurement.fx + measurement.fy):
                 raise SensorError(f"it gave ({measurement.fx}, {measurement.fy}) N")
         except Exception as error:
+            if isinstance(error, FishLost):
+                self._fail("fish-lost", "there is nothing to read any more", error)
             problem = f"the force sensor cannot be read: {text.named(error)}"
             # Once more, and nothing of it is new.
             measurement = replace(self._measurement, samples=0, suspect="", extremes=None)

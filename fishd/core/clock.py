@@ -79,6 +79,12 @@ class VirtualClock:
         self.now += max(0.0, seconds)
 
 
+class SlowClock(VirtualClock):
+    """The same for what people watch: its unix time is that of the machine."""
+
+    wall = staticmethod(time.time)
+
+
 def virtual_slots(clock: VirtualClock, period: float) -> Iterator[Slot]:
     """Slots of virtual time for ever, never late; moves the clock. period: [s]"""
     for index in itertools.count():

@@ -17,14 +17,20 @@ _LONGEST = 5000
 
 
 def status_line(status: Status) -> str:
-    """Mode, controller, frequency, mean thrust, lateness, missed ticks, and a servo not reached."""
+    """Mode, controller, frequency, mean thrust, lateness, missed ticks, and a servo not reached.
+
+    Of a swimmer its speed at that instant, instead of a thrust.
+    """
     what = status.mode if status.mode == "idle" else f"{status.mode} {status.controller}"
     if status.reason:
         what = f"{status.mode} {status.reason.code}"
     what = text.quoted(what)
     servo = "  servo not reached" if status.servo_lost else ""
+    got = f"thrust {thrust_words(status):>16}"
+    if status.speed is not None:
+        got = f"speed {status.speed * 1e3:6.1f} mm/s"
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  thrust {thrust_words(status):>16}  "
+        f"{what:<16} {status.frequency:5.2f} Hz  {got}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
     )

@@ -61,6 +61,10 @@ class SensorError(FishdError, OSError):
     """The force sensor cannot be read."""
 
 
+class FishLost(FishdError):
+    """A simulated fish cannot go on, and no later read will find it again."""
+
+
 class ServoError(FishdError, OSError):
     """The servo cannot be driven."""
 

@@ -363,6 +363,9 @@ class Status(Struct, frozen=True):
     clock: Annotated[
         float, unit("s", "When the snapshot was taken, on fishd's monotonic clock.")
     ] = 0.0
+    speed: Annotated[
+        float | None, unit("m/s", "As in `tick`; null for a fish that is tethered.")
+    ] = None
     boot: Annotated[
         str, note("Names this start of fishd's machine, from which its monotonic clock counts.")
     ] = ""

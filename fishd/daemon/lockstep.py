@@ -9,6 +9,7 @@ from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.controllers.remote.controller import Remote
 from fishd.core.clock import Slot, Ticker, VirtualClock, virtual_slots
+from fishd.daemon.slow_motion import SlowMotion
 
 POLL = 0.02
 """How soon a wait notices that another controller is active, or that fishd ends [s]."""
@@ -18,14 +19,16 @@ class Lockstep:
     """Yields slots as a `Ticker` does, and turns the loop in them.
 
     While `remote` is active, a tick follows as soon as the agent has answered. Otherwise ticks come
-    at the pace of real time.
+    at the pace of real time, or in slow motion.
     """
 
-    def __init__(self, loop: ControlLoop, clock: VirtualClock, period: float) -> None:
-        """Must be made inside a running asyncio loop."""
+    def __init__(
+        self, loop: ControlLoop, clock: VirtualClock, period: float, pace: SlowMotion | None = None
+    ) -> None:
+        """Must be made inside a running asyncio loop. pace: that of real time by default"""
         self._loop = loop
         self._slots = virtual_slots(clock, period)
-        self._pace = Ticker(period)
+        self._pace = pace or Ticker(period)
         self._events = asyncio.get_running_loop()
         self._news = asyncio.Event()
 

@@ -1,6 +1,7 @@
 """The daemon: from a configuration to a fish that swims until a signal ends it."""
 
 import asyncio
+import dataclasses
 import itertools
 import logging
 import math
@@ -20,7 +21,7 @@ from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
 from fishd.controllers.remote import wire
 from fishd.core import addresses
-from fishd.core.clock import SystemClock, Ticker, VirtualClock
+from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
 from fishd.daemon import realtime
@@ -31,8 +32,10 @@ from fishd.daemon.lockstep import Lockstep
 from fishd.daemon.logs import LogWriter
 from fishd.daemon.requests import Operations
 from fishd.daemon.shutdown import Shutdown, leave
+from fishd.daemon.slow_motion import SlowMotion
 from fishd.daemon.systemd_notify import SystemdNotifier
 from fishd.daemon.warm_up import mock_ticks
+from fishd.hardware.base import Robot
 from fishd.hardware.servo.pulses import REST
 
 log = logging.getLogger(__name__)
@@ -56,7 +59,13 @@ class Daemon:
         self._config = config
         self._file = file
         self._print_status = print_status
-        self._clock = VirtualClock() if config.lockstep else SystemClock()
+        self._slow = (
+            SlowMotion(config.tick, config.swimmer.slow_motion)
+            if config.robot == "swimmer"
+            else None
+        )
+        self._clock = SlowClock() if self._slow else _clock(config)
+        self._virtual = isinstance(self._clock, VirtualClock)
         self._events = asyncio.get_running_loop()
         self._housekeeping = itertools.cycle((self._report, realtime.collect_garbage))
         self._next_housekeeping = 0.0
@@ -73,12 +82,14 @@ class Daemon:
             self._gateways = Gateways(address, config.telemetry.address, stack)
             wire.start_context(stack)
             self._telemetry = Telemetry(self._gateways.telemetry.send)
-            self._mock_ticks = None if config.lockstep else mock_ticks(config)
+            self._mock_ticks = None if self._virtual else mock_ticks(config)
             controllers = registry.describe_all()  # imports what other packages offer
             preload()  # which would hold up the ticks later
             robot = assembly.open_robot(config, self._clock, stack, self._file)
+            if self._slow:
+                robot = _slowed(robot, self._slow)
             self._loop = assembly.build_loop(
-                config, robot, self._clock, self._telemetry, self._notifier.ticked
+                config, robot, self._clock, self._telemetry, self._ticked
             )
             stack.callback(self._loop.close)
             stack.callback(self._come_to_rest)
@@ -87,7 +98,7 @@ class Daemon:
             calibration_requests = CalibrationRequests(
                 self._loop, self._clock, config, assembly.state_folder(config)
             )
-            fifo = not config.lockstep and realtime.enter(
+            fifo = not self._virtual and realtime.enter(
                 config.realtime.priority, config.realtime.lock_memory
             )
             self._operations = Operations(
@@ -125,14 +136,14 @@ class Daemon:
             __version__,
             self._loop.robot.name,
             self._config.tick * 1e3,
-            " of virtual time" if self._config.lockstep else "",
+            " of virtual time" if self._virtual else "",
             self._gateways.control.address,
             self._gateways.telemetry.address,
         )
         realtime.quiet_garbage_collector()
         clock = self._clock
         lockstep = (
-            Lockstep(self._loop, clock, self._config.tick)
+            Lockstep(self._loop, clock, self._config.tick, self._slow)
             if isinstance(clock, VirtualClock)
             else None
         )
@@ -152,8 +163,11 @@ class Daemon:
                 self._between_ticks()
                 if stopping.is_set():
                     break
-            log.info("stopping: fading to neutral")
             self._notifier.stopping()
+            if self._slow:  # there is no servo, and a fade would take long
+                log.info("stopping")
+                return
+            log.info("stopping: fading to neutral")
             self._loop.stop()
             deadline = self._clock.monotonic() + FADE_LIMIT + SETTLING
             async for slot in ticker:
@@ -171,6 +185,10 @@ class Daemon:
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + STATUS_PERIOD / 2
             next(self._housekeeping)()
+
+    def _ticked(self, now: float) -> None:
+        """now: start of the tick, on the loop's clock [s]"""
+        self._notifier.ticked(time.monotonic() if self._virtual else now)
 
     def _warm_up(self) -> None:
         assert self._mock_ticks
@@ -204,6 +222,15 @@ class Daemon:
         self._notifier.status(line)
         if self._print_status:
             console.info("%s", line)
+
+
+def _clock(config: Config) -> Clock:
+    return VirtualClock() if config.lockstep else SystemClock()
+
+
+def _slowed(robot: Robot, slow: SlowMotion) -> Robot:
+    """The robot, which says of itself that it swims in slow motion."""
+    return dataclasses.replace(robot, degraded=lambda: (*robot.degraded(), slow.degraded()))
 
 
 async def swim(

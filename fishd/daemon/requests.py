@@ -133,7 +133,13 @@ class Operations:
             quantity_units=loop.active.quantity_units,
             clock=self._clock.monotonic(),
             boot=self._boot,
+            speed=self._speed(),
         )
+
+    def _speed(self) -> float | None:
+        truth = self._loop.robot.truth
+        course = truth().course if truth else None
+        return course.speed if course else None
 
     async def _status(self, _: protocol.NoArguments) -> Status:
         return self.status()

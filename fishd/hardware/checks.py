@@ -67,7 +67,7 @@ class Check(NamedTuple):
 
     name: str
     function: Callable[[Any], Result | None]
-    robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi")
+    robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi", "swimmer")
     """For which robots it is made."""
 
 

@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from fishd.client import Fish
-from fishd.config import Config
+from fishd.config import Config, check_tethered
 from fishd.control.reporting import Publisher
 from fishd.core import text
 from fishd.core.errors import (
@@ -105,6 +105,7 @@ class VirtualRig:
     """A simulated fish in virtual time."""
 
     def __init__(self, config: Config) -> None:
+        check_tethered(config.robot, "a measurement of thrust")
         self.name = "simulation"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
@@ -154,8 +155,9 @@ class LiveRig:
     """
 
     def __init__(self, fish: Fish) -> None:
-        """Raises `NoDaemon`."""
+        """Raises `NoDaemon`, and `ConfigError` where the fish swims freely."""
         status = fish.status()
+        check_tethered(status.robot, "a measurement of thrust")
         self.name = status.robot
         self.unit = status.force_unit
         self.tick = status.tick

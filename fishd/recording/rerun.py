@@ -180,7 +180,13 @@ class _Rerun:
 
     def _observe(self, tick: Tick, applied: float, dt: float) -> Observation:
         """What the controller sees in this tick."""
-        measurement = Measurement(tick.t - 1e-3 * tick.age_ms, tick.fx, tick.fy, tick.samples)
+        measurement = Measurement(
+            tick.t - 1e-3 * tick.age_ms,
+            tick.fx,
+            tick.fy,
+            tick.samples,
+            fin_velocity=tick.fin_velocity,
+        )
         again = self._estimator.update(measurement, applied, tick.t, dt)
         self.estimates.ticks += 1
         self.estimates.equal += all(

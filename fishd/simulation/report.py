@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.config import Config
+from fishd.config import Config, check_tethered
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, amplitude_of
@@ -20,7 +20,6 @@ from fishd.simulation.virtual_run import (
     EncodingPublisher,
     VirtualRun,
     check_length,
-    check_tethered,
 )
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -113,9 +112,10 @@ def judge(
     """As `simulate`, with a controller that is ready-made.
 
     publisher, begun: as for `simulate`
-    Raises `ParameterError` where the lengths do not fit one another, or the fish swims freely.
+    Raises `ParameterError` where the lengths do not fit one another, and `ConfigError` where the
+    fish swims freely.
     """
-    check_tethered(config, "efficiency")
+    check_tethered(config.robot, "efficiency")
     ticks, first = count_ticks(seconds, settle, config.tick)
     beats = Beats()
     since = 0.0

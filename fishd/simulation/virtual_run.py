@@ -125,15 +125,6 @@ def _fish(
     return fish.robot(), fish.take_window, None
 
 
-def check_tethered(config: Config, what: str) -> None:
-    """Raise `ParameterError` where the fish swims freely; what: that which is about a thrust."""
-    if config.robot == "swimmer":
-        raise ParameterError(
-            f"{what} is about the thrust of a tethered fish, and with robot: swimmer it swims "
-            "freely; robot: simulated is needed, or 'fishctl simulate'"
-        )
-
-
 def check_length(what: str, seconds: float) -> None:
     """Raise `ParameterError` where a length of time is not possible; what: what it is of."""
     if not 0.0 <= seconds < LONGEST:  # NaN is not

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fishd.core.errors import FishLost
 from fishd.core.signals import Course, Measurement, Truth
 from fishd.hardware.base import Robot
 from fishd.swimmer.fish import Diverged, Fish, Motion, Work
@@ -49,7 +50,7 @@ class Swimmer:
         self.fish = Fish(settings)
         self.amplitude = amplitude
         self.trouble: Diverged | None = None
-        """Why it cannot go on; every read raises it."""
+        """Why it cannot go on."""
         self.motion = self.fish.motion()
         """At the latest read."""
         self.tail_reach = (self.motion.tail_y, self.motion.tail_y)
@@ -66,13 +67,19 @@ class Swimmer:
         smoothing = settings.sensor_time / settings.numerics.step
         self._share = -math.expm1(-1.0 / smoothing) if smoothing else 1.0
 
+    def compile(self) -> None:
+        """Do what takes long when it is done for the first time, as in the first step."""
+        state = self.fish.state()
+        self.fish.step(0.0)
+        self.fish.restore(state)
+
     def read(self, now: float) -> Measurement:
         """Swim until `now` [s]; forces are means over the way, per metre of depth.
 
-        Raises `Diverged` where the fish cannot go on, then and ever after.
+        Raises `FishLost` where the fish cannot go on, then and ever after.
         """
         if self.trouble:
-            raise self.trouble
+            raise FishLost(str(self.trouble))
         if self._start is None:
             self._start = now - self._tick
         due = max(1, round((now - self._start) / self.fish.dt) - self._steps)
@@ -101,7 +108,7 @@ class Swimmer:
             self.fish.step(self._activation())
         except Diverged as error:
             self.trouble = error
-            raise
+            raise FishLost(str(error)) from error
         motion = self.fish.motion()
         self._sensed_rate += self._share * (motion.tail_rate - self._sensed_rate)
         return motion

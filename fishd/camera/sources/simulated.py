@@ -185,7 +185,7 @@ class _View:
 
         status: of the fishd that has ticked
         """
-        if not isinstance(tick.alpha, float):
+        if status.robot == "swimmer" or not isinstance(tick.alpha, float):
             raise _blind(status.robot)
         if math.isnan(tick.time):
             raise Trouble(
@@ -260,10 +260,10 @@ def _swimmer(config: dict[str, Any]) -> Swimmer:
 
 def _blind(robot: str) -> Trouble:
     """Why nothing can be drawn."""
-    if robot == "virtual-pi":
-        return Trouble(
-            "unusable",
-            "a virtual Pi does not tell where the tail is",
-            "let fishd drive robot: simulated",
-        )
+    why = {
+        "virtual-pi": "a virtual Pi does not tell where the tail is",
+        "swimmer": "a swimmer swims out of its sight",
+    }.get(robot)
+    if why:
+        return Trouble("unusable", why, "let fishd drive robot: simulated")
     return Trouble("unusable", "this fishd drives a real fish", "use source: v4l2")

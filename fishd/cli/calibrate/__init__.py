@@ -38,7 +38,7 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     measures: nothing changes.
     """
     with Fish(endpoint) as fish:
-        simulated = fish.status().robot == "simulated"
+        simulated = fish.status().robot in ("simulated", "swimmer")
         before = None if simulated else fish.calibrations().force
         after = fish.tare(seconds)
     if as_json:

@@ -50,7 +50,7 @@ def doctor(
             f"robot {config.robot}: {counts['ok']} ok, {counted(counts['warning'], 'warning')}, "
             f"{counts['FAIL']} failed, {counts['skipped']} skipped"
         )
-        if config.robot == "simulated":
+        if not config.has_hardware:
             echo("a simulated fish needs no hardware, so none was checked")
     return 1 if counts["FAIL"] else 0
 
@@ -68,7 +68,7 @@ def checks(context: Context) -> Iterator[Check]:
         *software.CHECKS,
         *computer.CHECKS,
         *timing.CHECKS,
-        *(drivers.checks(context) if context.robot != "simulated" else ()),
+        *(drivers.checks(context) if context.config.has_hardware else ()),
         *service.CHECKS,
     )
     return (check for check in every if context.robot in check.robots)

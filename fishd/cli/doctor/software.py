@@ -20,6 +20,8 @@ _MODULES = {package: module for module, package in PACKAGES.items()} | {
 _REQUIREMENT = re.compile(
     r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(;.*extra == [\"'](?P<extra>.+)[\"'])?"
 )
+_SWIMMER = {("swimmer", "numba"), ("lab", "scipy")}
+"""Extra and package of what `robot: swimmer` needs."""
 _BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
 
 
@@ -44,7 +46,7 @@ def packages(context: Context) -> Result:
     """Those that this configuration needs, as fishd's own metadata demands them."""
     robot, wanted, drivers = context.robot, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
-    if robot != "simulated":
+    if context.config.has_hardware:
         for _, plugins, settings in context.drivers:
             packages |= {name.lower() for name in plugins.find(settings.driver).packages}
             texts += plugins.requirements(settings.driver)
@@ -53,11 +55,12 @@ def packages(context: Context) -> Result:
         found = _REQUIREMENT.match(text)
         assert found
         name, extra = found["name"].lower(), found["extra"]
-        if extra is None or (extra == "pi" and name in packages):
+        of_swimmer = robot == "swimmer" and (extra, name) in _SWIMMER
+        if extra is None or (extra == "pi" and name in packages) or of_swimmer:
             wanted.append((name, found["bounds"]))
     problems = [problem for name, bounds in wanted if (problem := _problem(name, bounds))]
     if problems:
-        extra = "fishd" if robot == "simulated" else "fishd[pi]"
+        extra = {"simulated": "fishd", "swimmer": "fishd[swimmer]"}.get(robot, "fishd[pi]")
         return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
     who = f"robot {robot} with {' and '.join(drivers)}" if drivers else f"robot {robot}"
     return ok(f"all {len(wanted)} that {who} needs, under {sys.executable}")

@@ -20,7 +20,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from fishd.camera.frames import Stack
-from fishd.config import Config
+from fishd.config import Config, check_tethered
 from fishd.controllers.policy.card import Feature, FeatureName
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
@@ -113,8 +113,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         config: the fish that the scales are made for
         eye: what makes numbers of pictures, where the agent sees any; fit it before the first step
 
-        Raises `ConfigError` where the fish has another tick or Φ than `config`.
+        Raises `ConfigError` where the fish has another tick or Φ than `config`, or swims freely.
         """
+        check_tethered(config.robot, "learning")
         _check_agreement(link, config)
         self.link = link
         self.config = config

@@ -11,7 +11,7 @@ from fishd.assembly import build_loop
 from fishd.camera.frames import Stack, StackSettings
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.sight import SimulatedSight
-from fishd.config import Config, Start
+from fishd.config import Config, Start, check_tethered
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
@@ -112,7 +112,10 @@ class SimulatedLink:
         config: fish, rig, tick and limits; its robot and start are ignored
         randomisation: how much the fish and rig of each episode vary; by default not at all
         camera: what looks at the fish, if anything does
+
+        Raises `ConfigError` for a fish that swims freely.
         """
+        check_tethered(config.robot, "learning")
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
         self.config = replace(config, robot="simulated", start=Start())

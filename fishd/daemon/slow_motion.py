@@ -1,0 +1,54 @@
+"""Slow motion: ticks of a fish that takes longer to compute than to swim.
+
+Its time, which is that of the loop and of the controllers, moves by one period with each tick, and
+between two ticks several periods of real time pass. So no tick is late, none is skipped, and on a
+machine that is too slow the motion is only slower.
+"""
+
+import asyncio
+import time
+from collections import deque
+from typing import Self
+
+BREATH = 0.002
+"""Requests and telemetry have so long between two ticks, at least [s]."""
+SPAN = 100
+"""The pace is that of so many ticks."""
+TOO_SLOW = 1.1
+
+
+class SlowMotion:
+    """Paces ticks as a `Ticker` does, but never skips one."""
+
+    def __init__(self, period: float, factor: float) -> None:
+        """period: of the loop, in the fish's time [s]; factor: seconds for each of its seconds"""
+        self._period, self._factor = period, factor
+        self._due = time.monotonic()
+        self._latest: deque[float] = deque(maxlen=SPAN)
+
+    def close(self) -> None:
+        """Nothing is to be given back."""
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> None:
+        """Wait until the next tick may begin."""
+        await asyncio.sleep(max(BREATH, self._due - time.monotonic()))
+        now = time.monotonic()
+        self._latest.append(now)
+        self._due = max(self._due, now - self._period) + self._factor * self._period
+
+    @property
+    def pace(self) -> float:
+        """How many seconds a second of the fish has taken lately."""
+        if len(self._latest) < 2:
+            return self._factor
+        return (self._latest[-1] - self._latest[0]) / ((len(self._latest) - 1) * self._period)
+
+    def degraded(self) -> str:
+        """What a status says of it, in one line."""
+        line = f"slow motion: a second of the fish takes {self.pace:.3g} s"
+        if self.pace > TOO_SLOW * self._factor:
+            line += f", since this machine is too slow for swimmer.slow_motion: {self._factor:g}"
+        return line
