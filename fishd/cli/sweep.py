@@ -197,9 +197,7 @@ def _in_simulation(
 def _fish_of(point: "Point", file: Path | None, overrides: tuple[str, ...]) -> Config:
     pairs = [f"{key}={value}" for key, value in point.keys.items()]
     try:
-        config = load(file, (*overrides, *pairs))
-        check_tethered(config.robot, "sweep")
-        return config
+        return load(file, (*overrides, *pairs))
     except ConfigError as error:
         message = str(error)
         for pair in pairs:
@@ -219,11 +217,7 @@ def _on_robot(
         plan(seconds, point.parameters)  # which says that it is too short, before anything moves
     with Fish(endpoint) as fish:
         status = fish.status()
-        if status.robot == "swimmer":
-            raise FishdError(
-                "a fish that swims freely has no thrust to measure; its speed is swept in "
-                "simulation, with --config"
-            )
+        check_tethered(status.robot, "sweep --on robot")
         grid.check_remote(found, Limits(status.amplitude_limit, status.tick))
         begun = Begun("robot", fish.config(), {"seconds": seconds}, status.force_unit)
         with (
