@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 from fishd.swimmer.grid import Array
 from fishd.swimmer.robot import Swimmer
 
-PLACES = 41
+PLACES = 81
 """Along the body, evenly from head to tail."""
 
 
 class Midlines:
-    """Midlines of a swim in the laboratory, 330 bytes each."""
+    """Midlines of a swim in the laboratory, 660 bytes each."""
 
     def __init__(self) -> None:
         self._time: list[float] = []
