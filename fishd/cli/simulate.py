@@ -29,9 +29,7 @@ def run_options(function: Any) -> Any:
         click.option(
             "--settle",
             type=float,
-            default=10.0,
-            show_default=True,
-            help="Time before figures are taken [s].",
+            help="Time before figures are taken [s].  [default: 10; 3 of a swimmer]",
         ),
         click.option(
             "--seconds", type=float, default=60.0, show_default=True, help="Length of each run [s]."
@@ -62,7 +60,7 @@ def _simulate(
     name: str,
     parameters: dict[str, Any],
     seconds: float,
-    settle: float,
+    settle: float | None,
     file: Path | None,
     overrides: tuple[str, ...],
     recording: Path | None,
@@ -73,14 +71,17 @@ def _simulate(
     from fishd.simulation import simulate as run
 
     config = load(file, overrides)
+    free = config.robot == "swimmer"
+    if settle is None:
+        settle = 3.0 if free else 10.0
     with ExitStack() as stack:
         writer, begun = None, _nothing
-        if config.robot != "swimmer":
+        if not free:
             of_swimmer.refuse()
         if recording:
             writer = stack.enter_context(_recorder(recording))
             begun = partial(_describe, writer, config)
-        if config.robot == "swimmer":
+        if free:
             from fishd.cli.free_swim import swim
 
             asked = (config, name, parameters, seconds, settle, writer, begun)
