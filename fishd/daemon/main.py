@@ -141,6 +141,8 @@ class Daemon:
             self._gateways.telemetry.address,
         )
         realtime.quiet_garbage_collector()
+        if self._slow:
+            self._slow.stopping = stopping
         clock = self._clock
         lockstep = (
             Lockstep(self._loop, clock, self._config.tick, self._slow)

@@ -8,6 +8,7 @@ machine that is too slow the motion is only slower.
 import asyncio
 import time
 from collections import deque
+from contextlib import suppress
 from typing import Self
 
 BREATH = 0.002
@@ -23,6 +24,8 @@ class SlowMotion:
     def __init__(self, period: float, factor: float) -> None:
         """period: of the loop, in the fish's time [s]; factor: seconds for each of its seconds"""
         self._period, self._factor = period, factor
+        self.stopping = asyncio.Event()
+        """Ends the wait for a tick."""
         self._due = time.monotonic()
         self._latest: deque[float] = deque(maxlen=SPAN)
 
@@ -33,8 +36,10 @@ class SlowMotion:
         return self
 
     async def __anext__(self) -> None:
-        """Wait until the next tick may begin."""
-        await asyncio.sleep(max(BREATH, self._due - time.monotonic()))
+        """Wait until the next tick may begin, or fishd is to end."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(max(BREATH, self._due - time.monotonic())):
+                await self.stopping.wait()
         now = time.monotonic()
         self._latest.append(now)
         self._due = max(self._due, now - self._period) + self._factor * self._period

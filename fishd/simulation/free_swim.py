@@ -102,10 +102,12 @@ def swim(
         if resume:
             resume.check(settings)
             resume.put_into(fish)
+            run.loop.applied = fish.command  # which the new controller goes on from
             if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(given)):
                 track = Track(resume.track)
         before = len(track)
         track.begin(fish)
+        fish.compile()
         begun(run)
         run.loop.set_controller(name, controller)
         next_kept = fish.fish.time + keeping.every if keeping else float("inf")

@@ -1,6 +1,7 @@
 """Checkpoints: all that a swim needs to go on later, in one NPZ file.
 
-Body, water, time and track go on to the last bit. The controller is not in it, and begins anew.
+Body, water, time, track and command go on to the last bit. The controller is not in it: it begins
+anew, from the present command.
 """
 
 import io

@@ -140,6 +140,11 @@ class Swimmer:
         """What was done since the start, per metre of depth [J]."""
         return self.fish.work
 
+    @property
+    def command(self) -> float:
+        """The instruction angle now; 0 where the muscles are relaxed [rad]."""
+        return self._angle or 0.0
+
     def write(self, angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""
         self._angle = angle
@@ -171,12 +176,14 @@ class Swimmer:
         return Robot("swimmer", self, self, truth=self.truth, degraded=self.degraded)
 
     def state(self) -> dict[str, Array]:
-        """Everything that the next read depends on, but for the instruction angle, by name."""
-        return self.fish.state() | {"robot": np.array([self._phi, self._sensed_rate])}
+        """Everything that the next read depends on, by name."""
+        angle = math.nan if self._angle is None else self._angle
+        return self.fish.state() | {"robot": np.array([angle, self._phi, self._sensed_rate])}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave, to the last bit."""
         self.fish.restore(state)
-        self._phi, self._sensed_rate = map(float, state["robot"])
+        angle, self._phi, self._sensed_rate = map(float, state["robot"])
+        self._angle = None if math.isnan(angle) else angle
         self.motion = self.fish.motion()
         self.tail_reach = (self.motion.tail_y, self.motion.tail_y)

@@ -171,6 +171,7 @@ def line(**given: object) -> str:
         "controller": "hold",
         "thrust": 0.0217,
         "force_unit": "N",
+        "speed": None,
     }
     return status_line(Status(**fields | what | {"timing": Timing(none, none, {})} | given))
 

@@ -1,0 +1,27 @@
+"""A free swimmer that is soon computed, and looks like one: for tests of what is around it."""
+
+from fishd.assembly import open_swimmer
+from fishd.config import Config, load
+from fishd.swimmer.robot import Swimmer
+from rigs.documents import ROOT
+from rigs.processes import sets
+
+FILE = ROOT / "config" / "swimmer.yaml"
+COARSE = (
+    "swimmer.numerics.cell=0.002",
+    "swimmer.numerics.step=0.002",
+    "swimmer.numerics.fine_length=1.4",
+    "swimmer.numerics.stretch_along=1.2",
+    "swimmer.numerics.stretch_across=1.2",
+    "swimmer.water.length=0.3",
+)
+OPTIONS = ("--config", str(FILE), *sets(*COARSE))
+"""Of a command line."""
+
+
+def coarse(*overrides: str) -> Config:
+    return load(FILE, [*COARSE, *overrides])
+
+
+def swimmer(*overrides: str) -> Swimmer:
+    return open_swimmer(coarse(*overrides))

@@ -1,0 +1,87 @@
+"""What a configuration says of a swimmer: what is refused, and that nothing heavy is loaded."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from rigs.coarse_swimmer import FILE, OPTIONS
+from rigs.processes import FISHCTL, FISHD, addresses, call, fishctl, one_line, sets
+
+from fishd.config import load
+
+CHECKS = f"""
+import sys
+from fishd.config import load
+load({str(FILE)!r})
+print([name for name in ("numba", "scipy") if name in sys.modules])
+"""
+
+
+def test_the_example_is_a_swimmer_that_senses_its_tail() -> None:
+    config = load(FILE)
+    assert (config.robot, config.estimator.kind) == ("swimmer", "sensor")
+    assert config.limits.scaled
+    assert config.limits.virtual
+
+
+def test_a_configuration_is_checked_without_what_computes_the_fish() -> None:
+    done = call(sys.executable, "-c", CHECKS)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("override", "complaint"),
+    [
+        ("tick=0.0125", "tick: 0.0125 s is no whole number of steps of swimmer.numerics.step, "
+         "0.001 s; 0.012 s would be"),
+        ("swimmer.numerics.cell=0.005", "swimmer.numerics.cell: 0.005 m is too coarse"),
+        ("swimmer.numerics.step=0.005", "swimmer.numerics.step: 0.005 s is beyond the limit"),
+        ("swimmer.body.length=0.3", "swimmer.water.width: a tank of 0.2 m is too small"),
+        ("swimmer.muscle.strain=8", "swimmer.muscle.strain: 8 folds the body"),
+        ("estimator.kind=observer", "estimator.kind: observer is not valid with robot: swimmer"),
+        ("robot=simulated", "estimator.kind: sensor is not valid with robot: simulated"),
+        ("lockstep=true", "lockstep: true is not valid with robot: swimmer"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused_with_its_key(override: str, complaint: str) -> None:
+    done = fishctl("config", "check", str(FILE), "--set", override)
+    assert done.returncode == 78
+    assert complaint in one_line(done)
+
+
+def test_swing_may_go_by_the_lateral_force_instead() -> None:
+    assert not load(FILE, ["estimator.kind=lateral_force"]).limits.scaled
+
+
+def test_other_robots_do_not_mind_what_is_said_of_a_swimmer() -> None:
+    assert load(None, ["swimmer.numerics.cell=0.005"]).robot == "simulated"
+
+
+@pytest.mark.parametrize("program", [FISHD, FISHCTL])
+def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, program: str) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['numba'] = None\n")
+    simulates = ("simulate", "swing", "--seconds", "4") if program == FISHCTL else ()
+    own = addresses(tmp_path) if program == FISHD else ()
+    done = call(program, *simulates, *OPTIONS, *own, env={"PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 1
+    line = "robot: swimmer needs the package numba; with pip: pip install 'fishd[swimmer]'\n"
+    assert done.stderr.endswith(line)
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("measure", "swing", "--on", "simulation"),
+        ("sweep", "swing", "--C", "0.3,0.6"),
+        ("compare", "swing", "square"),
+        ("optimise", "square", "--over", "frequency=1:3"),
+        ("optimum",),
+        ("identify", "--experiment"),
+    ],
+)
+def test_verbs_about_the_thrust_of_a_tethered_fish_refuse_a_swimmer(words: tuple[str, ...]) -> None:
+    config = sets("robot=swimmer") if words[0] == "sweep" else ["--config", str(FILE)]
+    complaint = one_line(fishctl(*words, *config))
+    assert "robot: swimmer is not valid for" in complaint
+    assert "robot: simulated is needed" in complaint

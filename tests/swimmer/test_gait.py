@@ -1,0 +1,66 @@
+"""What a track tells: means over whole beats, and an interval that holds."""
+
+import numpy as np
+import pytest
+
+from fishd.swimmer.gait import gait, mass
+from fishd.swimmer.grid import Array
+from fishd.swimmer.settings import SwimmerSettings
+from fishd.swimmer.track import COLUMNS
+
+TICK, PERIOD = 0.01, 0.4
+SETTINGS = SwimmerSettings()
+
+
+def track(seconds: float, speed: Array | float = 0.1, **columns: float) -> dict[str, Array]:
+    """Of a fish that beats at 2.5 Hz. speed: in each tick, or in all of them [m/s]"""
+    ticks = round(seconds / TICK)
+    time = TICK * np.arange(1, ticks + 1)
+    phase = np.arange(ticks) % round(PERIOD / TICK)
+    found = {name: np.full(ticks, columns.get(name, 0.0)) for name in COLUMNS}
+    x = -np.cumsum(np.broadcast_to(speed, ticks)) * TICK
+    beat = {"time": time, "x": x, "command": np.where(phase < 20, -0.42, 0.42)}
+    tail = 0.012 * np.cos(2 * np.pi * phase / 40)
+    return found | beat | {"tail_lowest": tail, "tail_highest": tail}
+
+
+def test_means_are_those_of_whole_beats() -> None:
+    found = gait(track(4.2, muscle_power=0.06, thrust_power=0.01, lateral_power=0.03), SETTINGS)
+    assert found.beats == 9  # from the first upward reversal, at 0.2 s, to that at 3.8 s
+    assert found.frequency == pytest.approx(1 / PERIOD)
+    assert found.speed == pytest.approx(0.1)
+    assert found.tail_amplitude == pytest.approx(0.24)
+    assert found.strouhal == pytest.approx(2.5 * 0.024 / 0.1)
+    assert found.froude_efficiency == pytest.approx(0.25)
+    assert found.cost_of_transport == pytest.approx(0.06 / (mass(SETTINGS) * 0.1))
+    assert found.reynolds == pytest.approx(1e4)
+
+
+def test_a_ripple_within_the_beat_is_no_uncertainty() -> None:
+    ripple = 0.1 + 0.05 * np.sin(2 * np.pi * TICK / PERIOD * np.arange(2000))
+    assert gait(track(20.0, ripple), SETTINGS).speed_error == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_fish_that_has_hardly_beaten_has_no_interval() -> None:
+    assert gait(track(1.5), SETTINGS).speed_error is None
+    assert gait(track(2.2), SETTINGS).speed_error is not None
+
+
+def test_a_fish_that_does_not_beat_or_get_on_has_no_efficiency() -> None:
+    for still in (gait(track(2.0) | {"command": np.zeros(200)}, SETTINGS),
+                  gait(track(2.0, -0.01), SETTINGS)):  # fmt: skip
+        assert still.strouhal is still.froude_efficiency is still.cost_of_transport is None
+    assert gait(track(2.0) | {"command": np.zeros(200)}, SETTINGS).beats == 0
+
+
+def test_the_interval_covers_the_mean_although_beats_are_alike() -> None:
+    rng = np.random.default_rng(3)
+    held = 0
+    for _ in range(200):
+        wander, noise = np.zeros(3000), rng.normal(size=3000)
+        for index in range(1, 3000):  # correlated over 0.5 s
+            wander[index] = 0.98 * wander[index - 1] + noise[index]
+        found = gait(track(30.0, 0.1 + 0.002 * wander), SETTINGS)
+        assert found.speed_error
+        held += abs(found.speed - 0.1) <= found.speed_error
+    assert 180 <= held <= 199

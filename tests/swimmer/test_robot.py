@@ -1,0 +1,142 @@
+"""The free swimmer as the loop sees it: what moves it, what it tells, and what it is to be lost."""
+
+import math
+from typing import NoReturn
+
+import numpy as np
+import pytest
+from rigs.coarse_swimmer import coarse, swimmer
+
+from fishd.core.errors import ConfigError, FishLost
+from fishd.simulation import KeepingPublisher, VirtualRun, simulate
+from fishd.swimmer.fish import Diverged
+from fishd.swimmer.robot import Swimmer
+from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.tethered import TetheredFish
+
+PHI = 0.42
+TICK = 0.01
+
+
+def swum(fish: Swimmer, ticks: int, first: int = 1) -> None:
+    for index in range(first, first + ticks):
+        fish.read(index * TICK)
+
+
+def test_it_swims_until_the_time_at_which_it_is_read() -> None:
+    fish = swimmer()
+    assert fish.read(7.0).samples == 5
+    assert fish.fish.time == pytest.approx(TICK)
+    assert fish.read(7.03).samples == 15  # two slots were missed
+    assert fish.fish.time == pytest.approx(4 * TICK)
+
+
+@pytest.mark.parametrize(("angle", "activation"), [(PHI, 1.0), (-PHI / 2, -0.5), (2 * PHI, 1.0)])
+def test_the_muscles_do_what_the_command_is_of_its_limit(angle: float, activation: float) -> None:
+    fish = swimmer()
+    fish.write(angle)
+    fish.read(TICK)
+    assert fish.fish.activation == pytest.approx(activation)
+    assert fish.truth().phi == pytest.approx(activation * PHI)
+
+
+def test_muscles_relax_when_the_servo_is_released() -> None:
+    fish = swimmer()
+    fish.write(PHI)
+    fish.read(TICK)
+    fish.release()
+    fish.read(2 * TICK)
+    assert fish.fish.activation == 0.0
+
+
+def test_with_a_servo_the_muscles_follow_its_wheel() -> None:
+    fish, other = swimmer("swimmer.muscle.servo=true"), TetheredFish(PlantParameters())
+    half = fish.fish.dt / 2
+    for index, angle in enumerate([PHI, PHI, PHI, -PHI, -PHI], 1):
+        fish.write(angle)
+        fish.read(index * TICK)
+        other.advance(angle, TICK - half, 1)  # as in the middle of the last step
+        assert fish.truth().phi == pytest.approx(other.state.phi, abs=1e-9)
+        other.advance(angle, half, 1)
+
+
+def test_a_positive_command_moves_the_tail_to_positive_angles() -> None:
+    fish = swimmer()
+    fish.write(PHI)
+    swum(fish, 6)
+    truth, told = fish.truth(), fish.read(7 * TICK).fin_velocity
+    assert truth.alpha > 0.01
+    assert truth.alpha_rate > 1.0
+    assert told is not None
+    assert told > 1.0
+
+
+@pytest.mark.parametrize(("time", "told"), [(0.0, 2.0), (0.02, 2.0 * (1.0 - math.exp(-1.0)))])
+def test_the_fin_velocity_is_the_rate_of_the_tail_low_passed(time: float, told: float) -> None:
+    fish = swimmer(f"swimmer.sensor_time={time}")
+    turning = fish.motion._replace(tail_rate=2.0)
+    fish.fish.step = lambda activation: None  # type: ignore[method-assign]
+    fish.fish.motion = lambda: turning  # type: ignore[method-assign]
+    fish.read(TICK)
+    assert fish.read(2 * TICK).fin_velocity == pytest.approx(told)
+    assert fish.truth().alpha_rate == 2.0
+
+
+def test_a_fish_goes_on_from_its_state_to_the_last_bit() -> None:
+    fish, other = swimmer(), swimmer()
+    fish.write(PHI)
+    swum(fish, 20)
+    other.restore(fish.state())
+    swum(fish, 5, first=21)
+    swum(other, 5)  # its loop may begin to count anew
+    assert other.motion == fish.motion
+    assert other.work == fish.work
+    for name, array in fish.state().items():
+        assert np.array_equal(array, other.state()[name], equal_nan=True), name
+
+
+def test_to_compile_it_moves_nothing() -> None:
+    fish, other = swimmer(), swimmer()
+    fish.compile()
+    for each in (fish, other):
+        each.write(PHI)
+        swum(each, 5)
+    assert fish.motion == other.motion
+
+
+def diverges(_: float) -> NoReturn:
+    raise Diverged("the swimmer cannot go on at 0.100 s: a test")
+
+
+def test_a_fish_that_is_lost_stays_lost() -> None:
+    fish = swimmer()
+    fish.fish.step = diverges  # type: ignore[method-assign]
+    for _ in range(2):
+        with pytest.raises(FishLost, match=r"cannot go on at 0\.100 s"):
+            fish.read(1.0)
+    assert fish.degraded() == ("the swimmer cannot go on at 0.100 s: a test; restart fishd",)
+
+
+def test_the_loop_swims_it_and_latches_a_fault_of_its_own_where_it_is_lost() -> None:
+    publisher = KeepingPublisher()
+    with VirtualRun(coarse(), publisher) as run:
+        run.set_controller("swing", {})
+        for _ in range(30):
+            run.tick()
+        assert run.swimmer
+        run.swimmer.fish.step = diverges  # type: ignore[method-assign]
+        run.tick()
+        supervisor = run.loop.supervisor
+        assert supervisor.mode.value == "fault"
+        assert supervisor.reason
+        assert supervisor.reason.code == "fish-lost"
+    tick = publisher.ticks[29]
+    assert tick.mode == "running"
+    assert tick.fin_velocity == pytest.approx(tick.alpha_rate, rel=0.5)
+    assert tick.speed == run.swimmer.motion.speed
+    assert tick.x == run.swimmer.motion.x
+
+
+def test_nothing_judges_a_swimmer_as_if_it_were_tethered() -> None:
+    with pytest.raises(ConfigError, match="robot: simulated is needed"):
+        simulate(coarse(), "swing", {}, 2.0, 1.0)

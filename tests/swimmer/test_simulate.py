@@ -1,0 +1,218 @@
+"""`fishctl simulate` of a swimmer: what it tells, its files, and how it is cut off and goes on."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rigs.coarse_swimmer import OPTIONS, coarse
+from rigs.processes import FISHCTL, fishctl, one_line, sets
+
+from fishd.simulation.free_swim import swim
+from fishd.swimmer import checkpoint
+from fishd.swimmer.track import COLUMNS
+
+
+def simulated(*words: str) -> "subprocess.CompletedProcess[str]":
+    return fishctl("simulate", *words, *OPTIONS)
+
+
+def report(*words: str) -> dict[str, Any]:
+    done = simulated(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def table(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    with np.load(path) as found:
+        return {name: found[name] for name in found.files}
+
+
+@pytest.fixture(scope="module")
+def swum(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """A report of a square wave, and the folder with its files."""
+    folder = tmp_path_factory.mktemp("swum")
+    files = ("--save", str(folder / "track.npz"), "--checkpoint", str(folder / "end"))
+    words = ("square", "--frequency", "2.5", "--seconds", "4", "--settle", "1", *files)
+    return report(*words), folder
+
+
+def test_the_figures_agree_with_one_another(swum: tuple[dict[str, Any], Path]) -> None:
+    found, folder = swum
+    track = table(folder / "track.npz")
+    assert found["frequency"] == pytest.approx(2.5)
+    assert found["beats"] == 6
+    assert 0.0 < found["speed"] < 0.2
+    assert 0.0 < found["speed_error"] < found["speed"]
+    assert 0.1 < found["tail_amplitude"] < 0.4
+    assert 0.0 < found["froude_efficiency"] < 1.0
+    assert 0.0 < found["water_power"] <= found["muscle_power"]
+    amplitude = found["tail_amplitude"] * 0.1
+    assert found["strouhal"] == pytest.approx(2.5 * amplitude / found["speed"])
+    assert list(track) == list(COLUMNS)
+    assert len(track["time"]) == found["ticks"] == 400
+    assert set(track["activation"]) == {0.0, 1.0, -1.0}
+    settled = track["time"] > 1.0
+    speed = -np.polyfit(track["time"][settled], track["x"][settled], 1)[0]
+    assert speed == pytest.approx(found["speed"], rel=0.15)
+
+
+def test_a_person_gets_the_same_in_a_few_lines() -> None:
+    out = simulated("swing", "--seconds", "1.5", "--settle", "0.5").stdout
+    for word in ("speed", "frequency", "heading", "tail", "power", "cost", "Strouhal", "Froude"):
+        assert f"\n{word} " in out
+    assert "whole beats" in out
+
+
+def test_a_table_is_a_row_for_each_tick_in_either_form(tmp_path: Path) -> None:
+    words = ("sine", "--seconds", "0.3", "--settle", "0.1")
+    for name in ("a.csv", "b.npz"):
+        assert simulated(*words, "--save", str(tmp_path / name)).returncode == 0
+    rows = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
+    assert rows.dtype.names == tuple(COLUMNS)
+    other = table(tmp_path / "b.npz")
+    for name in COLUMNS:
+        assert rows[name] == pytest.approx(other[name], rel=1e-6, abs=1e-9)
+
+
+def test_a_swim_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> None:
+    hold = ("hold", "--angle", "0.3", "--settle", "0.1")
+    files = [("--save", str(tmp_path / f"{name}.npz")) for name in ("whole", "part", "rest")]
+    kept = str(tmp_path / "kept")
+    assert simulated(*hold, "--seconds", "0.6", *files[0]).returncode == 0
+    simulated(*hold, "--seconds", "0.4", *files[1], "--checkpoint", kept)
+    found = report(*hold, "--seconds", "0.6", *files[2], "--resume", kept)
+    assert found["resumed"] == pytest.approx(0.4)
+    whole, rest = table(tmp_path / "whole.npz"), table(tmp_path / "rest.npz")
+    for name in COLUMNS:
+        assert np.array_equal(whole[name], rest[name]), name
+
+
+def test_another_controller_swims_on_with_a_track_of_its_own(
+    swum: tuple[dict[str, Any], Path],
+) -> None:
+    found = report("sine", "--seconds", "0.3", "--settle", "0.1", "--resume", str(swum[1] / "end"))
+    assert found["resumed"] == pytest.approx(4.0)
+    assert found["ticks"] == 30
+    assert abs(found["speed"]) > 0.01  # of the swim before
+
+
+@pytest.mark.parametrize(
+    ("override", "complaint"),
+    [
+        ("swimmer.muscle.strain=0.5", "swimmer.muscle.strain 1.0, and here it is 0.5"),
+        ("swimmer.body.viscosity=2e-4", "swimmer.body.viscosity 0.0001, and here it is 0.0002"),
+        ("tick=0.02", "tick 0.01, and here it is 0.02"),
+        ("swimmer.muscle.servo=true", "swimmer.muscle.servo false, and here it is true"),
+    ],
+)
+def test_a_checkpoint_of_another_fish_is_refused_with_the_key_that_differs(
+    swum: tuple[dict[str, Any], Path], override: str, complaint: str
+) -> None:
+    kept = str(swum[1] / "end")
+    line = one_line(simulated("swing", "--resume", kept, "--set", override))
+    assert line.startswith(f"fishctl: {kept}: it is of a swim with {complaint}")
+
+
+def test_how_slow_the_motion_is_does_not_matter_to_a_checkpoint(
+    swum: tuple[dict[str, Any], Path],
+) -> None:
+    kept = ("--resume", str(swum[1] / "end"))
+    words = ("sine", "--seconds", "0.2", "--settle", "0.1", *kept)
+    assert simulated(*words, "--set", "swimmer.slow_motion=9").returncode == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 nor this"])
+def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "kept").write_bytes(content)
+    line = one_line(simulated("swing", "--resume", str(tmp_path / "kept")))
+    assert line == f"fishctl: {tmp_path}/kept: it is no checkpoint of a swimmer\n"
+
+
+def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
+    tmp_path: Path,
+) -> None:
+    kept = tmp_path / "kept"
+    keeps = ("--checkpoint", str(kept), "--checkpoint-every", "0.1")
+    narrow = sets("swimmer.numerics.fine_width=0.5", "swimmer.steering=0")
+    done = simulated("square", "--frequency", "2.5", *narrow, *keeps)
+    line = one_line(done)
+    assert done.returncode == 1
+    assert "the swimmer cannot go on at" in line
+    found = checkpoint.load(kept)
+    assert line.endswith(f"its last checkpoint is of {found.time:.2f} s: --resume {kept}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--save", "track.txt"), "track.txt: a name that ends in .csv or .npz is needed"),
+        (("--save", "no-such/track.csv"), "there is no folder no-such"),
+        (("--checkpoint", "no-such/kept"), "no-such/kept: there is no folder to put it into"),
+        (("--resume", "no-such"), "no-such: no such file"),
+        (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_it_swims(
+    words: tuple[str, ...], complaint: str
+) -> None:
+    assert complaint in one_line(simulated("swing", *words))
+
+
+def test_a_tethered_fish_has_no_checkpoints() -> None:
+    line = one_line(fishctl("simulate", "swing", "--checkpoint", "kept"))
+    assert "--checkpoint is for robot: swimmer" in line
+
+
+def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    kept, saved = tmp_path / "kept", tmp_path / "track.csv"
+    files = ("--checkpoint", str(kept), "--checkpoint-every", "0.1", "--save", str(saved))
+    command = (FISHCTL, "simulate", "swing", "--seconds", "500", *OPTIONS, *files)
+    swimming = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs)
+    os.close(theirs)
+    deadline = time.monotonic() + 60
+    while not kept.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    swimming.send_signal(signal.SIGINT)
+    seen = b""
+    try:
+        while chunk := os.read(ours, 4096):
+            seen += chunk
+    except OSError:  # nobody writes there any more
+        pass
+    os.close(ours)
+    assert swimming.wait(20) == 130
+    assert "mm/s" in seen.decode()
+    assert "interrupted; its last checkpoint is of" in seen.decode()
+    rows = len(saved.read_text().splitlines()) - 1
+    assert len(checkpoint.load(kept).track) == rows >= 10
+
+
+def test_muscles_with_a_servo_swim_too_and_slower_than_at_once() -> None:
+    words = ("square", "--frequency", "2.5", "--seconds", "2", "--settle", "1")
+    quick = report(*words)
+    slow = report(*words, "--set", "swimmer.muscle.servo=true")
+    assert slow["muscle_power"] < quick["muscle_power"]
+
+
+def test_a_recording_has_where_the_fish_was(tmp_path: Path) -> None:
+    path = tmp_path / "swim.mcap"
+    words = ("--seconds", "0.3", "--settle", "0.1", "--record", str(path))
+    assert simulated("square", *words).returncode == 0
+    done = fishctl("export", str(path), "--csv", "--to", str(tmp_path))
+    assert done.returncode == 0
+    header = (tmp_path / "swim.csv").read_text().partition("\n")[0].split(",")
+    assert {"x", "y", "speed", "heading"} <= set(header)
+
+
+def test_the_same_swim_gives_the_same_track() -> None:
+    first, second = (swim(coarse(), "swing", {"C": 0.6}, 0.5, 0.1).track.rows() for _ in range(2))
+    assert np.array_equal(first, second)

@@ -1,0 +1,75 @@
+"""A swimmer in a running fishd: its time is slower than that of people, and nothing is late."""
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rigs.coarse_swimmer import OPTIONS
+from rigs.processes import Daemon, running, wait_until
+
+from fishd.client import Fish
+
+FACTOR = 4.0
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    slow = ("--set", f"swimmer.slow_motion={FACTOR}")
+    with running(tmp_path_factory.mktemp("slow"), *OPTIONS, *slow) as daemon:
+        yield daemon
+
+
+def test_its_ticks_are_evenly_spaced_in_its_time_and_slower_in_that_of_people(
+    daemon: Daemon,
+) -> None:
+    with Fish(daemon.endpoint) as fish:
+        ticks = fish.ticks()
+        seen = [next(ticks) for _ in range(40)]
+    first, last = seen[0], seen[-1]
+    assert last.seq - first.seq == 39
+    assert last.time - first.time == pytest.approx(0.39)
+    assert last.t - first.t >= 0.9 * FACTOR * 0.39
+    assert isinstance(last.speed, float)
+
+
+def test_its_status_says_so_and_no_tick_is_late(daemon: Daemon) -> None:
+    wait_until(lambda: daemon.status().seq > 20)
+    status = daemon.status()
+    (line,) = status.degraded
+    assert line.startswith("slow motion: a second of the fish takes ")
+    assert (status.robot, status.mode, status.controller) == ("swimmer", "running", "swing")
+    assert (status.missed, status.overruns, status.reason) == (0, 0, None)
+    assert status.speed is not None
+    assert "mm/s" in daemon.fishctl("status").stdout
+
+
+def test_it_takes_requests_as_every_other_fish(daemon: Daemon) -> None:
+    assert daemon.fishctl("set-controller", "square", "--frequency", "2").returncode == 0
+    assert daemon.fishctl("set-parameter", "frequency", "3").returncode == 0
+    assert daemon.fishctl("stop").returncode == 0
+    wait_until(lambda: daemon.status().phi_c == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("tare",), "this fish's force sensor has no zero to set"),
+        (("measure", "swing"), "robot: swimmer is not valid for a measurement of thrust"),
+    ],
+)
+def test_what_only_a_tethered_fish_can_do_is_refused(
+    daemon: Daemon, words: tuple[str, ...], complaint: str
+) -> None:
+    done = daemon.fishctl(*words)
+    assert done.returncode != 0
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_it_ends_soon_however_slow_its_motion_is(tmp_path: Path) -> None:
+    slow = ("--set", "swimmer.slow_motion=1000")
+    with running(tmp_path, *OPTIONS, *slow) as daemon:
+        status, _, errors = daemon.end(signal.SIGTERM)
+    assert status == 0, errors
+    assert "hangs" not in errors
