@@ -4,12 +4,8 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from rigs.documents import ROOT
+from rigs.coarse_swimmer import OPTIONS
 from rigs.processes import fishctl, one_line
-
-COARSE = ["--config", str(ROOT / "config" / "swimmer.yaml")]
-for _each in ("cell=0.002", "step=0.002"):
-    COARSE += ["--set", f"swimmer.numerics.{_each}"]
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +15,7 @@ def swum(tmp_path_factory: pytest.TempPathFactory) -> Path:
     files = ["--checkpoint", "end.npz", "--save", "swim.npz", "--film", "wake.webp"]
     paths = [str(folder / each) if "." in each else each for each in files]
     lengths = ("--seconds", "1.5", "--settle", "0.5")
-    done = fishctl("simulate", "square", "--frequency", "4", *lengths, *COARSE, *paths)
+    done = fishctl("simulate", "square", "--frequency", "4", *lengths, *OPTIONS, *paths)
     assert (done.returncode, done.stderr) == (0, "")
     return folder
 
@@ -72,5 +68,5 @@ def test_what_cannot_be_drawn_is_one_line(
 def test_a_film_of_a_tethered_fish_or_of_another_kind_is_refused(tmp_path: Path) -> None:
     film = ("--film", str(tmp_path / "wake.mp4"))
     assert "--film is for robot: swimmer" in one_line(fishctl("simulate", "square", *film))
-    said = one_line(fishctl("simulate", "square", *COARSE, *film))
+    said = one_line(fishctl("simulate", "square", *OPTIONS, *film))
     assert "a film has no format .mp4" in said

@@ -7,10 +7,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from rigs.documents import ROOT
+from rigs.coarse_swimmer import FILE, OPTIONS, coarse
 from rigs.processes import fishctl, one_line
 
-from fishd.config import Config, load
+from fishd.config import Config
 from fishd.core.signals import Event, Tick
 from fishd.lab.sweep import figure, free_swimming
 from fishd.lab.sweep.curves import best, curves, plain
@@ -21,8 +21,6 @@ from fishd.lab.sweep.measuring import Lengths
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.sweep.settling import is_steady, judged_from
 
-FILE = ROOT / "config" / "swimmer.yaml"
-COARSE = ("swimmer.numerics.cell=0.002", "swimmer.numerics.step=0.002")
 WAVE = Point("square", {"frequency": 3.0})
 
 
@@ -36,7 +34,7 @@ class Dropped:
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return load(FILE, COARSE)
+    return coarse()
 
 
 def beats(speeds: np.ndarray, period: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +97,7 @@ def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     assert "the swimmer cannot go on at 0.04" in found.trouble
 
 
-def test_a_swim_is_stopped_between_beats(config: Config) -> None:
+def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
     lengths = Lengths(settle=0.1, periods=2)
     assert swim_freely(WAVE, config, lengths, Dropped(), stop=lambda: True) is None
 
@@ -149,10 +147,8 @@ def _no_worker_stays() -> Any:
 @pytest.mark.usefixtures("_no_worker_stays")
 def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    numerics = [word for each in COARSE for word in ("--set", each)]
     fast = ["--settle", "0.5", "--periods", "2", "--jobs", "1", "--folder", str(folder)]
-    coarse = ["--config", str(FILE), *numerics, "--set", "swimmer.muscle.strain=0.5"]
-    done = fishctl("sweep", "sine", "--frequency", "6", *coarse, *fast)
+    done = fishctl("sweep", "sine", "--frequency", "6", *OPTIONS, *fast)
     assert done.returncode == 0
     assert "sine frequency=6: " in done.stdout
     assert " mm/s, 6.0" in done.stdout

@@ -237,6 +237,8 @@ def learning() -> Iterator[Claim]:
 def swimming() -> Iterator[Claim]:
     """The free swimmer, on cells of 1 mm."""
     found = list(figure_6.fastest())
+    if not found:  # nothing has swum yet
+        return
     best = ", ".join(
         f"{frequency:g} Hz {first}{''.join(f' or {wave}' for wave in alike)}"
         for frequency, first, alike in found

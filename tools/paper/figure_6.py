@@ -170,6 +170,8 @@ def fastest() -> Iterator[tuple[float, str, list[str]]]:
             for wave, row in rows.items()
             if row
         }
+        if not speeds:
+            continue
         first = max(speeds, key=lambda wave: speeds[wave][0])
         top, error = speeds[first]
         alike = [

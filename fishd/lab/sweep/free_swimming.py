@@ -18,6 +18,7 @@ from fishd.swimmer.track import Track
 
 LONGEST = 20.0
 """A fish whose speed still changes is judged all the same after so long [s]."""
+_ASK_EVERY = 50
 
 
 def swim_freely(
@@ -31,19 +32,18 @@ def swim_freely(
     """The speed of a free swimmer at a point, over whole beats once it is settled.
 
     It swims until the speeds of `lengths.periods` beats, and of the seconds that `settling` names,
-    show no trend, or for `LONGEST` seconds: what of it is judged then is the later half, and
-    `settled` is None.
+    show no trend, or for `LONGEST` seconds: then the later half is judged, or as many beats as that
+    where it has fewer, and `settled` is None.
 
     publisher: gets every tick, and every event
     begun: called before the first of them
-    stop: asked after each beat whether to stop, and give None
+    stop: asked now and then whether to stop, and give None
     Raises `ParameterError` and `UnknownController`.
     """
     config = replace(config, start=Start())
     controller = registry.create(
         point.controller, point.parameters, replace(config.limits, virtual=True)
     )
-    longest = max(LONGEST, 4.0 * lengths.settle)
     track = Track()
     begins: list[int] = []
     with VirtualRun(config, publisher) as run:
@@ -54,7 +54,7 @@ def swim_freely(
         run.loop.set_controller(point.controller, controller)
         before = 0.0
         first: int | None = None
-        while first is None and len(track) * config.tick < longest:
+        while first is None and not _is_long_enough(track, begins, lengths, config.tick):
             command = run.loop.applied
             run.tick()
             trouble = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
@@ -65,10 +65,17 @@ def swim_freely(
             if command > 0.0 and before < 0.0 and len(track) * config.tick > lengths.settle:
                 begins.append(len(track) - 1)
                 first = _settled(track, begins, lengths, config)
-                if stop():
-                    return None
+            if len(track) % _ASK_EVERY == 0 and stop():
+                return None
             before = command or before
-    return _result(track, begins, first, config)
+    return _result(track, begins, first, lengths, config)
+
+
+def _is_long_enough(track: Track, begins: list[int], lengths: Lengths, tick: float) -> bool:
+    """A slow wave gets the time for its beats; what does not beat at all is not waited for."""
+    time, longest = len(track) * tick, max(LONGEST, 4.0 * lengths.settle)
+    waiting = 0 < len(begins) <= lengths.periods and time < 4.0 * longest
+    return time >= longest and not waiting
 
 
 def _settled(track: Track, begins: list[int], lengths: Lengths, config: Config) -> int | None:
@@ -90,9 +97,15 @@ def _at(track: Track, begins: list[int]) -> tuple[np.ndarray, np.ndarray]:
     return columns["time"][rows], columns["x"][rows]
 
 
-def _result(track: Track, begins: list[int], first: int | None, config: Config) -> SpeedResult:
+def _result(
+    track: Track, begins: list[int], first: int | None, lengths: Lengths, config: Config
+) -> SpeedResult:
     columns = track.columns()
-    row = first if first is not None else (begins[len(begins) // 2] if begins else len(track) // 2)
+    row = first
+    if row is None:
+        count = len(begins) - 1
+        beat = max(0, min(count // 2, count - lengths.periods))
+        row = begins[beat] if begins else len(track) // 2
     found = gait({name: values[row - 1 :] for name, values in columns.items()}, config.swimmer)
     return SpeedResult(
         speed=found.speed,
