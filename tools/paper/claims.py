@@ -253,7 +253,9 @@ def swimming() -> Iterator[Claim]:
     for row in _swum("swing"):
         share = row["speed_mm_per_s"] / top["speed_mm_per_s"]
         yield Claim(
-            "swing with C = 0 is close to the maximum" if row["setting"] == 0.0 else "(C = 0.6)",
+            "swing with C = 0 is close to the maximum"
+            if row["setting"] == 0.0
+            else "… and with C = 0.6",
             f"{row['speed_mm_per_s']:.1f} ± {row['error_mm_per_s']:.1f} mm/s at "
             f"{row['frequency_Hz']:.2f} Hz: {share:.0%} of the fastest wave, the "
             f"{top['controller']} wave of {top['setting']:g} Hz with "

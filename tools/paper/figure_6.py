@@ -30,6 +30,8 @@ CELL = 1.0
 """Of the figure [mm]; the step in ms is the same number on all grids."""
 CELLS = (2.0, 1.0, 0.5)
 """Of what is refined."""
+NEVER = "never"
+"""Of a speed that still changed in the end."""
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "swimmer.yaml"
 
 
@@ -104,7 +106,7 @@ def _row(case: Case, found: SpeedResult) -> Row:
         "speed_mm_per_s": 1e3 * (found.speed or 0.0),
         "error_mm_per_s": 1e3 * (found.error or 0.0),
         "beats": found.beats,
-        "steady_from_s": "never" if found.settled is None else found.settled,
+        "steady_from_s": NEVER if found.settled is None else found.settled,
         "seconds": found.seconds,
         "tail_side_to_side_over_L": found.tail_amplitude or 0.0,
         "muscle_power_W_per_m": found.muscle_power or 0.0,
@@ -152,12 +154,18 @@ def _bars(
     label: str,
     line: Any,
 ) -> None:
+    """Hollow where the speed still changed, and where there is no line."""
     axes.errorbar(
         column(rows, over),
         column(rows, "speed_mm_per_s"),
         yerr=column(rows, "error_mm_per_s"),
-        color=colour, marker=marker, mfc="white" if not line else colour, ls=line, lw=1.0,
+        color=colour, marker=marker, mfc=colour if line else "white", ls=line, lw=1.0,
         elinewidth=0.9, capsize=2, label=label,
+    )  # fmt: skip
+    changing = [row for row in rows if row["steady_from_s"] == NEVER]
+    axes.plot(
+        column(changing, over), column(changing, "speed_mm_per_s"), ls="", marker=marker,
+        color=colour, mfc="white", zorder=5,
     )  # fmt: skip
 
 
