@@ -43,6 +43,8 @@ class Lockstep:
         """The next slot, once it is due."""
         if self._agent():
             await asyncio.sleep(0)  # requests have their turn, however quick the agent is
+            if isinstance(self._pace, SlowMotion):
+                self._pace.hurry()
         else:
             await anext(self._pace)
         return next(self._slots)

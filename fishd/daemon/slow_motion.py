@@ -40,9 +40,15 @@ class SlowMotion:
         with suppress(TimeoutError):
             async with asyncio.timeout(max(BREATH, self._due - time.monotonic())):
                 await self.stopping.wait()
-        now = time.monotonic()
-        self._latest.append(now)
-        self._due = max(self._due, now - self._period) + self._factor * self._period
+        self._begin(max(self._due, time.monotonic() - self._period))
+
+    def hurry(self) -> None:
+        """Let the next tick begin at once: somebody else sets the pace."""
+        self._begin(time.monotonic())
+
+    def _begin(self, due: float) -> None:
+        self._latest.append(time.monotonic())
+        self._due = due + self._factor * self._period
 
     @property
     def pace(self) -> float:

@@ -1,6 +1,7 @@
 """A swimmer in a running fishd: its time is slower than that of people, and nothing is late."""
 
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from rigs.coarse_swimmer import OPTIONS
 from rigs.processes import Daemon, running, wait_until
 
-from fishd.client import Fish
+from fishd.client import Agent, Fish
 
 FACTOR = 4.0
 
@@ -65,6 +66,23 @@ def test_what_only_a_tethered_fish_can_do_is_refused(
     assert done.returncode != 0
     assert complaint in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> None:
+    slow = ("--set", "swimmer.slow_motion=100")  # a tick a second
+    with (
+        running(tmp_path, *OPTIONS, *slow) as daemon,
+        Fish(daemon.endpoint) as fish,
+        Agent(f"ipc://{tmp_path}/agent") as agent,
+    ):
+        fish.set_controller("remote", agent=agent.address)
+        first, begun = agent.observe(), time.monotonic()
+        for _ in range(40):
+            agent.act(0.2)
+            last = agent.observe()
+    assert last.seq - first.seq == 40
+    assert time.monotonic() - begun < 20.0
+    assert agent.lost == 0
 
 
 def test_it_ends_soon_however_slow_its_motion_is(tmp_path: Path) -> None:
