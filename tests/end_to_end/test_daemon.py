@@ -29,11 +29,12 @@ from fishd.core.unix_sockets import is_deserted
 SHIPPED = str(ROOT / "config" / "simulated.yaml")
 
 EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # which a simulated fish leaves out
+OF_A_SWIMMER = {"x", "y", "speed", "heading"}
 AT_TIMES = {"thrust_error", "quantities"}  # from the first rest on; where the controller has any
 TICK_FIELDS = {
     name: kind if isinstance(kind, type) else float
     for name, kind in get_type_hints(Tick).items()
-    if name not in EXTREMES | AT_TIMES
+    if name not in EXTREMES | OF_A_SWIMMER | AT_TIMES
 }
 
 
