@@ -16,7 +16,7 @@ from fishd.simulation import VirtualRun
 from fishd.swimmer.gait import gait
 from fishd.swimmer.track import Track
 
-LONGEST = 20.0
+LONGEST = 24.0
 """A fish whose speed still changes is judged all the same after so long [s]."""
 _ASK_EVERY = 50
 

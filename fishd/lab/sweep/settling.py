@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
-LEAST_TIME = 6.0
+LEAST_TIME = 8.0
 """The beats that are judged take as long at least: a fast wave has many in a moment [s]."""
-STEADY = 0.02
-"""The speed is steady where its two halves agree to this share of it, or of a tenth of a length a
-second, or within the 95 % interval of their difference."""
+STEADY, SCATTERING = 0.02, 0.05
+"""The speed is steady where its two halves agree to the first share of it, or of a tenth of a length
+a second; or to the second one, and within the 95 % interval of their difference."""
 
 
 def judged_from(begins: Array, x: Array) -> int:
@@ -41,8 +41,10 @@ def is_steady(begins: Array, x: Array, length: float) -> bool:
     speeds = -np.diff(x) / np.diff(begins)
     halves = speeds[: count // 2], speeds[count - count // 2 :]
     apart = abs(float(halves[0].mean() - halves[1].mean()))
-    allowed = STEADY * max(abs(float(speeds.mean())), 0.1 * length)
+    scale = max(abs(float(speeds.mean())), 0.1 * length)
+    allowed = STEADY * scale
     if count >= 4:
         variance = sum(half.var(ddof=1) / len(half) for half in halves)
-        allowed = max(allowed, float(stdtrit(count // 2 * 2 - 2, 0.975)) * math.sqrt(variance))
+        interval = float(stdtrit(count // 2 * 2 - 2, 0.975)) * math.sqrt(variance)
+        allowed = max(allowed, min(interval, SCATTERING * scale))
     return apart <= allowed
