@@ -10,8 +10,8 @@ Array = NDArray[np.float64]
 LEAST_TIME = 8.0
 """The beats that are judged take as long at least: a fast wave has many in a moment [s]."""
 STEADY, SCATTERING = 0.02, 0.05
-"""The speed is steady where its two halves agree to the first share of it, or of a tenth of a length
-a second; or to the second one, and within the 95 % interval of their difference."""
+"""The speed is steady where its two halves agree to the first share of it, or of a tenth of a
+length a second; or to the second one, and within the 95 % interval of their difference."""
 
 
 def judged_from(begins: Array, x: Array) -> int:
