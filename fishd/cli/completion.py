@@ -95,7 +95,7 @@ def complete_value(field: Field, incomplete: str) -> list[CompletionItem]:
     if field.kind == "boolean":
         return _matching(("true", "false"), incomplete)
     if not field.file:
-        return []
+        return _matching(field.words, incomplete)
     from fishd.controllers.policy import library
 
     names = library.names() if field.file == library.SUFFIX else []

@@ -65,6 +65,8 @@ class ParameterType(click.ParamType[Any]):
             return value
         if field.optional and value.lower() in ("null", "none", "default"):
             return None
+        if value in field.words:
+            return value
         if field.file and names_file(value, field.file):
             return str(Path(value).expanduser().absolute())  # fishd may run in another folder
         try:

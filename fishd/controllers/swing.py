@@ -1,10 +1,12 @@
 """`swing`: reverse when the fin slows down. The paper's model-free control (Fu et al.)."""
 
-from typing import Annotated
+from collections import deque
+from typing import Annotated, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.controllers.criterion_search import CriterionSearch, Phase, Rung
 from fishd.controllers.quantities import quantity
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
@@ -13,12 +15,20 @@ REFRACTORY = 0.05
 """Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
 
 
+SLOPE_OVER = 0.05
+"""The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
+
+
 class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `swing`."""
 
     C: Annotated[
-        float,
-        unit("1", "Reverse when the fin's speed falls to C times its last maximum.", ge=0, le=1),
+        Annotated[float, Meta(ge=0, le=1)] | Literal["auto"],
+        unit(
+            "1",
+            "Reverse when the fin's speed falls to C times its last maximum; auto: begin with 0.6, "
+            "and find what pushes most.",
+        ),
     ] = 0.6
     amplitude: Annotated[
         Amplitude,
@@ -49,6 +59,10 @@ class Swing(Controller[SwingParameters]):
     )
     reversal_speed: float = quantity("1", "C times `top_speed`: the tail reverses when so slow.")
     since_reversal: float = quantity("s", "Time since the last reversal.")
+    criterion: float | None = quantity("1", "With C auto: the C in use, or on trial.")
+    lead: float | None = quantity("s", "With C auto: how far ahead the speed is foreseen.")
+    searching: float | None = quantity("1", "With C auto: 1 while others are tried, else 0.")
+    ripple: float | None = quantity("N", "With C auto: ripple of F_x in the latest beats.")
 
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
@@ -57,6 +71,19 @@ class Swing(Controller[SwingParameters]):
         self.top_speed = 0.0
         self.reversal_speed = 0.0
         self.since_reversal = 0.0
+        ticks = max(1, round(SLOPE_OVER / limits.tick))
+        self._velocities: deque[float] = deque(maxlen=ticks + 1)
+        self._search: CriterionSearch | None = None
+        self.retune(parameters)
+
+    def retune(self, parameters: SwingParameters) -> None:
+        """Take new parameters; to set C to auto begins a search, to set anything else keeps it."""
+        super().retune(parameters)
+        if parameters.C != "auto":
+            self._search = None
+            self.criterion = self.lead = self.searching = self.ripple = None
+        elif self._search is None:
+            self._search = CriterionSearch()
 
     def activate(self, observation: Observation) -> None:
         """Push on towards the side of the present angle; from rest, towards plus."""
@@ -64,10 +91,11 @@ class Swing(Controller[SwingParameters]):
 
     def update(self, observation: Observation) -> float:
         """Plus or minus the amplitude [rad]."""
+        rung = self._rung(observation)
         self.since_reversal += observation.dt
-        speed = self._direction * observation.fin_velocity
         parameters = self.parameters
-        slowed = self._top_speed > 0.0 and speed <= parameters.C * self._top_speed
+        speed = self._direction * self._ahead(observation, rung.lead)
+        slowed = self._top_speed > 0.0 and speed <= rung.C * self._top_speed
         self._top_speed = max(self._top_speed, speed)
         settled = self.since_reversal > REFRACTORY * parameters.longest_half_period
         # Half a tick early is nearer to the longest half period than half a tick late.
@@ -79,5 +107,24 @@ class Swing(Controller[SwingParameters]):
             self._direction = -self._direction
             self._top_speed = 0.0
             self.since_reversal = 0.0
-        self.reversal_speed = parameters.C * self.top_speed
+        self.reversal_speed = rung.C * self.top_speed
         return self._direction * amplitude_of(parameters, self.limits)
+
+    def _ahead(self, observation: Observation, lead: float) -> float:
+        """The fin velocity `lead` s from now, if it goes on changing as it does."""
+        self._velocities.append(observation.fin_velocity)
+        change = self._velocities[-1] - self._velocities[0]
+        elapsed = observation.dt * max(1, len(self._velocities) - 1)
+        return observation.fin_velocity + lead * change / elapsed
+
+    def _rung(self, observation: Observation) -> Rung:
+        """When to reverse: as the parameter says, or as the search has found."""
+        if self.parameters.C != "auto":
+            return Rung(self.parameters.C)
+        assert self._search
+        self._search.update(observation.fx, observation.dt, self._direction)
+        rung = self._search.rung
+        self.criterion, self.lead = rung
+        self.searching = float(self._search.phase is not Phase.WATCH)
+        self.ripple = self._search.ripple
+        return rung

@@ -64,6 +64,8 @@ class Field(Struct, frozen=True, omit_defaults=True):
     """True where there is no default."""
     file: str = ""
     """Suffix, such as `.onnx`, where a text may be the path of a file: see `names_file`."""
+    words: tuple[str, ...] = ()
+    """Permitted beside a number, such as `auto`."""
 
 
 class Problem(Exception):
@@ -176,7 +178,8 @@ def wanted(field: Field) -> str:
     preposition = {"choice": "", "text": "of ", "list": "of "}.get(field.kind, "in ")
     within = preposition + field.interval
     words = (kind, within if field.interval else "", field.unit if field.unit != "1" else "")
-    return " ".join(filter(None, words)) + " (or null)" * field.optional
+    others = [*field.words, *(["null"] if field.optional else [])]
+    return " ".join(filter(None, words)) + (f" (or {' or '.join(others)})" if others else "")
 
 
 def names_file(text: str, suffix: str) -> bool:
@@ -230,9 +233,19 @@ def _unwrapped(kind: inspect.Type) -> tuple[inspect.Type, dict[str, Any], bool]:
     if isinstance(kind, inspect.Metadata):
         extra, kind = kind.extra_json_schema or {}, kind.type
     if isinstance(kind, inspect.UnionType):
-        kinds = (part for part in kind.types if not isinstance(part, inspect.NoneType))
-        return next(kinds), extra, True
+        kinds = [part for part in kind.types if not isinstance(part, inspect.NoneType)]
+        return kinds[0], extra, len(kinds) < len(kind.types)
     return kind, extra, False
+
+
+def _words(kind: inspect.Type) -> tuple[str, ...]:
+    """What a field takes beside the first of its types: the words of a Literal."""
+    if isinstance(kind, inspect.Metadata):
+        kind = kind.type
+    if not isinstance(kind, inspect.UnionType):
+        return ()
+    rest = [part for part in kind.types if isinstance(part, inspect.LiteralType)]
+    return tuple(str(word) for part in rest for word in part.values)
 
 
 def _describe(field: inspect.Field) -> Field:
@@ -247,6 +260,7 @@ def _describe(field: inspect.Field) -> Field:
         optional=optional,
         required=field.required,
         file=extra.get("file", ""),
+        words=_words(field.type) if isinstance(kind, inspect.FloatType) else (),
     )
 
 

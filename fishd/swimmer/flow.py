@@ -2,9 +2,14 @@
 
 Momentum in conservative form, u_t + ∇·((u − w) u) = −∇p/ρ + ν ∇²u, with the velocities u of the
 laboratory and w that of the grid. Advection and diffusion by the second-order Adams–Bashforth
-scheme; fluxes by the third-order upwind-biased scheme with the limiter of Koren (in: Numerical
-Methods for Advection–Diffusion Problems, Vieweg 1993, pp. 117–138); incremental pressure
-projection (Van Kan, SIAM J. Sci. Stat. Comput. 7, 1986, doi:10.1137/0907059).
+scheme; fluxes by the upwind-biased scheme of third order (κ = 1/3 in: van Leer, Upwind-difference
+methods for aerodynamic problems governed by the Euler equations, Lectures in Applied Mathematics
+22, 1985, pp. 327–336); incremental pressure projection (Van Kan, SIAM J. Sci. Stat. Comput. 7,
+1986, doi:10.1137/0907059).
+
+The fluxes have no limiter. Velocities need not stay within bounds as densities do, and a limiter
+takes every crest for an overshoot: with Koren's a vortex that a stream carries along is wrong by
+two to eight times as much, and the error falls with the second power of the cells, not the third.
 """
 
 from typing import Literal
@@ -185,16 +190,13 @@ def _carried(  # pragma: no cover
 ) -> float:
     """Flux of a quantity through a face between two values on either side of it.
 
-    Upwind-biased, of third order where it is smooth, and without new extremes.
+    Upwind-biased, of third order where cells are of one size.
     """
     forward = speed > 0.0
     step = after - before if forward else before - after
     behind = before - before2 if forward else after - after2
     upwind = before if forward else after
-    twice = 2.0 * abs(behind)
-    size = min(min(twice, (abs(step) + twice) / 3.0), 2.0 * abs(step))
-    limited = (size if step > 0.0 else -size) if step * behind > 0.0 else 0.0
-    return speed * (upwind + 0.5 * limited)
+    return speed * (upwind + (behind + 2.0 * step) / 6.0)
 
 
 @njit(cache=True, fastmath={"contract", "nsz", "arcp"})
@@ -353,6 +355,7 @@ def _courant(u: Array, v: Array, dx: Array, dy: Array, w: float) -> float:  # pr
         for j in range(dy.size):
             across = max(abs(v[i, j]), abs(v[i, j + 1])) / dy[j]
             here = max(abs(u[i, j] - w), abs(u[i + 1, j] - w)) / dx[i] + across
-            if not here <= worst:  # NaN, too
-                worst = here
+            if not np.isfinite(u[i, j] + u[i + 1, j] + v[i, j] + v[i, j + 1]):
+                return np.nan
+            worst = max(worst, here)
     return worst

@@ -1,28 +1,25 @@
-"""Bodies in the flow: which faces of the grid they cover, and momentum passed on without loss.
+"""Bodies in the flow: the water moves as they do where they are, and no momentum is lost.
 
 Direct forcing on a fixed grid (Fadlun et al., J. Comput. Phys. 161, 2000,
-doi:10.1006/jcph.2000.6484) by the share of a face that the body covers (Kajishima and Takiguchi,
-Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5). Where the body is, the water
-of the grid is its mass: the momentum that it has there, projected on the motions that the beam
-can make, gives the motion of the beam. So no force is exchanged between two solvers, and light
-bodies are no harder than heavy ones.
+doi:10.1006/jcph.2000.6484), by the share of the cell around a face that the body covers (Kajishima
+and Takiguchi, Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5), of second order
+(see `covers`). Where the body is, the water of the grid is its mass: the momentum that it has
+there, projected on the motions that the beam can make, gives the motion of the beam. So no force is
+exchanged between two solvers, and light bodies are no harder than heavy ones.
 """
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
 from fishd.swimmer.beam import Beam
+from fishd.swimmer.covers import Covered, circle, gather, impose, paint, slip
 from fishd.swimmer.flow import Flow
 from fishd.swimmer.grid import Array
 
-SHIFT = 0.5
-"""A face is half covered this many cells inside of the surface: the water next to a body moves with
-it, and makes it thicker by about so much."""
 IMPLICIT = 0.55
 """Share of the new shape in the elastic forces of a step; 0.5 would let the shortest waves of the
 beam ring for ever."""
+_DIAGONAL = np.arange(3)
 
 
 class LeftTheGrid(FishdError):
@@ -30,17 +27,17 @@ class LeftTheGrid(FishdError):
 
 
 class Immersed:
-    """A beam in a flow, rigid circles, or both."""
+    """A beam in a flow, a rigid circle, or both."""
 
     def __init__(self, flow: Flow, density: float, beam: Beam | None = None) -> None:
         """density: of the water [kg/m³]"""
         self.flow, self.density, self.beam = flow, density, beam
         grid = flow.grid
-        self._fixed_u, self._fixed_v = np.zeros(flow.u.shape), np.zeros(flow.v.shape)
+        self._fixed: tuple[Covered, Covered] | None = None
         self._freedom = np.ones((grid.nx, grid.ny))
-        self._has_fixed = False
+        self._cell_mass = density * grid.h**2
         self.fixed_impulse = np.zeros(2)
-        """What the circles took from the water in the latest step [N s]."""
+        """What the circle took from the water in the latest step [N s]."""
         if beam:
             self.velocity = np.zeros((beam.slices, 3))
             """Of the slices: vx, vy [m/s] and θ̇ [rad/s], at the latest step."""
@@ -52,71 +49,79 @@ class Immersed:
             self._before = np.zeros(beam.size)
 
     def add_circle(self, x: float, y: float, radius: float) -> None:
-        """Put a rigid circle there; lengths in m."""
+        """Put a rigid circle there, where cells are small; lengths in m."""
         grid = self.flow.grid
-        for cover, px, py in (
-            (self._fixed_u, grid.x[:, None], grid.yc[None]),
-            (self._fixed_v, grid.xc[:, None], grid.y[None]),
-        ):
-            distance = np.hypot(px - x, py - y) - radius
-            np.maximum(cover, np.clip(0.5 - distance / grid.h - SHIFT, 0.0, 1.0), out=cover)
-        self._freedom = _freedom(self._fixed_u, self._fixed_v)
-        self._has_fixed = True
+        on_u = circle(grid.x[:, None] - x, grid.yc[None] - y, radius, grid.h)
+        on_v = circle(grid.xc[:, None] - x, grid.y[None] - y, radius, grid.h)
+        self._fixed = on_u, on_v
+        self._freedom = _freedom(on_u.share, on_v.share)
 
     def step(self, dt: float, forces: Array | None = None) -> None:
         """One step of `dt` [s]; forces: on the unknowns of the beam, at the middle of the step."""
         self.flow.predict(dt)
-        if self._has_fixed:
-            self._hold_fixed()
+        if self._fixed:
+            self._hold(*self._fixed)
         freedom = self._freedom
         if self.beam:
-            freedom = self._move_beam(self.beam, dt, forces)
+            freedom = self._move(self.beam, dt, forces)
         self.flow.project(dt, freedom)
 
-    def _hold_fixed(self) -> None:
-        """Bring the water to rest where the circles are."""
-        flow, grid = self.flow, self.flow.grid
-        taken_u, taken_v = self._fixed_u * flow.ahead_u, self._fixed_v * flow.ahead_v
-        across_x = np.gradient(grid.x)  # between centres: widths of the faces' own cells
-        across_y = np.gradient(grid.y)
-        self.fixed_impulse = self.density * np.array(
-            [across_x @ (taken_u @ grid.dy), grid.dx @ (taken_v @ across_y)]
-        )
+    def _hold(self, on_u: Covered, on_v: Covered) -> None:
+        """Bring the water to rest where the circle is."""
+        flow = self.flow
+        taken_u = on_u.share * flow.ahead_u - slip(flow.ahead_u, on_u)
+        taken_v = on_v.share * flow.ahead_v - slip(flow.ahead_v, on_v)
+        self.fixed_impulse = self._cell_mass * np.array([taken_u.sum(), taken_v.sum()])
         flow.ahead_u -= taken_u
         flow.ahead_v -= taken_v
 
-    def _move_beam(self, beam: Beam, dt: float, forces: Array | None) -> Array:
+    def _move(self, beam: Beam, dt: float, forces: Array | None) -> Array:
         """Find the new motion, and let the water where the beam is have it; returns the freedom."""
-        flow, grid = self.flow, self.flow.grid
+        flow, grid, h = self.flow, self.flow.grid, self.flow.grid.h
         travel = np.zeros(beam.size)
         travel[0] = flow.grid_velocity
-        ahead = beam.q + dt * (1.5 * beam.rate - 0.5 * self._before - travel)
-        places, angle = beam.shape(ahead)
-        box = self._box(places, float(beam.half_thickness.max()))
-        body = (places, angle, beam.half_thickness, beam.taper, beam.spacing)
-        i, j = box[0], box[1]
-        cover_u, owner_u = _paint(
-            *body, grid.h, SHIFT, grid.x[i.start : i.stop + 1], grid.yc[j], beam.clamped
-        )
-        cover_v, owner_v = _paint(
-            *body, grid.h, SHIFT, grid.xc[i], grid.y[j.start : j.stop + 1], beam.clamped
-        )
-        faces_u = (slice(i.start, i.stop + 1), j)
-        faces_v = (i, slice(j.start, j.stop + 1))
-        if self._has_fixed:
-            np.minimum(cover_u, 1.0 - self._fixed_u[faces_u], out=cover_u)
-            np.minimum(cover_v, 1.0 - self._fixed_v[faces_v], out=cover_v)
-        ahead_u, ahead_v = flow.ahead_u[faces_u], flow.ahead_v[faces_v]
-        self.mass, momentum = _gather(
+        places, angle = beam.shape(beam.q + dt * (1.5 * beam.rate - 0.5 * self._before - travel))
+        i, j = self._box(places, float(beam.half_thickness.max()))
+        faces_u = slice(i.start, i.stop + 1), j
+        faces_v = i, slice(j.start, j.stop + 1)
+        body = places, angle, beam.half_thickness, beam.taper, beam.spacing, h
+        on_u = paint(*body, grid.x[faces_u[0]], grid.yc[j], beam.clamped)
+        on_v = paint(*body, grid.xc[i], grid.y[faces_v[1]], beam.clamped)
+        if self._fixed:
+            _yield(on_u, self._fixed[0], faces_u)
+            _yield(on_v, self._fixed[1], faces_v)
+        around_u, around_v = _around(flow.ahead_u, faces_u), _around(flow.ahead_v, faces_v)
+        self.mass, momentum = gather(
             places,
-            (cover_u, owner_u, ahead_u, grid.x[faces_u[0]], grid.yc[j]),
-            (cover_v, owner_v, ahead_v, grid.xc[i], grid.y[faces_v[1]]),
-            self.density * grid.h**2,
+            (on_u, around_u, grid.x[faces_u[0]], grid.yc[j]),
+            (on_v, around_v, grid.xc[i], grid.y[faces_v[1]]),
+            self._cell_mass,
+            h,
         )
         moves = beam.motion(angle)
+        rate = self._solve(beam, dt, moves, momentum, forces)
+        self.velocity = moves @ rate
+        self.force = ((self.mass @ self.velocity[:, :, None])[:, :, 0] - momentum) / dt
+        moving = self.velocity, places
+        impose(*moving, on_u, around_u, flow.ahead_u[faces_u], grid.yc[j], h, True)
+        impose(*moving, on_v, around_v, flow.ahead_v[faces_v], grid.xc[i], h, False)
+        beam.q = beam.q + dt * (0.5 * (rate + beam.rate) - travel)
+        self._before, beam.rate = beam.rate, rate
+        share_u, share_v = on_u.share, on_v.share
+        if self._fixed:
+            share_u = share_u + self._fixed[0].share[faces_u]
+            share_v = share_v + self._fixed[1].share[faces_v]
+        freedom = self._freedom.copy()
+        freedom[i, j] = _freedom(share_u, share_v)
+        return freedom
+
+    def _solve(
+        self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None
+    ) -> Array:
+        """Rates of the unknowns at the end of the step, from the momentum of all that moves."""
         flat = moves.reshape(-1, beam.size)
         heavy = self.mass.copy()
-        heavy[:, range(3), range(3)] += beam.excess
+        heavy[:, _DIAGONAL, _DIAGONAL] += beam.excess
         M = flat.T @ (heavy @ moves).reshape(-1, beam.size)
         driven = flat.T @ (momentum + beam.excess * self.velocity).ravel()
         reach = 0.5 * IMPLICIT * dt
@@ -124,21 +129,10 @@ class Immersed:
         if forces is not None:
             driven += dt * forces
         system = M + dt * (reach * beam.K + beam.D)
-        free = np.ix_(beam.free, beam.free)
         rate = np.zeros(beam.size)
-        rate[beam.free] = np.linalg.solve(system[free], driven[beam.free])
-        self.velocity = moves @ rate
-        self.force = ((self.mass @ self.velocity[:, :, None])[:, :, 0] - momentum) / dt
-        _impose(self.velocity, places, cover_u, owner_u, ahead_u, grid.yc[j], True)
-        _impose(self.velocity, places, cover_v, owner_v, ahead_v, grid.xc[i], False)
-        beam.q = beam.q + dt * (0.5 * (rate + beam.rate) - travel)
-        self._before, beam.rate = beam.rate, rate
-        if self._has_fixed:
-            cover_u = cover_u + self._fixed_u[faces_u]
-            cover_v = cover_v + self._fixed_v[faces_v]
-        freedom = self._freedom.copy()
-        freedom[i, j] = _freedom(cover_u, cover_v)
-        return freedom
+        first = beam.free[0]
+        rate[first:] = np.linalg.solve(system[first:, first:], driven[first:])
+        return rate
 
     def _box(self, places: Array, half_thickness: float) -> tuple[slice, slice]:
         """The cells around the body; raises `LeftTheGrid` where they are not all small."""
@@ -147,7 +141,7 @@ class Immersed:
         for axis, edges in ((0, grid.x), (1, grid.y)):
             low = places[:, axis].min() - half_thickness - 2.0 * grid.h
             high = places[:, axis].max() + half_thickness + 2.0 * grid.h
-            if not (edges[0] < low and high < edges[-1]):
+            if not (edges[1] < low and high < edges[-2]):
                 raise LeftTheGrid("the body left the water")
             first, last = np.searchsorted(edges, [low, high])
             ranges.append(slice(int(first) - 1, int(last)))
@@ -176,6 +170,20 @@ class Immersed:
             self._before, self.velocity = state["rate_before"].copy(), state["velocity"].copy()
 
 
+def _around(values: Array, faces: tuple[slice, slice]) -> Array:
+    """A copy of these faces and of one more on every side."""
+    i, j = faces
+    return values[i.start - 1 : i.stop + 1, j.start - 1 : j.stop + 1].copy()
+
+
+def _yield(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
+    """Leave to a fixed body what it covers."""
+    np.minimum(covered.share, 1.0 - fixed.share[faces], out=covered.share)
+    loose = fixed.share[faces] == 0.0
+    np.multiply(covered.moment_x, loose, out=covered.moment_x)
+    np.multiply(covered.moment_y, loose, out=covered.moment_y)
+
+
 def _freedom(cover_u: Array, cover_v: Array) -> Array:
     """0 in cells that are all body.
 
@@ -183,117 +191,3 @@ def _freedom(cover_u: Array, cover_v: Array) -> Array:
     of divergence, it could bend the less the shorter the steps are.
     """
     return np.asarray(1.0 - cover_u[1:] * cover_u[:-1] * cover_v[:, 1:] * cover_v[:, :-1])
-
-
-@njit(cache=True)
-def _paint(  # pragma: no cover
-    places: Array,
-    angle: Array,
-    half_thickness: Array,
-    taper: Array,
-    spacing: float,
-    h: float,
-    shift: float,
-    px: Array,
-    py: Array,
-    clamped: bool,
-) -> tuple[Array, NDArray[np.int64]]:
-    """The share of each face that the body covers, and the slice nearest to it (−1: none)."""
-    nx, ny = px.size, py.size
-    cover, owner = np.zeros((nx, ny)), np.full((nx, ny), -1)
-    nearest = np.full((nx, ny), np.inf)
-    last = places.shape[0] - 1
-    for s in range(last + 1):
-        x, y = places[s, 0], places[s, 1]
-        c, n = np.cos(angle[s]), np.sin(angle[s])
-        reach = max(half_thickness[s], 0.5 * h) + h
-        ends = s == 0 or s == last
-        along_reach = spacing + (h if ends else 0.0)
-        wide, high = abs(c) * along_reach + abs(n) * reach, abs(n) * along_reach + abs(c) * reach
-        i0 = max(0, int(np.ceil((x - wide - px[0]) / h)))
-        i1 = min(nx - 1, int((x + wide - px[0]) / h))
-        j0 = max(0, int(np.ceil((y - high - py[0]) / h)))
-        j1 = min(ny - 1, int((y + high - py[0]) / h))
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                rx, ry = px[i] - x, py[j] - y
-                along, across = rx * c + ry * n, abs(ry * c - rx * n)
-                if abs(along) > along_reach:
-                    continue
-                distance = rx * rx + ry * ry
-                if distance >= nearest[i, j]:
-                    continue
-                nearest[i, j] = distance
-                half = max(half_thickness[s] + taper[s] * along, 0.5 * h)
-                share = 0.5 - (across - half) / h - shift
-                if s == last:
-                    share = min(share, 0.5 - (along - 0.5 * spacing) / h - shift)
-                elif s == 0 and not clamped:
-                    share = min(share, 0.5 - (-along - 0.5 * spacing) / h - shift)
-                cover[i, j] = min(max(share, 0.0), 1.0)
-                owner[i, j] = s if share > 0.0 else -1
-    return cover, owner
-
-
-@njit(cache=True)
-def _gather(  # pragma: no cover
-    places: Array,
-    on_u: tuple[Array, NDArray[np.int64], Array, Array, Array],
-    on_v: tuple[Array, NDArray[np.int64], Array, Array, Array],
-    mass: float,
-) -> tuple[Array, Array]:
-    """Mass matrix, shape (slices, 3, 3), and momentum, (slices, 3), of the water in each slice."""
-    matrix, momentum = np.zeros((places.shape[0], 3, 3)), np.zeros((places.shape[0], 3))
-    cover, owner, speed, px, py = on_u
-    for i in range(px.size):
-        for j in range(py.size):
-            s = owner[i, j]
-            if s < 0:
-                continue
-            m, lever = mass * cover[i, j], places[s, 1] - py[j]
-            matrix[s, 0, 0] += m
-            matrix[s, 0, 2] += m * lever
-            matrix[s, 2, 2] += m * lever * lever
-            momentum[s, 0] += m * speed[i, j]
-            momentum[s, 2] += m * lever * speed[i, j]
-    cover, owner, speed, px, py = on_v
-    for i in range(px.size):
-        for j in range(py.size):
-            s = owner[i, j]
-            if s < 0:
-                continue
-            m, lever = mass * cover[i, j], px[i] - places[s, 0]
-            matrix[s, 1, 1] += m
-            matrix[s, 1, 2] += m * lever
-            matrix[s, 2, 2] += m * lever * lever
-            momentum[s, 1] += m * speed[i, j]
-            momentum[s, 2] += m * lever * speed[i, j]
-    for s in range(places.shape[0]):
-        matrix[s, 2, 0], matrix[s, 2, 1] = matrix[s, 0, 2], matrix[s, 1, 2]
-    return matrix, momentum
-
-
-@njit(cache=True)
-def _impose(  # pragma: no cover
-    velocity: Array,
-    places: Array,
-    cover: Array,
-    owner: NDArray[np.int64],
-    ahead: Array,
-    other: Array,
-    is_u: bool,
-) -> None:
-    """Give the covered faces the velocity of their slice.
-
-    other: y of the faces for u, x of them for v [m]
-    """
-    for i in range(owner.shape[0]):
-        for j in range(owner.shape[1]):
-            s = owner[i, j]
-            if s < 0:
-                continue
-            if is_u:
-                wanted = velocity[s, 0] + velocity[s, 2] * (places[s, 1] - other[j])
-            else:
-                wanted = velocity[s, 1] + velocity[s, 2] * (other[i] - places[s, 0])
-            ahead[i, j] += cover[i, j] * (wanted - ahead[i, j])

@@ -2,7 +2,7 @@
 
 The fast method for separable equations (Lynch, Rice and Thomas, Numerische Mathematik 6, 1964,
 doi:10.1007/BF01386067; Swarztrauber, SIAM Review 19, 1977, doi:10.1137/1019071): exact to rounding
-on a stretched grid, at the price of two matrix products.
+on a stretched grid, at the price of two matrix products, which are halved where the grid is even.
 """
 
 import numpy as np
@@ -29,8 +29,22 @@ class Poisson:
         # Symmetric after a scaling with the root of the cells' widths.
         root = np.sqrt(grid.dy)
         values, vectors = eigh_tridiagonal(diagonal / grid.dy, upper / (root[1:] * root[:-1]))
-        self._to_modes = np.ascontiguousarray(root[:, None] * vectors)
-        self._from_modes = np.ascontiguousarray(vectors.T / root[None, :])
+        to_modes, from_modes = root[:, None] * vectors, vectors.T / root[None, :]
+        self._half = 0
+        if np.allclose(grid.dy, grid.dy[::-1], rtol=1e-9, atol=0.0):
+            # The modes of an even grid are even and odd by turns: products of half the size do.
+            self._half = half = (grid.ny + 1) // 2
+            order = np.concatenate([np.arange(grid.ny - 1, -1, -2), np.arange(grid.ny - 2, -1, -2)])
+            values, to_modes, from_modes = values[order], to_modes[:, order], from_modes[order]
+            to_modes[half - 1] *= 1.0 if grid.ny % 2 == 0 else 0.5
+            to_modes, from_modes = to_modes[:half], from_modes[:, :half]
+        self._to_modes = np.ascontiguousarray(to_modes[:, : self._half or None])
+        self._from_modes = np.ascontiguousarray(from_modes[: self._half or None])
+        self._to_odd = np.ascontiguousarray(to_modes[:, self._half :])
+        self._from_odd = np.ascontiguousarray(from_modes[self._half :])
+        # Used again and again: what is taken anew costs as much as one of the products.
+        self._even, self._odd = (np.empty((grid.nx, self._half)) for _ in range(2))
+        self._modes, self._found = (np.empty((grid.nx, grid.ny)) for _ in range(2))
         along = np.diff(grid.xc)
         lower = np.zeros(grid.nx)
         higher = np.zeros(grid.nx)
@@ -47,10 +61,40 @@ class Poisson:
         self._coupling = lower
 
     def solve(self, f: Array) -> Array:
-        """φ [m² times the unit of f]; f: shape (nx, ny)."""
-        modes = (f * self._grid.dx[:, None]) @ self._to_modes
+        """φ [m² times the unit of f], which the next call may overwrite; f: shape (nx, ny)."""
+        grid, half = self._grid, self._half
+        if not half:
+            modes = (f * grid.dx[:, None]) @ self._to_modes
+            _sweep(modes, self._coupling, self._inverse_pivots)
+            return np.asarray(modes @ self._from_modes)
+        even, odd, modes = self._even, self._odd, self._modes
+        _fold(f, grid.dx, even, odd)
+        np.matmul(even, self._to_modes, out=modes[:, :half])
+        np.matmul(odd, self._to_odd, out=modes[:, half:])
         _sweep(modes, self._coupling, self._inverse_pivots)
-        return np.asarray(modes @ self._from_modes)
+        np.matmul(modes[:, :half], self._from_modes, out=even)
+        np.matmul(modes[:, half:], self._from_odd, out=odd)
+        _unfold(even, odd, self._found)
+        return self._found
+
+
+@njit(cache=True)
+def _fold(f: Array, dx: Array, even: Array, odd: Array) -> None:  # pragma: no cover
+    """What is even and what is odd across, times the width of the cells."""
+    nx, ny = f.shape
+    for i in range(nx):
+        for j in range(even.shape[1]):
+            even[i, j] = dx[i] * (f[i, j] + f[i, ny - 1 - j])
+            odd[i, j] = dx[i] * (f[i, j] - f[i, ny - 1 - j])
+
+
+@njit(cache=True)
+def _unfold(even: Array, odd: Array, found: Array) -> None:  # pragma: no cover
+    nx, ny = found.shape
+    for i in range(nx):
+        for j in range(even.shape[1]):
+            found[i, ny - 1 - j] = even[i, j] - odd[i, j]
+            found[i, j] = even[i, j] + odd[i, j]
 
 
 @njit(cache=True, fastmath=True)

@@ -35,7 +35,7 @@ def test_the_configuration_reference_names_every_key() -> None:
         (
             "start:\n  controller: swing\n  parameters:\n    C: 3\n",
             "fish.yaml:4: start.parameters.C: swing: C: 3 is not valid: "
-            "a number in [0, 1] is needed",
+            "a number in [0, 1] (or auto) is needed",
         ),
     ],
     ids=["unknown key", "out of bounds", "parameter of a controller"],

@@ -179,7 +179,7 @@ def test_the_command_prints_json_with_the_documented_keys() -> None:
     [
         (["swim"], "fishctl: no controller is named 'swim'; did you mean 'swing'?\n", 1),
         (["swing", "--C", "2"], "fishctl: swing: C: 2.0 is not valid: a number in [0, 1]", 1),
-        (["swing", "--C", "inf"], "'inf' is not valid: a number in [0, 1] is needed", 2),
+        (["swing", "--C", "inf"], "'inf' is not valid: a number in [0, 1] (or auto) is needed", 2),
         (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
         (["swing", "--seconds", "1"], "fishctl: nothing is left to judge", 1),
         (["swing", "--seconds", "0"], "a run of 0 s must be longer than the 10 s that it may", 1),

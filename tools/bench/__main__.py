@@ -19,7 +19,9 @@ NAMES = (
     "sweep",
     "identification",
     "estimators",
+    "swing",
     "camera",
+    "swimmer",
 )
 
 if __name__ == "__main__":

@@ -1,0 +1,74 @@
+"""`swing --C auto`: it finds the C of fish that are not like the model, and says what it does."""
+
+import pytest
+from rigs.harness import LIMITS, Rig, observe
+
+from fishd.config import load
+from fishd.controllers import registry
+from fishd.controllers.criterion_search import BEGIN, LADDER
+from fishd.simulation import simulate
+
+
+def efficiency(
+    C: float | str, *overrides: str, seconds: float = 120.0, settle: float = 60.0
+) -> float:
+    return simulate(load(None, overrides), "swing", {"C": C}, seconds, settle).efficiency
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "plant.servo_delay=0.08",
+        "plant.lateral_drag=0.12",
+        "plant.lateral_drag=0.4",
+        "plant.backlash=0.15",
+        "plant.servo_reaction=6e-3",
+    ],
+)
+def test_after_a_minute_it_is_near_the_best_where_a_fixed_criterion_is_not(change: str) -> None:
+    assert efficiency(0.6, change) < 0.93
+    assert efficiency("auto", change) > 0.97
+
+
+def test_on_the_model_the_search_costs_a_few_percent_at_most() -> None:
+    assert efficiency("auto", seconds=60, settle=0) > 0.95 * efficiency(0.6, seconds=60, settle=0)
+
+
+def test_neither_drift_nor_a_turned_sensor_misleads_it() -> None:
+    rig = ("simulation.drift=0.02", "simulation.drift_period=20", "simulation.rotation=0.17")
+    assert efficiency("auto", "plant.servo_delay=0.04", *rig) > 0.97
+
+
+def test_it_shows_what_it_does_in_telemetry() -> None:
+    rig = Rig()
+    rig.start("swing", C="auto")
+    ticks = rig.run(600)
+    tried = {tick.quantities["criterion"] for tick in ticks if tick.quantities}
+    assert {LADDER[BEGIN].C, LADDER[BEGIN + 1].C, LADDER[BEGIN - 1].C} <= tried
+    assert ticks[0].quantities["searching"] == 1.0
+    assert ticks[-1].quantities["ripple"] > 1e-3
+
+
+def test_a_fixed_criterion_shows_no_search() -> None:
+    rig = Rig()
+    rig.start("swing", C=0.6)
+    assert "criterion" not in rig.run(2)[-1].quantities
+
+
+def test_it_searches_anew_when_the_fish_changes() -> None:
+    rig = Rig()
+    rig.start("swing", C="auto")
+    assert any(tick.quantities["searching"] == 0.0 for tick in rig.run(900))
+    rig.fish.fish.parameters = load(None, ["plant.thrust_coefficient=0.03"]).plant
+    assert any(tick.quantities["searching"] == 1.0 for tick in rig.run(200))
+
+
+def test_a_number_that_is_set_ends_the_search_and_auto_begins_a_new_one() -> None:
+    controller = registry.create("swing", {"C": "auto"}, LIMITS)
+    controller.activate(observe())
+    controller.retune(registry.merged(controller, "swing", {"C": 0.3}))
+    controller.update(observe(fin_velocity=1.0))
+    assert controller.criterion is None
+    controller.retune(registry.merged(controller, "swing", {"C": "auto"}))
+    controller.update(observe(fin_velocity=1.0))
+    assert controller.criterion == 0.6

@@ -1,0 +1,139 @@
+"""The water alone: it keeps its volume and its momentum, and vortices age as they should."""
+
+import numpy as np
+import pytest
+
+from fishd.swimmer.flow import Flow
+from fishd.swimmer.grid import Array, Grid, edges
+
+NU = 1e-3
+
+
+def box(cells: int, stretched: bool = False) -> Grid:
+    """A square of 1 m."""
+    if stretched:
+        x = edges(0.0, 1.0, (0.3, 0.7), 1.0 / cells, 1.08)
+        return Grid(x, x.copy())
+    x = np.linspace(0.0, 1.0, cells + 1)
+    return Grid(x, x.copy())
+
+
+def divergence(flow: Flow) -> Array:
+    grid = flow.grid
+    return np.diff(flow.u, axis=0) / grid.dx[:, None] + np.diff(flow.v, axis=1) / grid.dy
+
+
+def put_vortex(flow: Flow, x: float, y: float, age: float, stream: float = 0.0) -> None:
+    """A vortex of Taylor's (1918), an exact solution: u_θ ~ r/t² exp(−r²/4νt), 0.3 m/s at most."""
+    grid = flow.grid
+    core = 4.0 * NU * age
+    strength = 0.3 * np.sqrt(2.0 * np.e / core)
+    for values, px, py, swirl in (
+        (flow.u, grid.x[:, None], grid.yc[None] + 0.0 * grid.x[:, None], -1.0),
+        (flow.v, grid.xc[:, None], grid.y[None] + 0.0 * grid.xc[:, None], 1.0),
+    ):
+        rx, ry = px - x, py - y
+        arm = ry if swirl < 0.0 else rx
+        values[:] = swirl * strength * arm * np.exp(-(rx**2 + ry**2) / core)
+    flow.u[:] += stream
+    flow.inlet = np.full(grid.ny, stream)
+    flow.v[:, [0, -1]] = 0.0
+
+
+def run(flow: Flow, seconds: float, dt: float) -> None:
+    for _ in range(round(seconds / dt)):
+        flow.predict(dt)
+        flow.project(dt)
+
+
+def test_still_water_stays_still() -> None:
+    flow = Flow(box(16, stretched=True), NU, "slip")
+    run(flow, 0.1, 0.01)
+    assert not flow.u.any()
+    assert not flow.v.any()
+
+
+@pytest.mark.parametrize("grid_velocity", [0.0, -0.4])
+def test_an_even_stream_stays_even(grid_velocity: float) -> None:
+    grid = box(16, stretched=True)
+    flow = Flow(grid, NU, "slip", inlet=np.full(grid.ny, 0.3))
+    flow.u[:], flow.grid_velocity = 0.3, grid_velocity
+    run(flow, 0.2, 0.01)
+    assert flow.u == pytest.approx(0.3)
+    assert flow.v == pytest.approx(0.0, abs=1e-12)
+
+
+def test_after_a_step_the_water_keeps_its_volume() -> None:
+    flow = Flow(box(24, stretched=True), NU, "no-slip")
+    flow.predict(0.01)
+    random = np.random.default_rng(1)
+    flow.ahead_u[1:-1] = random.normal(size=flow.u[1:-1].shape)
+    flow.ahead_v[:, 1:-1] = random.normal(size=flow.v[:, 1:-1].shape)
+    flow.project(0.01)
+    assert divergence(flow) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_vortex_ages_at_the_right_rate() -> None:
+    flow = Flow(box(64), NU, "slip")
+    put_vortex(flow, 0.5, 0.5, age=2.5)
+    before = flow.vorticity().max()
+    run(flow, 1.25, 0.0125)
+    assert flow.vorticity().max() / before == pytest.approx((2.5 / 3.75) ** 2, rel=0.02)
+
+
+def lost_way(cells: int) -> float:
+    """How wrong a vortex is that a stream carried along, relative."""
+    dt = 0.2 / cells
+    flow, right = Flow(box(cells), NU, "slip"), Flow(box(cells), NU, "slip")
+    put_vortex(flow, 0.4, 0.5, age=1.5, stream=0.25)
+    run(flow, 0.8, dt)
+    put_vortex(right, 0.6, 0.5, age=2.3, stream=0.25)
+    right.u[:] = 0.25 + (right.u - 0.25) * (1.5 / 2.3) ** 1.5
+    return float(np.abs(flow.u - right.u).max())
+
+
+def test_what_a_stream_carries_along_gets_there_with_an_error_of_third_order() -> None:
+    assert lost_way(48) / lost_way(96) > 6.0
+
+
+def test_a_grid_that_travels_with_the_stream_sees_the_same_water() -> None:
+    still, travelling = Flow(box(48), NU, "slip"), Flow(box(48), NU, "slip")
+    put_vortex(still, 0.5, 0.5, age=2.0)
+    put_vortex(travelling, 0.5, 0.5, age=2.0, stream=-0.3)
+    travelling.grid_velocity = -0.3
+    for flow in (still, travelling):
+        run(flow, 0.5, 0.005)
+    middle = slice(12, 36)
+    assert travelling.u[middle, middle] + 0.3 == pytest.approx(still.u[middle, middle], abs=2e-3)
+
+
+def test_its_momentum_changes_by_what_crosses_the_boundaries() -> None:
+    flow = Flow(box(32, stretched=True), NU, "no-slip")
+    put_vortex(flow, 0.6, 0.45, age=8.0, stream=0.1)
+    flow.grid_velocity = -0.05
+    for _ in range(5):
+        before = flow.momentum()
+        run(flow, 0.01, 0.01)
+        assert flow.momentum() - before == pytest.approx(flow.boundary_impulse, abs=1e-15)
+
+
+def test_a_restart_is_the_same_to_the_last_bit() -> None:
+    flow = Flow(box(16), NU, "slip")
+    put_vortex(flow, 0.5, 0.4, age=4.0, stream=0.1)
+    run(flow, 0.05, 0.01)
+    kept = flow.state()
+    run(flow, 0.05, 0.01)
+    other = Flow(box(16), NU, "slip", inlet=np.full(16, 0.1))
+    other.restore(kept)
+    run(other, 0.05, 0.01)
+    assert np.array_equal(flow.u, other.u)
+    assert np.array_equal(flow.v, other.v)
+    assert np.array_equal(flow.p, other.p)
+
+
+def test_it_says_how_far_the_water_goes_in_a_step() -> None:
+    flow = Flow(box(10), NU, "slip")
+    flow.u[4, 4], flow.grid_velocity = 0.2, -0.1
+    assert flow.courant_number(0.1) == pytest.approx(0.3)
+    flow.v[2, 2] = np.nan
+    assert np.isnan(flow.courant_number(0.1))

@@ -1,0 +1,38 @@
+"""The grid: small cells where they are asked for, growing slowly towards the ends."""
+
+import numpy as np
+import pytest
+
+from fishd.swimmer.grid import Grid, edges
+
+
+def test_it_reaches_from_end_to_end() -> None:
+    x = edges(-0.5, 0.5, (-0.1, 0.1), 2e-3, 1.04)
+    assert x[[0, -1]] == pytest.approx([-0.5, 0.5], abs=1e-12)
+
+
+def test_cells_are_small_where_asked_and_grow_by_the_ratio_at_most() -> None:
+    x = edges(-0.5, 0.5, (-0.1, 0.1), 2e-3, 1.04)
+    sizes = np.diff(x)
+    inside = (x[1:] < 0.1001) & (x[:-1] > -0.1001)
+    assert sizes[inside] == pytest.approx(2e-3)
+    growth = sizes[1:] / sizes[:-1]
+    assert growth.max() <= 1.0401
+    assert growth.min() >= 1.0 / 1.0401
+
+
+def test_without_growth_all_cells_are_alike() -> None:
+    assert np.diff(edges(0.0, 1.0, (0.2, 0.4), 0.05, 1.0)) == pytest.approx(0.05)
+
+
+def test_an_end_that_is_fine_has_no_stretched_cells() -> None:
+    x = edges(0.0, 1.0, (0.0, 0.4), 0.05, 1.1)
+    assert x[:9] == pytest.approx(0.05 * np.arange(9), abs=1e-12)
+    assert x[-1] == pytest.approx(1.0)
+
+
+def test_a_grid_knows_its_centres_sizes_and_smallest_cell() -> None:
+    grid = Grid(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.5, 1.0, 1.5]))
+    assert (grid.nx, grid.ny, grid.cells, grid.h) == (2, 3, 6, 0.5)
+    assert grid.xc == pytest.approx([0.5, 2.0])
+    assert grid.dy == pytest.approx(0.5)

@@ -1,0 +1,176 @@
+"""Bodies in the water: momentum is handed on, light ones are no harder, and none locks."""
+
+import numpy as np
+import pytest
+
+from fishd.swimmer.beam import Beam
+from fishd.swimmer.flow import Flow
+from fishd.swimmer.grid import Array, Grid, edges
+from fishd.swimmer.immersed import Immersed, LeftTheGrid
+
+CELL, LENGTH, HALF = 2e-3, 0.06, 6e-3
+EI = 2e-3
+
+
+def swimmer(
+    *, cell: float = CELL, excess: float = 0.0, clamped: bool = False, stream: float = 0.0
+) -> Immersed:
+    """A bar in a small tank, its head at (0.1, 0.06)."""
+    grid = Grid(edges(0.0, 0.3, (0.07, 0.2), cell, 1.1), edges(0.0, 0.12, (0.02, 0.1), cell, 1.1))
+    flow = Flow(grid, 1e-6, "slip", inlet=np.full(grid.ny, stream))
+    flow.u[:] = stream
+    beam = Beam(
+        LENGTH,
+        lambda X: np.full_like(X, HALF),
+        lambda X: np.full_like(X, EI),
+        10,
+        0.5 * cell,
+        density=excess,
+        clamped=clamped,
+    )
+    beam.q[:2] = 0.1, 0.06
+    return Immersed(flow, 1000.0, beam)
+
+
+def beam_of(body: Immersed) -> Beam:
+    assert body.beam
+    return body.beam
+
+
+def bend(body: Immersed, curvature: float) -> Array:
+    return beam_of(body).drive(lambda X: np.full_like(X, curvature))
+
+
+def momentum(body: Immersed) -> float:
+    """Along x, of the water and of what the body weighs more [kg m/s per metre]."""
+    return body.density * body.flow.momentum() + float(
+        beam_of(body).excess[:, 0] @ body.velocity[:, 0]
+    )
+
+
+@pytest.mark.parametrize("excess", [0.0, 3000.0])
+def test_water_and_body_together_keep_their_momentum(excess: float) -> None:
+    body = swimmer(excess=excess)
+    forces = bend(body, 6.0)
+    forces[0] = 2.0  # from outside, to have some
+    for _ in range(20):
+        before = momentum(body)
+        body.step(2e-3, forces)
+        gained = body.density * body.flow.boundary_impulse + 2e-3 * 2.0
+        assert momentum(body) - before == pytest.approx(gained, abs=1e-12)
+
+
+def swung(steps: int) -> float:
+    """By how much it has bent after 0.1 s [rad]."""
+    body = swimmer()
+    forces = bend(body, 10.0)
+    for _ in range(steps):
+        body.step(0.1 / steps, forces)
+    return float(beam_of(body).q[-1] - beam_of(body).q[2])
+
+
+def test_it_bends_as_far_however_short_the_steps() -> None:
+    assert swung(25) > 0.2
+    assert swung(400) == pytest.approx(swung(50), rel=0.05)
+
+
+def test_it_comes_to_rest_where_its_muscles_want_it() -> None:
+    body = swimmer()
+    forces = bend(body, 6.0)
+    for _ in range(500):
+        body.step(4e-3, forces)
+    q = beam_of(body).q
+    assert q[-1] - q[2] == pytest.approx(6.0 * LENGTH, rel=0.1)
+
+
+@pytest.mark.parametrize("excess", [-200.0, 0.0, 7000.0])
+def test_a_light_body_is_as_stable_as_a_heavy_one(excess: float) -> None:
+    body = swimmer(excess=excess)
+    forces = bend(body, 8.0)
+    fastest = 0.0
+    for k in range(300):
+        body.step(2e-3, forces if k < 50 else 0.0 * forces)
+        fastest = max(fastest, float(np.abs(body.velocity[:, :2]).max()))
+    assert 0.01 < fastest < 0.5
+    assert np.abs(body.velocity[:, :2]).max() < 0.6 * fastest
+
+
+def test_a_loose_body_drifts_with_the_stream() -> None:
+    body = swimmer(stream=0.1)
+    beam_of(body).rate[0] = 0.1
+    body.flow.grid_velocity = 0.1
+    body.flow.inlet[:] = 0.1
+    for _ in range(50):
+        body.step(4e-3)
+    assert body.velocity[:, 0] == pytest.approx(0.1, rel=0.02)
+
+
+def test_a_clamped_root_stays_where_it_is() -> None:
+    body = swimmer(clamped=True, stream=0.1)
+    forces = bend(body, 5.0)
+    for _ in range(20):
+        body.step(4e-3, forces)
+    assert beam_of(body).q[:3] == pytest.approx([0.1, 0.06, 0.0])
+    assert beam_of(body).q[-1] != 0.0
+
+
+def circle_in_stream(steps: int) -> tuple[Immersed, float]:
+    """After 0.6 s; and its drag [N/m]."""
+    grid = Grid(np.linspace(0.0, 0.3, 61), np.linspace(0.0, 0.2, 41))
+    flow = Flow(grid, 1e-4, "slip", inlet=np.full(grid.ny, 0.1))
+    flow.u[:] = 0.1
+    body = Immersed(flow, 1000.0)
+    body.add_circle(0.1, 0.1, 0.03)
+    for _ in range(steps):
+        body.step(0.6 / steps)
+    return body, float(body.fixed_impulse[0]) * steps / 0.6
+
+
+def test_water_rests_in_a_circle_and_pushes_it_downstream() -> None:
+    body, drag = circle_in_stream(60)
+    assert abs(body.flow.u[20, 20]) < 2e-3
+    assert 0.5 < drag / (0.5 * 1000.0 * 0.1**2 * 0.06) < 5.0
+    assert abs(body.fixed_impulse[1]) < 0.01 * abs(body.fixed_impulse[0])
+
+
+def test_the_drag_of_a_circle_does_not_depend_on_the_step() -> None:
+    assert circle_in_stream(60)[1] == pytest.approx(circle_in_stream(240)[1], rel=0.02)
+
+
+def test_outside_of_bodies_the_water_keeps_its_volume() -> None:
+    body = swimmer()
+    for _ in range(10):
+        body.step(4e-3, bend(body, 10.0))
+    flow, grid = body.flow, body.flow.grid
+    divergence = np.diff(flow.u, axis=0) / grid.dx[:, None] + np.diff(flow.v, axis=1) / grid.dy
+    x, y = grid.xc[:, None], grid.yc[None]
+    outside = (x < 0.09) | (x > 0.17) | (np.abs(y - 0.06) > 0.03)
+    assert np.abs(divergence[outside]).max() < 1e-9
+
+
+def test_a_restart_is_the_same_to_the_last_bit() -> None:
+    body = swimmer(excess=500.0)
+    forces = bend(body, 6.0)
+    for _ in range(10):
+        body.step(4e-3, forces)
+    kept = body.state()
+    other = swimmer(excess=500.0)
+    other.restore(kept)
+    for one in (body, other):
+        for _ in range(10):
+            one.step(4e-3, forces)
+    end, again = body.state(), other.state()
+    assert end.keys() == again.keys()
+    for name, value in end.items():
+        assert np.array_equal(value, again[name]), name
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [((0.15, 0.06), "small cells"), ((0.26, 0.06), "left the water"), ((0.1, 0.119), "left the")],
+)
+def test_a_body_that_leaves_is_told(place: tuple[float, float], message: str) -> None:
+    body = swimmer()
+    beam_of(body).q[:2] = place
+    with pytest.raises(LeftTheGrid, match=message):
+        body.step(1e-3)

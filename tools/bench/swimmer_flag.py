@@ -1,0 +1,243 @@
+"""An elastic flag behind a cylinder in a channel, and beams alone, beside published numbers.
+
+Turek and Hron, Proposal for numerical benchmarking of fluid–structure interaction between an
+elastic object and laminar incompressible flow, Springer 2006, doi:10.1007/3-540-34596-5_15. The
+authors' site, Featflow, has newer tables with finer steps, quoted here as solids4foam has them
+(tutorials/fluidSolidInteraction/HronTurekFsi3/verification/README.md, in its repository): FSI3
+swings at 5.46 Hz in them, not at 5.3.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from common.report import progress, table
+from fishd.swimmer.beam import Beam, Profile
+from fishd.swimmer.flow import Flow
+from fishd.swimmer.grid import Array, Grid, edges
+from fishd.swimmer.immersed import Immersed
+
+RHO = 1000.0
+RADIUS, CENTRE, HEIGHT, LENGTH, TIP, THICKNESS = 0.05, 0.2, 0.41, 2.5, 0.6, 0.02
+"""Of the benchmark's cylinder, channel and flag [m]."""
+POISSON = 0.4
+RAMP = 1.0
+"""The inflow grows for so long [s]."""
+
+
+class Wave(NamedTuple):
+    """What an oscillating quantity comes to, as in the benchmark."""
+
+    mean: float
+    """Of highest and lowest."""
+    amplitude: float
+
+    def text(self, factor: float = 1.0, digits: int = 2) -> str:
+        """The two with a sign between."""
+        mean, amplitude = factor * self.mean, factor * self.amplitude
+        return f"{mean:.{digits}f} ± {amplitude:.{digits}f}"
+
+
+class Case(NamedTuple):
+    """One of the benchmark's flows."""
+
+    inflow: float
+    """Mean [m/s]."""
+    density: float
+    """Of the flag [kg/m³]."""
+    shear_modulus: float
+    """[Pa]"""
+    end: float
+    """[s]"""
+    step: float
+    """With cells of 5 mm [s]."""
+    allowed: float
+    """Deviation of amplitude and frequency."""
+    published: dict[str, tuple[Wave, float, str, str]]
+    """By source: u_y [m], frequency [Hz], drag, lift."""
+
+
+PROPOSAL = "Turek and Hron 2006"
+FEATFLOW = "Featflow, newer, level 4"
+CASES = {
+    "FSI3": Case(
+        2.0, 1000.0, 2e6, 6.0, 4e-4, 0.03,
+        {
+            PROPOSAL: (Wave(1.48e-3, 34.38e-3), 5.3, "457.3 ± 22.7", "2.2 ± 149.8"),
+            FEATFLOW: (Wave(1.47e-3, 34.99e-3), 5.46, "460.5 ± 27.7", "2.5 ± 153.9"),
+        },
+    ),
+    "FSI2": Case(
+        1.0, 10000.0, 0.5e6, 16.0, 8e-4, 0.05,
+        {
+            PROPOSAL: (Wave(1.23e-3, 80.6e-3), 2.0, "208.8 ± 73.8", "0.9 ± 234.2"),
+            FEATFLOW: (Wave(1.30e-3, 81.6e-3), 1.93, "215.1 ± 77.7", "0.6 ± 237.8"),
+        },
+    ),
+}  # fmt: skip
+
+
+class Swing(NamedTuple):
+    """What a flag does."""
+
+    across: Wave
+    """u_y of its tip [m]."""
+    frequency: float
+    """[Hz]"""
+    drag: Wave
+    """[N/m]"""
+    lift: Wave
+
+
+def flag(case: Case, cell: float) -> Immersed:
+    """The channel with cylinder and flag, at rest."""
+    rows = round(HEIGHT / cell)
+    h = HEIGHT / rows
+    root = CENTRE + math.sqrt(RADIUS**2 - 0.25 * THICKNESS**2)
+    grid = Grid(edges(0.0, LENGTH, (0.13, 0.62), h, 1.05), np.linspace(0.0, HEIGHT, rows + 1))
+    young = 2.0 * case.shear_modulus * (1.0 + POISSON)
+    stiffness = young / (1.0 - POISSON**2) * THICKNESS**3 / 12.0
+    beam = Beam(
+        TIP - root,
+        even(0.5 * THICKNESS),
+        even(stiffness),
+        20,
+        0.5 * h,
+        density=case.density - RHO,
+        clamped=True,
+    )
+    beam.q[:2] = root, CENTRE
+    body = Immersed(Flow(grid, 1e-3, "no-slip"), RHO, beam)
+    body.add_circle(CENTRE, CENTRE, RADIUS)
+    return body
+
+
+def even(value: float) -> Profile:
+    """The same all along."""
+    return lambda X: np.full_like(X, value)
+
+
+def swing(case: Case, cell: float) -> Swing:
+    """Let the flag swing, and measure its last five periods."""
+    body, dt = flag(case, cell), case.step * cell / 5e-3
+    beam, grid = body.beam, body.flow.grid
+    assert beam
+    profile = grid.yc * (HEIGHT - grid.yc)
+    profile *= case.inflow / float(grid.dy @ profile / HEIGHT)
+    steps = round(case.end / dt)
+    history = np.empty((steps, 4))
+    for k in range(steps):
+        t = (k + 1) * dt
+        body.flow.inlet = profile * 0.5 * (1.0 - math.cos(math.pi * min(1.0, t / RAMP)))
+        before = body.velocity
+        body.step(dt)
+        places, angle = beam.shape(beam.q)
+        gained = (body.mass @ (body.velocity - before)[:, :, None])[:, :2, 0] / dt
+        force = (gained - body.force[:, :2]).sum(axis=0) + body.fixed_impulse / dt
+        tip = places[-1, 1] + 0.5 * beam.spacing * math.sin(angle[-1])
+        history[k] = t, tip - CENTRE, *force
+    t, across = history[:, 0], history[:, 1]
+    rising = crossings(t, across)[-6:]
+    last = history[t >= rising[0]]
+    return Swing(
+        wave(last[:, 1]), 5.0 / (rising[-1] - rising[0]), wave(last[:, 2]), wave(last[:, 3])
+    )
+
+
+def crossings(t: Array, values: Array) -> Array:
+    """When values rise through their mean over the last third."""
+    offset = values - values[2 * len(values) // 3 :].mean()
+    k = np.flatnonzero((offset[:-1] < 0.0) & (offset[1:] >= 0.0))
+    return np.asarray(t[k] - offset[k] / (offset[k + 1] - offset[k]) * (t[k + 1] - t[k]))
+
+
+def wave(values: Array) -> Wave:
+    """Mean and amplitude of a history."""
+    low, high = float(values.min()), float(values.max())
+    return Wave(0.5 * (high + low), 0.5 * (high - low))
+
+
+def turek_hron(finest: float) -> str:
+    """FSI3 and FSI2."""
+    rows = []
+    for name, case in CASES.items():
+        for source, (across, frequency, drag, lift) in case.published.items():
+            rows.append([name, source, across.text(1e3), f"{frequency:g}", drag, lift, "", ""])
+        for cell in (5e-3 * finest, 2.5e-3 * finest):
+            found = swing(case, cell)
+            rows.append(
+                [
+                    name,
+                    f"here, cells of {cell * 1e3:g} mm",
+                    found.across.text(1e3),
+                    f"{found.frequency:.3f}",
+                    found.drag.text(digits=1),
+                    found.lift.text(digits=1),
+                    *deviations(found, case),
+                ]
+            )
+            progress(*rows[-1])
+    heads = (
+        "case | source | u_y (mm) | f (Hz) | drag (N/m) | lift (N/m) | "
+        "u_y and f off 2006 by | off newer by"
+    )
+    return table(heads, rows)
+
+
+def deviations(found: Swing, case: Case) -> list[str]:
+    """Of amplitude and frequency from each publication; ✓ where both are allowed."""
+    cells = []
+    for across, frequency, _, _ in case.published.values():
+        off = found.across.amplitude / across.amplitude - 1.0, found.frequency / frequency - 1.0
+        met = max(map(abs, off)) <= case.allowed
+        cells.append(f"{off[0]:+.1%}, {off[1]:+.1%}" + (" ✓" if met else ""))
+    return cells
+
+
+FREE_FREE = (22.3733, 61.6728, 120.903)
+"""(βL)² of a free beam: cos βL cosh βL = 1."""
+WEIGHT = {"CSM1": (0.5e6, -66.10), "CSM2": (2e6, -16.97)}
+"""Shear modulus [Pa] and u_y of the flag's tip under 2 m/s² [mm] (Featflow, finest levels)."""
+
+
+def beam(finest: float) -> str:
+    """Frequencies of a free beam in vacuum; the flag of Turek and Hron under its own weight."""
+    thin, EI, line = 1e-3, 1e-2, 2.0
+    rows = []
+    for segments in (25, 50):
+        free = Beam(0.2, even(thin), even(EI), segments, 5e-4, density=RHO)
+        moves = free.motion(np.zeros(free.slices)).reshape(-1, free.size)
+        M = moves.T @ (free.excess.ravel()[:, None] * moves)
+        squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, free.K)).real)
+        found = np.sqrt(squares[3:6] * line / EI) * free.length**2
+        off = found / FREE_FREE - 1.0
+        rows += [
+            [
+                f"free beam, mode {k + 1}, {segments} segments",
+                f"{FREE_FREE[k]:.3f}",
+                f"{found[k]:.3f}",
+                f"{off[k]:+.2%}" + (" ✓" if abs(off[k]) <= 0.01 else ""),
+            ]
+            for k in range(3)
+        ]
+    for name, (modulus, asked) in WEIGHT.items():
+        got = sagged(CASES["FSI3"]._replace(shear_modulus=modulus))
+        rows.append(
+            [f"{name}, sag (mm)", f"{asked:.2f}", f"{got:.2f}", f"{got / asked - 1.0:+.2%}"]
+        )
+    return table("what | published | here | off by", rows)
+
+
+def sagged(case: Case) -> float:
+    """u_y of the flag's tip under 2 m/s² [mm]."""
+    held = flag(case, 5e-3).beam
+    assert held
+    weight = np.zeros((held.slices, 3))
+    weight[:, 1] = -2.0 * RHO * THICKNESS * held.spacing
+    q, free = held.q.copy(), held.free
+    for _ in range(200):
+        moves = held.motion(held.shape(q)[1]).reshape(-1, held.size)
+        rest = (moves.T @ weight.ravel() - held.K @ q)[free]
+        q[free] += 0.5 * np.linalg.solve(held.K[np.ix_(free, free)], rest)
+    return 1e3 * float(held.shape(q)[0][-1, 1] + 0.5 * held.spacing * math.sin(q[-1]) - CENTRE)
