@@ -256,10 +256,10 @@ def swimming() -> Iterator[Claim]:
             "swing with C = 0 is close to the maximum"
             if row["setting"] == 0.0
             else "… and with C = 0.6",
-            f"{row['speed_mm_per_s']:.1f} ± {row['error_mm_per_s']:.1f} mm/s at "
+            f"{_speed(row)} mm/s at "
             f"{row['frequency_Hz']:.2f} Hz: {share:.0%} of the fastest wave, the "
             f"{top['controller']} wave of {top['setting']:g} Hz with "
-            f"{top['speed_mm_per_s']:.1f} ± {top['error_mm_per_s']:.1f} mm/s",
+            f"{_speed(top)} mm/s",
             None if row["setting"] else share > swing_map.NEARLY_BEST,
         )
     swings = [0.5 * row["tail_side_to_side_over_L"] for row in waves]
@@ -278,11 +278,12 @@ def refinement() -> Iterator[tuple[str, str, str, str]]:
         rows = [figure_6.row_of(figure_6.Case(controller, setting, c)) for c in figure_6.CELLS]
         yield (
             f"{controller}, {what}",
-            *(
-                f"{row['speed_mm_per_s']:.1f} ± {row['error_mm_per_s']:.1f}" if row else "–"
-                for row in rows
-            ),
+            *(_speed(row) if row else "–" for row in rows),
         )
+
+
+def _speed(row: dict[str, Any]) -> str:
+    return f"{row['speed_mm_per_s']:.2f} ± {row['error_mm_per_s']:.2f}"
 
 
 def _swum(controller: str) -> list[dict[str, Any]]:
