@@ -1,6 +1,8 @@
 """Swims a free swimmer for `fishctl simulate`, and prints what it tells."""
 
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from fishd.cli.free_swim_options import SwimmerOptions
@@ -11,7 +13,9 @@ from fishd.core.errors import FishdError, MissingPackage, ParameterError
 from fishd.core.interruption import on_signal
 
 if TYPE_CHECKING:
+    from fishd.config import Config
     from fishd.simulation.free_swim import SwimReport, Swum
+    from fishd.swimmer.robot import Swimmer
 
 
 def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
@@ -24,6 +28,7 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
         from fishd.simulation.free_swim import Keeping
         from fishd.simulation.free_swim import swim as run
         from fishd.swimmer import checkpoint, track
+        from fishd.swimmer.midlines import Midlines
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         raise MissingPackage(
@@ -36,16 +41,28 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     keeping = Keeping(options.checkpoint, options.checkpoint_every) if options.checkpoint else None
     resume = checkpoint.load(options.resume) if options.resume else None
     interrupted = threading.Event()
-    with on_signal(interrupted.set), showing(asked[3], "s", err=as_json) as bar:
+    midlines = Midlines()
+    with (
+        on_signal(interrupted.set),
+        _filmed(asked[0], options) as film,
+        showing(asked[3], "s", err=as_json) as bar,
+    ):
+
+        def watch(fish: "Swimmer") -> None:
+            film(fish)
+            if options.save and options.save.suffix == ".npz":
+                midlines.add(fish)
+
         swum = run(
             *asked,
             progress=lambda passed, speed: bar.at(passed, f"{speed * 1e3:.1f} mm/s"),
             keeping=keeping,
             resume=resume,
             ended=interrupted.is_set,
+            watch=watch,
         )
     if options.save and len(swum.track):
-        track.save(swum.track, options.save)
+        track.save(swum.track, options.save, midlines.arrays())
     if swum.report and as_json:
         print_json(swum.report)
     elif swum.report:
@@ -62,6 +79,18 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
     return 0
+
+
+@contextmanager
+def _filmed(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Swimmer], None]]":
+    """What paints a fish, where a film is wanted, which is written in the end."""
+    if options.film is None:
+        yield lambda fish: None
+        return
+    from fishd.lab.swimmer.film import Film
+
+    with Film(options.film, config.swimmer) as film:
+        yield lambda fish: film.look(fish.fish)
 
 
 def _kept(swum: "Swum", options: SwimmerOptions) -> str:

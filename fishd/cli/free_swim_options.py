@@ -20,6 +20,7 @@ class SwimmerOptions(NamedTuple):
     checkpoint_every: float
     resume: Path | None
     save: Path | None
+    film: Path | None
 
     def refuse(self) -> None:
         """Raises `UsageError` where one was given and the fish is no swimmer."""
@@ -27,6 +28,7 @@ class SwimmerOptions(NamedTuple):
             ("--checkpoint", self.checkpoint),
             ("--resume", self.resume),
             ("--save", self.save),
+            ("--film", self.film),
         ):
             if path is not None:
                 raise click.UsageError(
@@ -36,14 +38,19 @@ class SwimmerOptions(NamedTuple):
 
 
 def swimmer_options(function: F) -> F:
-    """`--checkpoint`, `--checkpoint-every`, `--resume` and `--save`."""
+    """`--checkpoint`, `--checkpoint-every`, `--resume`, `--save` and `--film`."""
 
     def file_option(name: str, about: str) -> Callable[[F], F]:
         kind = click.Path(path_type=Path, dir_okay=False)
         return click.option(name, type=kind, metavar="FILE", help=f"Of a swimmer: {about}")
 
     decorators: list[Callable[[Any], Any]] = [
-        file_option("--save", "write its track, a row for each tick, into this .csv or .npz file."),
+        file_option("--film", "paint its wake while it swims: a .webp or .gif file."),
+        file_option(
+            "--save",
+            "write its track, a row for each tick, into this .csv file, or with its midlines into "
+            "this .npz file.",
+        ),
         file_option(
             "--resume",
             "go on from this checkpoint; with the same controller --seconds is the whole swim, "

@@ -55,6 +55,7 @@ VERBS = {
     },
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
+        "swimmer": Verb("swimmer", "swimmer", "Draw a fish that swims freely, and its wake."),
         "learn": Verb("learn", "learn", "Train policies, and write them to files."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },

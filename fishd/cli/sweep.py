@@ -1,4 +1,4 @@
-"""The verb that measures thrust over a grid of parameters, and proposes the best."""
+"""The verb that measures thrust, or speed, over a grid of parameters, and proposes the best."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -58,12 +58,14 @@ def sweep_options(function: Any) -> Any:
         click.option(
             "--periods",
             type=click.IntRange(min=2),
-            help="In simulation: tail beats judged at each point. [default: 20]",
+            help="In simulation: tail beats judged at each point; of a swimmer, at least. "
+            "[default: 20; of a swimmer 10]",
         ),
         click.option(
             "--settle",
             type=click.FloatRange(min=0.0),
-            help="In simulation: time before they are judged [s]. [default: 10]",
+            help="In simulation: time before they are judged [s]. [default: 10; of a swimmer 4, or "
+            "until its speed is steady]",
         ),
         click.option(
             "--vary",
@@ -88,6 +90,8 @@ def sweep_options(function: Any) -> Any:
 @click.group(cls=ControllerGroup, options=sweep_options, remote=True, several=True)
 def sweep() -> None:
     """Measure thrust over a grid of parameters: table, recordings, picture, and the best.
+
+    Of a fish that swims freely (robot: swimmer), the speed.
 
     CONTROLLERS is one, or several as square,sine,triangle. Each parameter takes a value, a list
     as 1,1.5,2, or a range as 0.4:4:0.2 (low:high:step); all combinations are measured. With
@@ -171,7 +175,6 @@ def _in_simulation(
     from fishd.lab.sweep.folder import Begun
     from fishd.lab.sweep.measuring import Lengths
 
-    lengths = Lengths(**{name: value for name, value in given.items() if value is not None})
     fish: dict[tuple[tuple[str, Any], ...], Config] = {}
     pairs = []
     for point in found:
@@ -180,8 +183,9 @@ def _in_simulation(
             fish[changed] = _fish_of(point, file, overrides)
         grid.check(point, replace(fish[changed].limits, virtual=True))
         pairs.append((point, fish[changed]))
-    config = msgspec.to_builtins(load(file, overrides))
-    begun = Begun("simulation", config, msgspec.to_builtins(lengths))
+    config = load(file, overrides)
+    lengths = Lengths.of(config, **given)
+    begun = Begun("simulation", msgspec.to_builtins(config), msgspec.to_builtins(lengths))
     with (
         _opened(path, begun, found) as folder,
         telling(folder, found, "points", 1.0, err) as count,
@@ -193,9 +197,7 @@ def _in_simulation(
 def _fish_of(point: "Point", file: Path | None, overrides: tuple[str, ...]) -> Config:
     pairs = [f"{key}={value}" for key, value in point.keys.items()]
     try:
-        config = load(file, (*overrides, *pairs))
-        check_tethered(config.robot, "sweep")
-        return config
+        return load(file, (*overrides, *pairs))
     except ConfigError as error:
         message = str(error)
         for pair in pairs:
@@ -215,6 +217,7 @@ def _on_robot(
         plan(seconds, point.parameters)  # which says that it is too short, before anything moves
     with Fish(endpoint) as fish:
         status = fish.status()
+        check_tethered(status.robot, "sweep --on robot")
         grid.check_remote(found, Limits(status.amplitude_limit, status.tick))
         begun = Begun("robot", fish.config(), {"seconds": seconds}, status.force_unit)
         with (

@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     from fishd.lab.sweep.curves import Best, WholeTicks
     from fishd.lab.sweep.folder import SweepFolder
     from fishd.lab.sweep.grid import Point
-    from fishd.lab.sweep.measuring import Result
+    from fishd.lab.sweep.results import Found, Quantity
 
 
 class Count:
     """Tells what is done, point by point."""
 
-    def __init__(self, show: Lines, before: int, each: float, unit: str) -> None:
+    def __init__(self, show: Lines, before: int, each: float, quantity: "Quantity") -> None:
         self._show = show
         self._finished = before
         self._each = each
-        self._unit = unit
+        self._quantity = quantity
 
-    def done(self, point: "Point", result: "Result") -> None:
+    def done(self, point: "Point", result: "Found") -> None:
         """A point is done."""
         self._finished += 1
         self._show.done(
-            f"{point.label()}: {_figures(result, self._unit)}", self._finished * self._each
+            f"{point.label()}: {_figures(result, self._quantity)}", self._finished * self._each
         )
 
     def at(self, seconds: float) -> None:
@@ -51,15 +51,16 @@ def telling(
     echo(f"{folder.path}: {counted(len(found), 'point')}{there}", err=err)
     with showing(len(found) * each, unit, err=err) as show:
         show.at(before * each)
-        yield Count(show, before, each, folder.begun.force_unit)
+        yield Count(show, before, each, folder.begun.quantity)
 
 
-def _figures(result: "Result", unit: str) -> str:
-    if result.thrust is None:
-        return f"no thrust: {result.trouble}"
+def _figures(result: "Found", quantity: "Quantity") -> str:
+    if result.value is None:
+        return f"no {quantity.name}: {result.trouble}"
     error = "" if result.error is None else f" ± {result.error * 1e3:.2f}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
-    return f"{result.thrust * 1e3:.2f}{error} m{unit}{beats}"
+    steady = "" if getattr(result, "settled", 0.0) is not None else ", not yet steady"
+    return f"{result.value * 1e3:.2f}{error} m{quantity.unit}{beats}{steady}"
 
 
 def conclude(
@@ -74,14 +75,15 @@ def conclude(
     from fishd.lab.sweep import curves, figure
 
     drawn = curves.curves(folder, found)
-    unit = folder.begun.force_unit
+    quantity = folder.begun.quantity
+    unit = quantity.unit
     bests = [
         (curve, msgspec.structs.replace(best, whole_ticks=curves.whole_ticks(folder, curve)))
         for curve in drawn
         if (best := curves.best(curve))
     ]
     if as_json:
-        print_json([best for _, best in bests])
+        print_json([curves.plain(best, quantity) for _, best in bests])
     else:
         for curve, best in bests:
             echo(f"{curve.label}: {_proposal(best, units.get(best.over, ''), unit)}")
@@ -89,12 +91,12 @@ def conclude(
                 echo(f"{curve.label}, of whole ticks: {_measured(best.whole_ticks, unit)}")
         echo(f"table: {folder.path / 'points.csv'}")
     if any(curve.peak for curve in drawn):
-        stem = folder.path / "thrust"
-        pictures = figure.draw(stem, drawn, units, error_of=error_of, force_unit=unit)
+        stem = folder.path / quantity.name
+        pictures = figure.draw(stem, drawn, units, error_of=error_of, quantity=quantity)
         if not as_json:
             echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
     fins = [
-        (result.fin_amplitude or 0.0, point.label())
+        (getattr(result, "fin_amplitude", None) or 0.0, point.label())
         for point in found
         if (result := folder.results.get(folder.key(point)))
     ]
@@ -113,21 +115,21 @@ def conclude(
     return 1 if troubles else 0
 
 
-def _proposal(best: "Best", unit: str, force_unit: str) -> str:
+def _proposal(best: "Best", unit: str, of: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
     error = "" if best.error is None else f" ± {best.error * 1e3:.2f}"
-    thrust = f"{best.thrust * 1e3:.2f}{error} m{force_unit}"
+    value = f"{best.value * 1e3:.2f}{error} m{of}"
     if best.x is None:
-        return thrust
+        return value
     if best.at_edge:
         return (
-            f"best measured at {best.over} {best.x:g}{symbol}, {thrust}: at the edge of the grid, "
+            f"best measured at {best.over} {best.x:g}{symbol}, {value}: at the edge of the grid, "
             "so the best may lie beyond it"
         )
     if best.x_low is None or best.x_high is None:
-        return f"best measured at {best.over} {best.x:.4g}{symbol}: {thrust}"
+        return f"best measured at {best.over} {best.x:.4g}{symbol}: {value}"
     interval = f"[{best.x_low:.4g}, {best.x_high:.4g}]"
-    return f"best {best.over} {best.x:.4g}{symbol} {interval}: {thrust}"
+    return f"best {best.over} {best.x:.4g}{symbol} {interval}: {value}"
 
 
 def _measured(found: "WholeTicks", force_unit: str) -> str:

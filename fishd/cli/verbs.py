@@ -18,6 +18,7 @@ _EXTRAS = {
     "matplotlib": "lab",
     "mcap": "record",
     "numba": "swimmer",
+    "PIL": "swimmer",
     "onnx": "policy",
     "onnxruntime": "policy",
     "pandas": "lab",

@@ -78,6 +78,7 @@ def swim(
     keeping: Keeping | None = None,
     resume: Checkpoint | None = None,
     ended: Callable[[], bool] = lambda: False,
+    watch: Callable[[Swimmer], None] = lambda fish: None,
 ) -> Swum:
     """Let a controller swim a free swimmer for `seconds`, and judge it after `settle` seconds.
 
@@ -86,6 +87,7 @@ def swim(
     keeping: write checkpoints, the last one when it ends
     resume: go on from there; with the same controller the time before counts
     ended: asked after every tick whether to end now
+    watch: shown the fish after every tick
     Raises `UnknownController`, `ParameterError`, `MissingPackage`, `CheckpointError`, and OSError
     where a checkpoint cannot be written.
     """
@@ -119,7 +121,7 @@ def swim(
         run.loop.set_controller(name, controller)
         next_kept = fish.fish.time + keeping.every if keeping else float("inf")
         since = time.perf_counter()
-        watch = _Speed(fish, first - before)
+        mean_speed = _Speed(fish, first - before)
 
         def keep() -> float | None:
             if keeping:
@@ -133,7 +135,8 @@ def swim(
             if fish.trouble:
                 break
             track.add(fish, command)
-            progress(len(track) * config.tick, watch.mean())
+            watch(fish)
+            progress(len(track) * config.tick, mean_speed.mean())
             if fish.fish.time >= next_kept - 1e-9:
                 kept = keep()
                 next_kept += keeping.every if keeping else 0.0

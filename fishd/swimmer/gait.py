@@ -65,7 +65,7 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     swimming direction.
     """
     time, x = track["time"], track["x"]
-    begins = _upward_reversals(track["command"])
+    begins = upward_reversals(track["command"])
     beats = max(0, len(begins) - 1)
     first, last = (begins[0], begins[-1]) if beats else (1, len(time))
     rows = slice(first, last)
@@ -104,7 +104,7 @@ def mass(settings: SwimmerSettings) -> float:
     return density * build_beam(settings).area
 
 
-def _upward_reversals(command: Array) -> list[int]:
+def upward_reversals(command: Array) -> list[int]:
     """The rows, but for the first, in which the command has become positive."""
     found, side = [], 0.0
     for index, angle in enumerate(command.tolist()):

@@ -1,10 +1,12 @@
 """The track of a swim: a row of numbers for each tick, and files of it."""
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fishd.core.errors import ParameterError
 from fishd.core.files import write_atomically
@@ -98,9 +100,12 @@ def check_name(path: Path) -> None:
         raise ParameterError(f"{path}: there is no folder {path.parent}")
 
 
-def save(track: Track, path: Path) -> None:
+def save(
+    track: Track, path: Path, others: Mapping[str, NDArray[np.floating]] | None = None
+) -> None:
     """Write a CSV file with a header, or an NPZ file with an array for each column.
 
+    others: arrays that go into an NPZ file, too
     Raises OSError.
     """
     if path.suffix == ".csv":
@@ -108,6 +113,6 @@ def save(track: Track, path: Path) -> None:
         lines += [",".join(f"{value:.9g}" for value in row) for row in track.rows().tolist()]
         write_atomically(path, "\n".join(lines) + "\n")
         return
-    content, columns = io.BytesIO(), cast(dict[str, Any], track.columns())
-    np.savez_compressed(content, **columns)
+    content, arrays = io.BytesIO(), cast(dict[str, Any], track.columns() | dict(others or {}))
+    np.savez_compressed(content, **arrays)
     write_atomically(path, content.getvalue())

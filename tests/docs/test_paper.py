@@ -7,7 +7,7 @@ import pytest
 
 from common.report import DOCS, between
 from fishd.simulation import Report
-from paper import claims, figure_3, figure_4, figure_5, swing_map
+from paper import claims, figure_3, figure_4, figure_5, figure_6, swing_map
 from paper.runs import Run, read, swim
 
 SECTIONS = (*claims.sections(), *swing_map.sections())
@@ -47,6 +47,20 @@ def test_swing_and_a_learned_policy_still_thrust_as_in_figure_3() -> None:
     ):
         swum = swim(figure_3.run(controller, parameters, 0.31))
         assert_same(swum, row(figure_3.NAME, source=source, amplitude_rad=0.31))
+
+
+def test_figure_6_has_every_swim_and_at_least_ten_beats_of_each() -> None:
+    rows = [figure_6.row_of(case) for case in figure_6.CASES]
+    assert all(row and row["beats"] >= 10 for row in rows)
+
+
+@pytest.mark.slow
+def test_the_free_swimmer_still_swims_as_in_figure_6() -> None:
+    case = figure_6.Case("square", 3.0, 2.0)
+    found, row = figure_6.swim(case), figure_6.row_of(case)
+    assert row
+    assert found.speed == pytest.approx(1e-3 * row["speed_mm_per_s"], rel=0.03)
+    assert found.beat_frequency == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize(

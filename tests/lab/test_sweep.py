@@ -18,14 +18,16 @@ from fishd.core.signals import Event, Tick
 from fishd.lab.begun import owned
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
-from fishd.lab.sweep.folder import MEASURED, Begun, SweepFolder
+from fishd.lab.sweep.folder import Begun, SweepFolder
 from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths, Result, swim
+from fishd.lab.sweep.measuring import Lengths, swim
+from fishd.lab.sweep.results import Result, quantity_of
 from fishd.lab.sweep.running import on_robot
 from fishd.recording import open_run
 from fishd.recording.rerun import rerun
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
+MEASURED = quantity_of("robot", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
 
 

@@ -56,7 +56,7 @@ def test_the_figures_agree_with_one_another(swum: tuple[dict[str, Any], Path]) -
     assert 0.0 < found["water_power"] <= found["muscle_power"]
     width = found["tail_width"] * 0.1
     assert found["strouhal"] == pytest.approx(2.5 * width / found["speed"])
-    assert list(track) == list(COLUMNS)
+    assert list(track) == [*COLUMNS, "midline_time", "midlines"]
     assert len(track["time"]) == found["ticks"] == 400
     assert set(track["activation"]) == {0.0, 1.0, -1.0}
     settled = track["time"] > 1.0

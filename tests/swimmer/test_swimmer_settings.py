@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from rigs.coarse_swimmer import FILE, OPTIONS
-from rigs.processes import FISHCTL, FISHD, addresses, call, fishctl, one_line, sets
+from rigs.processes import FISHCTL, FISHD, addresses, call, fishctl, one_line
 
 from fishd.config import load
 from fishd.core.errors import ConfigError
@@ -82,7 +82,6 @@ def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, progr
     "words",
     [
         ("measure", "swing", "--on", "simulation"),
-        ("sweep", "swing", "--C", "0.3,0.6"),
         ("compare", "swing", "square"),
         ("optimise", "square", "--over", "frequency=1:3"),
         ("optimum",),
@@ -90,7 +89,6 @@ def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, progr
     ],
 )
 def test_verbs_about_the_thrust_of_a_tethered_fish_refuse_a_swimmer(words: tuple[str, ...]) -> None:
-    config = sets("robot=swimmer") if words[0] == "sweep" else ["--config", str(FILE)]
-    complaint = one_line(fishctl(*words, *config))
+    complaint = one_line(fishctl(*words, "--config", str(FILE)))
     assert "robot: swimmer is not valid for" in complaint
     assert "robot: simulated is needed" in complaint

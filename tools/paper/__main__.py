@@ -9,10 +9,10 @@ from pathlib import Path
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import DOCS, progress, put  # noqa: E402
-from paper import claims, figure_2b, figure_3, figure_4, figure_5, swing_map  # noqa: E402
+from paper import claims, figure_2b, figure_3, figure_4, figure_5, figure_6, swing_map  # noqa: E402
 from paper.runs import FOLDER  # noqa: E402
 
-PARTS = (swing_map, figure_2b, figure_3, figure_4, figure_5)
+PARTS = (swing_map, figure_2b, figure_3, figure_4, figure_5, figure_6)
 """Each has `compute(jobs)`, which writes its tables, and `draw()`, which reads them again."""
 
 

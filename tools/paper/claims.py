@@ -5,14 +5,14 @@ The tables are those that the figures are drawn from; `docs/paper.md` holds what
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from common.report import table
 from fishd.config import Config
 from fishd.controllers.policy import file, library
 from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
 from fishd.virtual.plant.optimum import square_wave
-from paper import figure_2b, figure_3, figure_4, figure_5, swing_map
+from paper import figure_2b, figure_3, figure_4, figure_5, figure_6, swing_map
 from paper.runs import PLANT, column, read
 
 DOCUMENT = "paper.md"
@@ -44,6 +44,15 @@ def sections() -> list[tuple[str, str, str]]:
             ),
         )
         for name, claims in GROUPS.items()
+    ] + [
+        (
+            DOCUMENT,
+            "refinement",
+            table(
+                "speed (mm/s), cells of | " + " | ".join(f"{cell:g} mm" for cell in figure_6.CELLS),
+                refinement(),
+            ),
+        )
     ]
 
 
@@ -225,6 +234,62 @@ def learning() -> Iterator[Claim]:
     )
 
 
+def swimming() -> Iterator[Claim]:
+    """The free swimmer, on cells of 1 mm."""
+    found = list(figure_6.fastest())
+    if not found:  # nothing has swum yet
+        return
+    best = ", ".join(
+        f"{frequency:g} Hz {first}{''.join(f' or {wave}' for wave in alike)}"
+        for frequency, first, alike in found
+    )
+    yield Claim(
+        "the square wave is the fastest at every frequency",
+        f"the fastest, within the intervals: {best}",
+        all(first == "square" and not alike for _, first, alike in found),
+    )
+    waves = [row for wave in figure_6.WAVES for row in _swum(wave)]
+    top = max(waves, key=lambda row: row["speed_mm_per_s"])
+    for row in _swum("swing"):
+        share = row["speed_mm_per_s"] / top["speed_mm_per_s"]
+        yield Claim(
+            "swing with C = 0 is close to the maximum"
+            if row["setting"] == 0.0
+            else "… and with C = 0.6",
+            f"{_speed(row)} mm/s at "
+            f"{row['frequency_Hz']:.2f} Hz: {share:.0%} of the fastest wave, the "
+            f"{top['controller']} wave of {top['setting']:g} Hz with "
+            f"{_speed(top)} mm/s",
+            None if row["setting"] else share > swing_map.NEARLY_BEST,
+        )
+    swings = [0.5 * row["tail_side_to_side_over_L"] for row in waves]
+    yield Claim(
+        "tail amplitude of about 0.2 L",
+        f"{min(swings):.2f} to {max(swings):.2f} L to either side while it swims; the muscles "
+        "alone bend it by 0.21 L",
+        None,
+    )
+
+
+def refinement() -> Iterator[tuple[str, str, str, str]]:
+    """Who swims, and how fast on cells of each size."""
+    for controller, setting in figure_6.REFINED:
+        what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
+        rows = [figure_6.row_of(figure_6.Case(controller, setting, c)) for c in figure_6.CELLS]
+        yield (
+            f"{controller}, {what}",
+            *(_speed(row) if row else "–" for row in rows),
+        )
+
+
+def _speed(row: dict[str, Any]) -> str:
+    return f"{row['speed_mm_per_s']:.2f} ± {row['error_mm_per_s']:.2f}"
+
+
+def _swum(controller: str) -> list[dict[str, Any]]:
+    return read(figure_6.NAME, controller=controller, cell_mm=figure_6.CELL)
+
+
 def _steps(policy: str) -> int:
     """How long a policy has learned [control steps]."""
     return file.read(library.find(policy)).card.provenance.steps
@@ -245,4 +310,5 @@ GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
     "waveforms": waveforms,
     "swinging control": swinging,
     "learning": learning,
+    "free swimming": swimming,
 }

@@ -1,32 +1,33 @@
-"""What a sweep shows: a curve of thrust for each controller and setting, and its best point."""
+"""What a sweep shows: a curve for each controller and setting, and its best point."""
 
 import json
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec import Struct
 
 from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import PARAMETER, Point, axis
-from fishd.lab.sweep.measuring import Result
 from fishd.lab.sweep.peak import Peak, peak
+from fishd.lab.sweep.results import Found, Quantity
 
 _SLIP = 5e-3
 """Half beats this near to whole ticks count as such [ticks]."""
 
 
 class Curve(NamedTuple):
-    """Thrust over one quantity, all else being the same."""
+    """Thrust, or speed, over one quantity, all else being the same."""
 
     label: str
     over: str
     """That quantity, such as `frequency` or `plant.xi`; empty for a single point."""
     points: list[Point]
     x: list[float]
-    results: list[Result]
+    results: list[Found]
     peak: Peak | None
-    """None over nothing, or where no point has a thrust."""
+    """None over nothing, or where no point has a value."""
 
 
 class WholeTicks(Struct, frozen=True):
@@ -56,10 +57,10 @@ class Best(Struct, frozen=True):
     x_low: float | None
     """Its 95 % interval; None where there is none to tell."""
     x_high: float | None
-    thrust: float
-    """[N]"""
+    value: float
+    """Of the thrust [N] or the speed [m/s]."""
     error: float | None
-    """Half of its 95 % interval [N]."""
+    """Half of its 95 % interval."""
     at_edge: bool
     """The highest point is at the edge of the grid: the best may lie beyond."""
     whole_ticks: WholeTicks | None = None
@@ -85,15 +86,15 @@ def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
 
 
 def best(curve: Curve) -> Best | None:
-    """The best of a curve; None where no point has a thrust."""
+    """The best of a curve; None where no point has a value."""
     swum = [
-        (result.thrust, index)
+        (result.value, index)
         for index, result in enumerate(curve.results)
-        if result.thrust is not None
+        if result.value is not None
     ]
     if not swum:
         return None
-    thrust, index = max(swum)
+    value, index = max(swum)
     point, found = curve.points[index], curve.peak
     return Best(
         controller=point.controller,
@@ -103,21 +104,27 @@ def best(curve: Curve) -> Best | None:
         x=found.x if found else None,
         x_low=found.x_low if found else None,
         x_high=found.x_high if found else None,
-        thrust=found.y if found else thrust,
+        value=found.y if found else value,
         error=found.y_error if found else curve.results[index].error,
         at_edge=found.at_edge if found else False,
     )
 
 
+def plain(best: Best, quantity: Quantity) -> dict[str, Any]:
+    """The best as a program reads it: its value has the name of the quantity."""
+    found = msgspec.structs.asdict(best)
+    return {quantity.name if name == "value" else name: each for name, each in found.items()}
+
+
 def whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | None:
     """The best that was measured without dithered half beats; None where nothing was."""
-    if curve.over != "frequency" or curve.peak is None:
+    if curve.over != "frequency" or curve.peak is None or folder.begun.quantity.name != "thrust":
         return None
     tick = float(curve.points[0].keys.get("tick", folder.begun.config["tick"]))
     whole = {
         round(0.5 / x / tick): (thrust, x, result.error)
         for x, result in zip(curve.x, curve.results, strict=True)
-        if (thrust := result.thrust) is not None and x > 0.0 and _is_whole(0.5 / x / tick)
+        if (thrust := result.value) is not None and x > 0.0 and _is_whole(0.5 / x / tick)
     }
     if not whole:
         return None
@@ -138,9 +145,9 @@ def _curve(folder: SweepFolder, group: list[Point], over: str, all_of: Sequence[
     results = [folder.results[folder.key(point)] for point in group]
     x = [float(point.columns()[over]) for point in group] if over else []
     swum = [
-        (at, result.thrust, result.error)
+        (at, result.value, result.error)
         for at, result in zip(x, results, strict=False)
-        if result.thrust is not None
+        if result.value is not None
     ]
     top = peak(*map(list, zip(*swum, strict=True))) if swum else None
     label = group[0].label(without={*_shared(all_of), over})

@@ -1,4 +1,4 @@
-"""The picture of a sweep: thrust with its error bars, and the best point of each curve."""
+"""The picture of a sweep: values with their error bars, and the best point of each curve."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,9 +8,14 @@ import numpy as np
 
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, save
 from fishd.lab.sweep.curves import Curve
+from fishd.lab.sweep.results import Quantity
 
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, BLACK)
 MARKERS = "os^Dv<>"
+FREQUENCY = "frequency"
+FEW = 4
+"""So many points of a controller that chooses its frequency itself are shown among the curves over
+frequencies; more of them are a curve of their own."""
 
 
 def draw(
@@ -19,20 +24,25 @@ def draw(
     units: Mapping[str, str],
     *,
     error_of: str,
-    force_unit: str,
+    quantity: Quantity,
 ) -> list[Path]:
     """Write the picture as PNG and as SVG; returns both paths.
 
     stem: path without a suffix
     found: curves, one with a peak at least; those over one quantity share a panel, and those that
-        are over nothing, or without a thrust, are left out
+        are over nothing, or without a value, are left out. Where there are curves over a frequency,
+        the points of those that have none are shown at the frequency at which the tail beat.
     units: of what they are drawn over
     error_of: what the bars are, such as `the mean over beats`
     Raises `FishdError` where a file cannot be written, and `MissingPackage`.
     """
     panels: dict[str, list[Curve]] = {}
+    points: list[Curve] = []
+    has_frequencies = any(curve.peak and curve.over == FREQUENCY for curve in found)
     for curve in found:
-        if curve.peak:
+        if has_frequencies and _chooses_itself(curve):
+            points.append(curve)
+        elif curve.peak:
             panels.setdefault(curve.over, []).append(curve)
     paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
     with drawn(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:
@@ -40,22 +50,33 @@ def draw(
         for axes, (over, curves) in zip(shown, panels.items(), strict=True):
             for index, curve in enumerate(curves):
                 _draw(axes, curve, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)])
+            if over == FREQUENCY:
+                _draw_points(axes, points, len(curves))
             axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
             unit = units.get(over, "")
             axes.set_xlabel(f"{over} ({unit})" if unit not in ("", "1") else over)
             axes.legend()
-        shown[0].set_ylabel(f"thrust (m{force_unit})")
+        shown[0].set_ylabel(f"{quantity.name} (m{quantity.unit})")
         note = f"bars: 95 % interval of {error_of}; cross: best, of the parabola drawn"
         shown[0].set_title(note, fontsize=8, fontweight="normal", color=GREY)
         save(figure, paths[1])
     return paths
 
 
+def _chooses_itself(curve: Curve) -> bool:
+    """Are these a few points of a controller without a frequency, all of which beat the tail?"""
+    return (
+        len(curve.points) <= FEW
+        and not any(FREQUENCY in point.parameters for point in curve.points)
+        and all(result.beat_frequency > 0.0 for result in curve.results)
+    )
+
+
 def _draw(axes: Any, curve: Curve, colour: str, marker: str) -> None:
     shown = sorted(
-        (x, 1e3 * result.thrust, 1e3 * (result.error or 0.0))
+        (x, 1e3 * result.value, 1e3 * (result.error or 0.0))
         for x, result in zip(curve.x, curve.results, strict=True)
-        if result.thrust is not None
+        if result.value is not None
     )
     if not shown:
         return
@@ -76,3 +97,19 @@ def _draw(axes: Any, curve: Curve, colour: str, marker: str) -> None:
         best.x, 1e3 * best.y, xerr=xerr, yerr=1e3 * (best.y_error or 0.0), color="black",
         elinewidth=1.2, capsize=0, zorder=5,
     )  # fmt: skip
+
+
+def _draw_points(axes: Any, curves: Sequence[Curve], used: int) -> None:
+    """Single points, each with its name; used: how many colours and markers are."""
+    number = used
+    for curve in curves:
+        for point, result in zip(curve.points, curve.results, strict=True):
+            if result.value is None:
+                continue
+            axes.errorbar(
+                result.beat_frequency, 1e3 * result.value, yerr=1e3 * (result.error or 0.0),
+                color=COLOURS[number % len(COLOURS)], marker=MARKERS[number % len(MARKERS)],
+                linestyle="", markersize=6, markerfacecolor="white", elinewidth=0.8, capsize=2,
+                label=point.label(), zorder=6,
+            )  # fmt: skip
+            number += 1

@@ -6,7 +6,6 @@ from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
-from msgspec.structs import fields
 
 from fishd import __version__
 from fishd.core.errors import ConfigError
@@ -14,12 +13,11 @@ from fishd.core.files import FileProblem, write_atomically
 from fishd.lab import tables
 from fishd.lab.begun import begin
 from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Result
+from fishd.lab.sweep.results import Found, Quantity, quantity_of
 
 BEGUN, POINTS, RECORDINGS = "sweep.json", "points.csv", "ticks"
 RECORDING = "recording"
 """The column that names the recording of a point."""
-MEASURED = tuple(field.name for field in fields(Result))
 
 On = Literal["simulation", "robot"]
 
@@ -35,6 +33,11 @@ class Begun(Struct, frozen=True):
     force_unit: str = "N"
     version: str = __version__
 
+    @property
+    def quantity(self) -> Quantity:
+        """What is found at its points."""
+        return quantity_of(self.on, self.config, self.force_unit)
+
 
 class SweepFolder:
     """A folder in which points are kept as they are measured; `results` has them by their key."""
@@ -48,11 +51,11 @@ class SweepFolder:
         self.path = path
         self.begun = begun
         self._columns = tuple(columns)
-        self.results: dict[tuple[str, ...], Result] = {}
+        self.results: dict[tuple[str, ...], Found] = {}
         try:
             begin(path / BEGUN, begun, "sweep")
             (path / RECORDINGS).mkdir(exist_ok=True)
-            head = (*self._columns, *MEASURED, RECORDING)
+            head = (*self._columns, *begun.quantity.measured, RECORDING)
             self._read(head)
             self._table = tables.Table(path / POINTS, head)
         except OSError as error:
@@ -63,7 +66,7 @@ class SweepFolder:
         values = point.columns()
         return tuple(str(values.get(name, "")) for name in self._columns)
 
-    def keep(self, point: Point, result: Result, recording: bytes | Path) -> None:
+    def keep(self, point: Point, result: Found, recording: bytes | Path) -> None:
         """Keep what was measured, its recording first; raises `ConfigError` when it cannot be.
 
         recording: its content, or a file in `RECORDINGS`
@@ -107,16 +110,19 @@ class SweepFolder:
         path = self.path / POINTS
         if not path.exists():
             return
+        quantity = self.begun.quantity
         try:
             before, *rows = tables.read(path)
             if tuple(before) != head:
-                raise ConfigError(f"{path}: {_other(before)}; give another --folder")
+                raise ConfigError(
+                    f"{path}: {_other(before, quantity.measured)}; give another --folder"
+                )
             complete = [row for row in rows if len(row) == len(head)]
             for row in complete:
                 measured = dict(zip(head, row, strict=True))
-                given = {name: measured[name] for name in MEASURED if measured[name]}
+                given = {name: measured[name] for name in quantity.measured if measured[name]}
                 self.results[tuple(row[: len(self._columns)])] = msgspec.convert(
-                    given, Result, strict=False
+                    given, quantity.result, strict=False
                 )
         except ConfigError:
             raise
@@ -133,9 +139,9 @@ class SweepFolder:
         return ConfigError(f"{where}: cannot be written: {error.strerror}; nothing is lost")
 
 
-def _other(head: Sequence[str]) -> str:
+def _other(head: Sequence[str], measured: tuple[str, ...]) -> str:
     """Why a table with another head is not gone on with."""
-    measured = (*MEASURED, RECORDING)
+    measured = (*measured, RECORDING)
     if tuple(head[-len(measured) :]) == measured:
         return (
             "this sweep has other parameters or keys: it was of "

@@ -1,4 +1,4 @@
-"""The thrust at one point of a sweep: the true one of a simulated fish, or that of a rig."""
+"""One point of a sweep: the true thrust or speed of a simulated fish, or the thrust of a rig."""
 
 import math
 import tempfile
@@ -18,6 +18,7 @@ from fishd.lab.measurement import measure
 from fishd.lab.parallel import Stop
 from fishd.lab.rig import Rig, is_of_one
 from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.results import Found, Result
 from fishd.recording.writer import RunWriter
 from fishd.simulation import Beats, VirtualRun
 from fishd.virtual.plant.optimum import best_square_wave
@@ -26,32 +27,22 @@ SLOWEST = 0.4
 """A controller without a frequency is given the time of so slow a tail beat [Hz]."""
 
 
-class Result(Struct, frozen=True):
-    """What was found at a point; the measured columns of a sweep's table."""
-
-    thrust: float | None = None
-    """Mean over whole tail beats [N]; None where there is `trouble`."""
-    error: float | None = None
-    """Half of its 95 % interval [N]; None where it is not known."""
-    beat_frequency: float = 0.0
-    """Tail beats per second; 0 where the tail does not beat [Hz]."""
-    efficiency: float | None = None
-    """Thrust over that of the best square wave; of a simulated fish."""
-    fin_amplitude: float | None = None
-    """Largest fin angle of a half beat, mean [rad]; of a simulated fish."""
-    seconds: float = 0.0
-    """How long it swam and rested [s]."""
-    trouble: str = ""
-    """Why there is no thrust."""
-
-
 class Lengths(Struct, frozen=True):
     """How long a simulated fish swims at each point."""
 
     settle: float = 10.0
-    """Not judged [s]."""
+    """Not judged [s]; a free swimmer takes longer where it has to."""
     periods: int = 20
-    """Tail beats that are judged."""
+    """Tail beats that are judged; of a free swimmer, at least."""
+
+    @classmethod
+    def of(cls, config: Config, settle: float | None, periods: int | None) -> "Lengths":
+        """As given, or as is usual with such a fish."""
+        usual = cls(4.0, 10) if config.robot == "swimmer" else cls()
+        return cls(
+            usual.settle if settle is None else settle,
+            usual.periods if periods is None else periods,
+        )
 
 
 class Task(NamedTuple):
@@ -63,21 +54,29 @@ class Task(NamedTuple):
     stop: Stop
 
 
-def simulated(task: Task) -> tuple[Result, bytes] | None:
-    """What `swim` finds at a point, and its recording; None where told to stop."""
+def simulated(task: Task) -> tuple[Found, bytes] | None:
+    """What a simulated fish does at a point, and its recording; None where told to stop."""
     if task.stop.asked()():
         return None
     with tempfile.TemporaryDirectory() as folder:
         extra = {name: str(value) for name, value in task.point.columns().items()}
         path = Path(folder) / "point.mcap"
         with RunWriter(path, source="simulation", note=task.point.label(), extra=extra) as writer:
-            result = swim(
-                task.point,
-                task.config,
-                task.lengths,
-                writer,
-                lambda run: writer.describe(run.config, run.about()),
-            )
+            result: Found
+
+            def begun(run: VirtualRun) -> None:
+                writer.describe(run.config, run.about())
+
+            if task.config.robot == "swimmer":
+                from fishd.lab.sweep.free_swimming import swim_freely
+
+                asked = (task.point, task.config, task.lengths, writer)
+                swum = swim_freely(*asked, begun, task.stop.asked())
+                if swum is None:
+                    return None
+                result = swum
+            else:
+                result = swim(task.point, task.config, task.lengths, writer, begun)
         return result, path.read_bytes()
 
 

@@ -9,12 +9,13 @@ from fishd.lab.rig import Rig
 from fishd.lab.rig_recording import recorded
 from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths, Result, Task, on_rig, simulated
+from fishd.lab.sweep.measuring import Lengths, Task, on_rig, simulated
+from fishd.lab.sweep.results import Found
 
 STOP = "stop"
 """A file of this name in the folder ends a sweep in simulation."""
 
-Done = Callable[[Point, Result], None]
+Done = Callable[[Point, Found], None]
 
 
 def in_simulation(

@@ -1,0 +1,20 @@
+"""The verbs about a free swimmer, loaded when they are called (extra: swimmer)."""
+
+import click
+
+from fishd.cli.verbs import Verb, Verbs
+
+VERBS = {
+    "Draw": {
+        "wake": Verb("swimmer.wake", "wake", "Draw the water around it, from a checkpoint."),
+        "midlines": Verb("swimmer.midlines", "midlines", "Draw how its body moves in a beat."),
+    },
+}
+
+
+@click.group(cls=Verbs, verbs=VERBS)
+def swimmer() -> None:
+    """Draw a fish that swims freely: its wake, its midlines.
+
+    'fishctl simulate' swims it, and writes what these read; 'fishctl sweep' finds its speed.
+    """

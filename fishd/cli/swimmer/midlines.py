@@ -1,0 +1,42 @@
+"""The verb that draws how the body of a free swimmer moves."""
+
+from pathlib import Path
+
+import click
+
+from fishd.cli.options import FiniteRange
+from fishd.cli.output import counted, echo
+from fishd.cli.swimmer.options import picture_options
+from fishd.core import text
+from fishd.lab.swimmer import midline_figure
+from fishd.lab.swimmer.envelope import envelope
+from fishd.lab.swimmer.files import midlines_of
+from fishd.recording.folder import check_new
+
+
+@click.command()
+@click.argument("file", metavar="SWIM", type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--settle",
+    type=FiniteRange(min=0.0),
+    default=4.0,
+    show_default=True,
+    help="Beats before are left out [s].",
+)
+@picture_options
+def midlines(file: Path, settle: float, target: Path, form: str, force: bool) -> None:
+    """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
+
+    SWIM is what 'fishctl simulate ... --save FILE.npz' has written. The picture is named after it:
+    FILE-midlines.png.
+    """
+    path = target / f"{file.stem}-midlines.{form}"
+    check_new([path], replace=force)
+    found = envelope(*midlines_of(file), settle)
+    beats = len(found.periods)
+    frequency = beats / float(found.periods.sum())
+    title = f"{text.line(file.stem)}: midlines of the last of {counted(beats, 'beat')}, "
+    midline_figure.picture(found, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
+    echo(path)
+    tail = found.amplitudes[:, -1].mean()
+    echo(f"{counted(beats, 'beat')} of {frequency:.3f} Hz, tail ±{tail:.3f} lengths")

@@ -1,0 +1,59 @@
+"""The verb that draws the water around a free swimmer."""
+
+from pathlib import Path
+
+import click
+
+from fishd.cli.options import FiniteRange
+from fishd.cli.output import echo
+from fishd.cli.swimmer.options import picture_options
+from fishd.lab.swimmer import view, wake_figure
+from fishd.lab.swimmer.files import fish_of
+from fishd.recording.folder import check_new
+from fishd.swimmer import checkpoint
+
+
+@click.command()
+@click.argument("file", metavar="CHECKPOINT", type=click.Path(path_type=Path, readable=False))
+@click.option(
+    "--field",
+    "fields",
+    type=click.Choice(view.QUANTITIES),
+    multiple=True,
+    default=("vorticity", "speed"),
+    show_default=True,
+    help="What to draw. Repeatable.",
+)
+@click.option("--whole", is_flag=True, help="The whole tank, not only the fish and its near wake.")
+@click.option(
+    "--limit",
+    type=FiniteRange(min=0.0, min_open=True),
+    help="Where the colours end, in the unit of the field. [default: alike for all pictures of "
+    "such a fish]",
+)
+@picture_options
+def wake(
+    file: Path,
+    fields: tuple[view.Quantity, ...],
+    whole: bool,
+    limit: float | None,
+    target: Path,
+    form: str,
+    force: bool,
+) -> None:
+    """Draw vorticity and speed of the water, and the body in it.
+
+    CHECKPOINT is what 'fishctl simulate ... --checkpoint FILE' has written. The pictures are named
+    after it: FILE-vorticity.png.
+    """
+    fields = tuple(dict.fromkeys(fields))
+    if limit is not None and len(fields) > 1:
+        raise click.UsageError("--limit is of one field, and there are several: --field is needed")
+    paths = {field: target / f"{file.stem}-{field}.{form}" for field in fields}
+    check_new(paths.values(), replace=force)
+    fish = fish_of(checkpoint.load(file))
+    window = (view.whole if whole else view.around)(fish.settings)
+    for field, path in paths.items():
+        shown = view.view(fish, field, window, wake_figure.COLUMNS)
+        wake_figure.picture(shown, limit or view.scale(fish.settings, field), path)
+        echo(path)

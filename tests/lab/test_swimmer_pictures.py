@@ -1,0 +1,145 @@
+"""Pictures of a free swimmer: where things are in them, and that a film shows what swam."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fishd.core.errors import FishdError
+from fishd.lab.swimmer import midline_figure, view, wake_figure
+from fishd.lab.swimmer.envelope import envelope
+from fishd.lab.swimmer.film import MOST, Film
+from fishd.swimmer.fish import Fish
+from fishd.swimmer.settings import Numerics, SwimmerSettings
+
+COARSE = SwimmerSettings(numerics=Numerics(cell=2e-3, step=2e-3))
+
+
+@pytest.fixture(scope="module")
+def fish() -> Fish:
+    """After a second of a square wave of 2.5 Hz."""
+    swimmer = Fish(COARSE)
+    for step in range(500):
+        swimmer.step(1.0 if step % 200 < 100 else -1.0)
+    return swimmer
+
+
+def test_a_view_shows_the_water_where_it_is_in_the_laboratory(fish: Fish) -> None:
+    shown = view.view(fish, "speed", view.around(COARSE), 300)
+    window = shown.window
+    assert window.left == pytest.approx(-0.09 + fish.travelled)
+    assert shown.x == fish.motion().x
+    assert shown.outline[:, 0].min() < shown.x < shown.outline[:, 0].max()
+    rows, columns = shown.values.shape
+    assert columns == 300
+    assert (window.top - window.bottom) / rows == pytest.approx(0.3 / columns, rel=1e-2)
+    row, column = np.unravel_index(np.argmax(shown.values), shown.values.shape)
+    assert abs(window.left + 0.3 * (column + 0.5) / columns - shown.x) < 0.08  # not in the far wake
+    assert abs(window.bottom + 0.3 * (row + 0.5) / columns) < 0.04
+
+
+def test_between_the_nodes_of_a_stretched_grid_a_view_is_linear(fish: Fish) -> None:
+    grid = fish.flow.grid
+    before = fish.flow.p.copy()
+    fish.flow.p[:] = 3.0 * grid.xc[:, None] + 2.0 * grid.yc[None]
+    shown = view.view(fish, "pressure", view.around(COARSE), 50)
+    fish.flow.p[:] = before
+    middles = shown.window.left - fish.travelled + 0.3 * (np.arange(50) + 0.5) / 50
+    assert shown.values.mean(axis=0) == pytest.approx(3e3 * middles)
+
+
+def test_the_colours_end_at_a_round_value_of_the_size_that_occurs(fish: Fish) -> None:
+    for quantity in view.QUANTITIES:
+        limit = view.scale(COARSE, quantity)
+        shown = view.view(fish, quantity, view.around(COARSE), 300)
+        assert f"{limit:.0e}"[0] in "1235"
+        assert 0.1 * limit < np.abs(shown.values).max() < 10.0 * limit
+
+
+@pytest.mark.parametrize("quantity", view.QUANTITIES)
+def test_a_picture_of_the_wake_is_written(
+    fish: Fish, quantity: view.Quantity, tmp_path: Path
+) -> None:
+    shown = view.view(fish, quantity, view.whole(COARSE), 200)
+    wake_figure.picture(shown, view.scale(COARSE, quantity), tmp_path / "wake.png")
+    with Image.open(tmp_path / "wake.png") as picture:
+        assert picture.width > 2 * picture.height  # as long as the tank is
+
+
+@pytest.mark.parametrize("kind", [".webp", ".gif"])
+def test_a_film_has_a_frame_every_20_ms_and_shows_that_the_fish_moves(
+    kind: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"wake{kind}"
+    swimmer = Fish(COARSE)
+    with Film(path, COARSE) as film:
+        for _ in range(100):
+            swimmer.step(1.0)
+            film.look(swimmer)
+    with Image.open(path) as shown:
+        assert shown.n_frames == 11  # the first and the last among them
+        first, *_, last = [frame.astype(int) for frame in pixels(shown)]
+    assert (np.abs(first - last).sum(axis=2) > 100).sum() > 200
+
+
+def pixels(film: Image.Image) -> Iterator[np.ndarray]:
+    for number in range(film.n_frames):
+        film.seek(number)
+        yield np.asarray(film.convert("RGB"))
+
+
+def test_a_long_film_leaves_frames_out_and_keeps_its_pace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert MOST < 1000
+    monkeypatch.setattr("fishd.lab.swimmer.film.MOST", 4)
+    path = tmp_path / "wake.webp"
+    swimmer = Fish(COARSE)
+    with Film(path, COARSE) as film:
+        for _ in range(160):
+            swimmer.step(1.0)
+            film.look(swimmer)
+    with Image.open(path) as shown:
+        assert shown.n_frames == 3  # of 17
+        list(pixels(shown))
+        assert shown.info["duration"] == 320  # eight of 40 ms in one
+
+
+def test_a_film_of_another_kind_is_refused_before_anything_swims(tmp_path: Path) -> None:
+    with pytest.raises(FishdError, match=r"a film has no format \.mp4: \.webp or \.gif is needed"):
+        Film(tmp_path / "wake.mp4", COARSE)
+    with pytest.raises(FishdError, match="there is no folder"):
+        Film(tmp_path / "none" / "wake.webp", COARSE)
+
+
+def swum(beats: float, frequency: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    """A stiff front body and a tail that beats by ±0.1 L, obliquely across the laboratory."""
+    time = np.arange(0.0, beats / frequency, 0.005)
+    along = np.linspace(0.0, 0.1, 41)
+    across = 0.01 * (along / 0.1) ** 2 * np.sin(2.0 * np.pi * frequency * time)[:, None]
+    c, s = np.cos(0.2), np.sin(0.2)
+    x, y = c * along - s * across, s * along + c * across
+    return time, np.stack([x - 0.08 * time[:, None], y + 0.01 * time[:, None]], axis=2)
+
+
+def test_midlines_are_relative_to_the_mean_motion_wherever_the_fish_goes() -> None:
+    found = envelope(*swum(5.5))
+    assert found.periods == pytest.approx([0.5] * 4, rel=1e-3)
+    assert found.amplitudes[:, -1] == pytest.approx(0.1, rel=5e-3)
+    assert found.amplitudes[:, 20] == pytest.approx(0.025, rel=5e-3)
+    assert found.amplitudes[:, 0] == pytest.approx(0.0, abs=5e-4)
+    assert found.midlines[:, 0, 0] == pytest.approx(0.0, abs=0.01)
+    assert found.midlines[:, -1, 0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_tail_that_does_not_beat_has_no_midlines_of_a_beat() -> None:
+    with pytest.raises(FishdError, match="does not beat once"):
+        envelope(*swum(0.7))
+
+
+def test_a_picture_of_midlines_is_written(tmp_path: Path) -> None:
+    midline_figure.picture(envelope(*swum(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png")
+    with Image.open(tmp_path / "midlines.png") as picture:
+        assert picture.width == 1440

@@ -1,0 +1,169 @@
+"""Sweeps of a free swimmer: a speed is averaged once it is steady, and said to be one."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from rigs.coarse_swimmer import FILE, OPTIONS, coarse
+from rigs.processes import fishctl, one_line
+
+from fishd.config import Config
+from fishd.core.signals import Event, Tick
+from fishd.lab.sweep import figure, free_swimming
+from fishd.lab.sweep.curves import best, curves, plain
+from fishd.lab.sweep.folder import Begun, SweepFolder
+from fishd.lab.sweep.free_swimming import swim_freely
+from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.measuring import Lengths
+from fishd.lab.sweep.results import SpeedResult
+from fishd.lab.sweep.settling import is_steady, judged_from
+
+WAVE = Point("square", {"frequency": 3.0})
+
+
+class Dropped:
+    def tick(self, tick: Tick) -> None:
+        pass
+
+    def event(self, event: Event) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return coarse()
+
+
+def beats(speeds: np.ndarray, period: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """When beats of these speeds begin, and where the fish is then."""
+    return (
+        period * np.arange(len(speeds) + 1),
+        -np.concatenate([[0.0], np.cumsum(period * speeds)]),
+    )
+
+
+def test_the_start_is_dropped_until_the_mean_is_known_best() -> None:
+    times = 0.5 * np.arange(40)
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(40)
+    first = judged_from(*beats(0.1 * (1.0 - np.exp(-times / 1.5)) + noise))
+    assert 6 <= first <= 15
+    assert judged_from(*beats(0.1 + noise)) <= 8
+
+
+def test_a_speed_that_still_rises_is_not_steady_and_one_that_only_scatters_is() -> None:
+    noise = 1e-3 * np.random.default_rng(2).standard_normal(20)
+    assert is_steady(*beats(0.1 + noise), 0.1)
+    assert not is_steady(*beats(0.1 + noise + 0.01 * np.arange(20) / 20), 0.1)
+    assert is_steady(*beats(np.full(20, 0.1)), 0.1)
+    assert not is_steady(*beats(np.full(20, 0.1), period=0.1), 0.1)  # of two seconds only
+
+
+def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_is_said(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(free_swimming, "LONGEST", 2.0)
+    found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
+    assert found
+    assert (found.trouble, found.settled, found.seconds) == ("", None, 2.0)
+    assert found.beats == 2
+    assert found.beat_frequency == pytest.approx(3.0, rel=0.03)
+    assert found.speed is not None
+    assert 0.01 < found.speed < 0.1
+
+
+def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fishd.lab.sweep.settling.LEAST_TIME", 0.5)
+    monkeypatch.setattr("fishd.lab.sweep.settling.STEADY", 0.5)
+    found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
+    assert found
+    assert found.settled is not None
+    assert 0.3 < found.settled < 1.0
+    assert found.beats == 2
+    assert found.seconds == pytest.approx(found.settled + 2.0 / 3.0, abs=0.05)
+
+
+def test_a_fish_that_is_lost_is_a_point_without_a_speed(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fishd.swimmer.fish.UNSTABLE", 1e-6)
+    found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
+    assert found
+    assert found.speed is None
+    assert "the swimmer cannot go on at 0.04" in found.trouble
+
+
+def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
+    lengths = Lengths(settle=0.1, periods=2)
+    assert swim_freely(WAVE, config, lengths, Dropped(), stop=lambda: True) is None
+
+
+def opened(path: Path, config: Config) -> SweepFolder:
+    begun = Begun("simulation", msgspec.to_builtins(config), {})
+    return SweepFolder(path, begun, ["controller", "parameters.frequency", "parameters.C"])
+
+
+def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
+    tmp_path: Path, config: Config
+) -> None:
+    folder = opened(tmp_path, config)
+    found = [Point("square", {"frequency": value}) for value in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    found += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
+    speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
+    for point, speed in zip(found, speeds, strict=True):
+        result = SpeedResult(speed=speed, error=1e-3, beat_frequency=2.9, settled=4.0, beats=10)
+        folder.keep(point, result, b"a recording")
+    assert opened(tmp_path, config).results == folder.results
+    drawn = curves(folder, found)
+    told = best(drawn[0])
+    assert told
+    shown = plain(told, folder.begun.quantity)
+    assert shown["speed"] == pytest.approx(0.07, abs=4e-3)
+    assert "thrust" not in shown
+    picture, _ = figure.draw(
+        tmp_path / "speed",
+        drawn,
+        {"frequency": "Hz"},
+        error_of="it",
+        quantity=folder.begun.quantity,
+    )
+    text = picture.with_suffix(".svg").read_text()
+    assert all(words in text for words in ("speed (mm/s)", "swing C=0.6", "frequency (Hz)"))
+    assert "<!-- C -->" not in text  # no panel of its own
+
+
+@pytest.fixture
+def _no_worker_stays() -> Any:
+    from joblib.externals.loky import get_reusable_executor
+
+    yield
+    get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    fast = ["--settle", "0.5", "--periods", "2", "--jobs", "1", "--folder", str(folder)]
+    done = fishctl("sweep", "sine", "--frequency", "6", *OPTIONS, *fast)
+    assert done.returncode == 0
+    assert "sine frequency=6: " in done.stdout
+    assert " mm/s, 6.0" in done.stdout
+    with (folder / "points.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["strouhal"] or 1.0) > 0.0
+    assert int(row["beats"]) >= 2
+    assert (folder / row["recording"]).is_file()
+
+
+def test_a_grid_with_a_fish_that_cannot_be_computed_is_refused_before_anything_is_made(
+    tmp_path: Path,
+) -> None:
+    words = ("sweep", "square", "--vary", "swimmer.numerics.cell=0.002,0.02")
+    said = one_line(fishctl(*words, "--config", str(FILE), "--folder", str(tmp_path / "run")))
+    assert "swimmer.numerics.cell" in said
+    assert "too coarse" in said
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,190 @@
+"""Figure 6: the speed of the free swimmer against frequency, and what finer grids say of it.
+
+Hours of computing on the finest grid: rows that figure-6.csv has are not computed again.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import joblib
+
+from common.report import progress
+from fishd.config import Config, load
+from fishd.lab import drawing
+from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
+from fishd.lab.sweep.free_swimming import swim_freely
+from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.measuring import Lengths
+from fishd.lab.sweep.results import SpeedResult
+from fishd.simulation import EncodingPublisher
+from paper.runs import FOLDER, Row, column, read, write
+
+NAME = "figure-6"
+WAVES = ("square", "sine", "triangle")
+FREQUENCIES = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
+CRITERIA = (0.0, 0.6)
+TICK = 0.002
+"""As short as fishd's may be, so that hardly a reversal waits [s]."""
+CELL = 1.0
+"""Of the figure [mm]; the step in ms is the same number on all grids."""
+CELLS = (2.0, 1.0, 0.5)
+"""Of what is refined."""
+NEVER = "never"
+"""Of a speed that still changed in the end."""
+CONFIG = Path(__file__).resolve().parents[2] / "config" / "swimmer.yaml"
+
+
+class Case(NamedTuple):
+    """One swim."""
+
+    controller: str
+    setting: float
+    """The frequency of a wave [Hz], or C."""
+    cell: float
+    """[mm]"""
+
+
+FIGURE = [
+    *(Case(wave, frequency, CELL) for wave in WAVES for frequency in FREQUENCIES),
+    *(Case("swing", criterion, CELL) for criterion in CRITERIA),
+]
+REFINED = (("square", 3.0), ("sine", 2.0), ("swing", 0.6))
+CASES = FIGURE + [Case(*each, cell) for cell in CELLS if cell != CELL for each in REFINED]
+
+
+def config(cell: float) -> Config:
+    """The default swimmer on such a grid; cell: [mm]"""
+    numerics = "swimmer.numerics."
+    return load(
+        CONFIG, (f"tick={TICK}", f"{numerics}cell={1e-3 * cell}", f"{numerics}step={1e-3 * cell}")
+    )
+
+
+def swim(case: Case) -> SpeedResult:
+    """As `fishctl sweep` does; raises SystemExit where the fish could not go on."""
+    name = "C" if case.controller == "swing" else "frequency"
+    fish = config(case.cell)
+    point = Point(case.controller, {name: case.setting})
+    found = swim_freely(point, fish, Lengths.of(fish, None, None), EncodingPublisher())
+    assert found
+    if found.trouble:
+        raise SystemExit(f"{point.label()} at {case.cell:g} mm: {found.trouble}")
+    return found
+
+
+def compute(jobs: int) -> None:
+    """Every swim that is not in the table; each is kept as it ends."""
+    rows = {case: row for case in CASES if (row := row_of(case))}
+    missing = [case for case in CASES if case not in rows]
+    missing.sort(key=lambda case: case.cell)  # the longest first
+    parallel = joblib.Parallel(jobs, batch_size=1, return_as="generator_unordered")
+    for case, found in parallel(joblib.delayed(_numbered)(case) for case in missing):
+        rows[case] = _row(case, found)
+        progress(NAME, f"{case}", f"{1e3 * (found.speed or 0.0):.2f} mm/s")
+        write(NAME, [rows[each] for each in CASES if each in rows])
+
+
+def _numbered(case: Case) -> tuple[Case, SpeedResult]:
+    return case, swim(case)
+
+
+def row_of(case: Case) -> dict[str, Any] | None:
+    """What the table has of a swim."""
+    if not (FOLDER / f"{NAME}.csv").exists():
+        return None
+    having = {"controller": case.controller, "setting": case.setting, "cell_mm": case.cell}
+    return next(iter(read(NAME, **having)), None)
+
+
+def _row(case: Case, found: SpeedResult) -> Row:
+    return {
+        "controller": case.controller,
+        "setting": case.setting,
+        "cell_mm": case.cell,
+        "frequency_Hz": found.beat_frequency,
+        "speed_mm_per_s": 1e3 * (found.speed or 0.0),
+        "error_mm_per_s": 1e3 * (found.error or 0.0),
+        "beats": found.beats,
+        "steady_from_s": NEVER if found.settled is None else found.settled,
+        "seconds": found.seconds,
+        "tail_side_to_side_over_L": found.tail_width or 0.0,
+        "muscle_power_W_per_m": found.muscle_power or 0.0,
+        "cost_of_transport_J_per_kg_m": found.cost_of_transport or "",
+        "Strouhal": found.strouhal or "",
+        "Froude_efficiency": found.froude_efficiency or "",
+    }
+
+
+def draw() -> None:
+    """Speeds over frequencies on the left, over the size of the cells on the right."""
+    with drawing.drawn(FOLDER / f"{NAME}.svg", (8.4, 3.9)) as figure:
+        left, right = figure.subplots(1, 2, sharey=True, width_ratios=(5, 2))
+        styles = zip(WAVES, (BLACK, BLUE, ORANGE), "so^", strict=True)
+        colours = {}
+        for wave, colour, marker in styles:
+            rows = read(NAME, controller=wave, cell_mm=CELL)
+            colours[wave] = colour, marker
+            _bars(left, rows, "setting", colour, marker, wave, "-")
+        for criterion, marker, colour in zip(CRITERIA, "vD", (PURPLE, GREEN), strict=True):
+            rows = read(NAME, controller="swing", setting=criterion, cell_mm=CELL)
+            colours["swing"] = colour, marker
+            _bars(left, rows, "frequency_Hz", colour, marker, f"swing, C = {criterion:g}", "")
+        for (controller, setting), line in zip(REFINED, ("-", (0, (5, 2)), ":"), strict=True):
+            rows = read(NAME, controller=controller, setting=setting)
+            rows.sort(key=lambda row: float(row["cell_mm"]))
+            what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
+            _bars(right, rows, "cell_mm", *colours[controller], f"{controller}, {what}", line)
+        for axes in (left, right):
+            axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
+            axes.legend()
+        left.set_xlabel("frequency (Hz)")
+        left.set_ylabel("speed (mm/s)")
+        left.set_xlim(0.0, 6.3)
+        right.set_xlabel("size of the cells (mm)")
+        right.set_xlim(0.0, 2.2)
+
+
+def _bars(
+    axes: Any,
+    rows: list[dict[str, Any]],
+    over: str,
+    colour: str,
+    marker: str,
+    label: str,
+    line: Any,
+) -> None:
+    """Hollow where the speed still changed, and where there is no line."""
+    axes.errorbar(
+        column(rows, over),
+        column(rows, "speed_mm_per_s"),
+        yerr=column(rows, "error_mm_per_s"),
+        color=colour, marker=marker, mfc=colour if line else "white", ls=line, lw=1.0,
+        elinewidth=0.9, capsize=2, label=label,
+    )  # fmt: skip
+    changing = [row for row in rows if row["steady_from_s"] == NEVER]
+    axes.plot(
+        column(changing, over), column(changing, "speed_mm_per_s"), ls="", marker=marker,
+        color=colour, mfc="white", zorder=5,
+    )  # fmt: skip
+
+
+def fastest() -> Iterator[tuple[float, str, list[str]]]:
+    """For each frequency the fastest wave, and those that may be as fast within the intervals."""
+    for frequency in FREQUENCIES:
+        rows = {wave: row_of(Case(wave, frequency, CELL)) for wave in WAVES}
+        speeds = {
+            wave: (row["speed_mm_per_s"], row["error_mm_per_s"])
+            for wave, row in rows.items()
+            if row
+        }
+        if not speeds:
+            continue
+        first = max(speeds, key=lambda wave: speeds[wave][0])
+        top, error = speeds[first]
+        alike = [
+            wave
+            for wave, (speed, other) in speeds.items()
+            if wave != first and top - speed <= (error**2 + other**2) ** 0.5
+        ]
+        yield frequency, first, alike
