@@ -95,4 +95,5 @@ def main() -> None:
         sys.stderr.close()
         sys.exit(0)
     except OSError as error:
-        complain("fishctl", f"the output cannot be written: {error.strerror}", 1)
+        what = error.filename or "the output cannot be written"
+        complain("fishctl", f"{what}: {error.strerror or error}", 1)

@@ -4,6 +4,7 @@ Whatever a name leads to, a pipe, a device or a file without an end, the answer 
 """
 
 import os
+import secrets
 import stat
 from contextlib import suppress
 from pathlib import Path
@@ -74,13 +75,15 @@ def _check_kind(found: os.stat_result) -> None:
 def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> None:
     """Write a file, or replace it; a full disk or a kill leaves the old one, never half a file.
 
+    Of several writers at a time, the last one's is left, whole.
+
     new: there must be none of that name
-    Raises OSError.
+    Raises OSError, with the name of the file.
     """
-    part = path.with_name(f".{path.name}.part")
+    part = _beside(path)
     data = content.encode() if isinstance(content, str) else content
     try:
-        with part.open("wb") as file:
+        with part.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -88,6 +91,39 @@ def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> 
             path.hardlink_to(part)  # unlike a rename, never onto another file
         else:
             part.replace(path)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         with suppress(OSError):  # what went wrong before is to be told
             part.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Find out before long work whether a file can be written at its end.
+
+    Raises `FileProblem`.
+    """
+    part = _beside(path)
+    try:
+        if os.path.lexists(path):
+            _check_kind(path.stat())
+        else:
+            with suppress(FileNotFoundError):
+                path.lstat()  # which complains about a name that is too long
+        part.open("xb").close()
+    except FileNotFoundError:
+        raise FileProblem("there is no folder to put it into") from None
+    except OSError as error:
+        raise FileProblem(f"cannot be written: {error.strerror}") from None
+    except ValueError:
+        raise FileProblem("cannot be written: a name has no zero byte") from None
+    finally:
+        with suppress(OSError, ValueError):
+            part.unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    """A temporary name in the same folder, no other writer's, and of permitted length."""
+    return path.parent / f".{path.name[:50]}.{secrets.token_hex(6)}.part"

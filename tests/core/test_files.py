@@ -1,9 +1,11 @@
 """Whatever a name leads to, a pipe, a device, a file without an end, the answer comes at once."""
 
+import errno
 import os
 import socket
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import click
@@ -124,3 +126,70 @@ def test_a_link_to_a_good_file_is_followed_and_lines_end_alike(tmp_path: Path) -
     (tmp_path / "file").write_bytes(b"\xff")
     with pytest.raises(files.FileProblem, match="not a text file in UTF-8"):
         files.read_text(tmp_path / "link", 100, "a test")
+
+
+def test_writers_at_the_same_time_leave_a_whole_file_of_one_of_them(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    contents = [letter * 100_000 for letter in "abcd"]
+
+    def write(content: str) -> None:
+        for _ in range(20):
+            files.write_atomically(path, content)
+            assert path.read_text() in contents
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, contents))
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "file"
+    path.write_text("before")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        files.write_atomically(path, "after")
+    assert caught.value.filename == str(path)
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+    assert path.read_text() == "before"
+
+
+def test_a_new_file_replaces_none_and_has_the_usual_permissions(tmp_path: Path) -> None:
+    path, usual = tmp_path / "file", tmp_path / "usual"
+    usual.touch()
+    files.write_atomically(path, "first", new=True)
+    assert path.stat().st_mode == usual.stat().st_mode
+    with pytest.raises(FileExistsError):
+        files.write_atomically(path, "second", new=True)
+    assert path.read_text() == "first"
+
+
+def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> None:
+    files.check_writable(tmp_path / ("x" * 255))
+    files.write_atomically(tmp_path / ("ö" * 127), "long")
+    assert (tmp_path / ("ö" * 127)).read_text() == "long"
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("x" * 256, "cannot be written: File name too long"),
+        ("none/file", "there is no folder to put it into"),
+        ("file/file", "cannot be written: Not a directory"),
+        ("link", "is a device; a regular file is needed"),
+        ("/proc/file", "there is no folder to put it into|cannot be written"),
+        ("a\0b", "cannot be written: a name has no zero byte"),
+    ],
+)
+def test_whether_a_file_can_be_written_is_found_out_beforehand(
+    tmp_path: Path, name: str, complaint: str
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("/dev/null")
+    with pytest.raises(files.FileProblem, match=complaint):
+        files.check_writable(tmp_path / name)
+    assert {file.name for file in tmp_path.iterdir()} == {"file", "link"}
