@@ -5,13 +5,18 @@ anew, from the present command.
 """
 
 import io
+import lzma
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 
 from fishd.core import files
 from fishd.core.errors import FishdError
@@ -23,6 +28,30 @@ FORMAT = 2
 LONGEST = 2**30
 """Of a file [bytes]."""
 _STATE = "state."
+_NONE = (
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    EOFError,
+    OSError,
+    MemoryError,  # of an array that is said to be larger than the file
+    RuntimeError,  # encrypted, or packed in an unknown manner
+    SyntaxError,
+    tokenize.TokenError,
+    struct.error,
+    lzma.LZMAError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+"""What reading raises where a file is none."""
+
+
+class _About(Struct):
+    settings: dict[str, Any]
+    controller: str
+    parameters: dict[str, Any]
 
 
 class CheckpointError(FishdError):
@@ -44,7 +73,7 @@ class Checkpoint(NamedTuple):
     @property
     def time(self) -> float:
         """Of the fish [s]."""
-        return float(self.state["steps"]) * float(self.settings["swimmer"]["numerics"]["step"])
+        return float(self.track[-1, 0])
 
     def check(self, settings: Mapping[str, Any]) -> None:
         """Raises `CheckpointError` where it is of a fish with other settings than these."""
@@ -57,13 +86,38 @@ class Checkpoint(NamedTuple):
                 )
 
     def put_into(self, swimmer: Swimmer) -> None:
-        """Let the fish go on from here; raises `CheckpointError`."""
-        try:
-            swimmer.restore(self.state)
-        except (KeyError, ValueError) as error:
-            raise CheckpointError(
-                f"{self.path}: it is of another version of fishd, and does not fit ({error})"
-            ) from None
+        """Let the fish go on from here; raises `CheckpointError`, and the fish is as it was."""
+        self.check_state(swimmer.state())
+        step = swimmer.settings.numerics.step
+        time, end = int(self.state["steps"]) * step, self.track[-1, 0]
+        if abs(time - end) > 0.5 * step:
+            raise _damaged(
+                self.path, "track", f"ends at {end:.6g} s, and the fish is at {time:.6g} s"
+            )
+        swimmer.restore(self.state)
+
+    def check_state(self, fresh: Mapping[str, Array]) -> None:
+        """Raises `CheckpointError` where an array does not fit, or is not finite.
+
+        fresh: the state of such a fish at its start, or a part of it
+        """
+        for name, model in fresh.items():
+            found = self.state.get(name)
+            if found is None:
+                raise CheckpointError(
+                    f"{self.path}: it is of another version of fishd, and does not fit ({name!r})"
+                )
+            if (found.shape, found.dtype) != (model.shape, model.dtype):
+                raise _damaged(
+                    self.path,
+                    name,
+                    f"is of shape {found.shape} and type {found.dtype}, and needs to be of shape "
+                    f"{model.shape} and type {model.dtype}",
+                )
+            if not np.isfinite(found[np.isfinite(model)]).all() or np.isinf(found).any():
+                raise _damaged(self.path, name, "has values that are not finite")
+        if int(self.state["steps"]) < 0:
+            raise _damaged(self.path, "steps", "is negative")
 
 
 def save(
@@ -96,6 +150,12 @@ def load(path: Path) -> Checkpoint:
     except files.FileProblem as problem:
         raise CheckpointError(f"{path}: {problem}") from None
     try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > LONGEST:
+            raise CheckpointError(
+                f"{path}: it is damaged: unpacked it would be longer than {LONGEST / 2**20:g} MB"
+            )
         with np.load(io.BytesIO(content), allow_pickle=False) as found:
             arrays = {name: found[name] for name in found.files}
         about = msgspec.json.decode(str(arrays.pop("about")))
@@ -108,19 +168,26 @@ def load(path: Path) -> Checkpoint:
             raise CheckpointError(
                 f"{path}: it is of another version of fishd, whose track has other columns"
             )
+        about = msgspec.convert(about, _About)
         track = arrays.pop("track")
-        if track.ndim != 2 or track.shape[1] != len(COLUMNS):
-            raise ValueError("track")
-        return Checkpoint(
-            path=path,
-            settings=about["settings"],
-            controller=about["controller"],
-            parameters=about["parameters"],
-            state={name.removeprefix(_STATE): array for name, array in arrays.items()},
-            track=track,
-        )
-    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile):
+    except _NONE:
         raise CheckpointError(f"{path}: it is no checkpoint of a swimmer") from None
+    if track.ndim != 2 or track.shape[1] != len(COLUMNS) or not len(track):
+        raise _damaged(path, "track", f"is of shape {track.shape}, not a row for each tick")
+    if track.dtype != np.float64 or not np.isfinite(track).all():
+        raise _damaged(path, "track", "has values that are not finite numbers")
+    return Checkpoint(
+        path=path,
+        settings=about.settings,
+        controller=about.controller,
+        parameters=about.parameters,
+        state={name.removeprefix(_STATE): array for name, array in arrays.items()},
+        track=track,
+    )
+
+
+def _damaged(path: Path, name: str, how: str) -> CheckpointError:
+    return CheckpointError(f"{path}: it is damaged: {name} {how}")
 
 
 def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,11 +1,15 @@
 """`fishctl simulate` of a swimmer: what it tells, its files, and how it is cut off and goes on."""
 
+import io
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import time
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +23,8 @@ from fishd.swimmer import checkpoint
 from fishd.swimmer.track import COLUMNS
 
 
-def simulated(*words: str) -> "subprocess.CompletedProcess[str]":
-    return fishctl("simulate", *words, *OPTIONS)
+def simulated(*words: str | Path) -> "subprocess.CompletedProcess[str]":
+    return fishctl("simulate", *map(str, words), *OPTIONS)
 
 
 def report(*words: str) -> dict[str, Any]:
@@ -152,6 +156,66 @@ def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes
     (tmp_path / "kept").write_bytes(content)
     line = one_line(simulated("swing", "--resume", str(tmp_path / "kept")))
     assert line == f"fishctl: {tmp_path}/kept: it is no checkpoint of a swimmer\n"
+
+
+def bad(array: np.ndarray[Any, Any], value: float) -> np.ndarray[Any, Any]:
+    array = array.copy()
+    array.flat[-1] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "complaint"),
+    [
+        ("state.u", lambda u: u[:1], r"u is of shape \(1, \d+\) and type float64, and needs to be"),
+        ("state.u", lambda u: u[0, 0], r"u is of shape \(\) and type float64"),
+        ("state.p", lambda p: p.astype(complex), r"p is of shape .* and type complex128"),
+        ("state.p", lambda p: p.astype("U9"), r"p is of shape .* and type <U9"),
+        ("state.q", lambda q: bad(q, np.nan), "q has values that are not finite"),
+        ("state.velocity", lambda v: bad(v, np.inf), "velocity has values that are not finite"),
+        ("state.robot", lambda r: bad(r, np.nan), "robot has values that are not finite"),
+        ("state.robot", lambda r: r + np.inf, "robot has values that are not finite"),
+        ("state.steps", lambda steps: -steps, "steps is negative"),
+        ("state.steps", lambda steps: steps + 10, "track ends at 4 s, and the fish is at 4.02 s"),
+        ("state.steps", lambda steps: steps + 0.5, "steps is of shape .* and type float64"),
+        ("track", lambda track: bad(track, np.nan), "track has values that are not finite"),
+        ("track", lambda track: track[:0], "track is of shape"),
+        ("track", lambda track: track[0], "track is of shape"),
+    ],
+)
+def test_a_damaged_checkpoint_is_said_to_be_with_the_array_that_is(
+    swum: tuple[dict[str, Any], Path],
+    tmp_path: Path,
+    name: str,
+    change: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]],
+    complaint: str,
+) -> None:
+    arrays = table(swum[1] / "end")
+    damaged = tmp_path / "kept.npz"
+    np.savez(damaged, **arrays | {name: np.asarray(change(arrays[name]))})
+    line = one_line(simulated("sine", "--seconds", "0.2", "--settle", "0.1", "--resume", damaged))
+    assert re.match(rf"fishctl: {damaged}: it is damaged: {complaint}", line)
+
+
+def test_a_checkpoint_that_would_fill_the_memory_is_not_unpacked(
+    swum: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    bomb = tmp_path / "bomb.npz"
+    with (
+        zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("state.u.npy", "w", force_zip64=True) as member,
+    ):
+        for _ in range(2**10 + 1):
+            member.write(bytes(2**20))
+    with pytest.raises(checkpoint.CheckpointError, match="damaged: unpacked it would be longer"):
+        checkpoint.load(bomb)
+    header = io.BytesIO()
+    shape = {"descr": "<f8", "fortran_order": False, "shape": (2**44,)}
+    np.lib.format.write_array_header_1_0(header, shape)
+    with zipfile.ZipFile(bomb, "w") as archive:
+        archive.writestr("state.u.npy", header.getvalue())
+    with pytest.raises(checkpoint.CheckpointError, match="it is no checkpoint of a swimmer"):
+        checkpoint.load(bomb)
 
 
 def test_a_checkpoint_whose_track_has_other_columns_is_said_to_be_of_another_version(

@@ -20,6 +20,7 @@ def fish_of(checkpoint: Checkpoint) -> Fish:
     try:
         settings = msgspec.convert(checkpoint.settings["swimmer"], SwimmerSettings)
         fish = Fish(settings)
+        checkpoint.check_state(fish.state())
         fish.restore(checkpoint.state)
     except (KeyError, ValueError) as error:
         raise CheckpointError(
