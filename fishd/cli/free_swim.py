@@ -9,7 +9,7 @@ from fishd.cli.free_swim_options import SwimmerOptions
 from fishd.cli.lab_progress import showing
 from fishd.cli.output import echo, echo_rows, print_json, spelled
 from fishd.core.console import INTERRUPTED
-from fishd.core.errors import FishdError, MissingPackage, ParameterError
+from fishd.core.errors import FishdError, MissingPackage
 from fishd.core.interruption import on_signal
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
         ) from None
     if options.save:
         track.check_name(options.save)
-    if options.checkpoint and not options.checkpoint.absolute().parent.is_dir():
-        raise ParameterError(f"{options.checkpoint}: there is no folder to put it into")
+    options.check()
     keeping = Keeping(options.checkpoint, options.checkpoint_every) if options.checkpoint else None
     resume = checkpoint.load(options.resume) if options.resume else None
     interrupted = threading.Event()
@@ -60,9 +59,19 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
             resume=resume,
             ended=interrupted.is_set,
             watch=watch,
+            lost=lambda error: bar.warn(
+                f"fishctl: {options.checkpoint}: the checkpoint cannot be written: "
+                f"{error.strerror or error}; the fish swims on"
+            ),
         )
+    unsaved = False
     if options.save and len(swum.track):
-        track.save(swum.track, options.save, midlines.arrays())
+        try:
+            track.save(swum.track, options.save, midlines.arrays())
+        except OSError as error:
+            unsaved = True
+            why = error.strerror or error
+            echo(f"fishctl: {options.save}: the track cannot be written: {why}", err=True)
     if swum.report and as_json:
         print_json(swum.report)
     elif swum.report:
@@ -78,7 +87,7 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     if report and report.reason:
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
-    return 0
+    return 1 if unsaved or swum.lost else 0
 
 
 @contextmanager

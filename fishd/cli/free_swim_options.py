@@ -1,5 +1,6 @@
 """Options of `fishctl simulate` that only a free swimmer has: its files."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,6 +8,8 @@ from typing import Any, NamedTuple
 import click
 
 from fishd.cli.options import F, FiniteRange
+from fishd.core import files
+from fishd.core.errors import ParameterError
 
 EVERY = 5.0
 SETTLE = 8.0
@@ -35,6 +38,34 @@ class SwimmerOptions(NamedTuple):
                     f"{option} is for robot: swimmer, such as --config config/swimmer.yaml; a "
                     "tethered fish is soon simulated again, and --record keeps its ticks"
                 )
+
+    def check(self) -> None:
+        """Raises `ParameterError` where a file cannot be written, or should not be."""
+        for path in (self.checkpoint, self.save, self.film):
+            if path is not None:
+                _check(path)
+        for option, path in (("--checkpoint", self.checkpoint), ("--resume", self.resume)):
+            if path and self.save and _same(path, self.save):
+                raise ParameterError(f"{path}: {option} and --save need a file each")
+        kept = self.checkpoint
+        if kept and os.path.lexists(kept) and not (self.resume and _same(kept, self.resume)):
+            raise ParameterError(f"{kept} exists: --resume it, or remove it")
+
+
+def _check(path: Path) -> None:
+    if not path.name:
+        raise ParameterError("the name of a file is empty")
+    try:
+        files.check_writable(path)
+    except files.FileProblem as problem:
+        raise ParameterError(f"{path}: {problem}") from None
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether both names lead to the same file, or would."""
+    return one.resolve() == other.resolve() or (
+        one.exists() and other.exists() and one.samefile(other)
+    )
 
 
 def swimmer_options(function: F) -> F:

@@ -29,6 +29,10 @@ class Lines:
     def at(self, amount: float, found: str = "") -> None:
         """Say how much of the total is done by now, and what was found so far."""
 
+    def warn(self, line: str) -> None:
+        """Say a line on standard error."""
+        echo(line, err=True)
+
 
 class Bar(Lines):
     """The same, above a bar where they are on a terminal, too."""
@@ -50,6 +54,12 @@ class Bar(Lines):
     def at(self, amount: float, found: str = "") -> None:
         """Move the bar; what was found so far stands behind it."""
         self._progress.update(self._task, completed=amount, description=text.line(found))
+
+    def warn(self, line: str) -> None:
+        """Print it above the bar."""
+        self._progress.console.print(
+            text.block(line), markup=False, highlight=False, soft_wrap=True
+        )
 
 
 @contextmanager

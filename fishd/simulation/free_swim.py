@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from fishd.config import Config
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
+from fishd.core.errors import ParameterError
 from fishd.core.signals import Reason
 from fishd.simulation.report import count_ticks
 from fishd.simulation.virtual_run import EncodingPublisher, VirtualRun
@@ -62,6 +63,8 @@ class Swum(NamedTuple):
     """Why the fish could not go on."""
     kept: float | None
     """Time of the latest checkpoint that was written [s]."""
+    lost: OSError | None
+    """Why the latest one was not."""
     complete: bool
 
 
@@ -79,6 +82,7 @@ def swim(
     resume: Checkpoint | None = None,
     ended: Callable[[], bool] = lambda: False,
     watch: Callable[[Swimmer], None] = lambda fish: None,
+    lost: Callable[[OSError], None] = lambda error: None,
 ) -> Swum:
     """Let a controller swim a free swimmer for `seconds`, and judge it after `settle` seconds.
 
@@ -88,14 +92,19 @@ def swim(
     resume: go on from there; with the same controller the time before counts
     ended: asked after every tick whether to end now
     watch: shown the fish after every tick
-    Raises `UnknownController`, `ParameterError`, `MissingPackage`, `CheckpointError`, and OSError
-    where a checkpoint cannot be written.
+    lost: told the first time that a checkpoint cannot be written; the fish swims on
+    Raises `UnknownController`, `ParameterError`, `MissingPackage` and `CheckpointError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
     given = msgspec.structs.asdict(controller.parameters)
     ticks, first = count_ticks(seconds, settle, config.tick)
+    if first + 1 >= ticks:
+        raise ParameterError(
+            f"a run of {seconds:g} s is too short: it has to be judged by two ticks of "
+            f"{config.tick:g} s or more after the {settle:g} s that it may take to settle"
+        )
     settings = settings_of(config)
-    kept: float | None = None
+    keeper = _Keeper(keeping, lost)
     kept_rows: Array | None = None
     if resume:
         resume.check(settings)
@@ -123,11 +132,8 @@ def swim(
         since = time.perf_counter()
         mean_speed = _Speed(fish, first - before)
 
-        def keep() -> float | None:
-            if keeping:
-                checkpoint.save(keeping.path, fish, track, settings, name, given)
-                return fish.fish.time
-            return None
+        def keep() -> None:
+            keeper.keep(fish, track, settings, name, given)
 
         while len(track) < ticks:
             command = run.loop.applied
@@ -138,13 +144,13 @@ def swim(
             watch(fish)
             progress(len(track) * config.tick, mean_speed.mean())
             if fish.fish.time >= next_kept - 1e-9:
-                kept = keep()
+                keep()
                 next_kept += keeping.every if keeping else 0.0
             if ended():
                 break
         elapsed = time.perf_counter() - since
         if not fish.trouble and len(track) > before:
-            kept = keep()
+            keep()
         loop = run.loop
         report = None
         if len(track) > first + 1:
@@ -161,7 +167,9 @@ def swim(
                 fallback=loop.active.fallback,
                 real_time_factor=(len(track) - before) * config.tick / elapsed,
             )
-    return Swum(track, report, fish.trouble, kept, len(track) >= ticks)
+    return Swum(
+        track, report, fish.trouble, keeper.kept, keeper.trouble, complete=len(track) >= ticks
+    )
 
 
 def settings_of(config: Config) -> dict[str, Any]:
@@ -174,6 +182,32 @@ def settings_of(config: Config) -> dict[str, Any]:
         found["amplitude_limit"] = config.amplitude_limit
         found["plant"] = {"servo_speed": plant.servo_speed, "servo_lag": plant.servo_lag}
     return found
+
+
+class _Keeper:
+    """Writes checkpoints; one that cannot be written is no reason to end a swim."""
+
+    def __init__(self, keeping: Keeping | None, lost: Callable[[OSError], None]) -> None:
+        self._keeping, self._lost = keeping, lost
+        self._told = False
+        self.kept: float | None = None
+        """Time of the latest checkpoint [s]."""
+        self.trouble: OSError | None = None
+        """Why the latest one was not written."""
+
+    def keep(self, fish: Swimmer, *others: Any) -> None:
+        """Write one, where they are wanted; others: what `checkpoint.save` needs, too."""
+        if not self._keeping:
+            return
+        try:
+            checkpoint.save(self._keeping.path, fish, *others)
+        except OSError as error:
+            self.trouble = error
+            if not self._told:
+                self._told = True
+                self._lost(error)
+        else:
+            self.kept, self.trouble = fish.fish.time, None
 
 
 class _Speed:
