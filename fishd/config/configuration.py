@@ -192,6 +192,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             scaled=self.estimator.kind != "lateral_force",
             virtual=self.lockstep or self.robot == "swimmer",
             chatter=self.chatter,
+            tethered=self.robot != "swimmer",
         )
 
 

@@ -20,6 +20,9 @@ from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
+MOST_STEPS = 200
+"""Of a swimmer in a tick: between two ticks fishd answers nobody."""
+
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
     """The controller to start with is installed and accepts its parameters."""
@@ -162,6 +165,12 @@ def check_swimmer(swimmer: SwimmerSettings, tick: float) -> None:
             ("tick",),
             f"{tick:g} s is no whole number of steps of swimmer.numerics.step, {step:g} s; "
             f"{steps * step:g} s would be",
+        )
+    if steps > MOST_STEPS:
+        raise Problem(
+            ("swimmer", "numerics", "step"),
+            f"{step:g} s makes {steps} steps of a tick, and nothing answers meanwhile: at most "
+            f"{MOST_STEPS} are possible",
         )
 
 

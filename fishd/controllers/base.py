@@ -53,6 +53,8 @@ class Limits(Struct, frozen=True):
     """Time stands still while a controller thinks, so it may wait for others as long as it must."""
     chatter: ChatterSettings = ChatterSettings()
     """What becomes of a policy that reverses too fast."""
+    tethered: bool = True
+    """The fish hangs from its force sensor, so that F_x is its thrust."""
 
 
 P = TypeVar("P", bound=Struct)

@@ -8,6 +8,7 @@ from msgspec import Meta, Struct
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
 from fishd.controllers.criterion_search import CriterionSearch, Phase, Rung
 from fishd.controllers.quantities import quantity
+from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
@@ -15,6 +16,8 @@ REFRACTORY = 0.05
 """Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
 
 
+LONGEST_TICK = 0.15
+"""Of C auto: with longer ones a half beat has two or three, and its ripple cannot be told [s]."""
 SLOPE_OVER = 0.05
 """The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
 
@@ -75,6 +78,26 @@ class Swing(Controller[SwingParameters]):
         self._velocities: deque[float] = deque(maxlen=ticks + 1)
         self._search: CriterionSearch | None = None
         self.retune(parameters)
+
+    @classmethod
+    def check(cls, parameters: SwingParameters, limits: Limits) -> None:
+        """As for any controller; and C auto judges by F_x of a tethered fish, and by its shape.
+
+        Raises `ParameterError`.
+        """
+        super().check(parameters, limits)
+        if parameters.C != "auto":
+            return
+        if not limits.tethered:
+            raise ParameterError(
+                "C: auto goes by the ripple of F_x, which is the thrust of a tethered fish only; a "
+                "number in [0, 1] is needed"
+            )
+        if limits.tick > LONGEST_TICK:
+            raise ParameterError(
+                f"C: auto needs ticks of {LONGEST_TICK:g} s at most, not {limits.tick:g} s, to see "
+                "the ripple of F_x; a number in [0, 1] is needed"
+            )
 
     def retune(self, parameters: SwingParameters) -> None:
         """Take new parameters; to set C to auto begins a search, to set anything else keeps it."""

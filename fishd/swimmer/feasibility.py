@@ -20,6 +20,14 @@ SHARPEST = 0.9
 """Curvature times half thickness, at most: with 1 the inner side of the bend is folded."""
 FURTHEST = 2.5
 """The tail turns against the head by at most so much [rad]."""
+MOST_CELLS = 1_000_000
+"""Of the grid; a step of so many takes seconds, and a GB of memory."""
+MOST_VISCOUS = 0.125
+"""ν Δt/h² at most: explicit diffusion by Adams–Bashforth is stable to this in two dimensions."""
+LEAST_SEGMENT = 1.5
+"""A piece of the beam is at least so many cells long: shorter ones move too little water."""
+THINNEST = 0.05
+"""Thickness of the body, ends left out, over its largest."""
 _MARGIN = 1.2
 
 
@@ -68,6 +76,7 @@ def check(settings: SwimmerSettings) -> None:
     """Raises `Problem` with the key at fault, what is wrong and what would be right."""
     body, numerics = settings.body, settings.numerics
     _check_profile(body)
+    _check_cells(settings)
     thickest = 2.0 * float(half_thickness(body, np.linspace(0.0, body.length, 201)).max())
     most = min(body.length / LEAST_CELLS_LONG, thickest / LEAST_CELLS_THICK)
     if numerics.cell > most:
@@ -76,9 +85,22 @@ def check(settings: SwimmerSettings) -> None:
             f"{numerics.cell:g} m is too coarse for a fish {body.length:g} m long and "
             f"{thickest:.3g} m thick: at most {most:.3g} m",
         )
+    most_segments = int(body.length / (LEAST_SEGMENT * numerics.cell))
+    if numerics.segments > most_segments:
+        raise Problem(
+            ("swimmer", "numerics", "segments"),
+            f"{numerics.segments} are too many for cells of {numerics.cell:g} m: at most "
+            f"{most_segments}",
+        )
     _check_tank(settings)
     _check_bend(settings)
-    found = estimate(settings)
+    _check_diffusion(settings)
+    try:
+        found = estimate(settings)
+    except (np.linalg.LinAlgError, FloatingPointError, OverflowError):
+        raise Problem(
+            ("swimmer", "body"), "its stiffness and the water's density are too far apart"
+        ) from None
     if found.courant_number > LARGEST_COURANT:
         longest = numerics.step * LARGEST_COURANT / found.courant_number
         raise Problem(
@@ -92,6 +114,8 @@ def _check_profile(body: Body) -> None:
     points = body.profile
     if points is None:
         return
+    if not all(math.isfinite(number) for point in points for number in point):
+        raise Problem(("swimmer", "body", "profile"), "needs finite numbers")
     shares = [share for share, _ in points]
     rising = all(a < b for a, b in pairwise(shares))
     if len(points) < 2 or not rising or shares[0] != 0.0 or shares[-1] != 1.0:
@@ -102,6 +126,13 @@ def _check_profile(body: Body) -> None:
         )
     if min(s for _, s in points) < 0.0 or max(s for _, s in points) <= 0.0:
         raise Problem(("swimmer", "body", "profile"), "s must be 0 or more, and somewhere above")
+    inside = half_thickness(body, np.linspace(0.05, 0.95, 181) * body.length)
+    if inside.min() < THINNEST * inside.max():
+        raise Problem(
+            ("swimmer", "body", "profile"),
+            f"between X/L = 0.05 and 0.95 the body must be at least {THINNEST:g} times as thick as "
+            "where it is thickest",
+        )
 
 
 def _check_tank(settings: SwimmerSettings) -> None:
@@ -115,8 +146,40 @@ def _check_tank(settings: SwimmerSettings) -> None:
             raise Problem(
                 ("swimmer", "water", key),
                 f"a tank of {size:g} m is too small for a fish {body.length:g} m long: at least "
-                f"{needed:.3g} m",
+                f"{math.ceil(needed * 1000.0 - 1e-9) / 1000.0:g} m",
             )
+
+
+def _check_cells(settings: SwimmerSettings) -> None:
+    """The grid and the slices of the body fit into memory."""
+    body, water, numerics = settings.body, settings.water, settings.numerics
+    cells = 1.0
+    for size, share, ratio in (
+        (water.length, numerics.fine_length, numerics.stretch_along),
+        (water.width, numerics.fine_width, numerics.stretch_across),
+    ):
+        fine = share * body.length / numerics.cell
+        outside = max(0.0, size / numerics.cell - fine)
+        if ratio > 1.0:
+            outside = 2.0 * math.log1p(0.5 * outside * (ratio - 1.0)) / math.log(ratio)
+        cells *= fine + outside
+    if cells > MOST_CELLS:
+        raise Problem(
+            ("swimmer", "numerics", "cell"),
+            f"{numerics.cell:g} m would need {cells:.2g} cells, and at most {MOST_CELLS:.2g} are "
+            "possible: larger cells, a smaller tank or a stretched grid are needed",
+        )
+
+
+def _check_diffusion(settings: SwimmerSettings) -> None:
+    numerics, viscosity = settings.numerics, settings.water.viscosity
+    share = viscosity * numerics.step / numerics.cell**2
+    if share > MOST_VISCOUS:
+        raise Problem(
+            ("swimmer", "numerics", "step"),
+            f"{numerics.step:g} s is beyond the limit of stability in water of {viscosity:g} m²/s: "
+            f"at most {numerics.step * MOST_VISCOUS / share:.2g} s",
+        )
 
 
 def _check_bend(settings: SwimmerSettings) -> None:

@@ -23,6 +23,8 @@ RECENTRE = 2.0
 """So much of the way back to the middle of the grid in a second [1/s]."""
 UNSTABLE = 1.0
 """A Courant number beyond which nothing that is computed is to be believed."""
+_FASTEST = 0.05
+"""No body moves by so many of its lengths in a step."""
 _CHECKED_EVERY = 20
 _STEER_TIME = 0.4
 """Heading and place are averaged over about so long before the fish is steered [s]."""
@@ -152,7 +154,11 @@ class Fish:
         try:
             body.step(dt, forces)
         except LeftTheGrid as error:
-            raise self._diverged(f"{error}; swimmer.steering keeps it there") from None
+            if float(np.abs(self.body.velocity).max()) * dt < _FASTEST * self.settings.body.length:
+                raise self._diverged(f"{error}; swimmer.steering keeps it there") from None
+            raise self._diverged(
+                "the motion grew without bounds; a shorter swimmer.numerics.step may help"
+            ) from None
         except np.linalg.LinAlgError:
             raise self._diverged("the motion of the body has no solution") from None
         self._steps += 1

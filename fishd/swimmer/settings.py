@@ -83,10 +83,15 @@ class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     cell: Annotated[float, unit("m", "Size of the cells around the fish.", gt=0.0, le=0.1)] = 1e-3
     step: Annotated[float, unit("s", "Time step.", gt=0.0, le=0.1)] = 1e-3
     segments: Annotated[
-        int, Meta(ge=5, le=200, description="Pieces of the beam, in each of which it bends evenly.")
+        int,
+        Meta(
+            ge=5,
+            le=200,
+            description="Pieces of the beam, each bent evenly, and at least 1.5 cells long.",
+        ),
     ] = 25
     fine_length: Annotated[
-        float, unit("1", "Length of the part with small cells, in lengths of the fish.", ge=1.2)
+        float, unit("1", "Length of the part with small cells, in lengths of the fish.", ge=1.4)
     ] = 2.0
     fine_width: Annotated[
         float, unit("1", "Width of that part, in lengths of the fish.", ge=0.5)

@@ -1,11 +1,13 @@
 """`swing --C auto`: it finds the C of fish that are not like the model, and says what it does."""
 
 import pytest
+from msgspec.structs import replace
 from rigs.harness import LIMITS, Rig, observe
 
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.criterion_search import BEGIN, LADDER
+from fishd.core.errors import ParameterError
 from fishd.simulation import simulate
 
 
@@ -72,3 +74,10 @@ def test_a_number_that_is_set_ends_the_search_and_auto_begins_a_new_one() -> Non
     controller.retune(registry.merged(controller, "swing", {"C": "auto"}))
     controller.update(observe(fin_velocity=1.0))
     assert controller.criterion == 0.6
+
+
+def test_it_is_refused_where_the_force_does_not_tell_the_thrust() -> None:
+    with pytest.raises(ParameterError, match="which is the thrust of a tethered fish only"):
+        registry.create("swing", {"C": "auto"}, replace(LIMITS, tethered=False))
+    with pytest.raises(ParameterError, match=r"needs ticks of 0\.15 s at most, not 0\.2 s"):
+        registry.create("swing", {"C": "auto"}, replace(LIMITS, tick=0.2))

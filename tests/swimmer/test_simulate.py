@@ -230,8 +230,8 @@ def test_a_checkpoint_whose_track_has_other_columns_is_said_to_be_of_another_ver
 
 
 def test_a_swim_that_is_not_steady_is_said_to_need_a_longer_settle() -> None:
-    out = simulated("square", "--frequency", "2.5", "--seconds", "5", "--settle", "2").stdout
-    assert "\n            still slowing down by " in out  # a coarse fish overshoots
+    out = simulated("square", "--frequency", "2.5", "--seconds", "4", "--settle", "0").stdout
+    assert "\n            still speeding up by " in out
     assert " %/s: a longer --settle is needed\n" in out
 
 
