@@ -5,11 +5,7 @@ anew, from the present command.
 """
 
 import io
-import lzma
-import struct
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,24 +24,6 @@ FORMAT = 2
 LONGEST = 2**30
 """Of a file [bytes]."""
 _STATE = "state."
-_NONE = (
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    ArithmeticError,
-    EOFError,
-    OSError,
-    MemoryError,  # of an array that is said to be larger than the file
-    RuntimeError,  # encrypted, or packed in an unknown manner
-    SyntaxError,
-    tokenize.TokenError,
-    struct.error,
-    lzma.LZMAError,
-    zlib.error,
-    zipfile.BadZipFile,
-)
-"""What reading raises where a file is none."""
 
 
 class _About(Struct):
@@ -153,9 +131,7 @@ def load(path: Path) -> Checkpoint:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > LONGEST:
-            raise CheckpointError(
-                f"{path}: it is damaged: unpacked it would be longer than {LONGEST / 2**20:g} MB"
-            )
+            raise _damaged(path, "it", f"would be longer than {LONGEST / 2**20:g} MB unpacked")
         with np.load(io.BytesIO(content), allow_pickle=False) as found:
             arrays = {name: found[name] for name in found.files}
         about = msgspec.json.decode(str(arrays.pop("about")))
@@ -170,7 +146,9 @@ def load(path: Path) -> Checkpoint:
             )
         about = msgspec.convert(about, _About)
         track = arrays.pop("track")
-    except _NONE:
+    except CheckpointError:
+        raise
+    except Exception:  # NumPy and zipfile raise of all kinds for what is no archive of arrays
         raise CheckpointError(f"{path}: it is no checkpoint of a swimmer") from None
     if track.ndim != 2 or track.shape[1] != len(COLUMNS) or not len(track):
         raise _damaged(path, "track", f"is of shape {track.shape}, not a row for each tick")

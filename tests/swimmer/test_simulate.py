@@ -207,7 +207,7 @@ def test_a_checkpoint_that_would_fill_the_memory_is_not_unpacked(
     ):
         for _ in range(2**10 + 1):
             member.write(bytes(2**20))
-    with pytest.raises(checkpoint.CheckpointError, match="damaged: unpacked it would be longer"):
+    with pytest.raises(checkpoint.CheckpointError, match="damaged: it would be longer than 1024 MB"):
         checkpoint.load(bomb)
     header = io.BytesIO()
     shape = {"descr": "<f8", "fortran_order": False, "shape": (2**44,)}
@@ -257,12 +257,51 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
         (("--checkpoint", "no-such/kept"), "no-such/kept: there is no folder to put it into"),
         (("--resume", "no-such"), "no-such: no such file"),
         (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
+        (("--seconds", "1", "--settle", "0.99"), "a run of 1 s is too short"),
+        (("--checkpoint", ""), "the name of a file is empty"),
+        (("--checkpoint", "/dev/null"), "/dev/null: is a device; a regular file is needed"),
+        (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need a file each"),
     ],
 )
 def test_what_cannot_be_done_is_said_before_it_swims(
     words: tuple[str, ...], complaint: str
 ) -> None:
     assert complaint in one_line(simulated("swing", *words))
+
+
+def test_a_checkpoint_of_another_swim_is_not_written_over(
+    swum: tuple[dict[str, Any], Path],
+) -> None:
+    kept = swum[1] / "end"
+    before = kept.read_bytes()
+    line = one_line(simulated("swing", "--checkpoint", kept))
+    assert line == f"fishctl: {kept} exists: --resume it, or remove it\n"
+    assert kept.read_bytes() == before
+
+
+def test_a_folder_that_goes_away_costs_its_files_and_not_the_swim(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    files = ("--checkpoint", gone / "kept", "--checkpoint-every", "1", "--save", gone / "track.csv")
+    command = (FISHCTL, "simulate", "swing", "--seconds", "20", "--settle", "1", *OPTIONS, *files)
+    swimming = subprocess.Popen(
+        [str(word) for word in command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while not (gone / "kept").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    gone.rename(tmp_path / "elsewhere")
+    told, complaints = swimming.communicate(timeout=60)
+    assert swimming.returncode == 1
+    assert "\nspeed " in told
+    assert complaints.splitlines()[-2:] == [
+        f"fishctl: {gone}/kept: the checkpoint cannot be written: No such file or directory; the "
+        "fish swims on",
+        f"fishctl: {gone}/track.csv: the track cannot be written: No such file or directory",
+    ]
 
 
 def test_a_tethered_fish_has_no_checkpoints() -> None:
