@@ -257,7 +257,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
         (("--checkpoint", "no-such/kept"), "no-such/kept: there is no folder to put it into"),
         (("--resume", "no-such"), "no-such: no such file"),
         (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
-        (("--seconds", "1", "--settle", "0.99"), "a run of 1 s is too short"),
+        (("--seconds", "1", "--settle", "0.98"), "a run of 1 s is too short"),
         (("--checkpoint", ""), "the name of a file is empty"),
         (("--checkpoint", "/dev/null"), "/dev/null: is a device; a regular file is needed"),
         (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need a file each"),
