@@ -10,8 +10,9 @@ from fishd.hardware.base import Robot
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.window import VoltageWatch
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
+from fishd.virtual.plant.base import TrueWindow, Window
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import TetheredFish, TrueWindow, Window
+from fishd.virtual.plant.registry import open_plant
 
 
 class SimulatedFish:
@@ -19,7 +20,7 @@ class SimulatedFish:
 
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
-        self.fish = TetheredFish(plant)
+        self.fish = open_plant(plant)
         self.window: Window
         """The latest window with its true mean forces; there is none before the first read."""
         self._imperfections = Imperfections(settings, tick)

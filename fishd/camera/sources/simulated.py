@@ -25,8 +25,9 @@ from fishd.core.addresses import find_control
 from fishd.core.errors import FishError
 from fishd.core.schema import Problem, convert
 from fishd.core.signals import Status
+from fishd.virtual.plant.base import PlantState
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import PlantState, TetheredFish
+from fishd.virtual.plant.tethered import TetheredFish
 
 AGAIN = 0.3
 """Time between two looks for a fishd [s]."""
