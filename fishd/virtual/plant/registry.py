@@ -9,7 +9,6 @@ from fishd.core.foreign_code import contained
 from fishd.core.plugins import Plugins
 from fishd.virtual.plant.base import Plant, Window
 from fishd.virtual.plant.parameters import TETHERED, PlantParameters
-from fishd.virtual.plant.tethered import TetheredFish
 
 PLANTS: Plugins[Plant[Any]] = Plugins(
     "plant",
@@ -27,9 +26,8 @@ def open_plant(parameters: PlantParameters) -> Plant[Any]:
 
     Raises `UnknownPlant`, and `StartupError` where that of another package cannot begin.
     """
-    if parameters.model == TETHERED:
-        return TetheredFish(parameters)
-    return _Contained(parameters)
+    kind = PLANTS.find(parameters.model)
+    return kind(parameters) if parameters.model == TETHERED else _Contained(kind, parameters)
 
 
 class _Contained(Plant[PlantParameters]):
@@ -37,9 +35,8 @@ class _Contained(Plant[PlantParameters]):
 
     Settings = PlantParameters
 
-    def __init__(self, parameters: PlantParameters) -> None:
+    def __init__(self, kind: type[Plant[Any]], parameters: PlantParameters) -> None:
         super().__init__(parameters)
-        kind = PLANTS.find(parameters.model)
         try:
             self._plant = contained(kind, parameters)
             self.state = self._plant.state
