@@ -44,7 +44,11 @@ class SimulatedFish:
         samples = max(1, round(self._sample_rate * duration))
         self.window = window = self.fish.advance(self._angle, duration, samples)
         fx, fy = self._imperfections.apply(
-            window.sampled_thrust, window.sampled_lateral_force, now - self._start, duration
+            window.sampled_thrust,
+            window.sampled_lateral_force,
+            now - self._start,
+            duration,
+            samples,
         )
         if self._watches:
             self._watches = [watch for watch in self._watches if not watch.closed]
