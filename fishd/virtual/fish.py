@@ -10,7 +10,7 @@ from fishd.hardware.base import Robot
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.window import VoltageWatch
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
-from fishd.virtual.plant.base import TrueWindow, Window
+from fishd.virtual.plant.base import PlantWindow, TrueWindow, Window
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.registry import open_plant
 
@@ -21,8 +21,8 @@ class SimulatedFish:
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
         self.fish = open_plant(plant)
-        self.window: Window
-        """The latest window with its true mean forces; there is none before the first read."""
+        self.window: Window = PlantWindow(tick, 0.0, 0.0, 0.0, 0.0, 0.0)
+        """The latest window with its true mean forces; nothing happens before the first read."""
         self._imperfections = Imperfections(settings, tick)
         self._sample_rate = settings.sample_rate
         self._tick = tick
