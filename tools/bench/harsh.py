@@ -39,8 +39,8 @@ NAMES = {
 """The keys of each."""
 
 
-def cases(file: Path) -> list[Case]:
-    """None of them, each alone, all of them."""
+def cases(file: Path, amplitude: float) -> list[Case]:
+    """None of them, each alone, all of them; amplitude: Φ, the first override of each [rad]"""
     sections = yaml.safe_load(file.read_text(encoding="utf-8"))
     values = {
         f"{section}.{key}": value
@@ -52,7 +52,8 @@ def cases(file: Path) -> list[Case]:
         raise ValueError(f"{file} and NAMES differ by {sorted(named ^ set(values))}")
 
     def case(name: str, keys: Any) -> Case:
-        return Case(name, tuple(f"{key}={values[key]!r}" for key in keys))
+        own = (f"{key}={values[key]!r}" for key in keys)
+        return Case(name, (f"amplitude_limit={amplitude}", *own))
 
     alone = [case(name, keys) for name, keys in NAMES.items()]
     return [case("none", ()), *alone, case("all of them", values)]
@@ -60,12 +61,13 @@ def cases(file: Path) -> list[Case]:
 
 OPTIONS: Options = {
     "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
+    "--amplitude": {"type": float, "default": 0.42, "help": "Φ [rad]"},
 }
 
 
 def measure(options: Namespace) -> Report:
     """One table; a minute or two."""
-    fish = cases(FILE)
+    fish = cases(FILE, options.amplitude)
     with ProcessPoolExecutor(options.jobs) as pool:
         found = list(pool.map(measured, fish))
     rows = [row(case, shares) for case, shares in zip(fish, found, strict=True)]
@@ -78,7 +80,7 @@ def row(case: Case, shares: Shares) -> list[str]:
     """Of the table."""
     config = load(None, case.overrides)
     best = best_square_wave(config.plant, config.amplitude_limit)
-    alone = len(case.overrides) <= 2
-    keys = ", ".join(f"`{key.replace('=', ' ')}`" for key in case.overrides) if alone else ""
+    own = case.overrides[1:]
+    keys = ", ".join(f"`{key.replace('=', ' ')}`" for key in own) if len(own) <= 2 else ""
     thrust = f"{1e3 * best.thrust:.2f}"
     return [case.name, keys, thrust, percent(shares.fixed), percent(shares.auto)]

@@ -153,7 +153,7 @@ class Segment:
         if not turns.size:
             return 0.0
         k = int(turns[0])
-        share = _FINE[k] + _FINE[1] * float(rates[k] / (rates[k] - rates[k + 1]))
+        share = float(_FINE[k] + _FINE[1] * rates[k] / (rates[k] - rates[k + 1]))
         return self.length * share if _AT_AN_END < share < 1.0 - _AT_AN_END else 0.0
 
     def peak(self, response: Vector) -> float:

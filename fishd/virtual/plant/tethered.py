@@ -72,6 +72,7 @@ class TetheredFish(Plant[PlantParameters]):
         self._line = DelayLine(parameters.servo_delay) if parameters.servo_delay else None
         self._drag = parameters.quadratic_drag
         self._side_drag = parameters.lateral_quadratic_drag
+        self._brakes = bool(self._drag or self._side_drag)
         self._momentum = 0.0
         """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
 
@@ -125,7 +126,7 @@ class TetheredFish(Plant[PlantParameters]):
         )
 
         responses: Sequence[Vector] = ()
-        if self._drag or self._side_drag:
+        if self._brakes:
             segments, responses = self._cut_at_turns(segments, command, lag)
         cause = self._cause
         course: list[tuple[Segment, Vector]] = []
@@ -144,7 +145,7 @@ class TetheredFish(Plant[PlantParameters]):
             sampled_thrust -= total
             sampled_acceleration += total_acceleration
             sampled_rate += total_rate
-            if self._side_drag:
+            if responses:
                 rates = response[N : 2 * N]
                 integral, total = segment.sums.dot(np.abs(rates) * rates).tolist()
                 braking += integral
@@ -273,7 +274,7 @@ class TetheredFish(Plant[PlantParameters]):
             longest = min(longest, self._servo_time)
         if self.parameters.servo_reaction:
             longest = min(longest, 5.0 * _REACTION_TIME)
-        if self._drag or self._side_drag:
+        if self._brakes:
             longest = min(longest, _DRAG_STEP)
         instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]
         segments: list[Segment] = []

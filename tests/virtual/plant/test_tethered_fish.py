@@ -26,6 +26,7 @@ FISHES = {
     "quadratic drag alone": Fish(xi=0.0, lateral_drag=0.0, quadratic_drag=10.0),
     "quadratic lateral drag": Fish(lateral_quadratic_drag=0.02, xi=0.3),
     "quadratic drag, slack cables": Fish(quadratic_drag=0.5, backlash=0.1, cable_slack=0.05),
+    "quadratic drag, servo that pushes back": Fish(quadratic_drag=2.0, servo_reaction=0.004),
     "no damping": Fish(xi=0.0),
     "little damping": Fish(xi=0.02),
     "heavy damping": Fish(xi=15.0),
@@ -305,6 +306,14 @@ def test_shorter_steps_of_quadratic_drag_change_little_and_ever_less(
     assert errors[0] < 1e-6
     assert errors[1] < 1e-2 * errors[0]
     assert errors[2] < 1e-11
+
+
+@pytest.mark.parametrize("name", FISHES)
+def test_all_that_is_told_of_a_fish_is_plain_numbers(name: str) -> None:
+    fish = TetheredFish(FISHES[name])
+    for k in range(12):
+        window = fish.advance(0.42 * (-1) ** (k // 6), 0.05, samples=10)
+        assert {type(value) for value in (*fish.state, *means(window), window.fin_peak)} == {float}
 
 
 @settings(max_examples=200)
