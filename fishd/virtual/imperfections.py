@@ -50,7 +50,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         float,
         unit(
             "N",
-            "How far off such a sample is, to either side; a window is the mean of all its samples.",
+            "How far off such a sample is, either way; a window is the mean of all its samples.",
             ge=0,
             le=100,
         ),
