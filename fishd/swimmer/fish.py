@@ -28,8 +28,8 @@ _FASTEST = 0.05
 _CHECKED_EVERY = 20
 _STEER_TIME = 0.4
 """Heading and place are averaged over about so long before the fish is steered [s]."""
-_STEER_RATE = 4.0
-"""So fast the heading is corrected [1/s]."""
+_STEER_RATE = 2.0
+"""So fast the heading is corrected [1/s]; below 1/_STEER_TIME, or a gliding fish would swing."""
 _STEER_REACH = 10.0
 """Heading that is wanted for each metre off the middle [rad/m], and the largest one [rad]."""
 _STEER_MOST = 0.3
@@ -154,7 +154,8 @@ class Fish:
         try:
             body.step(dt, forces)
         except LeftTheGrid as error:
-            if float(np.abs(self.body.velocity).max()) * dt < _FASTEST * self.settings.body.length:
+            fastest = float(np.abs(body.velocity[:, :2]).max())
+            if fastest * dt < _FASTEST * self.settings.body.length:
                 raise self._diverged(f"{error}; swimmer.steering keeps it there") from None
             raise self._diverged(
                 "the motion grew without bounds; a shorter swimmer.numerics.step may help"
