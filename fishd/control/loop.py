@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
 from fishd.control.estimators.base import Estimator
+from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
@@ -74,6 +75,7 @@ class ControlLoop:
         self.neutral_for = 0.0
         """How long the instruction angle has been zero [s]."""
         self.thrust = thrust
+        self.lateral_sign = LateralSign()
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self._estimator = estimator
@@ -115,6 +117,7 @@ class ControlLoop:
         read = self._now()
         self.observation = observation = self._estimate(measurement, slot, dt)
         self._follow_thrust(observation)
+        self._watch_sign(observation)
         return Turn(slot, measurement, observation, (started, read, self._now()))
 
     def act(self, turn: Turn) -> None:
@@ -240,6 +243,13 @@ class ControlLoop:
         except ArithmeticError as error:
             self.reporter.problem("the thrust cannot be told, and is found anew", error)
             self.thrust.forget()
+
+    def _watch_sign(self, observation: Observation) -> None:
+        """Notice, when the tail sets off, that F_y is reversed."""
+        if self.supervisor.sensor_lost or not self.limits.tethered:
+            return
+        if self.lateral_sign.update(observation) and self.lateral_sign.reversed:
+            self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

@@ -14,7 +14,8 @@ from fishd.core.signals import Observation
 
 REFRACTORY = 0.05
 """Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
-
+FIRST_PUSH = 0.2
+"""Who begins from neutral does not reverse sooner: until the servo acts, all speed is noise [s]."""
 
 LONGEST_TICK = 0.15
 """Of C auto: with longer ones a half beat has two or three, and its ripple cannot be told [s]."""
@@ -70,6 +71,8 @@ class Swing(Controller[SwingParameters]):
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._direction = 1.0
+        self._first = False
+        """Has it begun from neutral, and not reversed yet?"""
         self._top_speed = 0.0  # since the last reversal
         self.top_speed = 0.0
         self.reversal_speed = 0.0
@@ -111,6 +114,7 @@ class Swing(Controller[SwingParameters]):
     def activate(self, observation: Observation) -> None:
         """Push on towards the side of the present angle; from rest, towards plus."""
         self._direction = 1.0 if observation.instruction_angle >= 0 else -1.0
+        self._first = observation.instruction_angle == 0.0
 
     def update(self, observation: Observation) -> float:
         """Plus or minus the amplitude [rad]."""
@@ -120,14 +124,17 @@ class Swing(Controller[SwingParameters]):
         speed = self._direction * self._ahead(observation, rung.lead)
         slowed = self._top_speed > 0.0 and speed <= rung.C * self._top_speed
         self._top_speed = max(self._top_speed, speed)
-        settled = self.since_reversal > REFRACTORY * parameters.longest_half_period
         # Half a tick early is nearer to the longest half period than half a tick late.
-        overdue = self.since_reversal + 0.5 * self.limits.tick > parameters.longest_half_period
+        nearly = self.since_reversal + 0.5 * self.limits.tick
+        settled = self.since_reversal > REFRACTORY * parameters.longest_half_period
+        if self._first:
+            settled = settled and nearly > FIRST_PUSH
+        overdue = nearly > parameters.longest_half_period
         reverses = (slowed and settled) or overdue
         if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
             self.top_speed = self._top_speed
         if reverses:
-            self._direction = -self._direction
+            self._direction, self._first = -self._direction, False
             self._top_speed = 0.0
             self.since_reversal = 0.0
         self.reversal_speed = rung.C * self.top_speed

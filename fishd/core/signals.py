@@ -223,6 +223,7 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "a trial of a calibration ended, and the one before it is used again",
         "empty",
     ),
+    ("calibration", "warning", "when the tail set off, F_y was seen to be reversed", "empty"),
     (
         "gateway",
         "warning",
@@ -369,3 +370,10 @@ class Status(Struct, frozen=True):
     boot: Annotated[
         str, note("Names this start of fishd's machine, from which its monotonic clock counts.")
     ] = ""
+    fy_reversed: Annotated[
+        bool | None,
+        note(
+            "Is F_y reversed against the tail, as it was seen when the tail set off from rest? "
+            "null while it was not seen."
+        ),
+    ] = None

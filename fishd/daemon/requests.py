@@ -120,7 +120,7 @@ class Operations:
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
-            degraded=loop.robot.degraded(),
+            degraded=(*loop.robot.degraded(), *filter(None, [loop.lateral_sign.complaint])),
             counters={**loop.robot.counters(), **self._counters()},
             realtime=self._realtime,
             telemetry=self._telemetry,
@@ -136,6 +136,7 @@ class Operations:
             clock=self._clock.monotonic(),
             boot=self._boot,
             speed=self._speed(),
+            fy_reversed=loop.lateral_sign.reversed,
         )
 
     def _speed(self) -> float | None:
