@@ -3,6 +3,7 @@
 | | | |
 |---|---|---|
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`features`) |
+| | of the latest `history` ticks | newest first |
 | action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
 | reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
 | | −`reward_scale` · `held_cost` | in a tick in which the shortest dwell held a reversal back |
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from fishd.camera.frames import Stack
 from fishd.config import Config, check_tethered
 from fishd.controllers.dwell import Dwell
-from fishd.controllers.policy.card import Feature, FeatureName
+from fishd.controllers.policy.card import Feature, FeatureName, Window
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost
@@ -124,7 +125,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.features = features(config, settings)
         self.settings = settings
         self.eye = eye
-        self.perception = Perception(self.features, eye)
+        window = Window(settings.history, settings.history * config.tick, settings.relative)
+        self.perception = Perception(self.features, eye, window)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
         shortest = config.limits.dwell if settings.dwell else 0.0
         self._dwell = Dwell(shortest, link.tick, link.amplitude)
@@ -164,6 +166,10 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         super().reset(seed=seed)
         draw = self.np_random
         self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
+        self.perception.forget()
+        if self.settings.own_thrust and self.link.config:
+            own = thrust_scale(self.link.config, self.settings)
+            self._reward_per_newton = self.settings.reward_scale / own
         self._begun = True
         self._steps = 0
         self._await_frames()
@@ -205,6 +211,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         """
         before = self.latest.time
         self.latest, lost = self.link.step(angle)
+        self.perception.note(self.latest)
         if self.eye and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before

@@ -16,7 +16,13 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.measurement import Sample, evaluate, plan
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.simulated_link import Camera, FunctionController, NullPublisher, at_edge
+from fishd.learning.env.simulated_link import (
+    Camera,
+    FunctionController,
+    NullPublisher,
+    at_edge,
+    drawn,
+)
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 from fishd.simulation import Report, VirtualRun
 
@@ -113,14 +119,15 @@ def in_simulation(
 def worst_of_others(
     config: Config, decide: Decide, settings: TrainingSettings, camera: Camera | None = None
 ) -> float:
-    """Lowest efficiency on fish at the edges of the randomisation, each over its own optimum.
+    """Lowest efficiency on fish of the randomisation, each over its own optimum.
 
     Each begins with rapid reversals, which some policies never leave.
     """
     found = settings.evaluation
+    place = at_edge if found.others_from == "edges" else drawn
     return min(
         judge(
-            at_edge(config, settings.randomisation, seed),
+            place(config, settings.randomisation, seed),
             _shaken(decide, config),
             found.seconds,
             found.settle,
@@ -189,8 +196,9 @@ def _shaken(decide: Decide, config: Config) -> Decide:
 
     def decided(observation: Observation, stack: Stack | None) -> float:
         tick = next(ticks)
+        angle = decide(observation, stack)  # what it sees of the shaking is in its history
         if tick * config.tick < SHAKE:
             return config.amplitude_limit * (-1.0) ** tick
-        return decide(observation, stack)
+        return angle
 
     return decided
