@@ -12,6 +12,7 @@ from fishd import simulation
 from fishd.camera.frames import Stack
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start
+from fishd.controllers.dwell import DwellLimit
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.measurement import Sample, evaluate, plan
@@ -121,20 +122,41 @@ def worst_of_others(
 ) -> float:
     """Lowest efficiency on fish of the randomisation, each over its own optimum.
 
-    Each begins with rapid reversals, which some policies never leave.
+    At the edges each begins with rapid reversals, which some policies never leave. In the range
+    they swim as `ppo` does, with the shortest dwell; who insists on less counts as worth nothing.
     """
-    found = settings.evaluation
-    place = at_edge if found.others_from == "edges" else drawn
-    return min(
-        judge(
-            place(config, settings.randomisation, seed),
-            _shaken(decide, config),
-            found.seconds,
-            found.settle,
-            camera,
-        ).efficiency
-        for seed in range(found.others)
-    )
+    swim = _at_edge if settings.evaluation.others_from == "edges" else _in_range
+    seeds = range(settings.evaluation.others)
+    return min(swim(config, decide, settings, camera, seed) for seed in seeds)
+
+
+def _at_edge(
+    config: Config,
+    decide: Decide,
+    settings: TrainingSettings,
+    camera: Camera | None,
+    seed: int,
+) -> float:
+    fish, found = at_edge(config, settings.randomisation, seed), settings.evaluation
+    return judge(fish, _shaken(decide, config), found.seconds, found.settle, camera).efficiency
+
+
+def _in_range(
+    config: Config,
+    decide: Decide,
+    settings: TrainingSettings,
+    camera: Camera | None,
+    seed: int,
+) -> float:
+    fish, found = drawn(config, settings.randomisation, seed), settings.evaluation
+    limits = fish.limits
+    limit = DwellLimit(limits.dwell, limits, fish.amplitude_limit)
+
+    def limited(observation: Observation, stack: Stack | None) -> float:
+        return limit.apply(decide(observation, stack), observation.dt)
+
+    report = judge(fish, limited, found.seconds, found.settle, camera)
+    return 0.0 if report.fallback else report.efficiency
 
 
 def on_link(
@@ -196,9 +218,8 @@ def _shaken(decide: Decide, config: Config) -> Decide:
 
     def decided(observation: Observation, stack: Stack | None) -> float:
         tick = next(ticks)
-        angle = decide(observation, stack)  # what it sees of the shaking is in its history
         if tick * config.tick < SHAKE:
             return config.amplitude_limit * (-1.0) ** tick
-        return angle
+        return decide(observation, stack)
 
     return decided
