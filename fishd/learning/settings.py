@@ -51,11 +51,11 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         unit("N", "F_x whose reward is `reward_scale`; null: the best square wave's thrust."),
     ] = None
-    own_thrust: Annotated[
+    own_fish: Annotated[
         bool,
         note(
-            "With thrust_scale: null, it is that of each simulated fish's own best square wave, "
-            "so that a randomised fish counts as much when it is weak."
+            "Where fish are randomised, thrust_scale: null is the best square wave's thrust of "
+            "each, so that a weak one counts as much, and chatter.dwell: auto is that of each."
         ),
     ] = False
     reward_scale: Annotated[float, note("Reward for thrust_scale.", gt=0, le=1000)] = 0.3

@@ -110,7 +110,7 @@ def test_the_fish_of_a_training_are_those_of_before_where_nothing_new_varies() -
 def test_a_weak_fish_is_rewarded_as_a_strong_one_for_its_own_best() -> None:
     def reward(own: bool, coefficient: float) -> float:
         config = load(None, ["simulation.noise=0", f"plant.thrust_coefficient={coefficient}"])
-        settings = replace(REMEMBERING, own_thrust=own)
+        settings = replace(REMEMBERING, own_fish=own)
         env = SwimEnv(SimulatedLink(config), CONFIG, settings)
         env.reset(seed=1)
         return sum(float(env.step(np.full(1, (-1.0) ** (k // 6)))[1]) for k in range(60))
@@ -135,7 +135,7 @@ def test_who_leans_on_the_shortest_dwell_is_worth_nothing_among_fish_of_the_rang
 
 def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
     chosen = replace(BRIEF.evaluation, others=2, others_from="range")
-    environment = replace(REMEMBERING, own_thrust=True, episode=32)
+    environment = replace(REMEMBERING, own_fish=True, episode=32)
     job = brief_job(
         tmp_path / "run", environment=environment, randomisation=HARSH, evaluation=chosen
     )

@@ -167,9 +167,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         draw = self.np_random
         self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
         self.perception.forget()
-        if self.settings.own_thrust and self.link.config:
-            own = thrust_scale(self.link.config, self.settings)
-            self._reward_per_newton = self.settings.reward_scale / own
+        if self.settings.own_fish and self.link.config:
+            self._suit(self.link.config)
         self._begun = True
         self._steps = 0
         self._await_frames()
@@ -179,6 +178,12 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         )
         self._dwell.activate(self.latest.instruction_angle)
         return self._seen(), self._info(lost)
+
+    def _suit(self, fish: Config) -> None:
+        """Reward the thrust of this fish by its own best, and hold reversals back as it needs."""
+        self._reward_per_newton = self.settings.reward_scale / thrust_scale(fish, self.settings)
+        shortest = fish.limits.dwell if self.settings.dwell else 0.0
+        self._dwell = Dwell(shortest, self.link.tick, self.link.amplitude)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Apply an instruction angle for one tick.
