@@ -143,3 +143,14 @@ def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
     assert latest
     assert latest.worst is not None
     assert latest.worst <= latest.efficiency
+
+
+def test_a_fish_of_its_own_is_held_back_by_its_own_shortest_dwell() -> None:
+    def reversals(own: bool) -> int:
+        late = load(None, ["plant.servo_delay=0.08"])  # whose dwell is 0.25 s
+        env = SwimEnv(SimulatedLink(late), CONFIG, replace(REMEMBERING, own_fish=own))
+        env.reset(seed=1)
+        sides = [act(env, -np.sign(env.latest.instruction_angle) or 1.0)[1] for _ in range(41)]
+        return int(np.count_nonzero(np.diff(np.sign(sides))))
+
+    assert (reversals(False), reversals(True)) == (10, 8)
