@@ -193,6 +193,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             virtual=self.lockstep or self.robot == "swimmer",
             chatter=self.chatter,
             tethered=self.robot != "swimmer",
+            thrust_coefficient=(
+                self.plant.thrust_coefficient if self.estimator.kind == "observer" else None
+            ),
         )
 
 

@@ -113,8 +113,8 @@ class ControlLoop:
         self._attend_panel(slot)
         measurement = self._read(slot)
         read = self._now()
-        self.observation = observation = self._estimate(measurement, slot, dt)
-        self._follow_thrust(observation)
+        observation = self._follow_thrust(self._estimate(measurement, slot, dt))
+        self.observation = observation
         return Turn(slot, measurement, observation, (started, read, self._now()))
 
     def act(self, turn: Turn) -> None:
@@ -230,16 +230,21 @@ class ControlLoop:
             fx, fy, angle = measurement.fx, measurement.fy, self.applied
             return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
 
-    def _follow_thrust(self, observation: Observation) -> None:
-        """Only a display hangs on this: where it fails, it begins anew."""
+    def _follow_thrust(self, observation: Observation) -> Observation:
+        """Add what is known of the thrust; where that fails, it begins anew."""
         if self.supervisor.sensor_lost:
-            return
+            return observation
         try:
             running = self.supervisor.mode is Mode.RUNNING
             self.thrust.update(observation, running, self.active.wave)
+            known = self.thrust.factor
         except ArithmeticError as error:
             self.reporter.problem("the thrust cannot be told, and is found anew", error)
             self.thrust.forget()
+            known = None
+        if known is None:
+            return observation
+        return replace(observation, thrust_factor=known[0], thrust_factor_error=known[1])
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

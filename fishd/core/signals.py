@@ -66,6 +66,11 @@ class Observation(Struct, frozen=True, gc=False):
     """Mean longitudinal force over the latest whole tail beats [N]."""
     frequency: float
     """Tail-beat frequency, from the reversals of the instruction angle; 0 when not beating [Hz]."""
+    thrust_factor: float | None = None
+    """Thrust over the mean square of `fin_velocity`, as rests or a measurement have shown it [N];
+    None while not known."""
+    thrust_factor_error: float | None = None
+    """Half of its 95 % interval [N]."""
 
 
 class Course(Struct, frozen=True, gc=False):
@@ -172,6 +177,17 @@ class Tick(Struct, frozen=True, gc=False):
     heading: Annotated[
         float | UnsetType, unit("rad", "True heading of the front body, against −x.")
     ] = UNSET
+    thrust_factor: Annotated[
+        float | UnsetType,
+        unit(
+            "N",
+            "Thrust over the mean square of `fin_velocity`, as rests or a measurement have shown "
+            "it; absent while not known, and where no controller swims.",
+        ),
+    ] = UNSET
+    thrust_factor_error: Annotated[float | UnsetType, unit("N", "Half of its 95 % interval.")] = (
+        UNSET
+    )
 
 
 Level = Literal["info", "warning", "error"]

@@ -20,6 +20,7 @@ NAMES = (
     "identification",
     "estimators",
     "swing",
+    "thrust",
     "camera",
     "swimmer",
 )
