@@ -88,7 +88,7 @@ class Reporter:
 
         now: the time after the servo was driven [s, monotonic]
         """
-        slot, measurement, observation, marks = turn
+        slot, measurement, observation, marks, power = turn
         thrust, error = loop.known_thrust
         extremes = measurement.extremes
         truth = loop.robot.truth() if loop.robot.truth else None
@@ -126,6 +126,7 @@ class Reporter:
                 y=course.y if course else UNSET,
                 speed=course.speed if course else UNSET,
                 heading=course.heading if course else UNSET,
+                power=UNSET if power is None else power,
             )
         )
 

@@ -43,7 +43,7 @@ class Tank:
         self._pulse = pulse
         self._imperfections = Imperfections(imperfections, tick)
         self._weights = tuple(_weights(name, settings) for name in _INPUTS)
-        self._fish = TetheredFish(plant)
+        self._fish = TetheredFish(plant, motor=imperfections.motor)
         for steps in range(1, _WARMED_UP + 1):
             self._fish.advance(None, steps * STEP, 1)
         self._fish.state = REST
@@ -52,6 +52,7 @@ class Tank:
         self._conversion = (0.0, 0.0)
         self._steps = 0
         self._impulse = 0.0
+        self._energy = 0.0
         self._fin_peak = 0.0
         self._lock = threading.Lock()
 
@@ -94,8 +95,9 @@ class Tank:
         with self._lock:
             duration = self._steps * STEP
             thrust = self._impulse / duration if duration else 0.0
-            window = TrueWindow(duration, thrust, self._fin_peak)
-            self._steps, self._impulse = 0, 0.0
+            power = self._energy / duration if duration else 0.0
+            window = TrueWindow(duration, thrust, self._fin_peak, power)
+            self._steps, self._impulse, self._energy = 0, 0.0, 0.0
             self._fin_peak = abs(self._fish.state.alpha)
         return window
 
@@ -109,6 +111,7 @@ class Tank:
             window = self._fish.advance(angle, (end - self._now) * STEP, 1)
             self._steps += end - self._now
             self._now = end
+            self._energy += window.power * window.duration
             impulse_x += window.thrust * window.duration
             impulse_y += window.lateral_force * window.duration
             state = self._fish.state
