@@ -115,6 +115,18 @@ def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> N
             raise Problem((section, key), f"GPIO {pin} is taken by {by} already")
 
 
+def check_i2c_addresses(claims: Mapping[str, Iterable[Claim]]) -> None:
+    """No address on a bus is that of two chips. claims: those of the drivers, by their sections"""
+    taken: dict[str, str] = {}
+    for section, found in claims.items():
+        for claim in found:
+            if claim.key == "address" and (by := taken.setdefault(claim.name, section)) != section:
+                raise Problem(
+                    (section, "address"),
+                    f"{claim.what} is that of {by} already: each chip needs an address of its own",
+                )
+
+
 def check_lockstep(robot: str, lockstep: bool) -> None:
     """Lockstep needs a simulated fish: only its time can stand still."""
     if lockstep and robot == "swimmer":
