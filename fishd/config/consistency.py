@@ -115,15 +115,18 @@ def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> N
             raise Problem((section, key), f"GPIO {pin} is taken by {by} already")
 
 
-def check_i2c_addresses(claims: Mapping[str, Iterable[Claim]]) -> None:
-    """No address on a bus is that of two chips. claims: those of the drivers, by their sections"""
-    taken: dict[str, str] = {}
-    for section, found in claims.items():
-        for claim in found:
-            if claim.key == "address" and (by := taken.setdefault(claim.name, section)) != section:
+def check_i2c_addresses(settings: Mapping[str, Any]) -> None:
+    """No two chips have the same address. settings: of the drivers, by their sections"""
+    taken: dict[tuple[int, int], str] = {}
+    for section, each in settings.items():
+        bus, address = (getattr(each, key, None) for key in ("bus", "address"))
+        if isinstance(bus, int) and isinstance(address, int):
+            by = taken.setdefault((bus, address), section)
+            if by != section:
                 raise Problem(
                     (section, "address"),
-                    f"{claim.what} is that of {by} already: each chip needs an address of its own",
+                    f"{address:#04x} on /dev/i2c-{bus} is that of {by} already: each chip needs "
+                    "an address of its own",
                 )
 
 

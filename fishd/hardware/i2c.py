@@ -52,11 +52,6 @@ def claim(bus: int) -> Claim:
     return Claim(f"i2c-{bus}", f"/dev/i2c-{bus}", "bus", _HEADER_PINS if bus == _HEADER_BUS else ())
 
 
-def address_claim(bus: int, address: int) -> Claim:
-    """An address on a bus, whose key is `address`: of one chip only."""
-    return Claim(f"i2c-{bus}-{address:#04x}", f"{address:#04x} on /dev/i2c-{bus}", "address")
-
-
 def open_bus(number: int) -> Any:
     """Open /dev/i2c-`number`, on which a transfer may take 20 ms at most; as module busio's I2C.
 

@@ -182,7 +182,7 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
     @classmethod
     def claims(cls, settings: Ads1115Settings) -> tuple[Claim, ...]:
         """Two programs on one bus would take each other's samples, without an error."""
-        return i2c.claim(settings.bus), i2c.address_claim(settings.bus, settings.address)
+        return (i2c.claim(settings.bus),)
 
     @classmethod
     def checks(cls, settings: Ads1115Settings) -> tuple[Check, ...]:

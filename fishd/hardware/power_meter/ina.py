@@ -105,8 +105,8 @@ class Ina(PowerMeterDriver[N]):
 
     @classmethod
     def claims(cls, settings: N) -> tuple[Claim, ...]:
-        """The bus, as other drivers of the same fishd may, and its address."""
-        return i2c.claim(settings.bus), i2c.address_claim(settings.bus, settings.address)
+        """The bus, which other drivers of the same fishd may use, too."""
+        return (i2c.claim(settings.bus),)
 
     @classmethod
     def checks(cls, settings: N) -> tuple[Check, ...]:

@@ -108,8 +108,7 @@ def test_a_current_beyond_the_range_is_not_believed(rig: MeterRig) -> None:
     rig.watts = lambda time: 6.0 * 40.0
     meter = rig.meter()
     with pytest.raises(SensorError, match="a smaller one is needed"):
-        for _ in range(3):
-            rig.tick(meter)
+        [rig.tick(meter) for _ in range(3)]
 
 
 def test_a_closed_meter_says_so_and_can_be_closed_twice(rig: MeterRig) -> None:

@@ -100,13 +100,11 @@ def test_a_meter_at_the_address_of_the_force_sensor_is_refused() -> None:
     )
 
 
-def test_its_bus_and_address_are_claimed_and_the_bus_once_only() -> None:
-    names = [part.path.name for part in parts_of(load(None, ["robot=pi", METER]))]
-    assert [name for name in names if "i2c" in name] == [
-        "fishd-i2c-1",
-        "fishd-i2c-1-0x48",
-        "fishd-i2c-1-0x40",
-    ]
+def test_a_bus_of_its_own_is_claimed_and_one_that_the_force_sensor_has_once_only() -> None:
+    for bus, expected in ((1, ["fishd-i2c-1"]), (3, ["fishd-i2c-1", "fishd-i2c-3"])):
+        config = load(None, ["robot=pi", METER, f"power_meter.bus={bus}"])
+        names = [part.path.name for part in parts_of(config)]
+        assert [name for name in names if "i2c" in name] == expected
 
 
 @pytest.mark.parametrize(
