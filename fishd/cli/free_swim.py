@@ -126,7 +126,7 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
         (
             "power",
             f"{report.muscle_power:.4g} W/m of the muscles, {report.water_power:.4g} W/m to the "
-            "water",
+            f"water, {report.steering_power:.2g} W/m of the steering",
         ),
         ("cost", _or_none(report.cost_of_transport, "{:.4g} J/(kg m)")),
         ("Strouhal", _or_none(report.strouhal, "{:.3f}") + f", Reynolds {report.reynolds:.0f}"),

@@ -28,8 +28,8 @@ _FASTEST = 0.05
 _CHECKED_EVERY = 20
 _STEER_TIME = 0.4
 """Heading and place are averaged over about so long before the fish is steered [s]."""
-_STEER_RATE = 4.0
-"""So fast the heading is corrected [1/s]."""
+_STEER_RATE = 2.0
+"""So fast the heading is corrected [1/s]; below 1/_STEER_TIME, or a gliding fish would swing."""
 _STEER_REACH = 10.0
 """Heading that is wanted for each metre off the middle [rad/m], and the largest one [rad]."""
 _STEER_MOST = 0.3
@@ -119,8 +119,10 @@ class Fish:
         self._travelled = 0.0
         self._drive = self.beam.drive(lambda X: curvature(settings, X))
         self._couple = self.beam.couple()
+        # Of a rod as long and heavy as the fish, and of the water that a plate as long turns with
+        # it, π/8 ρ (L/2)⁴ (Newman, Marine Hydrodynamics, 1977, table 4.3) [kg m²/m].
         self._inertia = water.density * (
-            self.beam.area * body.length**2 / 12.0 + math.pi * (0.5 * body.length) ** 4 / 8.0
+            self.beam.area * body.length**2 / 12.0 + math.pi / 8.0 * (0.5 * body.length) ** 4
         )
         self._averaged_heading = self._averaged_y = 0.0
         self._torque = 0.0
@@ -154,7 +156,8 @@ class Fish:
         try:
             body.step(dt, forces)
         except LeftTheGrid as error:
-            if float(np.abs(self.body.velocity).max()) * dt < _FASTEST * self.settings.body.length:
+            fastest = float(np.abs(body.velocity[:, :2]).max())
+            if fastest * dt < _FASTEST * self.settings.body.length:
                 raise self._diverged(f"{error}; swimmer.steering keeps it there") from None
             raise self._diverged(
                 "the motion grew without bounds; a shorter swimmer.numerics.step may help"

@@ -46,6 +46,8 @@ class Gait(Struct, frozen=True, kw_only=True):
     """Of the muscles [W/m]."""
     water_power: float
     """Of the body on the water [W/m]."""
+    steering_power: float
+    """Of the torque that keeps the fish on its way [W/m]."""
     cost_of_transport: float | None
     """Work of the muscles per mass and distance [J/(kg m)]; None where it does not get on."""
     strouhal: float | None
@@ -79,8 +81,9 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     frequency = beats / duration
     width = _tail_width(track, begins if beats else [first, last]) / length
     powers = {
-        name: float(track[name][rows].mean())
-        for name in ("muscle_power", "water_power", "thrust_power", "lateral_power")
+        name: float(column[rows].mean())
+        for name, column in track.items()
+        if name.endswith("_power")
     }
     _, means = _grouped(time, x, begins, LEAST_BEATS)
     gets_on = beats > 0 and speed > 0.0
@@ -95,6 +98,7 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
         tail_width=width,
         muscle_power=powers["muscle_power"],
         water_power=powers["water_power"],
+        steering_power=powers["steering_power"],
         cost_of_transport=powers["muscle_power"] / (mass(settings) * speed) if gets_on else None,
         strouhal=frequency * width * length / speed if gets_on else None,
         froude_efficiency=useful / (useful + lost) if gets_on and useful + lost > 0.0 else None,

@@ -30,6 +30,7 @@ COLUMNS = {
     "side_force": ("N/m", "mean force of the water along y"),
     "muscle_power": ("W/m", "of the muscles, mean; below 0 while they are stretched"),
     "water_power": ("W/m", "of the body on the water, mean"),
+    "steering_power": ("W/m", "of the torque that keeps the fish on its way, mean"),
     "thrust_power": ("W/m", "of those slices that push the fish forwards, mean"),
     "lateral_power": ("W/m", "of the body on the water along y, mean"),
 }
@@ -78,6 +79,7 @@ class Track:
             "side_force": window.side_force,
             "muscle_power": power(work.muscles, before.muscles),
             "water_power": power(work.water, before.water),
+            "steering_power": power(work.steering, before.steering),
             "thrust_power": power(work.forwards, before.forwards),
             "lateral_power": power(work.sideways, before.sideways),
         }
