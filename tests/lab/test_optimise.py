@@ -36,7 +36,7 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
     assert best.parameters == pytest.approx({"frequency": 1.7, "amplitude": 0.3}, rel=0.15)
     for name, truth in (("frequency", 1.7), ("amplitude", 0.3)):
         assert best.low[name] <= truth <= best.high[name]
-    assert best.thrust == pytest.approx(0.02, abs=2.0 * best.error)
+    assert best.value == pytest.approx(0.02, abs=2.0 * best.error)
 
 
 def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> None:
@@ -70,7 +70,7 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     assert swum <= 360
     truth = simulate(config, "square", found.parameters).mean_thrust
     assert truth >= 0.97 * BEST
-    assert found.thrust == pytest.approx(truth, abs=2.0 * found.error)
+    assert found.value == pytest.approx(truth, abs=2.0 * found.error)
 
 
 @pytest.mark.slow
