@@ -126,6 +126,7 @@ def _optimise(
     from fishd.lab.measurement import REST
     from fishd.lab.optimise.aim import Aim
     from fishd.lab.optimise.folder import Begun, SearchFolder, draw
+    from fishd.lab.optimise.least_power import LeastPower
     from fishd.lab.optimise.trials import lengths
 
     drawing.check_installed()
@@ -252,7 +253,7 @@ def _measured(
         ):
             show.at(before)
             for each in trials(
-                rig, task.controller, task.fixed, search, observe, task.budget, last
+                rig, task.controller, task.fixed, search, task.budget, last, observe
             ):
                 run.keep(each)
                 measured.append(each)

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.measurement import REST, evaluate, samples_of
-from fishd.lab.optimise.search import Range
+from fishd.lab.optimise.least_power import LeastPower
+from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig, refuse_lost
 
 STEADY = 1.5
@@ -47,21 +48,14 @@ class Trial(NamedTuple):
     """Time since the beginning, rest included [s]."""
 
 
-class Suggests(Protocol):
-    """A search, as trials need it."""
-
-    def suggest(self) -> dict[str, float]:
-        """The next candidate."""
-
-
 def trials(
     rig: Rig,
     controller: str,
     fixed: Mapping[str, Any],
-    search: Suggests,
-    observe: Callable[[Trial], None],
+    search: Search | LeastPower,
     budget: float,
     before: Trial | None = None,
+    observe: Callable[[Trial], None] | None = None,
 ) -> Iterator[Trial]:
     """Measure candidates on a rig for as long as the budget lasts.
 
@@ -69,9 +63,9 @@ def trials(
     beside a drift that is told apart by the rests before and after (`fishd.lab.measurement`).
 
     fixed: parameters that are not searched
-    observe: told of each candidate before `search` is asked for the next
     budget: time in the tank [s]
     before: the last one of a search that is gone on with, which `search` knows already
+    observe: told of each candidate, for `search` to know it; by default, its thrust
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
     rest: list[Tick] = []
@@ -96,7 +90,11 @@ def trials(
             math.nan if each is None else each for each in (found.watts, found.watts_error)
         )
         trial = Trial(candidate, found.thrust, found.error, power, power_error, swum, passed)
-        observe(trial)
+        if observe:
+            observe(trial)
+        else:
+            assert isinstance(search, Search)
+            search.observe(candidate, trial.thrust, trial.error)
         yield trial
         rest = after
 
