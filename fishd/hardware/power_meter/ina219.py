@@ -3,6 +3,7 @@
 import os
 from typing import Any
 
+from fishd.core.clock import Clock
 from fishd.hardware.power_meter.ina import Ina, InaSettings
 
 SHUNT_STEP = 10e-6
@@ -26,12 +27,17 @@ class Ina219(Ina[Ina219Settings]):
     full_scale = 0.32
     _chip: Any
 
-    def set_up(self, bus: Any) -> None:
-        """As the library does, but with the shunt averaged, so that no current goes unseen."""
+    def __init__(self, settings: Ina219Settings, clock: Clock, interval: float) -> None:
+        """Raises ImportError where the library is not installed."""
         from adafruit_ina219 import INA219
 
+        super().__init__(settings, clock, interval)
+        self._library = INA219
+
+    def set_up(self, bus: Any) -> None:
+        """As the library does, but with the shunt averaged, so that no current goes unseen."""
         try:
-            self._chip = INA219(bus, self.settings.address)
+            self._chip = self._library(bus, self.settings.address)
         except ValueError as error:  # with which the library says that nothing answers
             number = getattr(error.__context__, "errno", None)
             if number is None:
