@@ -42,7 +42,7 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
     plain, nested = [], []
     for field in fields_of(type(section)):
         value = getattr(section, field.name)
-        if isinstance(value, Struct):
+        if isinstance(value, Struct) or (isinstance(section, Config) and field.name in DRIVERS):
             nested.append((field, value))
         else:
             plain.append(_row(field, value, prefix))
@@ -60,8 +60,9 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
 def _driver_section(section: str) -> Iterator[str]:
     """The keys that all drivers have, then those of each of fishd's own."""
     plugins, default = DRIVERS[section]
-    common = plugins.find(default).Settings.__base__(driver=default)
     mine = [name for name in plugins.names() if plugins.package(name) == "fishd"]
+    (base,) = {b for b in plugins.find(mine[0]).Settings.__mro__ if b.__base__ is Struct}
+    common = base(driver=default or "")
     choice, *rows = [
         _row(field, getattr(common, field.name), f"{section}.") for field in fields_of(type(common))
     ]

@@ -1,9 +1,9 @@
-"""The two sections whose keys depend on a driver: `force_sensor` and `servo`."""
+"""The sections whose keys depend on a driver: `force_sensor`, `servo` and `power_meter`."""
 
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec import Struct
 
@@ -13,18 +13,33 @@ from fishd.core.foreign_code import contained
 from fishd.core.plugins import Plugins
 from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest
 from fishd.hardware.driver import Claim, Driver
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
-from fishd.hardware.settings import ForceSensorSettings, ServoSettings
+from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS
+from fishd.hardware.settings import ForceSensorSettings, PowerMeterSettings, ServoSettings
 
-DRIVERS: dict[str, tuple[Plugins[Any], str]] = {
+DRIVERS: dict[str, tuple[Plugins[Any], str | None]] = {
     "force_sensor": (FORCE_SENSORS, "ads1115"),
     "servo": (SERVOS, "pigpio"),
+    "power_meter": (POWER_METERS, None),
 }
-"""Of each section: where its drivers are found, and which one is the default."""
+"""Of each section: where its drivers are found, and which one is the default; None: none is."""
+VIRTUAL_PI = {"force_sensor": "ads1115", "servo": "pigpio", "power_meter": "ina219' or 'ina226"}
+"""What a virtual Pi has, by their drivers."""
+
+
+class Chosen(NamedTuple):
+    """The settings of each section, of its driver."""
+
+    force_sensor: ForceSensorSettings
+    servo: ServoSettings
+    power_meter: PowerMeterSettings | None
+
+    def sections(self) -> dict[str, Any]:
+        """Those that there are, by name."""
+        return {name: found for name, found in self._asdict().items() if found is not None}
 
 
 def convert_sections(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Both sections of a configuration, each as the settings of its driver; raises `Problem`."""
+    """These sections of a configuration, each as the settings of its driver; raises `Problem`."""
     return {name: _convert(name, data.get(name)) for name in DRIVERS}
 
 
@@ -66,22 +81,20 @@ def keys() -> list[str]:
     ]
 
 
-def check_drivers(
-    robot: str, tick: float, sensor: ForceSensorSettings, servo: ServoSettings
-) -> None:
+def check_drivers(robot: str, tick: float, chosen: Chosen) -> None:
     """What each driver itself demands of its settings, and that the robot has its hardware.
 
     tick: period of the loop [s]
     """
     if robot in ("simulated", "swimmer"):  # whose loop may be faster than any hardware
         tick = math.inf
-    for section, settings in (("force_sensor", sensor), ("servo", servo)):
+    for section, settings in chosen.sections().items():
         driver = driver_of(section, settings.driver)
         if robot == "virtual-pi" and not driver.on_virtual_pi:
             raise Problem(
                 (section, "driver"),
-                f"'{settings.driver}' is not valid: the virtual Pi has an ADS1115 and pigpiod; "
-                f"'{DRIVERS[section][1]}' is needed",
+                f"'{settings.driver}' is not valid: the virtual Pi has an ADS1115, pigpiod and an "
+                f"INA219 or INA226; '{VIRTUAL_PI[section]}' is needed",
             )
         try:
             contained(driver.check, settings, tick)
@@ -92,21 +105,23 @@ def check_drivers(
             raise Problem((section,), what) from error
 
 
-def claims_of(sensor: ForceSensorSettings, servo: ServoSettings) -> dict[str, tuple[Claim, ...]]:
+def claims_of(chosen: Chosen) -> dict[str, tuple[Claim, ...]]:
     """What the drivers use alone, by their sections."""
     return {
         section: driver_of(section, settings.driver).claims(settings)
-        for section, settings in (("force_sensor", sensor), ("servo", servo))
+        for section, settings in chosen.sections().items()
     }
 
 
 def _convert(section: str, data: Any) -> Any:
     plugins, default = DRIVERS[section]
     if data is None:
+        if default is None:
+            return None
         data = {}
     if not isinstance(data, Mapping):
         raise Problem((section,), "a section (a mapping of keys to values) is needed")
-    name = data.get("driver", default)
+    name = data.get("driver", default) or None
     if not isinstance(name, str):
         raise Problem((section, "driver"), f"one of {', '.join(plugins.names())} is needed")
     target = driver_of(section, name).Settings

@@ -17,6 +17,7 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
 from fishd.control.servo_output import ServoOutput
+from fishd.control.servo_power import ServoPower
 from fishd.control.statistics import Statistics
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits
@@ -42,6 +43,8 @@ class Turn(NamedTuple):
     measurement: Measurement
     observation: Observation
     marks: tuple[float, float, float]
+    power: float | None
+    """Mean electrical power of the servo since the previous tick, where it is known [W]."""
 
 
 class ControlLoop:
@@ -67,6 +70,7 @@ class ControlLoop:
         self.reporter = Reporter(clock, publisher)
         self.active = ActiveController(limits, self.reporter)
         self.servo = ServoOutput(robot, clock.monotonic)
+        self.power = ServoPower(robot, self.reporter, limits.tick)
         self.seq = 0
         """Number of the latest tick."""
         self.applied = 0.0
@@ -112,10 +116,11 @@ class ControlLoop:
                 self._fail("controller-error", f"controller {name} cannot begin", error)
         self._attend_panel(slot)
         measurement = self._read(slot)
+        power = self.power.read(slot.deadline)
         read = self._now()
         observation = self._follow_thrust(self._estimate(measurement, slot, dt))
         self.observation = observation
-        return Turn(slot, measurement, observation, (started, read, self._now()))
+        return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
         """Second half of a tick: let the controller choose, drive the servo, publish."""

@@ -88,7 +88,7 @@ class Reporter:
 
         now: the time after the servo was driven [s, monotonic]
         """
-        slot, measurement, observation, marks = turn
+        slot, measurement, observation, marks, power = turn
         thrust, error = loop.known_thrust
         extremes = measurement.extremes
         swims = loop.supervisor.mode is Mode.RUNNING
@@ -131,6 +131,7 @@ class Reporter:
                 heading=course.heading if course else UNSET,
                 thrust_factor=UNSET if factor is None else factor,
                 thrust_factor_error=UNSET if factor_error is None else factor_error,
+                power=UNSET if power is None else power,
             )
         )
 

@@ -188,6 +188,14 @@ class Tick(Struct, frozen=True, gc=False):
     thrust_factor_error: Annotated[float | UnsetType, unit("N", "Half of its 95 % interval.")] = (
         UNSET
     )
+    power: Annotated[
+        float | UnsetType,
+        unit(
+            "W",
+            "Mean electrical power of the servo since the previous tick; absent without a power "
+            "meter, or while it cannot be read.",
+        ),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -199,6 +207,7 @@ EventKind = Literal[
     "fault",
     "overrun",
     "servo",
+    "power",
     "calibration",
     "gateway",
     "mark",
@@ -232,6 +241,8 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "empty",
     ),
     ("servo", "info", "a servo that could not be reached can be reached again", "empty"),
+    ("power", "warning", "the power meter cannot be read; the fish swims on", "empty"),
+    ("power", "info", "a power meter that could not be read can be read again", "empty"),
     ("calibration", "info", "another calibration was saved and is used now", "`file`"),
     (
         "calibration",
@@ -381,6 +392,10 @@ class Status(Struct, frozen=True):
     ] = 0.0
     speed: Annotated[
         float | None, unit("m/s", "As in `tick`; null for a fish that is tethered.")
+    ] = None
+    power: Annotated[
+        float | None,
+        unit("W", "Mean of `power` over the last 2 s; null where it is not known."),
     ] = None
     boot: Annotated[
         str, note("Names this start of fishd's machine, from which its monotonic clock counts.")

@@ -120,7 +120,7 @@ class Operations:
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
-            degraded=loop.robot.degraded(),
+            degraded=self._degraded(),
             counters={**loop.robot.counters(), **self._counters()},
             realtime=self._realtime,
             telemetry=self._telemetry,
@@ -136,7 +136,12 @@ class Operations:
             clock=self._clock.monotonic(),
             boot=self._boot,
             speed=self._speed(),
+            power=loop.power.mean,
         )
+
+    def _degraded(self) -> tuple[str, ...]:
+        lines, trouble = self._loop.robot.degraded(), self._loop.power.trouble
+        return (*lines, trouble) if trouble else lines
 
     def _speed(self) -> float | None:
         truth = self._loop.robot.truth

@@ -19,7 +19,7 @@ class SimulatedFish:
 
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
-        self.fish = TetheredFish(plant)
+        self.fish = TetheredFish(plant, motor=settings.motor)
         self.window: Window
         """The latest window with its true mean forces; there is none before the first read."""
         self._imperfections = Imperfections(settings, tick)
@@ -69,7 +69,11 @@ class SimulatedFish:
         self._fin_speed = state.alpha_rate
         # Where the fin has not turned, it is at the end that it has gone furthest.
         peak = window.fin_peak if turned else abs(state.alpha)
-        return TrueWindow(window.duration, window.thrust, peak)
+        return TrueWindow(window.duration, window.thrust, peak, window.power)
+
+    def power(self, now: float) -> float:
+        """Mean electrical power of the servo over the latest window, which ended `now` [W]."""
+        return self.window.power
 
     def write(self, angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""
@@ -90,4 +94,11 @@ class SimulatedFish:
 
     def robot(self) -> Robot:
         """This fish as the loop sees it."""
-        return Robot(name="simulated", sensor=self, servo=self, truth=self.truth, tared=self)
+        return Robot(
+            name="simulated",
+            sensor=self,
+            servo=self,
+            truth=self.truth,
+            tared=self,
+            power=self.power,
+        )

@@ -10,10 +10,11 @@ from typing import Annotated
 from msgspec import Struct
 
 from fishd.core.schema import note, unit
+from fishd.virtual.plant.motor import MotorSettings
 
 
 class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How imperfect the simulated rig is."""
+    """How imperfect the simulated rig is, and what its servo draws."""
 
     noise: Annotated[
         float, unit("N", "Noise of each force, rms of the mean over one tick.", ge=0, le=1)
@@ -62,6 +63,9 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         ),
     ] = 200.0
     seed: Annotated[int, note("Same seed, same noise and drift, to the last bit.", ge=0)] = 0
+    motor: Annotated[MotorSettings, note("The motor of the servo: what power it needs.")] = (
+        MotorSettings()
+    )
 
 
 class Imperfections:

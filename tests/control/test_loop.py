@@ -249,7 +249,11 @@ class Restless(Wrapped):
     reads = 0
 
     def robot(self) -> Robot:
-        return replace(super().robot(), truth=lambda: Truth(*self.news(3)))
+        return replace(
+            super().robot(),
+            truth=lambda: Truth(*self.news(3)),
+            power=lambda now: self.news(1)[0],
+        )
 
     def news(self, count: int) -> list[float]:
         return [1e-3 * (self.reads**2 + k / 10) for k in range(count)]

@@ -4,7 +4,7 @@
 |---|---|---|
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`features`) |
 | action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
-| reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
+| reward | `reward_scale` · (F_x − `power_price` · P) / `thrust_scale` | of the tick that followed |
 
 An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
 """
@@ -124,6 +124,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.eye = eye
         self.perception = Perception(self.features, eye)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
+        self._price, self._cost = settings.power_price, 0.0  # N/W, N
         self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
         """Mean thrust of the best square wave of the configured fish [N]."""
@@ -179,7 +180,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             raise ResetNeeded("no episode has begun: call reset before step")
         lost = self.advance(_share(action) * self.link.amplitude)
         self._steps += 1
-        reward = self._reward_per_newton * self.latest.fx
+        reward = self._reward_per_newton * (self.latest.fx - self._cost)
         info = self._info(lost)
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
@@ -188,10 +189,17 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
 
-        Raises `LinkLost`.
+        Raises `LinkLost`, and `ConfigError` where power has a price, but is not known.
         """
         before = self.latest.time
-        self.latest, lost = self.link.step(angle)
+        self.latest, lost, power = self.link.step(angle)
+        if self._price:
+            if power is None:
+                raise ConfigError(
+                    "environment.power_price: the power of the servo is not known here: learn in "
+                    "simulation, or set it to 0"
+                )
+            self._cost = self._price * power
         if self.eye and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before
@@ -263,7 +271,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             return
         begun, began = self.latest.time, time.monotonic()
         while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
-            self.latest, _ = self.link.step(0.0)
+            self.latest = self.link.step(0.0).observation
             if self._look():
                 return
         raise LinkLost(

@@ -16,6 +16,7 @@ from msgspec import Struct
 
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
 from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
+from fishd.virtual.plant.motor import Motor, MotorSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
 # Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
@@ -49,6 +50,7 @@ class Window(Struct, frozen=True, eq=False):
         sampled_thrust: mean of F_x at the midpoints of equal parts of the window, N.
         sampled_lateral_force: mean of F_y at the same instants, N.
         course: the segments of the window and the fin's response in each, for `fin_peak`.
+        power: mean electrical power of the servo, W; NaN where the fish has no motor.
     """
 
     duration: float
@@ -57,6 +59,7 @@ class Window(Struct, frozen=True, eq=False):
     sampled_thrust: float
     sampled_lateral_force: float
     course: Sequence[tuple[Segment, Vector]]
+    power: float = math.nan
 
     @property
     def fin_peak(self) -> float:
@@ -73,6 +76,8 @@ class TrueWindow(NamedTuple):
     """Mean F_x [N]."""
     fin_peak: float
     """Largest |α| [rad]."""
+    power: float = math.nan
+    """Mean electrical power of the servo [W]; NaN for a fish without one."""
 
 
 class TetheredFish:
@@ -84,7 +89,13 @@ class TetheredFish:
         cables: between wheel and tail.
     """
 
-    def __init__(self, parameters: PlantParameters, state: PlantState = REST) -> None:
+    def __init__(
+        self,
+        parameters: PlantParameters,
+        state: PlantState = REST,
+        motor: MotorSettings | None = None,
+    ) -> None:
+        """motor: of the servo, where its power is of interest"""
         self.parameters = parameters
         self.state = state
         self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
@@ -96,6 +107,9 @@ class TetheredFish:
         self._line = DelayLine(parameters.servo_delay) if parameters.servo_delay else None
         self._momentum = 0.0
         """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
+        self._motor = Motor(motor, parameters) if motor else None
+        self._pulls = True
+        """Did the wheel move the tail in the latest segment?"""
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
@@ -124,6 +138,7 @@ class TetheredFish:
             sum(w.sampled_thrust for w in windows),
             sum(w.sampled_lateral_force for w in windows),
             [segment for w in windows for segment in w.course],
+            sum(w.power * w.duration for w in windows) / duration,
         )
 
     def _swim(
@@ -150,6 +165,8 @@ class TetheredFish:
         course = []
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
         momentum = self._momentum
+        motor = self._motor if angle is not None else None
+        energy = motor.begin(lag) if motor else 0.0
         for segment in segments:
             cause[0], cause[1] = alpha, rate
             lag = self._drive(segment, command, lag)
@@ -161,7 +178,13 @@ class TetheredFish:
             sampled_thrust -= total
             sampled_acceleration += total_acceleration
             sampled_rate += total_rate
+            if motor:
+                energy += motor.spent(segment, response if self._pulls else None)
 
+        power = math.nan
+        if self._motor:
+            self._motor.end(lag if motor else 0.0)
+            power = self._motor.idle + energy / duration
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
         inertia, drag = p.thrust_coefficient, p.lateral_drag
         reaction = self._momentum - momentum
@@ -173,6 +196,7 @@ class TetheredFish:
             inertia * sampled_thrust / samples,
             -(inertia * sampled_acceleration + drag * sampled_rate) / samples + reaction / whole,
             course,
+            power,
         )
 
     def _reached(self, angle: float, phi: float) -> float:
@@ -197,6 +221,8 @@ class TetheredFish:
             later = relax(lag, segment.length / self._servo_time)
         if p.servo_reaction:
             self._react(segment, nodes)
+        if self._motor:
+            self._motor.turn(nodes)
         cause[2] = p.coupling * command
         if not self.cables.taut:
             self._pull(segment, command, lag, later)
@@ -209,6 +235,7 @@ class TetheredFish:
         moves, angle = self.cables.pull(
             command - p.servo_lag * halfway, command - p.servo_lag * later
         )
+        self._pulls = moves
         if moves:
             cause[2] = p.coupling * (command - angle)
         else:
