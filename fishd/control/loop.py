@@ -79,6 +79,8 @@ class ControlLoop:
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self._estimator = estimator
+        self.found_leak = estimator.found_leak
+        """As of the estimator, at the latest tick [s]."""
         self._now = clock.monotonic
         self._notify = notify
         self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
@@ -238,6 +240,9 @@ class ControlLoop:
         if self.supervisor.sensor_lost:
             return
         try:
+            if self._estimator.found_leak != self.found_leak:
+                self.found_leak = self._estimator.found_leak
+                self.thrust.forget_factor()
             running = self.supervisor.mode is Mode.RUNNING
             self.thrust.update(observation, running, self.active.wave)
         except ArithmeticError as error:

@@ -126,6 +126,7 @@ class Reporter:
                 y=course.y if course else UNSET,
                 speed=course.speed if course else UNSET,
                 heading=course.heading if course else UNSET,
+                leak=UNSET if loop.found_leak is None else loop.found_leak,
             )
         )
 

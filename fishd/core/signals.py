@@ -172,6 +172,10 @@ class Tick(Struct, frozen=True, gc=False):
     heading: Annotated[
         float | UnsetType, unit("rad", "True heading of the front body, against −x.")
     ] = UNSET
+    leak: Annotated[
+        float | UnsetType,
+        unit("s", "The leak in use, with `estimator.leak: auto`; absent with a number."),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -376,4 +380,7 @@ class Status(Struct, frozen=True):
             "Is F_y reversed against the tail, as it was seen when the tail set off from rest? "
             "null while it was not seen."
         ),
+    ] = None
+    leak: Annotated[
+        float | None, unit("s", "As in `tick`; null where `estimator.leak` is a number.")
     ] = None

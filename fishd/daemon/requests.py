@@ -137,6 +137,7 @@ class Operations:
             boot=self._boot,
             speed=self._speed(),
             fy_reversed=loop.lateral_sign.reversed,
+            leak=loop.found_leak,
         )
 
     def _speed(self) -> float | None:
