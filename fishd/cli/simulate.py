@@ -126,6 +126,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
             "controller",
             f"{report.controller} {spelled(report.parameters)} {_until(report, settle)}".rstrip(),
         ),
+        *_chosen(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
         ("frequency", f"{report.frequency:.3f} Hz{_half_beats(report, config.tick)}"),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
@@ -154,6 +155,15 @@ def _until(report: "Report", settle: float) -> str:
         return ""
     whose = "whose figures these are" if report.took_over <= settle else "the figures are of both"
     return f"until {report.took_over:.2f} s, then {report.successor}; {whose}"
+
+
+def _chosen(report: "Report") -> list[tuple[str, str]]:
+    """What the controller chose where it was left to it."""
+    if report.parameters.get("C") != "auto" or "criterion" not in report.quantities:
+        return []
+    found = report.quantities
+    ahead = f", of the speed that is foreseen {found['lead']:g} s ahead" if found["lead"] else ""
+    return [("", f"C = {found['criterion']:g} at the end{ahead}")]
 
 
 def _half_beats(report: "Report", tick: float) -> str:

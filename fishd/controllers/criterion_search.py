@@ -48,7 +48,7 @@ NEIGHBOURS = (1, -1, 2, -2)
 """Steps on the ladder that are tried, in this order."""
 
 
-class Gait(NamedTuple):
+class Judgement(NamedTuple):
     """What the force says of some beats."""
 
     merit: float
@@ -75,7 +75,7 @@ class CriterionSearch:
         self._rung = BEGIN
         self._trials = list(NEIGHBOURS)
         self._turn = 0
-        self._reference = self._trial = Gait(0.0, 0.0)
+        self._reference = self._trial = Judgement(0.0, 0.0)
         self._known = 0.0
         self._watched = 0.0
         self._side = 0.0
@@ -126,15 +126,15 @@ class CriterionSearch:
         if len(self._variances) >= 2 * BEATS - 1 or hopeless:
             self._judge(gait)
 
-    def _gait(self) -> Gait:
+    def _gait(self) -> Judgement:
         """As the half beats since the phase began show it."""
         count = len(self._variances)
         mean = sum(self._variances) / count
         half_beat = self._lasted / (count + 1)
         self.ripple = math.sqrt(mean)
-        return Gait(self.ripple * half_beat**FASTER_RIPPLES, half_beat)
+        return Judgement(self.ripple * half_beat**FASTER_RIPPLES, half_beat)
 
-    def _judge(self, gait: Gait) -> None:
+    def _judge(self, gait: Judgement) -> None:
         """Go on, knowing the gait of a whole phase."""
         match self.phase:
             case Phase.BEFORE:
@@ -152,7 +152,7 @@ class CriterionSearch:
             case Phase.WATCH:
                 self._watch(gait)
 
-    def _decide(self, after: Gait) -> None:
+    def _decide(self, after: Judgement) -> None:
         """Take the rung that was tried, or stay."""
         step = self._trials.pop(0)
         usual = 0.5 * (self._reference.merit + after.merit)
@@ -184,7 +184,7 @@ class CriterionSearch:
             self._known, self._watched = self._reference.merit, 0.0
         self._begin(Phase.TRIAL if self._trials else Phase.WATCH)
 
-    def _watch(self, gait: Gait) -> None:
+    def _watch(self, gait: Judgement) -> None:
         """Search anew where the fish is another one; now and then try one neighbour."""
         self._reference = gait
         if abs(gait.merit - self._known) > CHANGED * self._known:

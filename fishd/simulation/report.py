@@ -58,6 +58,8 @@ class Report(Struct, frozen=True):
     """Why another controller took over, if one did."""
     successor: str | None
     """Which one that was."""
+    quantities: dict[str, float]
+    """Of the controller, at the end."""
     took_over: float | None
     """When it took over [s]; the figures are its own where that was before the end of settling."""
     microseconds_per_tick: float
@@ -135,6 +137,7 @@ def judge(
         elapsed = time.perf_counter() - since
         loop = virtual.loop
         fallback = loop.active.fallback
+        quantities = loop.active.quantities
         successor = loop.active.name if fallback else None
 
     amplitude = amplitude_of(controller.parameters, config.limits)
@@ -158,6 +161,7 @@ def judge(
         reason=loop.supervisor.reason,
         fallback=fallback,
         successor=successor,
+        quantities=quantities,
         took_over=took_over,
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,

@@ -119,8 +119,10 @@ class Fish:
         self._travelled = 0.0
         self._drive = self.beam.drive(lambda X: curvature(settings, X))
         self._couple = self.beam.couple()
+        # Of a rod as long and heavy as the fish, and of the water that a plate as long turns with
+        # it, π/8 ρ (L/2)⁴ (Newman, Marine Hydrodynamics, 1977, table 4.3) [kg m²/m].
         self._inertia = water.density * (
-            self.beam.area * body.length**2 / 12.0 + math.pi * (0.5 * body.length) ** 4 / 8.0
+            self.beam.area * body.length**2 / 12.0 + math.pi / 8.0 * (0.5 * body.length) ** 4
         )
         self._averaged_heading = self._averaged_y = 0.0
         self._torque = 0.0

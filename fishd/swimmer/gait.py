@@ -81,8 +81,9 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     frequency = beats / duration
     width = _tail_width(track, begins if beats else [first, last]) / length
     powers = {
-        name: float(track[name][rows].mean())
-        for name in ("muscle_power", "water_power", "steering_power", "thrust_power", "lateral_power")
+        name: float(column[rows].mean())
+        for name, column in track.items()
+        if name.endswith("_power")
     }
     _, means = _grouped(time, x, begins, LEAST_BEATS)
     gets_on = beats > 0 and speed > 0.0

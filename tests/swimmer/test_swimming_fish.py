@@ -1,0 +1,46 @@
+"""A fish in its tank: no energy comes from nowhere, and without muscles it comes to rest."""
+
+import numpy as np
+import pytest
+from rigs.coarse_swimmer import coarse
+
+from fishd.swimmer.fish import Fish, Work
+
+
+def swim(fish: Fish, seconds: float, frequency: float) -> None:
+    """A square wave, or with 0 Hz relaxed muscles."""
+    for _ in range(round(seconds / fish.dt)):
+        fish.step((1.0 if fish.time * frequency % 1.0 < 0.5 else -1.0) if frequency else 0.0)
+
+
+def kinetic_energy(fish: Fish) -> float:
+    """Of all that moves on the grid, the body included [J/m]."""
+    flow, grid = fish.flow, fish.flow.grid
+    u, v = 0.5 * (flow.u[1:] + flow.u[:-1]), 0.5 * (flow.v[:, 1:] + flow.v[:, :-1])
+    return float(500.0 * grid.dx @ (u**2 + v**2) @ grid.dy)
+
+
+@pytest.mark.parametrize("steering", [0, 1])
+def test_a_fish_that_stops_beating_comes_to_rest(steering: int) -> None:
+    fish = Fish(coarse(f"swimmer.steering={steering}").swimmer)
+    swim(fish, 2.0, 2.5)
+    speed, left = fish.motion().speed, [kinetic_energy(fish)]
+    for _ in range(3):
+        swim(fish, 2.0, 0.0)
+        left.append(kinetic_energy(fish))
+    assert speed > 0.05
+    assert left == sorted(left, reverse=True)
+    assert left[-1] < 0.1 * left[0]
+    assert 0.0 < fish.motion().speed < 0.7 * speed
+    assert abs(fish.motion().tail_rate) < 0.05
+
+
+def test_the_water_gets_no_more_than_muscles_and_steering_give() -> None:
+    fish = Fish(coarse().swimmer)
+    swim(fish, 0.8, 2.5)
+    before = np.array(fish.work)
+    for _ in range(5):
+        swim(fish, 0.4, 2.5)  # one beat
+        work = Work(*(np.array(fish.work) - before))
+        assert 0.85 * work.muscles < work.water < work.muscles + work.steering
+        assert abs(work.steering) < 0.01 * work.muscles
