@@ -87,6 +87,7 @@ def _row(field: Field, default: object, prefix: str) -> list[str]:
     permitted = field.interval or ANY[field.kind]
     if field.kind == "integer":
         permitted += ", whole"
+    permitted += "".join(f", or `{word}`" for word in field.words)
     if field.optional:
         permitted += ", or `null`"
     unit = "" if field.unit == "1" else field.unit

@@ -37,7 +37,7 @@ class Pilot:
         self.card = found.card
         self._network = Network(found)
         self._write = Layout(self.card.observation).write
-        self._limit = DwellLimit(limits.chatter.dwell, limits, self.card.amplitude)
+        self._limit = DwellLimit(limits.dwell, limits, self.card.amplitude)
         self._angle = 0.0
         self._begun = False
         self.blind = 0.0

@@ -206,6 +206,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
         *_swum(status),
+        *([("leak", f"{status.leak:.3g} s, found")] if status.leak is not None else []),
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),

@@ -3,6 +3,7 @@
 Each section is a struct of the part that it configures; this module only puts them together.
 """
 
+import math
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from fishd.config import consistency as config_checks
 from fishd.config import drivers
 from fishd.config.overrides import apply_overrides
 from fishd.control.estimators.base import EstimatorSettings
-from fishd.controllers.base import ChatterSettings, Limits
+from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, leaves, note, unit, without_empty_sections
@@ -30,6 +31,7 @@ from fishd.hardware.settings import (
 from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.plant.dwell import shortest_dwell
 from fishd.virtual.plant.parameters import PlantParameters
 
 SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
@@ -208,12 +210,23 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             tick=self.tick,
             scaled=self.estimator.kind != "lateral_force",
             virtual=self.lockstep or self.robot == "swimmer",
+            dwell=self._dwell,
             chatter=self.chatter,
             tethered=self.robot != "swimmer",
             thrust_coefficient=(
                 self.plant.thrust_coefficient if self.estimator.kind == "observer" else None
             ),
         )
+
+    @property
+    def _dwell(self) -> float:
+        """Shortest time between two reversals of a policy [s]."""
+        if self.chatter.dwell != "auto":
+            return self.chatter.dwell
+        if self.robot == "swimmer":  # whose muscles are no servo
+            return DWELL
+        shortest = min(shortest_dwell(self.plant, self.amplitude_limit), LONGEST_DWELL)
+        return round(math.ceil(shortest / self.tick - 1e-9) * self.tick, 9)
 
 
 def service_file() -> Path | None:

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
 from fishd.control.estimators.base import Estimator
+from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
@@ -78,9 +79,12 @@ class ControlLoop:
         self.neutral_for = 0.0
         """How long the instruction angle has been zero [s]."""
         self.thrust = thrust
+        self.lateral_sign = LateralSign()
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self._estimator = estimator
+        self.found_leak = estimator.found_leak
+        """As of the estimator, at the latest tick [s]."""
         self._now = clock.monotonic
         self._notify = notify
         self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
@@ -120,6 +124,7 @@ class ControlLoop:
         read = self._now()
         observation = self._follow_thrust(self._estimate(measurement, slot, dt))
         self.observation = observation
+        self._watch_sign(observation)
         return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
@@ -240,6 +245,9 @@ class ControlLoop:
         if self.supervisor.sensor_lost:
             return observation
         try:
+            if self._estimator.found_leak != self.found_leak:
+                self.found_leak = self._estimator.found_leak
+                self.thrust.forget_factor()
             running = self.supervisor.mode is Mode.RUNNING
             self.thrust.update(observation, running, self.active.wave)
             known = self.thrust.factor
@@ -250,6 +258,13 @@ class ControlLoop:
         if known is None:
             return observation
         return replace(observation, thrust_factor=known[0], thrust_factor_error=known[1])
+
+    def _watch_sign(self, observation: Observation) -> None:
+        """Notice, when the tail sets off, that F_y is reversed."""
+        if self.supervisor.sensor_lost or not self.limits.tethered:
+            return
+        if self.lateral_sign.update(observation) and self.lateral_sign.reversed:
+            self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

@@ -132,6 +132,7 @@ class Reporter:
                 thrust_factor=UNSET if factor is None else factor,
                 thrust_factor_error=UNSET if factor_error is None else factor_error,
                 power=UNSET if power is None else power,
+                leak=UNSET if loop.found_leak is None else loop.found_leak,
             )
         )
 

@@ -7,6 +7,8 @@ from fishd.core.signals import Observation
 
 REFRACTORY = 0.05
 """Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
+FIRST_PUSH = 0.2
+"""Who begins from neutral does not reverse sooner: until the servo acts, all speed is noise [s]."""
 SLOPE_OVER = 0.05
 """The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
 
@@ -23,6 +25,8 @@ class Reversal:
         """[s]"""
         self._tick = limits.tick
         self._direction = 1.0
+        self._first = False
+        """Has it begun from neutral, and not reversed yet?"""
         self._top_speed = 0.0  # since the last reversal
         ticks = max(1, round(SLOPE_OVER / limits.tick))
         self._velocities: deque[float] = deque(maxlen=ticks + 1)
@@ -35,6 +39,7 @@ class Reversal:
     def begin(self, angle: float) -> None:
         """Push on towards the side of this angle; from 0, towards plus."""
         self._direction = 1.0 if angle >= 0 else -1.0
+        self._first = angle == 0.0
 
     def update(self, observation: Observation, C: float, lead: float, longest: float) -> None:
         """Take in a tick.
@@ -47,14 +52,17 @@ class Reversal:
         speed = self._direction * self._ahead(observation, lead)
         slowed = self._top_speed > 0.0 and speed <= C * self._top_speed
         self._top_speed = max(self._top_speed, speed)
-        settled = self.since_reversal > REFRACTORY * longest
         # Half a tick early is nearer to the longest half period than half a tick late.
-        overdue = self.since_reversal + 0.5 * self._tick > longest
+        nearly = self.since_reversal + 0.5 * self._tick
+        settled = self.since_reversal > REFRACTORY * longest
+        if self._first:
+            settled = settled and nearly > FIRST_PUSH
+        overdue = nearly > longest
         reverses = (slowed and settled) or overdue
         if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
             self.top_speed = self._top_speed
         if reverses:
-            self._direction = -self._direction
+            self._direction, self._first = -self._direction, False
             self._top_speed = 0.0
             self.since_reversal = 0.0
         self.reversal_speed = C * self.top_speed

@@ -196,6 +196,10 @@ class Tick(Struct, frozen=True, gc=False):
             "meter, or while it cannot be read.",
         ),
     ] = UNSET
+    leak: Annotated[
+        float | UnsetType,
+        unit("s", "The leak in use, with `estimator.leak: auto`; absent with a number."),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -250,6 +254,7 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "a trial of a calibration ended, and the one before it is used again",
         "empty",
     ),
+    ("calibration", "warning", "when the tail set off, F_y was seen to be reversed", "empty"),
     (
         "gateway",
         "warning",
@@ -400,3 +405,13 @@ class Status(Struct, frozen=True):
     boot: Annotated[
         str, note("Names this start of fishd's machine, from which its monotonic clock counts.")
     ] = ""
+    fy_reversed: Annotated[
+        bool | None,
+        note(
+            "Is F_y reversed against the tail, as it was seen when the tail set off from rest? "
+            "null while it was not seen."
+        ),
+    ] = None
+    leak: Annotated[
+        float | None, unit("s", "As in `tick`; null where `estimator.leak` is a number.")
+    ] = None

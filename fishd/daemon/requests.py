@@ -137,11 +137,16 @@ class Operations:
             boot=self._boot,
             speed=self._speed(),
             power=loop.power.mean,
+            fy_reversed=loop.lateral_sign.reversed,
+            leak=loop.found_leak,
         )
 
     def _degraded(self) -> tuple[str, ...]:
-        lines, trouble = self._loop.robot.degraded(), self._loop.power.trouble
-        return (*lines, trouble) if trouble else lines
+        loop = self._loop
+        return (
+            *loop.robot.degraded(),
+            *filter(None, [loop.power.trouble, loop.lateral_sign.complaint]),
+        )
 
     def _speed(self) -> float | None:
         truth = self._loop.robot.truth

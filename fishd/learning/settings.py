@@ -52,6 +52,18 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             "ticks", "An episode begins after up to so many ticks at a random angle.", ge=0, le=1000
         ),
     ] = 10
+    dwell: Annotated[
+        bool, note("Reversals that ppo would hold back (chatter.dwell) are held back here, too.")
+    ] = True
+    held_cost: Annotated[
+        float,
+        note(
+            "Share of reward_scale that a tick costs in which one is held back, so that policies "
+            "do not lean on it.",
+            ge=0,
+            le=10,
+        ),
+    ] = 0.5
 
 
 class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

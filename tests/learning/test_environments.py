@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from msgspec.structs import replace
 from rigs.processes import Daemon
 from rigs.swimming import BRIEF, Resting, brief_job
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
@@ -113,6 +114,37 @@ def test_an_action_beyond_its_space_is_clipped() -> None:
     env.reset(seed=1)
     env.step([7])
     assert env.latest.instruction_angle == 0.42  # type: ignore[attr-defined]
+
+
+def applied(settings: EnvironmentSettings, *overrides: str) -> tuple[str, float]:
+    """Which side was applied in each of twelve ticks in which the other one was wanted, and reward.
+
+    The reward is without that of thrust, for a fish that has none to speak of.
+    """
+    config = load(None, [*STILL, *overrides])
+    env = SwimEnv(SimulatedLink(config), config, replace(settings, thrust_scale=1e9))
+    env.reset(seed=1)
+    env.swim(0.42)
+    sides, rewards = "", 0.0
+    for _ in range(12):
+        wanted = -np.sign([env.latest.instruction_angle])
+        rewards += float(env.step(wanted)[1])
+        sides += "+" if env.latest.instruction_angle > 0 else "-"
+    return sides, rewards
+
+
+def test_a_reversal_that_ppo_would_hold_back_is_held_back_and_costs() -> None:
+    settings = EnvironmentSettings(longest_start=0, reward_scale=2.0, held_cost=0.25)
+    sides, reward = applied(settings)
+    assert sides == "+++----++++-"
+    assert reward == pytest.approx(-9 * 0.5, abs=1e-6)
+    assert applied(settings, "plant.servo_delay=0.08")[0] == "++++-----+++"  # dwell 0.25 s
+    assert applied(settings, "chatter.dwell=0")[0] == "-+-+-+-+-+-+"
+
+
+def test_a_training_may_do_without_the_shortest_dwell() -> None:
+    sides, reward = applied(EnvironmentSettings(longest_start=0, dwell=False))
+    assert (sides, reward) == ("-+-+-+-+-+-+", pytest.approx(0.0, abs=1e-6))
 
 
 def test_a_step_before_the_first_episode_and_after_the_end_says_what_is_wrong() -> None:

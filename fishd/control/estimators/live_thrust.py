@@ -103,6 +103,12 @@ class LiveThrust:
         self._factor_size = None
         self.forget_zero()
 
+    def forget_factor(self) -> None:
+        """The fin velocity has another scale from now on; the zero is what it was."""
+        self._factor, self._factor_variance, self._covariance = 0.0, None, 0.0
+        self._block = None
+        self._beats.clear()
+
     def calibrate(self, factor: float, error: float) -> None:
         """Take the factor from a measurement.
 

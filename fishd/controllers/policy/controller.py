@@ -46,6 +46,7 @@ class Ppo(Controller[PpoParameters]):
 
     Parameters = PpoParameters
     action: float = quantity("1", "What the network put out, before it is cut to -1 to 1.")
+    held: float = quantity("1", "In what share of the latest ticks a reversal was held back.")
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Reads, checks and warms up the policy."""
@@ -56,7 +57,7 @@ class Ppo(Controller[PpoParameters]):
         card, self._network = _open(parameters, limits)
         self._write = Layout(card.observation).write
         self._amplitude = card.amplitude
-        self._limit = DwellLimit(limits.chatter.dwell, limits, card.amplitude)
+        self._limit = DwellLimit(limits.dwell, limits, card.amplitude)
         self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
@@ -90,7 +91,9 @@ class Ppo(Controller[PpoParameters]):
         self.action = action = self._choose(observation)
         if math.isfinite(action):
             action = max(-1.0, min(1.0, action))
-        return self._limit.apply(self._amplitude * action, observation.dt)
+        angle = self._limit.apply(self._amplitude * action, observation.dt)
+        self.held = self._limit.share
+        return angle
 
     def _choose(self, observation: Observation) -> float:
         """What the network puts out."""

@@ -5,6 +5,7 @@
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`features`) |
 | action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
 | reward | `reward_scale` · (F_x − `power_price` · P) / `thrust_scale` | of the tick that followed |
+| | −`reward_scale` · `held_cost` | in a tick in which the shortest dwell held a reversal back |
 
 An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
 """
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from fishd.camera.frames import Stack
 from fishd.config import Config, check_tethered
+from fishd.controllers.dwell import Dwell
 from fishd.controllers.policy.card import Feature, FeatureName
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
@@ -125,6 +127,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.perception = Perception(self.features, eye)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
         self._price, self._cost = settings.power_price, 0.0  # N/W, N
+        shortest = config.limits.dwell if settings.dwell else 0.0
+        self._dwell = Dwell(shortest, link.tick, link.amplitude)
+        self._held_cost = settings.held_cost * settings.reward_scale
         self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
         """Mean thrust of the best square wave of the configured fish [N]."""
@@ -167,6 +172,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         lost = sum(
             self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
         )
+        self._dwell.activate(self.latest.instruction_angle)
         return self._seen(), self._info(lost)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
@@ -178,13 +184,21 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._check_open()
         if not self._begun:
             raise ResetNeeded("no episode has begun: call reset before step")
-        lost = self.advance(_share(action) * self.link.amplitude)
+        lost = self.swim(_share(action) * self.link.amplitude)
         self._steps += 1
         reward = self._reward_per_newton * (self.latest.fx - self._cost)
+        reward -= self._held_cost * self._dwell.held
         info = self._info(lost)
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
         return self._seen(), reward, False, truncated, info
+
+    def swim(self, angle: float) -> int:
+        """Swim one tick at an angle [rad], or at that of before where it would reverse too soon.
+
+        Gives the number of ticks lost. Raises `LinkLost`.
+        """
+        return self.advance(self._dwell.apply(angle, self.link.tick))
 
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.

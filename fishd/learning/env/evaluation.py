@@ -151,7 +151,7 @@ def on_link(
             samples.append(
                 Sample(round(seen.time / tick), seen.fx, seen.fin_velocity, angle, swims)
             )
-            env.advance(angle)
+            env.swim(angle)
     shares = np.array([each.phi_c for each in samples if each.swims]) / amplitude
     frequency, fullness = beat_frequency(shares, tick), float(np.mean(np.abs(shares)))
     try:
