@@ -15,7 +15,7 @@ from msgspec import Struct
 from common.report import DOCS, between, put, table
 from fishd.camera.settings import CameraSettings
 from fishd.config import Config
-from fishd.config.drivers import DRIVERS
+from fishd.config.drivers import CHOICES
 from fishd.core.schema import Field, fields_of
 
 MARKER = "keys"
@@ -42,7 +42,7 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
     plain, nested = [], []
     for field in fields_of(type(section)):
         value = getattr(section, field.name)
-        if isinstance(value, Struct) or (isinstance(section, Config) and field.name in DRIVERS):
+        if isinstance(value, Struct) or (isinstance(section, Config) and field.name in CHOICES):
             nested.append((field, value))
         else:
             plain.append(_row(field, value, prefix))
@@ -51,36 +51,35 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
     for field, value in nested:
         name = prefix + field.name
         yield f"### `{name}`\n\n{field.description}"
-        if field.name in DRIVERS and isinstance(section, Config):
-            yield from _driver_section(name)
+        if field.name in CHOICES and isinstance(section, Config):
+            yield from _choice_section(name)
         else:
             yield from _sections(value, name + ".")
 
 
-def _driver_section(section: str) -> Iterator[str]:
-    """The keys that all drivers have, then those of each of fishd's own."""
-    plugins, default = DRIVERS[section]
+def _choice_section(section: str) -> Iterator[str]:
+    """The keys that all drivers or plants have, then those of each of fishd's own."""
+    plugins, default, settings_of_default, key, page = CHOICES[section]
+    base = settings_of_default.__base__ if default else Struct
+    common = (settings_of_default if base is Struct else base)(**{key: default or ""})
     mine = [name for name in plugins.names() if plugins.package(name) == "fishd"]
-    (base,) = {b for b in plugins.find(mine[0]).Settings.__mro__ if b.__base__ is Struct}
-    common = base(driver=default or "")
     choice, *rows = [
         _row(field, getattr(common, field.name), f"{section}.") for field in fields_of(type(common))
     ]
-    choice[2] = f"{', '.join(f'`{name}`' for name in mine)}, or [another](writing-a-driver.md)"
+    choice[2] = f"{', '.join(f'`{name}`' for name in mine)}, or [another]({page})"
     yield table(HEAD, [choice, *rows])
     for name in mine:
-        driver = plugins.find(name)
-        settings = driver.Settings(driver=name)
-        about = inspect.cleandoc(driver.__doc__).partition("\n")[0]
-        yield f"#### `driver: {name}`\n\n{about}"
-        yield table(
-            HEAD,
-            [
-                _row(field, getattr(settings, field.name), f"{section}.")
-                for field in fields_of(driver.Settings)
-                if not hasattr(common, field.name)
-            ],
-        )
+        found = plugins.find(name)
+        settings = found.Settings(**{key: name})
+        own = [
+            _row(field, getattr(settings, field.name), f"{section}.")
+            for field in fields_of(found.Settings)
+            if not hasattr(common, field.name)
+        ]
+        if own:
+            about = inspect.cleandoc(found.__doc__).partition("\n")[0]
+            yield f"#### `{key}: {name}`\n\n{about}"
+            yield table(HEAD, own)
 
 
 def _row(field: Field, default: object, prefix: str) -> list[str]:

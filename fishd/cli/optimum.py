@@ -9,14 +9,14 @@ from fishd.cli.config import fish_options
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
 from fishd.config import check_tethered, load
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
 
 if TYPE_CHECKING:
     from fishd.lab.optimum import Optima, OptimalControl
 
 _LARGEST = 1.57
 """As for amplitude_limit [rad]."""
-_LEFT_OUT = ("cable_slack", "backlash", "servo_dead_zone")
+_LEFT_OUT = ("model", "quadratic_drag", "cable_slack", "backlash", "servo_dead_zone")
 """What the closed forms and the optimal control do not know."""
 
 
@@ -126,7 +126,10 @@ def _control_rows(found: "OptimalControl") -> list[tuple[str, str]]:
 
 
 def _say_what_is_left_out(plant: PlantParameters, control: bool) -> None:
-    left_out = [f"plant.{name}" for name in _LEFT_OUT if getattr(plant, name)]
+    ideal = of_the_paper(plant)
+    left_out = [
+        f"plant.{name}" for name in _LEFT_OUT if getattr(plant, name) != getattr(ideal, name)
+    ]
     if left_out:
         who = "the limits and the optimal control leave" if control else "the limits leave"
         echo(f"fishctl: {who} out {', '.join(left_out)}", err=True)

@@ -275,6 +275,7 @@ def _check(config: Config) -> None:
     servo = config.servo
     drivers.check_drivers(config.robot, config.tick, config.driver_settings)
     checks.check_neutral(servo)
+    drivers.check_plant(config.plant)
     checks.check_pulses(servo, config.amplitude_limit)
     checks.check_i2c_addresses(config.driver_settings.sections())
     checks.check_pins(drivers.claims_of(config.driver_settings), config.panel)
@@ -300,13 +301,13 @@ def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
 
 def _convert(data: Mapping[str, Any]) -> Config:
     """Each section on its own; raises `Problem`."""
-    rest = {key: value for key, value in data.items() if key not in drivers.DRIVERS}
+    rest = {key: value for key, value in data.items() if key not in drivers.CHOICES}
     config = convert(rest, Config, elsewhere=drivers.keys)
-    return msgspec.structs.replace(config, **drivers.convert_sections(data))
+    return msgspec.structs.replace(config, **drivers.convert_sections(data, keys))
 
 
 def keys() -> list[str]:
-    """Every key in dotted form, those of all drivers that load among them."""
+    """Every key in dotted form, those of all drivers and plants that load among them."""
     return list(dict.fromkeys(leaves(Config) + drivers.keys()))
 
 
@@ -318,15 +319,16 @@ def to_yaml(config: Config | dict[str, Any]) -> str:
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON Schema of the configuration, with the keys of all drivers that load."""
-    choices = {section: drivers.settings_of_drivers(section) for section in drivers.DRIVERS}
+    """The JSON Schema of the configuration, with the keys of all drivers and plants that load."""
+    choices = {section: drivers.settings_of_drivers(section) for section in drivers.CHOICES}
     types = [Config, *(struct for found in choices.values() for struct in found.values())]
     (top, *_), parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
     properties = parts["Config"]["properties"]
     for section, found in choices.items():
         refs = []
-        for name, struct in found.items():
-            parts[struct.__name__]["properties"]["driver"] = {"const": name}
+        for struct in dict.fromkeys(found.values()):
+            named = [name for name, keys_of in found.items() if keys_of is struct]
+            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"enum": named}
             refs.append({"$ref": f"#/$defs/{struct.__name__}"})
         default = {key: value for key, value in properties[section].items() if key == "default"}
         properties[section] = {"anyOf": refs, **default}

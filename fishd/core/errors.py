@@ -33,6 +33,10 @@ class UnknownDriver(FishdError, LookupError):
     """No installed package offers a driver of that name, or it does not load."""
 
 
+class UnknownPlant(FishdError, LookupError):
+    """No installed package offers a plant of that name, or it does not load."""
+
+
 class PolicyError(FishdError, ValueError):
     """A file holds no policy, or one that does not fit this robot."""
 

@@ -39,6 +39,7 @@ class Plugins(Generic[T]):
         struct: str,
         built_in: Mapping[str, str],
         unknown: type[FishdError],
+        of: type[Struct] = Struct,
     ) -> None:
         """
         kind: what one is called in messages, such as `controller`
@@ -46,6 +47,7 @@ class Plugins(Generic[T]):
         struct: name of the class attribute that is the struct, such as `Parameters`
         built_in: fishd's own, each with `module:class`
         unknown: raised where a name is unknown, or its package does not load
+        of: what that struct is a subclass of
         """
         self.kind = kind
         self._group = group
@@ -53,6 +55,7 @@ class Plugins(Generic[T]):
         self._struct = struct
         self._built_in = built_in
         self._unknown = unknown
+        self._of = of
         self._found: dict[str, type[T]] = {}
         self._entries: dict[str, EntryPoint] = {}
         self._stamps: list[int] = []
@@ -105,8 +108,10 @@ class Plugins(Generic[T]):
         if missing := sorted(getattr(found, "__abstractmethods__", ())):
             raise self._unknown(f"{where} does not define {', '.join(missing)}")
         struct: Any = getattr(found, self._struct, None)
-        if not (isinstance(struct, type) and issubclass(struct, Struct)):
-            raise self._unknown(f"{where} has no {self._struct}, a msgspec.Struct")
+        if not (isinstance(struct, type) and issubclass(struct, self._of)):
+            wanted = f"{self._of.__module__}.{self._of.__qualname__}"
+            wanted = "msgspec.Struct" if self._of is Struct else f"subclass of {wanted}"
+            raise self._unknown(f"{where} has no {self._struct}, a {wanted}")
         try:
             contained(msgspec.json.encode, fields_of(struct))
         except Exception as error:

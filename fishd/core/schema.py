@@ -305,11 +305,11 @@ def _explain(
         elif isinstance(value, list | tuple):
             value = value[int(key)]
     if not path:
-        return Problem(path, f"{_shown(value)} is not valid: a mapping of keys to values is needed")
+        return Problem(path, f"{shown(value)} is not valid: a mapping of keys to values is needed")
     field = _field_at(target, path)
     return Problem(
         path,
-        f"{_shown(value)} is not valid: {wanted(_describe(field))} is needed"
+        f"{shown(value)} is not valid: {wanted(_describe(field))} is needed"
         + _degrees(value, field),
     )
 
@@ -370,7 +370,8 @@ def _sections(
             yield field.name, kind.cls
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value in a message, as much of it as is worth showing."""
     if value is None or isinstance(value, bool):
         return spelled(value)
     return text.quoted(_glimpse.repr(value))

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.camera.frames import Stack
 from fishd.camera.simulated.settings import SimulatedCameraSettings
-from fishd.config import Config
+from fishd.config import Config, adopt
 from fishd.controllers.policy.card import Card
 from fishd.controllers.policy.file import FRAMES, INPUT, PolicyFile
 from fishd.controllers.policy.network import Sight, to_onnx
@@ -31,7 +31,6 @@ from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
-from fishd.virtual.plant.parameters import PlantParameters
 
 TOLERANCE = 1e-5
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ."""
@@ -180,7 +179,7 @@ def _evaluated(
         config, _ = runs.read(checkpoint.parent)
     except FishdError:
         config = Config()
-    plant = msgspec.convert(card.provenance.plant, PlantParameters)
+    plant = adopt({"plant": card.provenance.plant}).plant
     config = replace(config, tick=card.tick, amplitude_limit=card.amplitude, plant=plant)
     decide = DeterministicPolicy(policy, perception, card.amplitude)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from fishd.virtual.plant.tethered import TrueWindow
+from fishd.virtual.plant.base import TrueWindow
 
 
 class Beats:

@@ -17,7 +17,7 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Event, Tick
 from fishd.hardware.base import Robot
 from fishd.virtual.fish import SimulatedFish
-from fishd.virtual.plant.tethered import TrueWindow
+from fishd.virtual.plant.base import TrueWindow
 
 if TYPE_CHECKING:
     from fishd.swimmer.robot import Swimmer

@@ -16,9 +16,9 @@ from fishd.hardware.base import Robot
 from fishd.swimmer.fish import Diverged, Fish, Motion, Work
 from fishd.swimmer.grid import Array
 from fishd.swimmer.settings import SwimmerSettings
+from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.drive_train import relax
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import TrueWindow
 
 
 class Window(NamedTuple):

@@ -10,8 +10,9 @@ from fishd.hardware.base import Robot
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.window import VoltageWatch
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
-from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import TetheredFish, TrueWindow, Window
+from fishd.virtual.plant.base import PlantWindow, TrueWindow, Window
+from fishd.virtual.plant.parameters import TETHERED, PlantParameters
+from fishd.virtual.plant.registry import open_plant
 
 
 class SimulatedFish:
@@ -19,9 +20,9 @@ class SimulatedFish:
 
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
-        self.fish = TetheredFish(plant, motor=settings.motor)
-        self.window: Window
-        """The latest window with its true mean forces; there is none before the first read."""
+        self.fish = open_plant(plant, settings.motor)
+        self.window: Window = PlantWindow(tick, 0.0, 0.0, 0.0, 0.0, 0.0)
+        """The latest window with its true mean forces; nothing happens before the first read."""
         self._imperfections = Imperfections(settings, tick)
         self._sample_rate = settings.sample_rate
         self._tick = tick
@@ -43,7 +44,11 @@ class SimulatedFish:
         samples = max(1, round(self._sample_rate * duration))
         self.window = window = self.fish.advance(self._angle, duration, samples)
         fx, fy = self._imperfections.apply(
-            window.sampled_thrust, window.sampled_lateral_force, now - self._start, duration
+            window.sampled_thrust,
+            window.sampled_lateral_force,
+            now - self._start,
+            duration,
+            samples,
         )
         if self._watches:
             self._watches = [watch for watch in self._watches if not watch.closed]
@@ -100,5 +105,5 @@ class SimulatedFish:
             servo=self,
             truth=self.truth,
             tared=self,
-            power=self.power,
+            power=self.power if self.fish.parameters.model == TETHERED else None,
         )

@@ -1,16 +1,17 @@
 """Errors of a real rig's force measurement, as settings and as a function of time.
 
-A real sensor is turned against the fish, carries an offset that drifts slowly, and is noisy.
+A real sensor is turned against the fish, carries an offset that drifts slowly, and is noisy. Mains
+hum, a sample that is far off now and then, and the steps of an ADC come with its electronics.
 """
 
 import math
 import random
 from typing import Annotated
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.core.schema import note, unit
-from fishd.virtual.plant.motor import MotorSettings
+from fishd.virtual.plant.parameters import MotorSettings
 
 
 class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -19,6 +20,46 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     noise: Annotated[
         float, unit("N", "Noise of each force, rms of the mean over one tick.", ge=0, le=1)
     ] = 1e-3
+    noise_freedom: Annotated[
+        Annotated[float, Meta(ge=2.1, le=1000)] | None,
+        unit(
+            "1",
+            "Degrees of freedom of Student's t-distribution, for noise that has this one, with the "
+            "same rms: the fewer, the more often a force is far off. null: Gaussian noise.",
+        ),
+    ] = None
+    hum: Annotated[
+        float,
+        unit(
+            "N",
+            "Amplitude of mains hum on each force, in phases that depend on the seed.",
+            ge=0,
+            le=10,
+        ),
+    ] = 0.0
+    hum_frequency: Annotated[float, unit("Hz", "Frequency of that hum.", ge=0.1, le=1000)] = 50.0
+    spike_rate: Annotated[
+        float,
+        unit(
+            "1/s",
+            "Spikes per second on each force, at random times: single samples that are far off.",
+            ge=0,
+            le=1000,
+        ),
+    ] = 0.0
+    spike_size: Annotated[
+        float,
+        unit(
+            "N",
+            "How far off such a sample is, either way; a window is the mean of all its samples.",
+            ge=0,
+            le=100,
+        ),
+    ] = 0.1
+    quantum: Annotated[
+        Annotated[float, Meta(ge=1e-9, le=1)] | None,
+        unit("N", "Step in which the mean force of a window is told; null for none."),
+    ] = None
     offset_x: Annotated[float, unit("N", "Constant offset on F_x.", ge=-10, le=10)] = 0.0
     offset_y: Annotated[float, unit("N", "Constant offset on F_y.", ge=-10, le=10)] = 0.0
     drift: Annotated[
@@ -62,7 +103,9 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             le=10_000,
         ),
     ] = 200.0
-    seed: Annotated[int, note("Same seed, same noise and drift, to the last bit.", ge=0)] = 0
+    seed: Annotated[
+        int, note("Same seed, same noise, drift, hum and spikes, to the last bit.", ge=0)
+    ] = 0
     motor: Annotated[MotorSettings, note("The motor of the servo: what power it needs.")] = (
         MotorSettings()
     )
@@ -81,15 +124,22 @@ class Imperfections:
         self._cos = math.cos(settings.rotation)
         self._sin = math.sin(settings.rotation)
         self._walk_x = self._walk_y = 0.0
+        self._noise = self._random.gauss if settings.noise_freedom is None else self._student
+        disturbed = settings.hum or settings.spike_rate or settings.quantum
+        self._electronics = [Electronics(settings, axis) for axis in "xy"] if disturbed else None
 
-    def apply(self, fx: float, fy: float, time: float, duration: float) -> tuple[float, float]:
+    def apply(
+        self, fx: float, fy: float, time: float, duration: float, samples: int = 0
+    ) -> tuple[float, float]:
         """The forces as the rig shows them [N], for a window of `duration` that ends at `time` [s].
 
         time: since the start, for the same seed to mean the same drift in every run
+        samples: how many, evenly spread, the window is the mean of; 0 where one conversion lasts
+            all window long
         Noise of a longer window averages out as white noise does.
         """
         settings = self._settings
-        gauss = self._random.gauss
+        gauss, random_noise = self._random.gauss, self._noise
         noise = settings.noise * math.sqrt(self._tick / duration)
         if settings.drift_walk:
             step = settings.drift_walk * math.sqrt(duration)
@@ -99,7 +149,72 @@ class Imperfections:
         steady = settings.drift_rate * time
         drift_x = settings.drift * math.sin(angle + self._phase_x) + steady + self._walk_x
         drift_y = settings.drift * math.sin(angle + self._phase_y) + steady + self._walk_y
-        return (
-            self._cos * fx - self._sin * fy + settings.offset_x + drift_x + gauss(0.0, noise),
-            self._sin * fx + self._cos * fy + settings.offset_y + drift_y + gauss(0.0, noise),
-        )
+        shown_x = self._cos * fx - self._sin * fy + settings.offset_x + drift_x
+        shown_y = self._sin * fx + self._cos * fy + settings.offset_y + drift_y
+        shown_x += random_noise(0.0, noise)
+        shown_y += random_noise(0.0, noise)
+        if self._electronics:
+            x, y = self._electronics
+            shown_x = x.read(shown_x, time, duration, samples)
+            shown_y = y.read(shown_y, time, duration, samples)
+        return shown_x, shown_y
+
+    def _student(self, mean: float, deviation: float) -> float:
+        """As `gauss`, with heavier tails: a Gaussian over the root of a chi-square per degree."""
+        freedom = self._settings.noise_freedom
+        assert freedom is not None
+        chi_square = self._random.gammavariate(0.5 * freedom, 2.0)
+        spread = self._random.gauss(0.0, 1.0) * math.sqrt((freedom - 2.0) / chi_square)
+        return mean + deviation * spread
+
+
+class Electronics:
+    """What they do to one of the two forces: hum, spikes and the steps of the ADC."""
+
+    def __init__(self, settings: SimulationSettings, axis: str) -> None:
+        """axis: `x` or `y`, for chances of its own"""
+        self._settings = settings
+        self._random = random.Random(f"electronics {axis} {settings.seed}")
+        self._phase = self._random.uniform(0, math.tau)
+        self._next_spike = self._wait()
+
+    def read(self, force: float, time: float, duration: float, samples: int) -> float:
+        """What is read of a force [N]; the rest is as for `Imperfections.apply`."""
+        settings = self._settings
+        if settings.hum:
+            angle = math.tau * settings.hum_frequency * (time - 0.5 * duration) + self._phase
+            left = _left_of_sine(settings.hum_frequency * duration, samples)
+            force += settings.hum * left * math.sin(angle)
+        if settings.spike_rate:
+            force += self._spikes(time - duration, time) * settings.spike_size / max(1, samples)
+        if settings.quantum:
+            force = settings.quantum * round(force / settings.quantum)
+        return force
+
+    def _spikes(self, begin: float, end: float) -> int:
+        """Those upwards less those downwards, from `begin` to `end` [s]."""
+        spikes = 0
+        while self._next_spike < end:
+            side = self._random.choice((-1, 1))
+            if self._next_spike >= begin:  # else nothing was converted then
+                spikes += side
+            self._next_spike += self._wait()
+        return spikes
+
+    def _wait(self) -> float:
+        rate = self._settings.spike_rate
+        return self._random.expovariate(rate) if rate else math.inf
+
+
+def _left_of_sine(periods: float, samples: int) -> float:
+    """Amplitude of the mean of a sine over a window of so many periods, for one of 1.
+
+    It is taken at the midpoints of `samples` equal parts, or everywhere with 0.
+    """
+    angle = math.pi * periods
+    if not samples:
+        return math.sin(angle) / angle
+    step = math.sin(angle / samples)
+    if abs(step) < 1e-9:  # each sample of the hum is like the one before, or its opposite
+        return math.cos(angle) / math.cos(angle / samples)
+    return math.sin(angle) / (samples * step)

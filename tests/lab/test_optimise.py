@@ -17,7 +17,7 @@ from fishd.lab.rig import VirtualRig
 from fishd.recording import open_run, read
 from fishd.recording.rerun import rerun
 from fishd.simulation import VirtualRun, simulate
-from fishd.virtual.plant.tethered import TrueWindow
+from fishd.virtual.plant.base import TrueWindow
 
 BEST = 25.736e-3
 """Of the default fish, by a square wave of whole ticks, at 1.667 Hz [N]."""

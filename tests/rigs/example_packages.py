@@ -21,6 +21,7 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import Tank
 from fishd.virtual.pi.virtual_pi import VirtualPi
+from fishd.virtual.plant.registry import PLANTS
 from rigs.documents import ROOT
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.lockstep_rig import LockstepRig
@@ -50,8 +51,8 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def forget_drivers() -> None:
-    """Look for the drivers of other packages again."""
-    for plugins in (FORCE_SENSORS, SERVOS):
+    """Look for the drivers and plants of other packages again."""
+    for plugins in (FORCE_SENSORS, SERVOS, PLANTS):
         plugins._found.clear()
 
 

@@ -67,17 +67,19 @@ def addresses(folder: Path) -> list[str]:
     return sets(f"control.address=ipc://{folder}/control", "telemetry.address=tcp://127.0.0.1:0")
 
 
-def install(site: Path, modules: Mapping[str, str], **controllers: str) -> None:
-    """Put a package of controllers into a folder of PYTHONPATH, as pip would.
+def install(
+    site: Path, modules: Mapping[str, str], *, group: str = "fishd.controllers", **classes: str
+) -> None:
+    """Put a package of controllers, or of another group, into a folder of PYTHONPATH, as pip would.
 
-    controllers: name to `module:class`
+    classes: name to `module:class`
     """
-    package = next(iter(controllers))
+    package = next(iter(classes))
     info = site / f"{package}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    lines = (f"{name} = {where}\n" for name, where in controllers.items())
-    (info / "entry_points.txt").write_text("[fishd.controllers]\n" + "".join(lines))
+    lines = (f"{name} = {where}\n" for name, where in classes.items())
+    (info / "entry_points.txt").write_text(f"[{group}]\n" + "".join(lines))
     for name, code in modules.items():
         (site / f"{name}.py").write_text(code)
 

@@ -18,8 +18,8 @@ from fishd.core.errors import ConfigError, ParameterError
 from fishd.simulation import Beats, EncodingPublisher, Report, judge, simulate
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import Imperfections
+from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.optimum import square_wave
-from fishd.virtual.plant.tethered import TrueWindow
 
 REALISTIC = ["simulation.offset_y=0.02", "simulation.drift=0.02", "simulation.rotation=0.1"]
 

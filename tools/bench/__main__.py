@@ -20,6 +20,7 @@ NAMES = (
     "identification",
     "estimators",
     "swing",
+    "harsh",
     "thrust",
     "camera",
     "swimmer",

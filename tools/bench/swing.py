@@ -12,7 +12,7 @@ from argparse import Namespace
 from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
-from common.report import Options, Report, table
+from common.report import BrokenPromise, Options, Report, table
 from fishd.config import Config, load
 from fishd.simulation import simulate
 
@@ -96,7 +96,10 @@ def measured(case: Case) -> Shares:
     config: Config = load(None, case.overrides)
 
     def share(C: float | str, seconds: float, settle: float) -> float:
-        return simulate(config, "swing", {"C": C}, seconds, settle).efficiency
+        report = simulate(config, "swing", {"C": C}, seconds, settle)
+        if report.reason:
+            raise BrokenPromise(f"{case.name}: {report.reason.message}")
+        return report.efficiency
 
     return Shares(
         share(0.6, LEARNT, 10.0), share("auto", LEARNT, 0.0), share("auto", SECONDS, LEARNT)

@@ -25,8 +25,9 @@ from fishd.core.addresses import find_control
 from fishd.core.errors import FishError
 from fishd.core.schema import Problem, convert
 from fishd.core.signals import Status
-from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import PlantState, TetheredFish
+from fishd.virtual.plant.base import PlantState
+from fishd.virtual.plant.parameters import TETHERED, PlantParameters
+from fishd.virtual.plant.tethered import TetheredFish
 
 AGAIN = 0.3
 """Time between two looks for a fishd [s]."""
@@ -244,9 +245,13 @@ class _View:
 def _swimmer(config: dict[str, Any]) -> Swimmer:
     """Raises `Trouble` where the configuration is of another version."""
     try:
+        plant = dict(config["plant"])
+        if plant.get("model", TETHERED) != TETHERED:
+            # It has keys of its own. Until the next tick it goes on as the tethered fish would.
+            plant = {name: plant[name] for name in PlantParameters.__struct_fields__}
         return Swimmer(
             tick=float(config["tick"]),
-            plant=convert(config["plant"], PlantParameters),
+            plant=convert(plant, PlantParameters),
             sample_rate=float(config["simulation"]["sample_rate"]),
             lockstep=bool(config["lockstep"]),
         )

@@ -16,7 +16,7 @@ import msgspec
 from fishd import assembly
 from fishd.client import Fish
 from fishd.config import Config
-from fishd.config.drivers import DRIVERS
+from fishd.config.drivers import CHOICES
 from fishd.core.addresses import find_control, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.plugins import Plugins
@@ -195,7 +195,7 @@ class Context(Machine):
     def drivers(self) -> tuple[tuple[str, Plugins[Any], Any], ...]:
         """Section, kind and settings of each driver: sensor, servo, and a power meter if any."""
         chosen = self.config.driver_settings.sections()
-        return tuple((name, DRIVERS[name][0], settings) for name, settings in chosen.items())
+        return tuple((name, CHOICES[name].plugins, settings) for name, settings in chosen.items())
 
 
 def sudo_unless(uid: int) -> str:

@@ -16,7 +16,14 @@ from fishd.core.schema import nearest
 from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Problem, solve
 from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
 from fishd.lab.identification.response import Array
-from fishd.lab.identification.result import UNITS, Channel, Estimate, Fit, Identification
+from fishd.lab.identification.result import (
+    UNITS,
+    UNKNOWN_TO_FITS,
+    Channel,
+    Estimate,
+    Fit,
+    Identification,
+)
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -296,10 +303,9 @@ def _remarks(
     untold: Array | None,
 ) -> tuple[str, ...]:
     remarks = []
-    if any(e.name == "servo_reaction" and e.value for e in estimates):
-        remarks.append(
-            "servo_reaction is as in the configuration, but no fit takes it into account"
-        )
+    unfitted = [e.name for e in estimates if e.name in UNKNOWN_TO_FITS and e.value]
+    for name in unfitted:
+        remarks.append(f"{name} is as in the configuration, but no fit takes it into account")
     if untold is not None:
         involved = [name for name, part in zip(names, untold, strict=True) if abs(part) > 0.3]
         remarks.append(

@@ -20,11 +20,15 @@ UNITS = {
     "cable_slack": "rad",
     "servo_dead_zone": "rad",
     "servo_reaction": "N s^2/rad",
+    "quadratic_drag": "1/rad",
+    "lateral_quadratic_drag": "N s^2/rad^2",
     "rotation": "rad",
     "offset_x": "N",
     "offset_y": "N",
 }
 """What is estimated, in the order of tables; the names are those of the configuration."""
+UNKNOWN_TO_FITS = ("servo_reaction", "quadratic_drag", "lateral_quadratic_drag")
+"""What only the configuration knows."""
 OF_THE_RIG = ("rotation", "offset_x", "offset_y")
 """What belongs into the section `simulation`, not `plant`."""
 

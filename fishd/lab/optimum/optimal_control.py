@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.core.errors import ParameterError
+from fishd.virtual.plant.base import PlantState
 from fishd.virtual.plant.drive_train import relax
 from fishd.virtual.plant.optimum import SteadyState, best_square_wave
-from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import PlantState, TetheredFish
+from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
+from fishd.virtual.plant.tethered import TetheredFish
 
 Array = NDArray[np.float64]
 
@@ -81,8 +81,9 @@ def optimal_control(
 ) -> OptimalControl:
     """Find the periodic command within ±amplitude (rad) of greatest mean thrust; some seconds.
 
-    The equations are those of Fu et al.: slack, backlash, dead zone, delay and reaction of the
-    servo are left out. intervals: even; a reversal can be at the end of each.
+    The equations are those of Fu et al.: another model, quadratic drag, slack, backlash, dead zone,
+    delay and reaction of the servo are left out.
+    intervals: even; a reversal can be at the end of each
 
     Raises `ParameterError` without damping, where thrust has no bound.
     """
@@ -92,14 +93,7 @@ def optimal_control(
         raise ParameterError(
             "plant.xi: 0 is not possible here: without damping, thrust at ω₀ has no bound"
         )
-    p = replace(
-        parameters,
-        cable_slack=0.0,
-        backlash=0.0,
-        servo_dead_zone=0.0,
-        servo_delay=0.0,
-        servo_reaction=0.0,
-    )
+    p = of_the_paper(parameters)
     best_square = best_square_wave(p, amplitude)
     problem = _Problem(p, amplitude, intervals)
     random = np.random.default_rng(seed)

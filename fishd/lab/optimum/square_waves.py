@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
 from fishd.virtual.plant.optimum import SteadyState, best_square_wave, fast_servo_thrust
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
 
 Array = NDArray[np.float64]
 
@@ -72,12 +72,9 @@ def slow_servo(parameters: PlantParameters, amplitudes: ArrayLike) -> Optima:
 def _with_fast_servo(parameters: PlantParameters) -> PlantParameters:
     """For an amplitude of 1 rad."""
     return replace(
-        parameters,
+        of_the_paper(parameters),
         servo_speed=_FASTER * parameters.omega0,
         servo_lag=_CLOSER,
-        cable_slack=0.0,
-        backlash=0.0,
-        servo_dead_zone=0.0,
     )
 
 

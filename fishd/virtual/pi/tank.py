@@ -11,8 +11,9 @@ from collections.abc import Callable
 from fishd.core.signals import Truth
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import REST, TetheredFish, TrueWindow
+from fishd.virtual.plant.registry import open_plant
 
 STEP = 1e-4
 """Time moves in whole multiples of this [s], so that few different lengths of time occur: the fish
@@ -46,10 +47,9 @@ class Tank:
         self._pulse = pulse
         self._imperfections = Imperfections(imperfections, tick)
         self._weights = tuple(_weights(name, settings) for name in _INPUTS)
-        self._fish = TetheredFish(plant, motor=imperfections.motor)
+        self._fish = open_plant(plant, imperfections.motor)
         for steps in range(1, _WARMED_UP + 1):
             self._fish.advance(None, steps * STEP, 1)
-        self._fish.state = REST
         self._start = start
         self._now = _steps(start)
         self._conversion = (0.0, 0.0)

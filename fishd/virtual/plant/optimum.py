@@ -1,6 +1,7 @@
 """The best periodic square wave, from the equations: the yardstick of every controller.
 
-The periodic state is solved for directly, so no transient is ever simulated.
+The periodic state of the tethered fish is solved for directly, without simulating a transient. A
+fin with quadratic drag, and a plant of another package, swim until each beat is like the last.
 """
 
 import cmath
@@ -12,9 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from fishd.virtual.plant.base import PlantState
 from fishd.virtual.plant.drive_train import lag_after_reversal
-from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import PlantState, TetheredFish, Window
+from fishd.virtual.plant.parameters import TETHERED, PlantParameters
+from fishd.virtual.plant.registry import open_plant
+from fishd.virtual.plant.tethered import FinWindow, TetheredFish
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _PRECISION = 1e-4  # of the best frequency, relative; the thrust is flat there
@@ -24,6 +27,10 @@ _PRECISION = 1e-4  # of the best frequency, relative; the thrust is flat there
 _SCAN_BELOW = 8.0
 _SCAN_ABOVE = 1.5
 _SCANNED = 32
+
+_SETTLED = 1e-7  # of the thrust of a fish that swims, relative
+_ROUGHLY = 1e-3  # while it is only to be seen which frequencies are worth a closer look
+_MOST_BEATS = 200
 
 
 class SteadyState(NamedTuple):
@@ -59,6 +66,8 @@ def fast_servo_thrust(parameters: PlantParameters, amplitude: float, frequency: 
 
 def square_wave(parameters: PlantParameters, amplitude: float, frequency: float) -> SteadyState:
     """Return the periodic regime of φ_c = ±amplitude (rad) reversed twice per period (Hz)."""
+    if not _linear(parameters):
+        return _Swimming(parameters, amplitude).settled(frequency, _SETTLED)
     window = _half_period(parameters, amplitude, frequency)
     return SteadyState(frequency, window.thrust, window.fin_peak)
 
@@ -77,16 +86,57 @@ def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadySta
     lowest = min(resonance, saturated) / _SCAN_BELOW
     scan = sorted([resonance, *np.geomspace(lowest, _SCAN_ABOVE * resonance, _SCANNED).tolist()])
 
-    def thrust(log_frequency: float) -> float:
-        return _half_period(p, amplitude, math.exp(log_frequency)).thrust
+    swimming = None if _linear(p) else _Swimming(p, amplitude)
+
+    def thrust(log_frequency: float, precision: float = _SETTLED) -> float:
+        frequency = math.exp(log_frequency)
+        if swimming:
+            return swimming.settled(frequency, precision).thrust
+        return _half_period(p, amplitude, frequency).thrust
 
     logs = [math.log(frequency) for frequency in scan]
-    thrusts = [thrust(x) for x in logs]
+    thrusts = [thrust(x, _ROUGHLY) for x in logs]
     best = min(max(thrusts.index(max(thrusts)), 1), len(logs) - 2)
     return square_wave(p, amplitude, math.exp(_maximum(thrust, logs[best - 1], logs[best + 1])))
 
 
-def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> Window:
+def _linear(parameters: PlantParameters) -> bool:
+    """Is the fin's state after half a period an affine map of that before?"""
+    return parameters.model == TETHERED and not parameters.quadratic_drag
+
+
+class _Swimming:
+    """A fish that swims square waves of one amplitude (rad), one after the other."""
+
+    def __init__(self, parameters: PlantParameters, amplitude: float) -> None:
+        # As for a linear fin, what shifts all in time or is no thrust is left out.
+        self._fish = open_plant(replace(parameters, servo_delay=0.0, servo_reaction=0.0))
+        self._amplitude = amplitude
+
+    def settled(self, frequency: float, precision: float) -> SteadyState:
+        """Swim until what is left of the transient is within a precision of the thrust.
+
+        The change from beat to beat shrinks by some factor r, so r/(1 − r) of it is still to come.
+        It may also change its sign, and be small once for that alone.
+        """
+        half_period = 0.5 / frequency
+        thrust = change = math.inf
+        peak, good = 0.0, 0
+        for _ in range(_MOST_BEATS):
+            there = self._fish.advance(self._amplitude, half_period, samples=1)
+            back = self._fish.advance(-self._amplitude, half_period, samples=1)
+            before, thrust = thrust, 0.5 * (there.thrust + back.thrust)
+            earlier, change = change, abs(thrust - before)
+            peak = max(there.fin_peak, back.fin_peak)
+            shrinks = change / earlier if earlier else 0.0
+            left = change * shrinks / (1.0 - shrinks) if shrinks < 1.0 else math.inf
+            good = good + 1 if earlier < math.inf and left <= precision * abs(thrust) else 0
+            if good == 2:
+                break
+        return SteadyState(frequency, thrust, peak)
+
+
+def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> FinWindow:
     """Return the half period after a reversal to +amplitude, in the periodic regime.
 
     Half a period is an affine map of (α, α̇); by antisymmetry the regime is what it negates. The

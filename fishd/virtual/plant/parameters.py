@@ -4,8 +4,10 @@ from typing import Annotated
 
 from msgspec import Struct
 
-from fishd.core.schema import unit
+from fishd.core.schema import note, unit
 
+TETHERED = "tethered"
+"""The model of fishd itself."""
 LARGEST_FIN = 1.0
 """The equations are of small fin angles, with α for sin α, which is 19 % more here [rad]."""
 
@@ -13,6 +15,7 @@ LARGEST_FIN = 1.0
 class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Constants of the servo, the fin and the forces; the defaults are those of Fu et al."""
 
+    model: Annotated[str, note("Equations of the simulated fish: the name of a plant.")] = TETHERED
     omega0: Annotated[
         float,
         unit(
@@ -45,6 +48,24 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit("N s/rad", "Lateral drag coefficient K_d, in F_y = −K α̈ − K_d α̇.", ge=0.0, le=10.0),
     ] = 39.9e-3
+    quadratic_drag: Annotated[
+        float,
+        unit(
+            "1/rad",
+            "Quadratic drag c of the fin: −c |α̇| α̇ is added to α̈.",
+            ge=0.0,
+            le=100.0,
+        ),
+    ] = 0.0
+    lateral_quadratic_drag: Annotated[
+        float,
+        unit(
+            "N s^2/rad^2",
+            "Quadratic lateral drag coefficient K_q: −K_q |α̇| α̇ is added to F_y.",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 0.0
     cable_slack: Annotated[
         float,
         unit(
@@ -86,3 +107,62 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=0.1,
         ),
     ] = 0.0
+
+
+def of_the_paper(parameters: PlantParameters) -> PlantParameters:
+    """The fish that has no more than the equations of Fu et al. know."""
+    p = parameters
+    return PlantParameters(
+        omega0=p.omega0,
+        xi=p.xi,
+        coupling=p.coupling,
+        servo_speed=p.servo_speed,
+        servo_lag=p.servo_lag,
+        thrust_coefficient=p.thrust_coefficient,
+        lateral_drag=p.lateral_drag,
+    )
+
+
+class MotorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The motor in the simulated servo; the defaults are round figures of a standard servo."""
+
+    voltage: Annotated[float, unit("V", "Supply of the servo, U.", gt=0.0, le=60.0)] = 6.0
+    idle_current: Annotated[
+        float, unit("A", "What its electronics draw, with pulses and without.", ge=0.0, le=10.0)
+    ] = 0.01
+    no_load_current: Annotated[
+        float,
+        unit(
+            "A",
+            "What it draws beside that at its highest speed without a load, i₀; in proportion at "
+            "lower ones.",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 0.2
+    stall_current: Annotated[
+        float, unit("A", "What it draws when it is held fast.", gt=0.0, le=100.0)
+    ] = 2.0
+    stall_torque: Annotated[
+        float, unit("N m", "Torque at the wheel when it is held fast.", gt=0.0, le=100.0)
+    ] = 1.0
+    rotor_inertia: Annotated[
+        float,
+        unit(
+            "kg m^2",
+            "Moment of inertia of rotor and gears, at the wheel: that of the rotor times the "
+            "square of the gears' ratio.",
+            ge=0.0,
+            le=1.0,
+        ),
+    ] = 1e-3
+    tail_inertia: Annotated[
+        float,
+        unit(
+            "kg m^2",
+            "Moment of inertia I of the tail about its hinge, with the water that it moves; its "
+            "torque on the wheel is λ I ω₀² (λφ − α), that is λ I (α̈ + ξω₀α̇).",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 1.3e-3

@@ -9,15 +9,15 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
 
+from fishd.virtual.plant.base import REST, Plant, PlantState
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
 from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
-from fishd.virtual.plant.motor import Motor, MotorSettings
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.motor import Motor
+from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 
 # Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
 # the last it stands, both to the last digit; in between, segments shorten towards the transition.
@@ -26,29 +26,14 @@ _GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer segments g
 _FIN_REACH = 3.0  # segment length, in units of the fin's shortest time, that N nodes resolve
 _LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all segment long
 _ROUNDING = 1e-9  # a window of exactly one servo time constant stays one segment
+_DRAG_STEP = 0.05  # longest segment with quadratic drag, s
 _REACTION_TIME = 0.01  # of the mount that passes the servo's reaction on to the sensor, s
 
 
-class PlantState(NamedTuple):
-    """Everything the equations remember."""
-
-    phi: float = 0.0  # servo wheel angle, rad
-    alpha: float = 0.0  # fin angle, rad
-    alpha_rate: float = 0.0  # fin angular velocity, rad/s
-
-
-REST = PlantState()
-
-
-class Window(Struct, frozen=True, eq=False):
-    """What the force sensor feels during one window.
+class FinWindow(Struct, frozen=True, eq=False):
+    """A `Window` whose peak is worked out when asked for.
 
     Attributes:
-        duration: s.
-        thrust: mean of F_x over the window, N.
-        lateral_force: mean of F_y over the window, N.
-        sampled_thrust: mean of F_x at the midpoints of equal parts of the window, N.
-        sampled_lateral_force: mean of F_y at the same instants, N.
         course: the segments of the window and the fin's response in each, for `fin_peak`.
         power: mean electrical power of the servo, W; NaN where the fish has no motor.
     """
@@ -63,31 +48,20 @@ class Window(Struct, frozen=True, eq=False):
 
     @property
     def fin_peak(self) -> float:
-        """Largest |α| within the window, rad; worked out when asked for."""
+        """Largest |α| within the window [rad]."""
         return max(segment.peak(response) for segment, response in self.course)
 
 
-class TrueWindow(NamedTuple):
-    """What truly happened during a window, for those who judge a run."""
-
-    duration: float
-    """[s]"""
-    thrust: float
-    """Mean F_x [N]."""
-    fin_peak: float
-    """Largest |α| [rad]."""
-    power: float = math.nan
-    """Mean electrical power of the servo [W]; NaN for a fish without one."""
-
-
-class TetheredFish:
-    """A fish in still water that cannot swim away; not safe for use from several threads.
+class TetheredFish(Plant[PlantParameters]):
+    """The equations of Fu et al., and what a real rig adds; not safe for use from several threads.
 
     Attributes:
         parameters: constants of this fish.
         state: where it is now; assign to it to put the fish elsewhere.
         cables: between wheel and tail.
     """
+
+    Settings = PlantParameters
 
     def __init__(
         self,
@@ -96,7 +70,7 @@ class TetheredFish:
         motor: MotorSettings | None = None,
     ) -> None:
         """motor: of the servo, where its power is of interest"""
-        self.parameters = parameters
+        super().__init__(parameters)
         self.state = state
         self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
         self._servo_time = parameters.servo_lag / parameters.servo_speed
@@ -105,13 +79,16 @@ class TetheredFish:
         self._equal_segments = lru_cache(maxsize=64)(self._segments)
         self._cause: Vector = np.zeros(N + 3)
         self._line = DelayLine(parameters.servo_delay) if parameters.servo_delay else None
+        self._drag = parameters.quadratic_drag
+        self._side_drag = parameters.lateral_quadratic_drag
+        self._brakes = bool(self._drag or self._side_drag)
         self._momentum = 0.0
         """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
         self._motor = Motor(motor, parameters) if motor else None
         self._pulls = True
         """Did the wheel move the tail in the latest segment?"""
 
-    def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
+    def advance(self, instruction_angle: float | None, duration: float, samples: int) -> FinWindow:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
 
         None means no pulses: the servo then holds the wheel where it is. `samples` instants make
@@ -131,7 +108,7 @@ class TetheredFish:
         windows = [
             self._swim(part.angle, duration, samples, (part.begin, part.end)) for part in parts
         ]
-        return Window(
+        return FinWindow(
             duration,
             sum(w.thrust * w.duration for w in windows) / duration,
             sum(w.lateral_force * w.duration for w in windows) / duration,
@@ -143,7 +120,7 @@ class TetheredFish:
 
     def _swim(
         self, angle: float | None, whole: float, samples: int, part: tuple[float, float]
-    ) -> Window:
+    ) -> FinWindow:
         """Swim a part of a window in which the servo knows one instruction.
 
         part: when in the window it begins and ends (s); sampled means are those of the window, as
@@ -155,22 +132,27 @@ class TetheredFish:
         command = phi if angle is None else self._reached(angle, phi)
         lag = (command - phi) / p.servo_lag
         cuts = self._cuts(command, phi, lag, duration) if lag else ()
-        segments = (
+        segments: Sequence[Segment] = (
             self._segments(whole, samples, part, cuts)
             if cuts
             else self._equal_segments(whole, samples, part)
         )
 
+        responses: Sequence[Vector] = ()
+        if self._brakes:
+            segments, responses = self._cut_at_turns(segments, command, lag)
         cause = self._cause
-        course = []
+        course: list[tuple[Segment, Vector]] = []
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
+        braking = sampled_braking = 0.0
         momentum = self._momentum
         motor = self._motor if angle is not None else None
         energy = motor.begin(lag) if motor else 0.0
         for segment in segments:
             cause[0], cause[1] = alpha, rate
             lag = self._drive(segment, command, lag)
-            response = segment.response.dot(cause)  # half the overhead of @
+            # Half the overhead of @:
+            response = responses[len(course)] if responses else segment.response.dot(cause)
             course.append((segment, response))
             integral, total = segment.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
             alpha, rate, total_acceleration, total_rate = response[3 * N :].tolist()
@@ -178,6 +160,11 @@ class TetheredFish:
             sampled_thrust -= total
             sampled_acceleration += total_acceleration
             sampled_rate += total_rate
+            if responses:
+                rates = response[N : 2 * N]
+                integral, total = segment.sums.dot(np.abs(rates) * rates).tolist()
+                braking += integral
+                sampled_braking += total
             if motor:
                 energy += motor.spent(segment, response if self._pulls else None)
 
@@ -188,16 +175,56 @@ class TetheredFish:
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
         inertia, drag = p.thrust_coefficient, p.lateral_drag
         reaction = self._momentum - momentum
-        return Window(
+        braking, sampled_braking = self._side_drag * braking, self._side_drag * sampled_braking
+        return FinWindow(
             duration,
             inertia * thrust / duration,
-            -(inertia * (rate - start.alpha_rate) + drag * (alpha - start.alpha) - reaction)
+            -(
+                inertia * (rate - start.alpha_rate)
+                + drag * (alpha - start.alpha)
+                + braking
+                - reaction
+            )
             / duration,
             inertia * sampled_thrust / samples,
-            -(inertia * sampled_acceleration + drag * sampled_rate) / samples + reaction / whole,
+            -(inertia * sampled_acceleration + drag * sampled_rate + sampled_braking) / samples
+            + reaction / whole,
             course,
             power,
         )
+
+    def _cut_at_turns(
+        self, segments: Sequence[Segment], command: float, lag: float
+    ) -> tuple[Sequence[Segment], Sequence[Vector]]:
+        """Cut where the fin turns, and return the parts with what the fin does in each.
+
+        Quadratic drag has a kink there that no polynomial follows.
+        """
+        cause, before = self._cause, (self.cables.tail, self._momentum)
+        _, alpha, rate = self.state
+        pieces: list[Segment] = []
+        responses: list[Vector] = []
+        to_do = list(reversed(segments))
+        while to_do:
+            segment = to_do.pop()
+            cause[0], cause[1] = alpha, rate
+            tail = self.cables.tail
+            later = self._drive(segment, command, lag)
+            response = (
+                segment.braked(cause, self._drag) if self._drag else segment.response.dot(cause)
+            )
+            if turn := segment.turn(response):
+                self.cables.tail = tail
+                rest = tuple(t - turn for t in segment.instants if t >= turn)
+                to_do.append(self._segment(segment.length - turn, rest))
+                to_do.append(self._segment(turn, tuple(t for t in segment.instants if t < turn)))
+            else:
+                pieces.append(segment)
+                responses.append(response)
+                lag = later
+                alpha, rate = response[3 * N : 3 * N + 2].tolist()
+        self.cables.tail, self._momentum = before
+        return pieces, responses
 
     def _reached(self, angle: float, phi: float) -> float:
         """Where the wheel goes: the angle itself, or the edge of its dead zone."""
@@ -272,6 +299,8 @@ class TetheredFish:
             longest = min(longest, self._servo_time)
         if self.parameters.servo_reaction:
             longest = min(longest, 5.0 * _REACTION_TIME)
+        if self._brakes:
+            longest = min(longest, _DRAG_STEP)
         instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]
         segments: list[Segment] = []
         taken = bisect_left(instants, 0.0)

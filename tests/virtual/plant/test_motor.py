@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from fishd.virtual.plant.motor import MotorSettings
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
 PLANT = PlantParameters()

@@ -86,6 +86,8 @@ def test_no_frequency_beats_the_best_square_wave(xi: float, amplitude: float, sl
         PlantParameters(servo_delay=0.03, servo_reaction=0.002),
         PlantParameters(backlash=0.9),
         PlantParameters(servo_dead_zone=0.5),
+        PlantParameters(quadratic_drag=3.0, servo_delay=0.03, backlash=0.05),
+        PlantParameters(xi=0.0, quadratic_drag=0.5),
     ],
 )
 def test_a_square_wave_from_rest_ends_up_in_the_periodic_state(p: PlantParameters) -> None:
@@ -96,6 +98,22 @@ def test_a_square_wave_from_rest_ends_up_in_the_periodic_state(p: PlantParameter
     assert windows[-1].thrust == pytest.approx(steady.thrust, rel=digits, abs=1e-12)
     if p == DEFAULT:
         assert windows[-1].fin_peak == pytest.approx(steady.fin_amplitude, rel=1e-9)
+
+
+def test_a_trace_of_quadratic_drag_hardly_changes_the_best_square_wave() -> None:
+    without = best_square_wave(DEFAULT, 0.42)
+    best = best_square_wave(PlantParameters(quadratic_drag=1e-9), 0.42)
+    assert best.frequency == pytest.approx(without.frequency, rel=1e-3)
+    assert best.thrust == pytest.approx(without.thrust, rel=1e-6)
+    assert best.fin_amplitude == pytest.approx(without.fin_amplitude, rel=1e-3)
+
+
+def test_no_frequency_beats_the_best_square_wave_with_quadratic_drag() -> None:
+    p = PlantParameters(quadratic_drag=2.0, backlash=0.05)
+    best = best_square_wave(p, 0.42)
+    for frequency in np.geomspace(0.4, 4.0, 12).tolist():
+        assert square_wave(p, 0.42, frequency).thrust <= best.thrust
+    assert best.thrust < 0.9 * best_square_wave(PlantParameters(backlash=0.05), 0.42).thrust
 
 
 @pytest.mark.parametrize("xi", [0.0, 0.3, 1.2, 2.0, 8.0])

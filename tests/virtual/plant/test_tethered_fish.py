@@ -3,8 +3,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from fishd.virtual.plant import tethered
+from fishd.virtual.plant.base import REST, PlantState
 from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import REST, PlantState, TetheredFish, Window
+from fishd.virtual.plant.tethered import FinWindow, TetheredFish
 
 Fish = PlantParameters
 FISHES = {
@@ -20,6 +22,11 @@ FISHES = {
     "lazy servo": Fish(servo_dead_zone=0.1),
     "servo that pushes back": Fish(servo_reaction=0.004, cable_slack=0.05),
     "fast servo that pushes back": Fish(servo_speed=200.0, servo_lag=0.05, servo_reaction=-0.002),
+    "quadratic drag": Fish(quadratic_drag=3.0, lateral_quadratic_drag=0.02),
+    "quadratic drag alone": Fish(xi=0.0, lateral_drag=0.0, quadratic_drag=10.0),
+    "quadratic lateral drag": Fish(lateral_quadratic_drag=0.02, xi=0.3),
+    "quadratic drag, slack cables": Fish(quadratic_drag=0.5, backlash=0.1, cable_slack=0.05),
+    "quadratic drag, servo that pushes back": Fish(quadratic_drag=2.0, servo_reaction=0.004),
     "no damping": Fish(xi=0.0),
     "little damping": Fish(xi=0.02),
     "heavy damping": Fish(xi=15.0),
@@ -43,7 +50,7 @@ def dead_band(angle: float, slack: float) -> float:
 
 def integrate(
     p: PlantParameters, state: PlantState, command: float | None, duration: float, samples: int
-) -> tuple[PlantState, Window]:
+) -> tuple[PlantState, FinWindow]:
     """The equations as they stand, given to an adaptive solver."""
     from scipy.integrate import solve_ivp  # takes long to load, in every worker of pytest
 
@@ -57,11 +64,14 @@ def integrate(
         # The wheel turns one way all window long, and the tail was where it is.
         tail = max(phi - p.backlash, min(phi + p.backlash, state.phi))
         drive = p.coupling * dead_band(tail, p.cable_slack)
-        return -p.xi * p.omega0 * rate - p.omega0**2 * (alpha - drive)
+        braking = p.quadratic_drag * abs(rate) * rate
+        return -p.xi * p.omega0 * rate - braking - p.omega0**2 * (alpha - drive)
 
     def forces(phi: float, alpha: float, rate: float) -> tuple[float, float]:
         a = acceleration(phi, alpha, rate)
-        return -p.thrust_coefficient * alpha * a, -p.thrust_coefficient * a - p.lateral_drag * rate
+        side = p.thrust_coefficient * a + p.lateral_drag * rate
+        side += p.lateral_quadratic_drag * abs(rate) * rate
+        return -p.thrust_coefficient * alpha * a, -side
 
     def derivative(_: float, y: np.ndarray) -> list[float]:
         phi, alpha, rate = y[:3]
@@ -83,7 +93,7 @@ def integrate(
     phi, alpha, rate, thrust, lateral_force, reaction = solution.y[:, -1]
     instants = (np.arange(samples) + 0.5) * duration / samples
     sampled = np.mean([forces(*solution.sol(t)[:3]) for t in instants], axis=0).tolist()
-    window = Window(
+    window = FinWindow(
         duration,
         thrust / duration,
         lateral_force / duration,
@@ -103,7 +113,7 @@ def natural_scales(p: PlantParameters) -> tuple[list[float], list[float]]:
     return [1.0, alpha, rate], [thrust, lateral_force] * 2
 
 
-def means(window: Window) -> list[float]:
+def means(window: FinWindow) -> list[float]:
     return [
         window.thrust,
         window.lateral_force,
@@ -236,12 +246,15 @@ def test_many_samples_average_to_the_exact_mean() -> None:
     assert window.sampled_lateral_force == pytest.approx(window.lateral_force, rel=1e-5)
 
 
-def turning_point(p: PlantParameters, start: PlantState, command: float, duration: float) -> float:
+def turning_point(
+    p: PlantParameters, start: PlantState, tail: float, command: float, duration: float
+) -> float:
     """The fin angle where the fin turns, within a window in which it does."""
     low, high = 0.0, duration
     for _ in range(12):
         middle = 0.5 * (low + high)
         fish = TetheredFish(p, start)
+        fish.cables.tail = tail
         fish.advance(command, middle, samples=1)
         if start.alpha_rate * fish.state.alpha_rate > 0.0:
             low = middle
@@ -264,14 +277,62 @@ def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
     peak = fish.advance(command, duration, samples=1).fin_peak
     seen = [abs(state.alpha)]
     for _ in range(_STEPS):
-        before = slow_motion.state
+        before, tail = slow_motion.state, slow_motion.cables.tail
         slow_motion.advance(command, duration / _STEPS, samples=1)
         after = slow_motion.state
         seen.append(abs(after.alpha))
         if before.alpha_rate * after.alpha_rate < 0.0:  # it turned in between: find where
-            seen.append(abs(turning_point(p, before, command, duration / _STEPS)))
+            seen.append(abs(turning_point(p, before, tail, command, duration / _STEPS)))
     assert peak == pytest.approx(max(seen), rel=2e-5, abs=1e-7)
     assert peak >= (1.0 - 1e-6) * max(seen) - 1e-12  # far below, the equations are not resolved
+
+
+def swum_with_quadratic_drag(step: float, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+    monkeypatch.setattr(tethered, "_DRAG_STEP", step)
+    sluggish = Fish(servo_lag=2.9, quadratic_drag=20.0, lateral_quadratic_drag=0.02)
+    fish = TetheredFish(sluggish, PlantState(0.0, 0.5, 3.0))
+    forces = [means(fish.advance(0.42 * (-1) ** k, 0.31, samples=31)) for k in range(10)]
+    return np.array([*forces[-1], *fish.state])
+
+
+def test_shorter_steps_of_quadratic_drag_change_little_and_ever_less(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    exact = swum_with_quadratic_drag(0.005, monkeypatch)
+    errors = [
+        np.abs(swum_with_quadratic_drag(step, monkeypatch) / exact - 1.0).max()
+        for step in (0.2, 0.1, tethered._DRAG_STEP)
+    ]
+    assert errors[0] < 1e-6
+    assert errors[1] < 1e-2 * errors[0]
+    assert errors[2] < 1e-11
+
+
+@pytest.mark.parametrize("name", FISHES)
+def test_all_that_is_told_of_a_fish_is_plain_numbers(name: str) -> None:
+    fish = TetheredFish(FISHES[name])
+    for k in range(12):
+        window = fish.advance(0.42 * (-1) ** (k // 6), 0.05, samples=10)
+        assert {type(value) for value in (*fish.state, *means(window), window.fin_peak)} == {float}
+
+
+@settings(max_examples=30)
+@given(
+    st.floats(0.1, 100.0),
+    st.floats(-10.0, 10.0),
+    st.floats(-1000.0, 1000.0),
+    st.sampled_from([0.1, 12.5, 1000.0]),
+)
+def test_quadratic_drag_stops_any_fin(
+    drag: float, angle: float, rate: float, omega0: float
+) -> None:
+    fish = TetheredFish(Fish(quadratic_drag=drag, omega0=omega0), PlantState(0.0, angle, rate))
+    energy = rate**2 + (omega0 * angle) ** 2
+    for _ in range(5):
+        fish.advance(0.0, min(0.1, 2.0 / omega0), samples=3)
+        _, angle, rate = fish.state
+        assert rate**2 + (omega0 * angle) ** 2 <= energy * (1.0 + 1e-9)
+        energy = rate**2 + (omega0 * angle) ** 2
 
 
 @pytest.mark.parametrize(("duration", "samples"), [(0.0, 10), (-0.1, 10), (0.05, 0)])

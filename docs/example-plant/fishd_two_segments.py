@@ -1,0 +1,117 @@
+"""`two-segments`: a tail in two pieces. The servo moves the first; the tip hangs on it by a spring.
+
+With the angle α of the first piece and β of the tip, each against the axis of the fish, and the
+tip's share s of the inertia:
+
+    φ̇ = Ω tanh((φ_c − φ)/Δ)
+    α̈ = −ξω₀ α̇ − ω₀² (α − λφ) + s/(1 − s) ω_t² (β − α)
+    β̈ = −ζω_t β̇ − ω_t² (β − α)
+    F_x = −K ((1 − s) α α̈ + s β β̈)
+    F_y = −K ((1 − s) α̈ + s β̈) − K_d ((1 − s) α̇ + s β̇)
+"""
+
+import math
+from typing import Annotated
+
+from fishd.virtual.plant.base import (
+    REST,
+    Plant,
+    PlantParameters,
+    PlantState,
+    PlantWindow,
+    Problem,
+    unit,
+)
+
+STEP = 0.003
+"""Longest step of the integration [s]."""
+UNKNOWN = (
+    "quadratic_drag",
+    "lateral_quadratic_drag",
+    "cable_slack",
+    "backlash",
+    "servo_delay",
+    "servo_dead_zone",
+    "servo_reaction",
+)
+"""Keys of every plant that this one makes nothing of."""
+
+Numbers = tuple[float, ...]
+
+
+class TwoSegmentsParameters(PlantParameters, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The tip, beside the keys of every plant."""
+
+    tip_omega0: Annotated[
+        float, unit("rad/s", "Natural angular frequency of the tip, ω_t.", ge=1.0, le=100.0)
+    ] = 20.0
+    tip_xi: Annotated[float, unit("1", "Damping of the tip, ζ.", ge=0.0, le=20.0)] = 0.6
+    tip_share: Annotated[float, unit("1", "The tip's share s of the inertia.", ge=0.0, le=0.9)] = (
+        0.3
+    )
+
+
+class TwoSegments(Plant[TwoSegmentsParameters]):
+    """A fish whose tail has a passive tip."""
+
+    Settings = TwoSegmentsParameters
+
+    def __init__(self, parameters: TwoSegmentsParameters) -> None:
+        super().__init__(parameters)
+        self.state = REST
+        self._tip = (0.0, 0.0)  # β [rad] and β̇ [rad/s]
+
+    @classmethod
+    def check(cls, parameters: TwoSegmentsParameters) -> None:
+        """Refuse what it knows nothing of."""
+        for key in UNKNOWN:
+            if value := getattr(parameters, key):
+                raise Problem((key,), f"{value:g} is not valid: this plant has none; 0 is needed")
+
+    def advance(
+        self, instruction_angle: float | None, duration: float, samples: int
+    ) -> PlantWindow:
+        """As `Plant.advance`, by the Runge–Kutta method of order 4."""
+        command = self.state.phi if instruction_angle is None else instruction_angle
+        # An even number of steps to a sample, so that one ends in the middle, where it is taken.
+        steps = 2 * math.ceil(0.5 * duration / samples / STEP)
+        h = duration / samples / steps
+        y: Numbers = (*self.state, *self._tip, 0.0, 0.0)
+        sampled = [0.0, 0.0]
+        peak = abs(self.state.alpha)
+        for _ in range(samples):
+            for k in range(steps):
+                y = self._step(y, command, h)
+                peak = max(peak, abs(y[1]))
+                if 2 * (k + 1) == steps:
+                    *_, fx, fy = self._rates(y, command)
+                    sampled[0] += fx / samples
+                    sampled[1] += fy / samples
+        self.state, self._tip = PlantState(*y[:3]), y[3:5]
+        return PlantWindow(duration, y[5] / duration, y[6] / duration, *sampled, fin_peak=peak)
+
+    def _step(self, y: Numbers, command: float, h: float) -> Numbers:
+        k1 = self._rates(y, command)
+        k2 = self._rates(_moved(y, k1, 0.5 * h), command)
+        k3 = self._rates(_moved(y, k2, 0.5 * h), command)
+        k4 = self._rates(_moved(y, k3, h), command)
+        mean = [(a + 2.0 * (b + c) + d) / 6.0 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)]
+        return _moved(y, mean, h)
+
+    def _rates(self, y: Numbers, command: float) -> Numbers:
+        """Of φ, α, α̇, β, β̇; and F_x and F_y, whose integrals are their impulses."""
+        p = self.parameters
+        phi, alpha, alpha_rate, beta, beta_rate, *_ = y
+        turning = p.servo_speed * math.tanh((command - phi) / p.servo_lag)
+        s, pull = p.tip_share, p.tip_omega0**2 * (beta - alpha)
+        a = -p.xi * p.omega0 * alpha_rate - p.omega0**2 * (alpha - p.coupling * phi)
+        a += s / (1.0 - s) * pull
+        b = -p.tip_xi * p.tip_omega0 * beta_rate - pull
+        fx = -p.thrust_coefficient * ((1.0 - s) * alpha * a + s * beta * b)
+        fy = -p.thrust_coefficient * ((1.0 - s) * a + s * b)
+        fy -= p.lateral_drag * ((1.0 - s) * alpha_rate + s * beta_rate)
+        return turning, alpha_rate, a, beta_rate, b, fx, fy
+
+
+def _moved(y: Numbers, rates: Numbers, time: float) -> Numbers:
+    return tuple(value + time * rate for value, rate in zip(y, rates, strict=True))

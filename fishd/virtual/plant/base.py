@@ -1,0 +1,122 @@
+"""What a plant is: a fish on its force sensor, as equations. docs/writing-a-plant.md adds one."""
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+
+from msgspec import Struct
+
+from fishd.core.schema import Problem, note, unit
+from fishd.virtual.plant.parameters import PlantParameters
+
+__all__ = [
+    "REST",
+    "Plant",
+    "PlantParameters",
+    "PlantState",
+    "PlantWindow",
+    "Problem",
+    "TrueWindow",
+    "Window",
+    "note",
+    "unit",
+]
+
+P = TypeVar("P", bound=PlantParameters)
+
+
+class PlantState(NamedTuple):
+    """Where the fish is; all that the equations of the tethered fish remember."""
+
+    phi: float = 0.0  # servo wheel angle, rad
+    alpha: float = 0.0  # fin angle, rad
+    alpha_rate: float = 0.0  # fin angular velocity, rad/s
+
+
+REST = PlantState()
+
+
+class Window(Protocol):
+    """What the force sensor feels during one window; a `PlantWindow` is one."""
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+
+    @property
+    def thrust(self) -> float:
+        """Mean of F_x over the window [N]."""
+
+    @property
+    def lateral_force(self) -> float:
+        """Mean of F_y over the window [N]."""
+
+    @property
+    def sampled_thrust(self) -> float:
+        """Mean of F_x at the midpoints of equal parts of the window [N]."""
+
+    @property
+    def sampled_lateral_force(self) -> float:
+        """Mean of F_y at the same instants [N]."""
+
+    @property
+    def fin_peak(self) -> float:
+        """Largest |α| within the window [rad]."""
+
+    @property
+    def power(self) -> float:
+        """Mean electrical power of the servo [W]; NaN for a fish without a motor."""
+
+
+class PlantWindow(Struct, frozen=True):
+    """A window whose numbers are all known at once."""
+
+    duration: float
+    thrust: float
+    lateral_force: float
+    sampled_thrust: float
+    sampled_lateral_force: float
+    fin_peak: float
+    power: float = math.nan
+
+
+class TrueWindow(NamedTuple):
+    """What truly happened during a window, for those who judge a run."""
+
+    duration: float
+    """[s]"""
+    thrust: float
+    """Mean F_x [N]."""
+    fin_peak: float
+    """Largest |α| [rad]."""
+    power: float = math.nan
+    """Mean electrical power of the servo [W]; NaN for a fish without a motor."""
+
+
+class Plant(ABC, Generic[P]):
+    """A fish in still water that cannot swim away, at rest at first; knows no clock, no chance."""
+
+    Settings: ClassVar[type[Any]]
+    """Its keys in section `plant`: a frozen msgspec struct, a subclass of `PlantParameters`."""
+
+    state: PlantState
+    """Where it is now."""
+
+    def __init__(self, parameters: P) -> None:
+        """parameters: of this fish"""
+        self.parameters = parameters
+
+    @classmethod
+    def check(cls, parameters: P) -> None:
+        """Refuse parameters that are valid one by one but not together.
+
+        Raises `Problem((key,), message)`.
+        """
+
+    @abstractmethod
+    def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
+        """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
+
+        None means no pulses: the wheel then stays where it is. `samples` instants make the sampled
+        means, as an ADC that is read evenly within the window does.
+        """

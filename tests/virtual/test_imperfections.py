@@ -1,0 +1,146 @@
+import math
+import statistics
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from fishd.assembly import build_loop, open_in_virtual_time
+from fishd.config import load
+from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.core.signals import Measurement
+from fishd.simulation.virtual_run import KeepingPublisher
+from fishd.virtual.fish import SimulatedFish
+from fishd.virtual.imperfections import Imperfections, SimulationSettings
+from fishd.virtual.plant.parameters import PlantParameters
+
+TICK = 0.05
+SAMPLES = 10
+"""In a tick."""
+
+
+def at_rest(ticks: int, tick: float = TICK, **rig: float) -> list[Measurement]:
+    """What a fish that hangs still is said to feel."""
+    settings = SimulationSettings(sample_rate=SAMPLES / tick, **{"noise": 0.0, **rig})
+    fish = SimulatedFish(PlantParameters(), settings, tick)
+    return [fish.read(k * tick) for k in range(ticks)]
+
+
+def test_hum_has_its_frequency_and_amplitude_in_both_forces() -> None:
+    settings = SimulationSettings(noise=0.0, hum=0.003, hum_frequency=60.0, sample_rate=1000.0)
+    fish = SimulatedFish(PlantParameters(), settings, 0.001)
+    forces = [fish.read(0.001 * k) for k in range(1000)]
+    for values in ([f.fx for f in forces], [f.fy for f in forces]):
+        spectrum = np.abs(np.fft.rfft(values)) / 500.0
+        assert int(np.argmax(spectrum)) == 60
+        assert spectrum[60] == pytest.approx(0.003, rel=1e-6)
+        assert np.sort(spectrum)[-2] < 1e-9
+
+
+@pytest.mark.parametrize("frequency", [3.0, 50.0, 60.0, 187.0, 200.0, 400.0])
+def test_a_window_has_the_mean_of_its_samples_of_the_hum(frequency: float) -> None:
+    settings = SimulationSettings(noise=0.0, hum=0.01, hum_frequency=frequency)
+    rig, single = Imperfections(settings, TICK), Imperfections(settings, TICK)
+    apart = TICK / SAMPLES
+    for k in range(5):
+        end = (k + 1) * TICK
+        samples = [
+            single.apply(0.0, 0.0, end - TICK + (i + 1) * apart, apart, 1) for i in range(SAMPLES)
+        ]
+        shown = rig.apply(0.0, 0.0, end, TICK, SAMPLES)
+        assert shown == pytest.approx(np.mean(samples, axis=0), abs=1e-12)
+
+
+def test_a_long_conversion_has_the_mean_of_all_of_the_hum() -> None:
+    settings = SimulationSettings(noise=0.0, hum=0.01)
+    shown = Imperfections(settings, TICK).apply(0.0, 0.0, 1.007, 0.007)
+    many = Imperfections(settings, TICK).apply(0.0, 0.0, 1.007, 0.007, 10_000)
+    assert shown == pytest.approx(many, rel=1e-6)
+    whole_period = Imperfections(settings, TICK).apply(0.0, 0.0, 1.02, 0.02)
+    assert whole_period == pytest.approx((0.0, 0.0), abs=1e-12)
+
+
+def test_spikes_are_as_frequent_as_said_and_shared_by_the_samples_of_a_window() -> None:
+    seconds = 2000
+    found = at_rest(round(seconds / TICK), spike_rate=0.5, spike_size=0.2)
+    for values in ([f.fx for f in found], [f.fy for f in found]):
+        spikes = [round(value / (0.2 / SAMPLES), 6) for value in values if value]
+        assert all(size == int(size) for size in spikes)
+        count = sum(map(abs, spikes))
+        assert count == pytest.approx(0.5 * seconds, abs=4.0 * math.sqrt(0.5 * seconds))
+        upwards = sum(size for size in spikes if size > 0)
+        assert upwards == pytest.approx(0.5 * count, abs=2.0 * math.sqrt(count))
+    together = sum(1 for f in found if f.fx and f.fy)
+    assert together < 60  # 0.025² of the windows by chance: 25
+
+
+def test_a_spike_leaves_the_noise_as_it_was_and_decays_in_the_fin_velocity() -> None:
+    rig = ["simulation.noise=0.001", "simulation.seed=4"]
+    spikes = ["simulation.spike_rate=0.05", "simulation.spike_size=0.5"]
+    calm, struck = (load(None, [*rig, *more]) for more in ([], spikes))
+    runs = []
+    for config in (calm, struck):
+        clock, publisher = VirtualClock(), KeepingPublisher()
+        fish = SimulatedFish(config.plant, config.simulation, config.tick)
+        loop = build_loop(config, fish.robot(), clock, publisher)
+        for slot, _ in zip(virtual_slots(clock, config.tick), range(1200), strict=False):
+            loop.tick(slot)
+        runs.append(publisher.ticks)
+    off = [b.fy - a.fy for a, b in zip(*runs, strict=True)]
+    hits = [k for k, by in enumerate(off) if abs(by) > 1e-12]
+    assert hits
+    assert {round(abs(off[k]), 9) for k in hits} == {0.05}  # 0.5 N in one sample of ten
+    fooled = [abs(b.fin_velocity - a.fin_velocity) for a, b in zip(*runs, strict=True)]
+    first = hits[0]
+    assert max(fooled[:first], default=0.0) == 0.0
+    assert fooled[first] == pytest.approx(0.05 * TICK, rel=0.3)  # the integral of the force
+    assert fooled[first + 20] < 0.2 * fooled[first]
+
+
+def test_on_a_virtual_pi_a_spike_is_one_bad_conversion() -> None:
+    rig = ["simulation.noise=0", "simulation.spike_rate=2", "simulation.spike_size=0.2"]
+    config = load(None, ["robot=virtual-pi", "virtual_pi.adc_noise=0", *rig])
+    with ExitStack() as stack:
+        robot, _ = open_in_virtual_time(config, stack)
+        found = [robot.sensor.read(TICK * k) for k in range(400)]
+    level = statistics.median(f.fx for f in found)
+    sizes = [round(abs(f.fx - level) * f.samples / 0.2, 1) for f in found if f.samples]
+    hits = [size for size in sizes if size > 0.5]
+    assert 5 <= len(hits) <= 40  # in 20 s, while that channel converts: half of the time
+    assert hits.count(1.0) > 0.8 * len(hits)
+
+
+def test_forces_are_told_in_whole_steps() -> None:
+    found = at_rest(500, quantum=0.0005, noise=0.002)
+    steps = {round(f.fx / 0.0005, 9) for f in found}
+    assert len(steps) > 10
+    assert all(step == int(step) for step in steps)
+
+
+def test_heavy_tails_leave_the_rms_and_make_outliers() -> None:
+    gaussian = [f.fx for f in at_rest(20_000, noise=0.001)]
+    heavy = [f.fx for f in at_rest(20_000, noise=0.001, noise_freedom=3.0)]
+    assert np.std(gaussian) == pytest.approx(0.001, rel=0.03)
+    assert np.std(heavy) == pytest.approx(0.001, rel=0.15)
+    assert sum(abs(x) > 0.004 for x in gaussian) <= 5  # 1.3 of 20 000
+    assert 80 < sum(abs(x) > 0.004 for x in heavy) < 200  # 6.2e-3 of them: 124
+
+
+def test_the_same_seed_gives_the_same_forces_to_the_last_bit_and_another_one_others() -> None:
+    harsh = {
+        "noise": 0.001,
+        "noise_freedom": 4.0,
+        "hum": 0.003,
+        "spike_rate": 1.0,
+        "quantum": 1e-5,
+        "drift_walk": 1e-4,
+    }
+    first, again = (at_rest(300, seed=7, **harsh) for _ in range(2))
+    assert first == again
+    assert at_rest(300, seed=8, **harsh) != first
+
+
+def test_what_is_off_changes_no_bit_of_the_rest() -> None:
+    plain = at_rest(100, noise=0.001, drift=0.01)
+    assert at_rest(100, noise=0.001, drift=0.01, hum=0.0, hum_frequency=60.0) == plain
+    assert at_rest(100, noise=0.001, drift=0.01, spike_size=3.0) == plain
