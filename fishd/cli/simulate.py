@@ -129,7 +129,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
         ),
         *_chosen(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
-        ("power", _power(report)),
+        *_power(report),
         ("frequency", f"{report.frequency:.3f} Hz{_half_beats(report, config.tick)}"),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
         (
@@ -151,10 +151,12 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
     ]
 
 
-def _power(report: "Report") -> str:
+def _power(report: "Report") -> list[tuple[str, str]]:
     """Into the servo, by its loss model; and what a watt of it gives."""
+    if not report.mean_power:
+        return []
     per_watt = report.mean_thrust * 1e3 / report.mean_power
-    return f"{power_words(report.mean_power)} into the servo: {per_watt:.3g} mN per W"
+    return [("power", f"{power_words(report.mean_power)} into the servo: {per_watt:.3g} mN per W")]
 
 
 def _until(report: "Report", settle: float) -> str:

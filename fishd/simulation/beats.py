@@ -56,7 +56,7 @@ class Beats:
             fin_amplitude=sums.peaks / sums.halves,
             mean_angle=mean,
             squareness=mean / rms if rms else 0.0,
-            power=sums.energy / sums.duration,
+            power=None if math.isnan(sums.energy) else sums.energy / sums.duration,
             half_beats=(sums.shortest, sums.longest) if frequency else (0, 0),
         )
 
@@ -69,7 +69,7 @@ class BeatMeans(NamedTuple):
     fin_amplitude: float  # rad
     mean_angle: float  # of |φ_c|, rad
     squareness: float  # mean |φ_c| over rms φ_c
-    power: float  # electrical, of the servo, W
+    power: float | None  # electrical, of the servo, W; None for a fish without a motor
     half_beats: tuple[int, int]  # shortest and longest, ticks
     thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
 

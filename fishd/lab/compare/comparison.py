@@ -124,6 +124,7 @@ def trace(ticks: Sequence[Tick]) -> Trace:
 
 def _standing(label: str, reports: list[Report]) -> Standing:
     thrusts = [report.mean_thrust for report in reports]
+    powers = [report.mean_power for report in reports if report.mean_power is not None]
     per_watt = [report.mean_thrust / report.mean_power for report in reports if report.mean_power]
     return Standing(
         contestant=label,
@@ -139,7 +140,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         faults=[report.reason.message for report in reports if report.reason],
         fallbacks=[report.fallback.message for report in reports if report.fallback],
         runs=reports,
-        power=fmean(report.mean_power for report in reports),
+        power=fmean(powers) if powers else None,
         thrust_per_watt=fmean(per_watt) if per_watt else None,
         thrust_per_watt_error=error_of_mean(per_watt),
     )
