@@ -22,7 +22,12 @@ from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, leaves, note, unit, without_empty_sections
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 from fishd.hardware.servo.pigpio import PigpioSettings
-from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
+from fishd.hardware.settings import (
+    ForceSensorSettings,
+    PanelSettings,
+    PowerMeterSettings,
+    ServoSettings,
+)
 from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
@@ -158,6 +163,13 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     servo: Annotated[ServoSettings, note("The tail servo; not for a simulated fish.")] = (
         PigpioSettings(driver="pigpio")
     )
+    power_meter: Annotated[
+        PowerMeterSettings | None,
+        note(
+            "The power meter of the servo, where there is one; null without. Not for a simulated "
+            "fish, whose servo has a model."
+        ),
+    ] = None
     panel: Annotated[
         PanelSettings, note("E-stop button and status light, where there are any.")
     ] = PanelSettings()
@@ -186,6 +198,11 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return self.robot in ("pi", "virtual-pi")
 
     @property
+    def driver_settings(self) -> drivers.Chosen:
+        """What its sections of drivers say."""
+        return drivers.Chosen(self.force_sensor, self.servo, self.power_meter)
+
+    @property
     def limits(self) -> Limits:
         """What controllers must respect."""
         return Limits(
@@ -196,6 +213,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             dwell=self._dwell,
             chatter=self.chatter,
             tethered=self.robot != "swimmer",
+            thrust_coefficient=(
+                self.plant.thrust_coefficient if self.estimator.kind == "observer" else None
+            ),
         )
 
     @property
@@ -252,12 +272,13 @@ def _check(config: Config) -> None:
     checks = config_checks
     checks.check_start(config.start.controller, config.start.parameters, config.limits)
     checks.check_addresses(config.telemetry.address, config.control.address)
-    sensor, servo = config.force_sensor, config.servo
-    drivers.check_drivers(config.robot, config.tick, sensor, servo)
+    servo = config.servo
+    drivers.check_drivers(config.robot, config.tick, config.driver_settings)
     checks.check_neutral(servo)
     drivers.check_plant(config.plant)
     checks.check_pulses(servo, config.amplitude_limit)
-    checks.check_pins(drivers.claims_of(sensor, servo), config.panel)
+    checks.check_i2c_addresses(config.driver_settings.sections())
+    checks.check_pins(drivers.claims_of(config.driver_settings), config.panel)
     checks.check_lockstep(config.robot, config.lockstep)
     checks.check_estimator(config.robot, config.estimator.kind, config.plant)
     checks.check_virtual_pi(config.virtual_pi)
@@ -305,8 +326,9 @@ def json_schema() -> dict[str, Any]:
     properties = parts["Config"]["properties"]
     for section, found in choices.items():
         refs = []
-        for name, struct in found.items():
-            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"const": name}
+        for struct in dict.fromkeys(found.values()):
+            named = [name for name, keys_of in found.items() if keys_of is struct]
+            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"enum": named}
             refs.append({"$ref": f"#/$defs/{struct.__name__}"})
         default = {key: value for key, value in properties[section].items() if key == "default"}
         properties[section] = {"anyOf": refs, **default}

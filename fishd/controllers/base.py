@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 from msgspec import Meta, Struct
 
@@ -56,6 +56,18 @@ class Limits(Struct, frozen=True):
     """What becomes of a policy that reverses too fast; the dwell that holds is the one above."""
     tethered: bool = True
     """The fish hangs from its force sensor, so that F_x is its thrust."""
+    thrust_coefficient: float | None = None
+    """K of the fish that the observer believes in: thrust over the mean square of its fin velocity
+    [N s²/rad²]; None where the fin velocity is of no model."""
+
+
+class Likeness(NamedTuple):
+    """Of the wave of a controller to that of another one."""
+
+    name: str
+    """Of the other one."""
+    but_for: frozenset[str]
+    """Parameters that the other one has not, and that are not of the kind of wave."""
 
 
 P = TypeVar("P", bound=Struct)
@@ -71,6 +83,8 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[Struct]]
+    swims_like: ClassVar[Likeness | None] = None
+    """What is known of the thrust of that other controller's wave holds for this one's, too."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Raises TypeError where its quantities cannot be shown."""

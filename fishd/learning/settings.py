@@ -59,6 +59,16 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         ),
     ] = False
     reward_scale: Annotated[float, note("Reward for thrust_scale.", gt=0, le=1000)] = 0.3
+    power_price: Annotated[
+        float,
+        unit(
+            "N/W",
+            "Thrust that a watt of the servo must give at the least: the reward is of F_x less "
+            "this times the power. In simulation only: agents of a fishd are not told the power.",
+            ge=0,
+            le=1000,
+        ),
+    ] = 0.0
     episode: Annotated[int, unit("ticks", "Steps of an episode.", ge=2)] = 768
     longest_start: Annotated[
         int,

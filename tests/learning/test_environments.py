@@ -16,6 +16,7 @@ from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import ConfigError, NoDaemon
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
@@ -216,3 +217,31 @@ def test_without_a_fishd_it_says_where_it_looked(tmp_path: Path) -> None:
 def test_no_policy_learns_from_a_fin_velocity_that_it_will_not_be_shown() -> None:
     with pytest.raises(ConfigError, match="observer is not possible with fin_velocity"):
         gymnasium.make("fishd/Swim-v0", overrides=("estimator.kind=observer",))
+
+
+def test_power_with_a_price_is_taken_off_the_reward() -> None:
+    config, rewards = load(None), []
+    for price in (0.0, 0.01):
+        link, settings = SimulatedLink(config), EnvironmentSettings(power_price=price)
+        env = SwimEnv(link, config, settings)
+        env.reset(seed=1)
+        rewards.append(env.step(np.array([1.0], np.float32))[1])
+        power = link.step(0.42).power
+        assert power is not None
+        assert power > 0.06
+    assert rewards[1] < rewards[0] - 0.3 * 0.01 * 0.06 / env.best_thrust
+
+
+class Unmetered(SimulatedLink):
+    """A fish whose power nobody knows."""
+
+    def step(self, angle: float) -> StepResult:
+        return super().step(angle)._replace(power=None)
+
+
+def test_power_that_is_not_known_can_have_no_price() -> None:
+    config = load(None)
+    env = SwimEnv(Unmetered(config), config, EnvironmentSettings(power_price=0.01, longest_start=0))
+    env.reset(seed=1)
+    with pytest.raises(ConfigError, match=r"environment\.power_price: the power of the servo"):
+        env.step(np.array([1.0], np.float32))

@@ -113,7 +113,7 @@ def test_it_swims_a_fishd_in_real_time_and_leaves_it_at_rest(daemon: Daemon, fis
         told: dict[float, float] = {}
         for n in range(20):
             angle = 0.02 * (n + 1)
-            found, lost = link.step(angle)
+            found, lost, _ = link.step(angle)
             if not lost:
                 told[before.fx] = angle
                 assert found.time == pytest.approx(before.time + 0.1)

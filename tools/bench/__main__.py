@@ -21,6 +21,7 @@ NAMES = (
     "estimators",
     "swing",
     "harsh",
+    "thrust",
     "camera",
     "swimmer",
 )

@@ -32,8 +32,9 @@ LEAST_NOISE = 1e-6
 """No force is known better [N]."""
 REVERSED = (
     "F_y is reversed: it pushed the way in which the tail set off, so swing and policies fail; "
-    "where a positive angle moves the tail to the fish's left, mend F_y (fishctl calibrate force: "
-    "+y pulls to its left), else servo.direction (fishctl calibrate servo)"
+    "where a positive angle moves the tail to the fish's left, mend F_y with "
+    "'fishctl calibrate force' (+y pulls to its left), else servo.direction with "
+    "'fishctl calibrate servo'"
 )
 
 

@@ -58,6 +58,12 @@ class Standing(Struct, frozen=True, kw_only=True):
     """Why another controller took over in runs, if one did; the figures are those of both."""
     runs: list[Report] = []
     """Of a simulated fish."""
+    power: float | None = None
+    """Electrical power of the servo [W]; None where it is not known."""
+    thrust_per_watt: float | None = None
+    """[N/W]"""
+    thrust_per_watt_error: float | None = None
+    """Half of its 95 % interval [N/W]; None for one run in simulation."""
 
 
 def compare(
@@ -138,6 +144,8 @@ def trace(ticks: Sequence[Tick]) -> Trace:
 
 def _standing(label: str, reports: list[Report]) -> Standing:
     thrusts = [report.mean_thrust for report in reports]
+    powers = [report.mean_power for report in reports if report.mean_power is not None]
+    per_watt = [report.mean_thrust / report.mean_power for report in reports if report.mean_power]
     return Standing(
         contestant=label,
         controller=reports[0].controller,
@@ -152,6 +160,9 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         faults=[report.reason.message for report in reports if report.reason],
         fallbacks=[report.fallback.message for report in reports if report.fallback],
         runs=reports,
+        power=fmean(powers) if powers else None,
+        thrust_per_watt=fmean(per_watt) if per_watt else None,
+        thrust_per_watt_error=error_of_mean(per_watt),
     )
 
 

@@ -5,7 +5,7 @@
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`features`) |
 | | of the latest `history` ticks | newest first |
 | action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
-| reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
+| reward | `reward_scale` · (F_x − `power_price` · P) / `thrust_scale` | of the tick that followed |
 | | −`reward_scale` · `held_cost` | in a tick in which the shortest dwell held a reversal back |
 
 An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
@@ -128,6 +128,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         window = Window(settings.history, settings.history * config.tick, settings.relative)
         self.perception = Perception(self.features, eye, window)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
+        self._price, self._cost = settings.power_price, 0.0  # N/W, N
         shortest = config.limits.dwell if settings.dwell else 0.0
         self._dwell = Dwell(shortest, link.tick, link.amplitude)
         self._held_cost = settings.held_cost * settings.reward_scale
@@ -196,7 +197,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             raise ResetNeeded("no episode has begun: call reset before step")
         lost = self.swim(_share(action) * self.link.amplitude)
         self._steps += 1
-        reward = self._reward_per_newton * self.latest.fx - self._held_cost * self._dwell.held
+        reward = self._reward_per_newton * (self.latest.fx - self._cost)
+        reward -= self._held_cost * self._dwell.held
         info = self._info(lost)
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
@@ -212,11 +214,18 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
 
-        Raises `LinkLost`.
+        Raises `LinkLost`, and `ConfigError` where power has a price, but is not known.
         """
         before = self.latest.time
-        self.latest, lost = self.link.step(angle)
+        self.latest, lost, power = self.link.step(angle)
         self.perception.note(self.latest)
+        if self._price:
+            if power is None:
+                raise ConfigError(
+                    "environment.power_price: the power of the servo is not known here: learn in "
+                    "simulation, or set it to 0"
+                )
+            self._cost = self._price * power
         if self.eye and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before
@@ -288,7 +297,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             return
         begun, began = self.latest.time, time.monotonic()
         while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
-            self.latest, _ = self.link.step(0.0)
+            self.latest = self.link.step(0.0).observation
             if self._look():
                 return
         raise LinkLost(

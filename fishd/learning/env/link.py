@@ -21,6 +21,8 @@ class StepResult(NamedTuple):
     observation: Observation
     lost: int = 0
     """Ticks since the previous observation in which another angle than the action was applied."""
+    power: float | None = None
+    """Mean electrical power of the servo since then [W]; None where it is not known."""
 
 
 class Link(Protocol):

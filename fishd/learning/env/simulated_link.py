@@ -155,7 +155,7 @@ class SimulatedLink:
         reason = self._loop.supervisor.reason
         if reason:
             raise LinkLost(f"the loop is in {self._loop.supervisor.mode}: {reason.message}")
-        return StepResult(self._turn.observation)
+        return StepResult(self._turn.observation, power=self._turn.power)
 
     def look(self) -> Stack | None:
         """What the simulated camera shows."""
