@@ -46,6 +46,16 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=10,
         ),
     ] = 1.0
+    lead: Annotated[
+        float,
+        unit(
+            "s",
+            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does; C "
+            "auto finds its own.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
 
 
 class Swing(Controller[SwingParameters]):
@@ -88,6 +98,12 @@ class Swing(Controller[SwingParameters]):
         super().check(parameters, limits)
         if parameters.C != "auto":
             return
+        if parameters.lead:
+            raise ParameterError(
+                f"lead: {parameters.lead:g} s is not valid with C auto, which finds its own; leave "
+                "it out, or give C a number in [0, 1]",
+                ("lead",),
+            )
         if not limits.tethered:
             raise ParameterError(
                 "C: auto goes by the ripple of F_x, which is the thrust of a tethered fish only; a "
@@ -143,7 +159,7 @@ class Swing(Controller[SwingParameters]):
     def _rung(self, observation: Observation) -> Rung:
         """When to reverse: as the parameter says, or as the search has found."""
         if self.parameters.C != "auto":
-            return Rung(self.parameters.C)
+            return Rung(self.parameters.C, self.parameters.lead)
         assert self._search
         self._search.update(observation.fx, observation.dt, self._direction)
         rung = self._search.rung
