@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from statistics import NormalDist
 
+from fishd.core.errors import FishdError
 from fishd.learning.adapt.state import Contender, Verdict
 
 SQUARE = "square"
@@ -23,6 +24,7 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
     chosen. The square wave itself has 1, without an error.
 
     contenders: the one named `square` among them
+    Raises `FishdError` where that hardly thrusts, so that it is no measure.
     """
     square = next(one for one in contenders if one.name == SQUARE)
     others = [one for one in contenders if one is not square]
@@ -49,7 +51,10 @@ def _share(one: Contender, square: Contender, wider: float) -> tuple[float, floa
     a, b = one.thrust, square.thrust
     va, vb = (wider * one.error) ** 2, (wider * square.error) ** 2
     if not b > 0.0 or vb >= b * b:
-        return (a / b if b else math.nan), -math.inf, math.inf
+        raise FishdError(
+            f"the best square wave found thrusts {1e3 * b:.2f} ± {1e3 * square.error:.2f} mN: too "
+            "little to be told from nothing, so no efficiency is known"
+        )
     middle, scale = a * b, b * b - vb
     half = math.sqrt(max(0.0, middle**2 - (a * a - va) * scale))
     return a / b, (middle - half) / scale, (middle + half) / scale
