@@ -53,8 +53,8 @@ def response(
 ) -> Array:
     """Window means of [−α α̈, −α̈, −α̇, −φ̈] for λ = 1, of shape (4, len(ends) − 1).
 
-    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third + J · the
-    fourth, which is smoothed as the mount of the servo does.
+    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third +
+    J · the fourth, which is smoothed as the mount of the servo does.
 
     commands: φ_c in each slot of one period [rad], from the start on
     ends: slots at whose starts windows end; the first one begins where the first window does

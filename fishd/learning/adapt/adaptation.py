@@ -11,7 +11,7 @@ from fishd.lab.measurement import measure
 from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import Rig, is_of_one
 from fishd.learning.adapt import steps as do
-from fishd.learning.adapt.practice import practise
+from fishd.learning.adapt.practice import practise, simulated
 from fishd.learning.adapt.state import FISH, POLICY, AdaptFolder, Contender, State
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import SQUARE, judge
@@ -133,11 +133,12 @@ class Adaptation:
 
         path = self._run.recording("search")
         with self._in_tank("search", "searching square waves"), self._tank.recorded(path, _NOTE):
-            state.square = do.search_square_waves(
-                self._tank, search, budget, tuple(state.trials), keep
-            )
+            do.search_square_waves(self._tank, search, budget, tuple(state.trials), keep)
+        state.square, told = do.best_of(search, state.trials, state.fitted, self._tank.amplitude)
         tried = f"{len(state.trials)} square waves tried"
-        self._done(f"search: {tried}; best at {state.square:.4g} Hz")
+        agree = "they agree with" if told else "whatever"
+        does = "" if told else " says"
+        self._done(f"search: {tried}; best at {state.square:.4g} Hz, {agree} the fit{does}")
 
     def _practise(self, state: State) -> None:
         assert state.fitted
@@ -213,6 +214,7 @@ class Adaptation:
                 frequency=found.frequency,
                 seconds=seconds,
                 remark=found.remark,
+                expected=self._expected(state, gait),
                 **_truth(self._config, self._rig, gait),
             )
         )
@@ -220,6 +222,12 @@ class Adaptation:
         self._done(f"{gait.name}: {measured} at {found.frequency:.3f} Hz")
         if found.remark:
             self._show.warn(f"fishctl: {gait.name}: {found.remark}")
+
+    def _expected(self, state: State, gait: Gait) -> float:
+        """The thrust of a gait on the identified fish [N]."""
+        assert state.fitted
+        config = simulated(self._config, state.fitted)
+        return simulate(config, gait.controller, gait.parameters).mean_thrust
 
     @contextmanager
     def _in_tank(self, step: str, doing: str) -> Iterator[None]:

@@ -20,9 +20,12 @@ from fishd.learning.settings import (
 from fishd.learning.train.jobs import Job
 from fishd.learning.train.progress import Display
 from fishd.learning.train.training import train
+from fishd.virtual.plant.optimum import best_square_wave
 
 EPISODE = 128
 """Steps with one fish of the cloud; then the next one is drawn."""
+NOISE = 0.3
+"""More noise of a tick than this share of the best thrust would drown the reward."""
 EVERY, OTHERS = 5, 3
 """Evaluations after so many updates, on the identified fish and so many others of the cloud."""
 
@@ -42,9 +45,9 @@ def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
 
 def simulated(config: Config, fitted: Fitted) -> Config:
     """The identified fish on its rig, with the loop of the real one."""
-    return replace(
-        config, robot="simulated", plant=fitted.plant, simulation=fitted.rig, start=Start()
-    )
+    best = best_square_wave(fitted.plant, config.amplitude_limit).thrust
+    rig = replace(fitted.rig, noise=min(fitted.rig.noise, NOISE * best))
+    return replace(config, robot="simulated", plant=fitted.plant, simulation=rig, start=Start())
 
 
 def practise(

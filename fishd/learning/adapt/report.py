@@ -12,7 +12,7 @@ import numpy as np
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
 from fishd.lab.identification.result import OF_THE_RIG, UNITS
 from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State
-from fishd.learning.adapt.verdict import NAMES, SQUARE, percent
+from fishd.learning.adapt.verdict import NAMES, SQUARE, spelled
 from fishd.learning.run_folder.tables import EVALUATIONS
 from fishd.virtual.plant.optimum import square_wave
 
@@ -180,7 +180,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         share = state.verdict.others.get(one.name)
         efficiency = "1"
         if share:
-            efficiency = f"{percent(share[0])} [{percent(share[1])}, {percent(share[2])}]"
+            efficiency = spelled(share)
         row = [
             NAMES[one.name] + (", the winner" if one.name == state.verdict.winner else ""),
             f"{1e3 * one.thrust:.2f} ± {1e3 * one.error:.2f} mN",

@@ -82,6 +82,8 @@ class Contender(Struct, frozen=True, kw_only=True):
     seconds: float
     """How long it was measured, rests included [s]."""
     remark: str = ""
+    expected: float
+    """On the identified fish, in simulation [N]."""
     true_thrust: float | None = None
     """Of a simulated fish [N]."""
     true_efficiency: float | None = None
@@ -98,6 +100,8 @@ class Verdict(Struct, frozen=True, kw_only=True):
     high: float
     others: dict[str, tuple[float, float, float]]
     """Of each one but the square wave: efficiency, and its interval."""
+    told: bool
+    """Is it the winner by measurement alone? Else others did as well, as far as that tells."""
     claim: str
     """The same in a sentence."""
 

@@ -5,6 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.stats import chi2
+
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.measurement import REST, SWIM
 from fishd.lab.measurement import plan as plan_of
@@ -14,7 +17,7 @@ from fishd.learning.adapt.cloud import cloud, identified
 from fishd.learning.adapt.state import Fitted, Rung
 from fishd.learning.adapt.tank import Tank
 from fishd.virtual.imperfections import SimulationSettings
-from fishd.virtual.plant.optimum import best_square_wave
+from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
 FITTED = (*DEFAULT, "servo_dead_zone", "servo_reaction")
 """What is fitted: all of a fish that a fit can find, but slack, which backlash stands for."""
@@ -24,6 +27,8 @@ AROUND = 2.0
 """Square waves are searched from so many times below to above the best of the identified fish."""
 SLOWEST, FASTEST = 0.3, 8.0
 """They are searched between these, whatever the fit says [Hz]."""
+DISAGREES = 0.01
+"""Square waves disagree with the identified fish where so few as good as it would miss so much."""
 ENDS = 0.25
 """Of a swim of `swing --C auto`, the last share, in which its search is over as a rule."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
@@ -86,8 +91,8 @@ def search_square_waves(
     budget: float,
     before: Sequence[Trial],
     keep: Callable[[Trial], None],
-) -> float:
-    """Try square waves until the budget is used [s]; the frequency of the best [Hz].
+) -> None:
+    """Try square waves until the budget is used [s].
 
     before: those that were tried already; keep: called with each new one
     """
@@ -95,7 +100,30 @@ def search_square_waves(
         search.observe(each.parameters, each.thrust, each.error)
     for each in trials(rig, "square", {}, search, budget, before[-1] if before else None):
         keep(each)
-    return search.proposal().parameters["frequency"]
+
+
+def best_of(
+    search: Search, tried: Sequence[Trial], fitted: Fitted, amplitude: float
+) -> tuple[float, bool]:
+    """The frequency of the best square wave [Hz], and whether the identified fish has told it.
+
+    Where what was tried agrees with that fish, up to a factor, its curve says where the maximum is:
+    it stands on a whole excitation, and a few trials with noise tell less. Where it does not, the
+    search alone says so.
+    """
+    curve = {
+        frequency: square_wave(fitted.plant, amplitude, frequency).thrust
+        for frequency in search.ranges[0].values
+    }
+    expected = np.array([curve[each.parameters["frequency"]] for each in tried])
+    measured = np.array([each.thrust for each in tried])
+    weights = np.array([(1.96 / each.error) ** 2 for each in tried])
+    factor = (weights @ (expected * measured)) / (weights @ expected**2)
+    missed = weights @ (measured - factor * expected) ** 2
+    agrees = factor > 0.0 and chi2.sf(missed, max(1, len(tried) - 1)) > DISAGREES
+    if agrees:
+        return max(curve, key=lambda frequency: curve[frequency]), True
+    return search.proposal().parameters["frequency"], False
 
 
 def least_search(rig: Tank, search: Search) -> float:

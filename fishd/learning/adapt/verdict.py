@@ -13,11 +13,15 @@ NAMES = {
     "swing": "swing as --C auto has found it",
     SQUARE: "the best square wave found",
 }
+_UNTOLD = "; the measurement does not tell all of them apart, and on the identified fish it is best"
 _LEVEL = 0.05
 
 
 def judge(contenders: Sequence[Contender]) -> Verdict:
     """The one with the largest measured thrust wins.
+
+    Where the measurement does not tell others from it, that one of them wins which thrusts most on
+    the identified fish.
 
     Efficiencies are thrusts over that of the square wave. Their intervals are so wide that all of
     them hold together in 95 % of cases (Bonferroni): that of the winner is as good for having been
@@ -31,7 +35,13 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
     normal = NormalDist()
     wider = normal.inv_cdf(1.0 - 0.5 * _LEVEL / max(1, len(others))) / normal.inv_cdf(0.975)
     shares = {one.name: _share(one, square, wider) for one in others}
-    winner = max(contenders, key=lambda one: one.thrust)
+    first = max(contenders, key=lambda one: one.thrust)
+    level = [
+        one
+        for one in contenders
+        if first.thrust - one.thrust <= wider * math.hypot(first.error, one.error)
+    ]
+    winner = max(level, key=lambda one: one.expected)
     efficiency, low, high = shares.get(winner.name, (1.0, 1.0, 1.0))
     return Verdict(
         winner=winner.name,
@@ -39,7 +49,8 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
         low=low,
         high=high,
         others=shares,
-        claim=_claim(winner.name, shares),
+        told=len(level) == 1,
+        claim=_claim(winner.name, shares) + ("" if len(level) == 1 else _UNTOLD),
     )
 
 
@@ -62,20 +73,17 @@ def _share(one: Contender, square: Contender, wider: float) -> tuple[float, floa
 
 def _claim(winner: str, shares: dict[str, tuple[float, float, float]]) -> str:
     if winner in shares:
-        efficiency, low, high = shares[winner]
-        clear = "" if low > 1.0 else "; the interval does not tell it from that wave"
-        return (
-            f"{NAMES[winner]} thrusts {percent(efficiency)} "
-            f"[{percent(low)}, {percent(high)}] of {NAMES[SQUARE]}{clear}"
-        )
+        return f"{NAMES[winner]} wins: it thrusts {spelled(shares[winner])} of {NAMES[SQUARE]}"
     if not shares:
-        return f"{NAMES[SQUARE]} is the only one that could be measured"
-    best = max(shares, key=lambda name: shares[name][0])
-    efficiency, low, high = shares[best]
-    return (
-        f"nothing thrusts more than {NAMES[SQUARE]}: {NAMES[best]} has {percent(efficiency)} "
-        f"[{percent(low)}, {percent(high)}] of it"
-    )
+        return f"{NAMES[SQUARE]} wins: it is the only one that could be measured"
+    others = " and ".join(f"{NAMES[name]} {spelled(share)}" for name, share in shares.items())
+    return f"{NAMES[SQUARE]} wins: of its thrust has {others}"
+
+
+def spelled(share: tuple[float, float, float]) -> str:
+    """An efficiency with its interval."""
+    value, low, high = share
+    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
 
 
 def percent(share: float) -> str:
