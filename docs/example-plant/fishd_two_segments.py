@@ -66,10 +66,7 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
         """Refuse what it knows nothing of."""
         for key in UNKNOWN:
             if value := getattr(parameters, key):
-                what = (
-                    f"{value:g} is not valid with model two-segments, which has none: 0 is needed"
-                )
-                raise Problem((key,), what)
+                raise Problem((key,), f"{value:g} is not valid: this plant has none; 0 is needed")
 
     def advance(
         self, instruction_angle: float | None, duration: float, samples: int

@@ -292,8 +292,9 @@ def json_schema() -> dict[str, Any]:
     properties = parts["Config"]["properties"]
     for section, found in choices.items():
         refs = []
-        for name, struct in found.items():
-            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"const": name}
+        for struct in dict.fromkeys(found.values()):
+            named = [name for name, keys_of in found.items() if keys_of is struct]
+            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"enum": named}
             refs.append({"$ref": f"#/$defs/{struct.__name__}"})
         default = {key: value for key, value in properties[section].items() if key == "default"}
         properties[section] = {"anyOf": refs, **default}

@@ -43,7 +43,7 @@ FAULTS = {
     ),
     "fish-lost": Fault(
         "the computation of a swimmer has diverged, or it has left the part of the tank that is "
-        "computed well",
+        "computed well; or a plant of another package has failed",
         "change what the message says, and start fishd again: this fish is gone",
     ),
     "estimate-error": Fault(

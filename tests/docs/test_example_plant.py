@@ -111,8 +111,8 @@ def test_what_it_has_no_equation_for_is_refused_by_key(site: Path) -> None:
     done = fishctl(site, "simulate", "swing", *sets(MODEL, "plant.backlash=0.1"))
     assert done.returncode == 78
     assert done.stderr == (
-        "fishctl: --set plant.backlash=0.1: plant.backlash: 0.1 is not valid with model "
-        "two-segments, which has none: 0 is needed\n"
+        "fishctl: --set plant.backlash=0.1: plant.backlash: 0.1 is not valid: this "
+        "plant has none; 0 is needed\n"
     )
 
 

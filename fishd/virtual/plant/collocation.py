@@ -147,14 +147,13 @@ class Segment:
         raise ArithmeticError(f"no fin with a quadratic drag of {drag:g} 1/rad can move so fast")
 
     def turn(self, response: Vector) -> float:
-        """Return when (s) the fin turns, given the response; 0 where it does not, or at an end."""
+        """Return when (s) the fin first turns, given the response; 0 for not, or at an end only."""
         rates = response[N : 2 * N] @ _TO_FINE
-        turns = np.flatnonzero(rates[1:] * rates[:-1] < 0.0)
-        if not turns.size:
-            return 0.0
-        k = int(turns[0])
-        share = float(_FINE[k] + _FINE[1] * rates[k] / (rates[k] - rates[k + 1]))
-        return self.length * share if _AT_AN_END < share < 1.0 - _AT_AN_END else 0.0
+        for k in np.flatnonzero(rates[1:] * rates[:-1] < 0.0):
+            share = float(_FINE[k] + _FINE[1] * rates[k] / (rates[k] - rates[k + 1]))
+            if _AT_AN_END < share < 1.0 - _AT_AN_END:
+                return self.length * share
+        return 0.0
 
     def peak(self, response: Vector) -> float:
         """Return the largest |α| (rad) within it, given the product `self.response @ …`."""

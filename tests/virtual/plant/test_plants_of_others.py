@@ -7,7 +7,7 @@ import pytest
 from rigs.example_packages import forget_drivers
 from rigs.processes import install
 
-from fishd.config import load, to_yaml
+from fishd.config import json_schema, load, to_yaml
 from fishd.core.errors import ConfigError, FishLost, StartupError
 from fishd.simulation import simulate
 from fishd.simulation.virtual_run import KeepingPublisher, VirtualRun
@@ -57,6 +57,9 @@ class Foreign(Struct):
 class Unrelated(Good):
     Settings = Foreign
 
+class Plain(Good):
+    Settings = PlantParameters
+
 class Listing(Good):
     class Settings(PlantParameters, frozen=True, kw_only=True):
         lengths: list[float] = []
@@ -68,7 +71,7 @@ class Choosy(Good):
 """
 NAMES = (
     *("good", "unable", "breaking", "dividing", "silent", "unfinished"),
-    *("unrelated", "listing", "choosy"),
+    *("unrelated", "plain", "listing", "choosy"),
 )
 
 
@@ -98,6 +101,17 @@ def test_what_is_shown_of_it_can_be_read_back(tmp_path: Path) -> None:
     file.write_text(to_yaml(config))
     assert load(file) == config
     assert load(file).plant.xi == 0.7
+
+
+def test_the_schema_knows_its_keys_and_takes_the_others_that_add_none() -> None:
+    schema = json_schema()
+    models = {}
+    for ref in schema["$defs"]["Config"]["properties"]["plant"]["anyOf"]:
+        keys = schema["$defs"][ref["$ref"].rpartition("/")[2]]["properties"]
+        models |= dict.fromkeys(keys["model"]["enum"], "size" in keys)
+    assert models["tethered"] is False
+    assert models["plain"] is False
+    assert models["good"] is True
 
 
 @pytest.mark.parametrize(
