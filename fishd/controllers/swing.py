@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
-from fishd.controllers.criterion_search import CriterionSearch, Phase, Rung
+from fishd.controllers.criterion_search import BEGIN, LADDER, CriterionSearch, Phase, Rung
 from fishd.controllers.quantities import quantity
 from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
@@ -18,6 +18,9 @@ REFRACTORY = 0.05
 
 LONGEST_TICK = 0.15
 """Of C auto: with longer ones a half beat has two or three, and its ripple cannot be told [s]."""
+BLIND = 4
+"""With a lead, so many half beats come first that C = 0.6 ends: the speed of a fin that only begins
+to swing is not foreseen."""
 SLOPE_OVER = 0.05
 """The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
 
@@ -50,8 +53,8 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does; C "
-            "auto finds its own.",
+            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does, after "
+            "two beats with C = 0.6; C auto finds its own.",
             ge=0,
             le=1,
         ),
@@ -86,6 +89,7 @@ class Swing(Controller[SwingParameters]):
         self.since_reversal = 0.0
         ticks = max(1, round(SLOPE_OVER / limits.tick))
         self._velocities: deque[float] = deque(maxlen=ticks + 1)
+        self._reversals = 0 if parameters.lead else BLIND
         self._search: CriterionSearch | None = None
         self.retune(parameters)
 
@@ -146,6 +150,7 @@ class Swing(Controller[SwingParameters]):
             self._direction = -self._direction
             self._top_speed = 0.0
             self.since_reversal = 0.0
+            self._reversals += 1
         self.reversal_speed = rung.C * self.top_speed
         return self._direction * amplitude_of(parameters, self.limits)
 
@@ -159,7 +164,8 @@ class Swing(Controller[SwingParameters]):
     def _rung(self, observation: Observation) -> Rung:
         """When to reverse: as the parameter says, or as the search has found."""
         if self.parameters.C != "auto":
-            return Rung(self.parameters.C, self.parameters.lead)
+            foresees = self._reversals >= BLIND
+            return Rung(self.parameters.C, self.parameters.lead) if foresees else LADDER[BEGIN]
         assert self._search
         self._search.update(observation.fx, observation.dt, self._direction)
         rung = self._search.rung

@@ -11,7 +11,7 @@ from fishd.lab.measurement import measure
 from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import Rig, is_of_one
 from fishd.learning.adapt import steps as do
-from fishd.learning.adapt.practice import practise, simulated
+from fishd.learning.adapt.practice import TRIES, practise, simulated
 from fishd.learning.adapt.state import FISH, POLICY, AdaptFolder, Contender, State
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import SQUARE, judge
@@ -144,9 +144,10 @@ class Adaptation:
         assert state.fitted
 
         def progress(done: int) -> None:
-            self._show.at(
-                self._tank.used, f"training, {done} of {self._steps} steps; the fish rests"
-            )
+            again, step = divmod(done - 1, self._steps)
+            more = f", once more ({again + 1} of {TRIES})" if again else ""
+            doing = f"training, {step + 1} of {self._steps} steps{more}; the fish rests"
+            self._show.at(self._tank.used, doing)
 
         state.trained = found = practise(
             self._config, state.fitted, self._run.path, self._steps, self._seed, progress

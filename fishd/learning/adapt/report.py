@@ -30,7 +30,9 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     Raises `FishdError` where one cannot be written.
     """
     picture = run.path / PICTURE
-    draw(run.state, run.path / TRAINING / EVALUATIONS, amplitude, picture)
+    trained = run.state.trained.folder if run.state.trained else ""
+    evaluations = run.path / (trained or TRAINING) / EVALUATIONS
+    draw(run.state, evaluations, amplitude, picture)
     run.write(PAGE, page(run.state, picture.read_bytes(), again))
     return picture, run.path / PAGE
 

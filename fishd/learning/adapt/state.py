@@ -58,6 +58,9 @@ class Trained(Struct, frozen=True, kw_only=True):
     """How the policy did on the fish of the fit, or why there is none."""
 
     steps: int
+    """Of all trainings."""
+    folder: str = ""
+    """Of the one that it is from."""
     efficiency: float | None = None
     """Over the best square wave of the identified fish."""
     worst: float | None = None

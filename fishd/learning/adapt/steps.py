@@ -29,8 +29,6 @@ SLOWEST, FASTEST = 0.3, 8.0
 """They are searched between these, whatever the fit says [Hz]."""
 DISAGREES = 0.01
 """Square waves disagree with the identified fish where so few as good as it would miss so much."""
-ENDS = 0.25
-"""Of a swim of `swing --C auto`, the last share, in which its search is over as a rule."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
 """Shares of the tank time; the comparison has the rest."""
 LEAST = 150.0
@@ -69,9 +67,10 @@ def settle_swing(rig: Tank, seconds: float) -> Rung:
     """Let `swing --C auto` search for so long; the C and the lead that it ends with."""
     ticks = rig.swim("swing", {"C": "auto"}, seconds)
     rig.rest(REST)
-    end = ticks[-max(1, round(ENDS * len(ticks))) :]
+    end = ticks[len(ticks) // 2 :]
     shown = [tick.quantities for tick in end if tick.quantities]
     watching = [each for each in shown if not each["searching"]]
+    # Of a search that goes on, the rung between the trials is the one that lasts longest.
     rungs = Counter((each["criterion"], each["lead"]) for each in watching or shown)
     (criterion, lead), _ = rungs.most_common(1)[0]
     return Rung(criterion, lead, bool(watching))
