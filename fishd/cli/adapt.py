@@ -4,6 +4,7 @@ import contextlib
 import shlex
 from collections.abc import Iterator
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,9 +91,8 @@ def adapt(
     Ctrl-C lets the fish rest; the same command with the --folder goes on, and measures nothing
     again.
     """
-    import onnxruntime  # noqa: F401 (which is missing is said before the fish swims)
-    import tensorboard  # noqa: F401
-
+    for package in ("onnxruntime", "tensorboard"):  # missing ones are named before the fish swims
+        import_module(package)
     from fishd.lab import drawing
     from fishd.lab.begun import owned
     from fishd.learning.adapt import report

@@ -146,9 +146,7 @@ def summary(found: list[Adapted]) -> str:
     shares = [each.share for each in found]
     claims = [each.claims[each.winner] for each in found if each.winner in each.claims]
     every = [claim for each in found for claim in each.claims.values()]
-    policies = [
-        each.thrusts["policy"][2] / each.best for each in found if "policy" in each.thrusts
-    ]
+    policies = [each.thrusts["policy"][2] / each.best for each in found if "policy" in each.thrusts]
     winners = [each.thrusts[each.winner] for each in found]
     rows = [
         ["winner, of the best square wave, median", f"{percent(statistics.median(shares))} %"],

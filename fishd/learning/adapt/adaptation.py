@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 from fishd.config import Config
 from fishd.core.errors import FishdError
 from fishd.lab.identification import experiment
-from fishd.lab.measurement import measure
+from fishd.lab.measurement import REST, measure
 from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import Rig, is_of_one
 from fishd.learning.adapt import steps as do
@@ -112,7 +112,7 @@ class Adaptation:
             self._show.warn(f"fishctl: careful: {remark}")
 
     def _settle_swing(self, state: State) -> None:
-        seconds = do.BUDGET["swing"] * self._tank_time - do.REST
+        seconds = do.BUDGET["swing"] * self._tank_time - REST
         path = self._run.recording("swing")
         with self._in_tank("swing", "swing --C auto"), self._tank.recorded(path, _NOTE):
             state.swing = do.settle_swing(self._tank, seconds)

@@ -1,5 +1,6 @@
 """The fish that an identification leaves possible: draws from its estimates and their errors."""
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
@@ -35,7 +36,7 @@ def cloud(found: Identification, seed: int = 0, count: int = FISH) -> tuple[Plan
 
 def identified(found: Identification) -> PlantParameters:
     """The identified fish."""
-    return PlantParameters(**{e.name: e.value for e in found.estimates if e.name not in OF_THE_RIG})
+    return msgspec.convert(found.plant, PlantParameters)
 
 
 def _normal(found: Identification, name: str) -> tuple[float, float]:

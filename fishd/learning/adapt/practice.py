@@ -77,9 +77,7 @@ def practise(
         if place.exists():
             shutil.rmtree(place)
         task = settings(fitted, steps, (seed + index) % 2**32)
-        outcome = train(
-            Job(config=simulated(config, fitted), settings=task, folder=place), display
-        )
+        outcome = train(Job(config=simulated(config, fitted), settings=task, folder=place), display)
         message = outcome.message or message
         if outcome.best and (best is None or _merit(outcome) > _merit(best)):
             best = outcome

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy.stats import chi2
 
@@ -55,7 +56,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     offset, drift = found["offset_y"], found.channels[1].drift
     fitted = Fitted(
         plant=plant,
-        rig=SimulationSettings(**found.simulation),
+        rig=msgspec.convert(found.simulation, SimulationSettings),
         offset=max(offset.high - offset.value, 0.5 * drift),
         cloud=cloud(found, seed),
         found=found.to_builtins(),
