@@ -53,8 +53,8 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does; after "
-            "two beats with C = 0.6. C auto finds its own.",
+            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does; the "
+            "first two beats are with C = 0.6. C auto finds its own.",
             ge=0,
             le=1,
         ),
