@@ -202,7 +202,7 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> Non
     run = folder(tmp_path / "run")
     with (
         VirtualRig(config) as rig,
-        pytest.raises(Unidentifiable, match="the best fit explains .* of F_x only"),
+        pytest.raises(Unidentifiable, match=r"the best fit explains .* of F_x only"),
     ):
         Adaptation(rig, config, run, 150.0, 640, 0, Quiet()).run()
     assert folder(run.path).state.excitation == "excitation.mcap"
