@@ -6,9 +6,9 @@ import pytest
 from msgspec.structs import replace
 from rigs.harness import Rig
 
-from bench.swing import FIRST_SEED, FISH, harsh
 from fishd.core.signals import Measurement
 from fishd.hardware.base import ForceSensor, Robot
+from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH, harsh
 
 REST = 3.0
 
@@ -40,7 +40,7 @@ def started(rig: Rig, controller: str = "swing", **parameters: object) -> bool |
     return rig.loop.lateral_sign.reversed
 
 
-@pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + FISH))
+@pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + HARSH_FISH))
 def test_any_fish_shows_it_when_it_sets_off(seed: int) -> None:
     fish = harsh(seed).overrides
     for controller, parameters in (("swing", {}), ("square", {"frequency": 1.5}), ("sine", {})):

@@ -50,12 +50,12 @@ class Ppo(Controller[PpoParameters]):
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Reads, checks and warms up the policy."""
-        from fishd.controllers.policy.card import Layout
+        from fishd.controllers.policy.card import History
 
         self.parameters = parameters  # without super(), which would do all of it twice
         self.limits = limits
         card, self._network = _open(parameters, limits)
-        self._write = Layout(card.observation).write
+        self._history = History(card.observation, card.window, self._network.row)
         self._amplitude = card.amplitude
         self._limit = DwellLimit(limits.dwell, limits, card.amplitude)
         self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -68,6 +68,8 @@ class Ppo(Controller[PpoParameters]):
     def activate(self, observation: Observation) -> None:
         """Take over as if the tail had reversed just now."""
         self._limit.activate(observation.instruction_angle)
+        self._history.forget()
+        self._latest = observation
 
     def retune(self, parameters: PpoParameters) -> None:
         """Refuse: another policy must be loaded and warmed up outside the loop."""
@@ -98,7 +100,7 @@ class Ppo(Controller[PpoParameters]):
     def _choose(self, observation: Observation) -> float:
         """What the network puts out."""
         network = self._network
-        self._write(observation, network.row)
+        self._history.push(observation)
         return network.run()
 
 

@@ -3,6 +3,7 @@
 | | | |
 |---|---|---|
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`features`) |
+| | of the latest `history` ticks | newest first |
 | action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
 | reward | `reward_scale` · (F_x − `power_price` · P) / `thrust_scale` | of the tick that followed |
 | | −`reward_scale` · `held_cost` | in a tick in which the shortest dwell held a reversal back |
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from fishd.camera.frames import Stack
 from fishd.config import Config, check_tethered
 from fishd.controllers.dwell import Dwell
-from fishd.controllers.policy.card import Feature, FeatureName
+from fishd.controllers.policy.card import Feature, FeatureName, Window
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost
@@ -124,7 +125,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.features = features(config, settings)
         self.settings = settings
         self.eye = eye
-        self.perception = Perception(self.features, eye)
+        window = Window(settings.history, settings.history * config.tick, settings.relative)
+        self.perception = Perception(self.features, eye, window)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
         self._price, self._cost = settings.power_price, 0.0  # N/W, N
         shortest = config.limits.dwell if settings.dwell else 0.0
@@ -165,6 +167,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         super().reset(seed=seed)
         draw = self.np_random
         self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
+        self.perception.forget()
+        if self.settings.own_fish and self.link.config:
+            self._suit(self.link.config)
         self._begun = True
         self._steps = 0
         self._await_frames()
@@ -174,6 +179,12 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         )
         self._dwell.activate(self.latest.instruction_angle)
         return self._seen(), self._info(lost)
+
+    def _suit(self, fish: Config) -> None:
+        """Reward the thrust of this fish by its own best, and hold reversals back as it needs."""
+        self._reward_per_newton = self.settings.reward_scale / thrust_scale(fish, self.settings)
+        shortest = fish.limits.dwell if self.settings.dwell else 0.0
+        self._dwell = Dwell(shortest, self.link.tick, self.link.amplitude)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Apply an instruction angle for one tick.
@@ -214,6 +225,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
                     "simulation, or set it to 0"
                 )
             self._cost = self._price * power
+        self.perception.note(self.latest)
         if self.eye and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before

@@ -6,6 +6,7 @@ One step of an agent: it sends an instruction angle, one tick passes, it receive
 from typing import NamedTuple, Protocol
 
 from fishd.camera.frames import Stack
+from fishd.config import Config
 from fishd.core.errors import FishdError
 from fishd.core.signals import Observation
 
@@ -31,6 +32,10 @@ class Link(Protocol):
     """Period of the loop [s]."""
     amplitude: float
     """Φ [rad]"""
+
+    @property
+    def config(self) -> Config | None:
+        """The fish that swims now, where that is known."""
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
         """Acquire control, if it is not held yet; the observation that the next action answers.
