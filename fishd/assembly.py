@@ -31,7 +31,7 @@ from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.driver import ServoDriver, survived
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
+from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
@@ -39,6 +39,7 @@ from fishd.virtual.fish import SimulatedFish
 
 if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
     from fishd.hardware.panel import RpiGpioPanel
+    from fishd.hardware.power_meter.sampled_power import SampledPower
     from fishd.swimmer.robot import Swimmer
     from fishd.virtual.pi.virtual_pi import VirtualPi
 
@@ -87,7 +88,7 @@ def open_swimmer(config: Config) -> "Swimmer":
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
     """What no other fishd may drive meanwhile; `fishctl release`, the last resort, does not ask."""
     if config.robot == "pi":
-        return ownership.parts_of_pi(claims_of(config.force_sensor, config.servo))
+        return ownership.parts_of_pi(claims_of(config.driver_settings))
     if config.robot == "virtual-pi":
         return ownership.parts_of_virtual_pi(virtual_pi_socket(config.virtual_pi.socket))
     return ()
@@ -208,7 +209,9 @@ def assemble(
     folder = CalibrationFolder(state_folder(config))
     for line in folder.ignored():
         log.warning("%s", line)
-    sensor = open_sensor(config, clock, threaded=threaded)
+    meter = _open_power_meter(config, clock, stack, threaded=threaded)
+    beside = meter.catch_up if meter else _nothing
+    sensor = open_sensor(config, clock, threaded=threaded, beside=beside)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -257,14 +260,46 @@ def assemble(
         tared=sensor,
         calibrated=CalibratedParts(sensor, servo, tell_release),
         degraded=degraded,
-        counters=lambda: {**sensor.counters(), **survived(servo.driver)},
+        counters=lambda: {
+            **sensor.counters(),
+            **survived(servo.driver),
+            **(meter.counters() if meter else {}),
+        },
+        power=meter.read if meter else None,
         countdown=servo.driver.countdown,
     )
 
 
-def open_sensor(config: Config, clock: Clock, *, threaded: bool) -> SampledSensor:
+def _nothing() -> None:
+    pass
+
+
+def _open_power_meter(
+    config: Config, clock: Clock, stack: ExitStack, *, threaded: bool
+) -> "SampledPower | None":
+    """The power meter, where there is one; one that does not answer is no error."""
+    settings = config.power_meter
+    if settings is None:
+        return None
+    from fishd.hardware.power_meter.sampled_power import SampledPower, interval_of
+
+    with driver_packages(settings.driver):
+        driver = POWER_METERS.find(settings.driver)(settings, clock, interval_of(config.tick))
+    meter = SampledPower(driver, clock, threaded=threaded, tick=config.tick)
+    stack.callback(meter.close)
+    return meter
+
+
+def open_sensor(
+    config: Config,
+    clock: Clock,
+    *,
+    threaded: bool,
+    beside: Callable[[], None] = _nothing,
+) -> SampledSensor:
     """The force sensor alone, with the calibration that was saved last.
 
+    beside: as of `SampledSensor`
     Raises `StartupError` when a package is missing, and `ConfigError` for a damaged calibration.
     """
     settings = config.force_sensor
@@ -272,7 +307,9 @@ def open_sensor(config: Config, clock: Clock, *, threaded: bool) -> SampledSenso
     calibration = found[0] if found else ForceCalibration()
     with driver_packages(settings.driver):
         driver = FORCE_SENSORS.find(settings.driver)(settings, clock)
-    return SampledSensor(driver, calibration, clock, threaded=threaded, tick=config.tick)
+    return SampledSensor(
+        driver, calibration, clock, threaded=threaded, tick=config.tick, beside=beside
+    )
 
 
 def _cut_by_calibration(config: Config, servo: CalibratedServo) -> str:

@@ -42,7 +42,7 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
     plain, nested = [], []
     for field in fields_of(type(section)):
         value = getattr(section, field.name)
-        if isinstance(value, Struct):
+        if isinstance(value, Struct) or (isinstance(section, Config) and field.name in CHOICES):
             nested.append((field, value))
         else:
             plain.append(_row(field, value, prefix))
@@ -60,8 +60,8 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
 def _choice_section(section: str) -> Iterator[str]:
     """The keys that all drivers or plants have, then those of each of fishd's own."""
     plugins, default, settings_of_default, key, page = CHOICES[section]
-    base = settings_of_default.__base__
-    common = (settings_of_default if base is Struct else base)(**{key: default})
+    base = settings_of_default.__base__ if default else Struct
+    common = (settings_of_default if base is Struct else base)(**{key: default or ""})
     mine = [name for name in plugins.names() if plugins.package(name) == "fishd"]
     choice, *rows = [
         _row(field, getattr(common, field.name), f"{section}.") for field in fields_of(type(common))
@@ -86,6 +86,7 @@ def _row(field: Field, default: object, prefix: str) -> list[str]:
     permitted = field.interval or ANY[field.kind]
     if field.kind == "integer":
         permitted += ", whole"
+    permitted += "".join(f", or `{word}`" for word in field.words)
     if field.optional:
         permitted += ", or `null`"
     unit = "" if field.unit == "1" else field.unit

@@ -9,7 +9,7 @@ from fishd.camera.frames import Stack
 from fishd.controllers.base import Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.controllers.policy import opening
-from fishd.controllers.policy.card import Layout
+from fishd.controllers.policy.card import History
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
@@ -36,8 +36,8 @@ class Pilot:
         found = opening.read(policy, limits)
         self.card = found.card
         self._network = Network(found)
-        self._write = Layout(self.card.observation).write
-        self._limit = DwellLimit(limits.chatter.dwell, limits, self.card.amplitude)
+        self._history = History(self.card.observation, self.card.window, self._network.row)
+        self._limit = DwellLimit(limits.dwell, limits, self.card.amplitude)
         self._angle = 0.0
         self._begun = False
         self.blind = 0.0
@@ -59,6 +59,7 @@ class Pilot:
         if not self._begun:
             self._begun = True
             self._limit.activate(observation.instruction_angle)
+        self._history.push(observation)
         if self.card.pictures and stack is None:
             self.blind += observation.dt
             angle = 0.0 if self.waits else self._angle
@@ -70,7 +71,6 @@ class Pilot:
 
     def _chosen(self, observation: Observation, stack: Stack | None) -> float:
         network = self._network
-        self._write(observation, network.row)
         if self.card.pictures and stack is not None:
             self._show(stack)
         action = network.run()

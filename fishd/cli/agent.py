@@ -150,7 +150,7 @@ class _Swim:
                 echo("no frames: the fish waits at neutral", err=True)
             elif waited and not pilot.waits:
                 echo("frames are back: it swims on", err=True)
-            seen, lost = link.step(angle)
+            seen, lost, _ = link.step(angle)
             self.swum = seen.time - begun
             self._angles.append(abs(seen.instruction_angle))
             self._lost += lost

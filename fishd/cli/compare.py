@@ -260,7 +260,9 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
     table.add_column("contestant", overflow="fold")
     heads = ["efficiency"] if simulated else []
     heads += ["lowest – highest"] if several else []
-    for head in (*heads, f"m{unit}", "Hz", "|φ_c|/Φ", "square"):
+    metered = all(standing.thrust_per_watt is not None for standing in standings)
+    costs = ["W", f"m{unit}/W"] if metered else []
+    for head in (*heads, f"m{unit}", *costs, "Hz", "|φ_c|/Φ", "square"):
         table.add_column(head, justify="right", no_wrap=True)
     for standing in standings:
         cells = [f"{standing.efficiency:.1%}"] if simulated else []
@@ -272,11 +274,19 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
             standing.contestant,
             *cells,
             f"{standing.thrust * 1e3:.2f}{error}",
+            *(_costs(standing) if metered else []),
             f"{standing.frequency:.3f}",
             f"{standing.fullness:.3f}",
             f"{standing.squareness:.3f}",
         )
     return table
+
+
+def _costs(standing: "Standing") -> list[str]:
+    """Power, and what each watt gave."""
+    gave, error = standing.thrust_per_watt or 0.0, standing.thrust_per_watt_error
+    interval = "" if error is None else f" ± {error * 1e3:.2f}"
+    return [f"{standing.power or 0.0:.3f}", f"{gave * 1e3:.2f}{interval}"]
 
 
 def _of_simulated(standings: "list[Standing]") -> str | None:

@@ -13,7 +13,7 @@ from fishd.cli.output import echo, echo_rows, made_printable, measured, print_js
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core.addresses import ENDPOINT_VARIABLE
-from fishd.core.console import thrust_words
+from fishd.core.console import power_words, thrust_words
 from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
 from fishd.core.schema import Field, nearest
@@ -206,6 +206,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
         *_swum(status),
+        *([("leak", f"{status.leak:.3g} s, found")] if status.leak is not None else []),
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
@@ -222,6 +223,8 @@ def _swum(status: Status) -> list[tuple[str, str]]:
     rows = [("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz")]
     if status.thrust_error is None and not status.sensor_lost:
         rows.append(("", _ZERO))
+    if status.power is not None:
+        rows.append(("power", f"{power_words(status.power)} into the servo, mean of 2 s"))
     return rows
 
 

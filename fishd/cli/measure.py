@@ -13,7 +13,7 @@ from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core import text
-from fishd.core.console import INTERRUPTED
+from fishd.core.console import INTERRUPTED, power_words
 from fishd.core.interruption import interrupted_once
 
 if TYPE_CHECKING:
@@ -127,4 +127,16 @@ def _measure(
 def _line(found: "Measured") -> str:
     what = f"{found.controller} {spelled(dict(found.parameters))}".rstrip()
     thrust = f"{found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} m{text.quoted(found.unit)}"
-    return f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"
+    line = f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"
+    return line + _power(found)
+
+
+def _power(found: "Measured") -> str:
+    """What the servo took, where that is known, and what a watt of it gave."""
+    from fishd.lab.objective import per_watt
+
+    gave, error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
+    if gave is None or error is None or not found.watts:
+        return ""
+    unit = f"m{text.quoted(found.unit)}"
+    return f"; {power_words(found.watts)}, {gave * 1e3:.2f} ± {error * 1e3:.2f} {unit} per W"

@@ -4,8 +4,9 @@ import contextlib
 import time
 from collections.abc import Iterator
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 import msgspec
@@ -28,7 +29,9 @@ from fishd.core.schema import Field, nearest
 from fishd.simulation import simulate
 
 if TYPE_CHECKING:
+    from fishd.lab.optimise.aim import Aim
     from fishd.lab.optimise.folder import SearchFolder
+    from fishd.lab.optimise.least_power import LeastPower
     from fishd.lab.optimise.search import Proposal, Range, Search
     from fishd.lab.optimise.trials import Trial
     from fishd.lab.rig import Rig
@@ -44,6 +47,18 @@ def optimise_options(function: Any) -> Any:
             type=click.Path(path_type=Path),
             help="Where table, recordings and picture go; a search that began in it is gone on "
             "with. [default: runs/optimise-DATE-TIME]",
+        ),
+        click.option(
+            "--at-least",
+            type=click.FloatRange(min=0.0, min_open=True),
+            metavar="MN",
+            help="A thrust [mN]: search what gives it for the least power.",
+        ),
+        click.option(
+            "--objective",
+            type=click.Choice(["thrust", "thrust-per-watt"]),
+            help="What is to be the most; with a watt, of the servo's electrical power. "
+            "[default: thrust]",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the search."),
         click.option(
@@ -100,6 +115,8 @@ def _optimise(
     budget: float,
     until: float,
     seed: int,
+    objective: Literal["thrust", "thrust-per-watt"] | None,
+    at_least: float | None,
     folder: Path | None,
     endpoint: str | None,
     as_json: bool,
@@ -107,16 +124,20 @@ def _optimise(
     from fishd.lab import drawing
     from fishd.lab.begun import owned
     from fishd.lab.measurement import REST
+    from fishd.lab.optimise.aim import Aim
     from fishd.lab.optimise.folder import Begun, SearchFolder, draw
-    from fishd.lab.optimise.search import Search
+    from fishd.lab.optimise.least_power import LeastPower
     from fishd.lab.optimise.trials import lengths
 
     drawing.check_installed()
+    if objective and at_least:
+        raise click.UsageError("--objective and --at-least: each is an aim of its own, give one")
+    aim = Aim(objective or "thrust", at_least * 1e-3 if at_least else None)
     refuse_other(on, {"--config": file, "--set": overrides}, {})
     path = folder or Path("runs") / f"optimise-{datetime.now():%Y%m%d-%H%M%S}"
     with _fish(on, file, overrides, endpoint) as (rig, config):
         ranges = [_range(text, name, parameters, rig) for text in over]
-        search = Search(ranges, seed)
+        search = aim.search(ranges, seed)
         if on == "simulation":
             for end in ("low", "high"):
                 ends = {each.name: getattr(each, end) for each in ranges}
@@ -127,12 +148,12 @@ def _optimise(
             )
         searched = {each.name: (each.low, each.high) for each in ranges}
         unit = rig.unit
-        begun = Begun(on, name, parameters, searched, seed, config, unit)
+        begun = Begun(on, name, parameters, searched, seed, config, unit, aim.objective, aim.target)
         with owned(path, "search"):
             run = SearchFolder(path, begun)
-            task = _Task(name, parameters, search, budget, until)
-            whole, last, thinking = _measured(task, rig, run, unit, as_json)
-    if last is None:
+            task = _Task(name, parameters, search, budget, until, aim)
+            whole, measured, thinking = _measured(task, rig, run, unit, as_json)
+    if not measured:
         if whole:
             raise ParameterError(f"a budget of {budget:g} s is too short for the first candidate")
         echo(f"fishctl: stopped before the first candidate; to go on: {again(path)}", err=True)
@@ -140,11 +161,11 @@ def _optimise(
     try:
         with interrupted_once():
             found = search.proposal()
-            optimum = optimum_of(name, search.trials, last, found)
+            optimum = optimum_of(name, measured, search, found, aim)
             if on == "simulation":
                 swum = simulate(load(file, overrides), name, {**parameters, **found.parameters})
                 truth = {"true_thrust": swum.mean_thrust, "efficiency": swum.efficiency}
-                optimum = replace(optimum, **truth)
+                optimum = replace(optimum, **truth, true_power=swum.mean_power)
                 warn_of_fin(swum.fin_amplitude)
             else:
                 optimum = replace(optimum, thinking=thinking)
@@ -158,7 +179,12 @@ def _optimise(
                 print_json(optimum)
             else:
                 say(optimum, unit, units, path)
-            pictures = draw(path, search, found, units, unit)
+            shown = (
+                search.alike((one.parameters, one.power, one.power_error) for one in measured)
+                if isinstance(search, LeastPower)
+                else search
+            )
+            pictures = draw(path, shown, found, units, _label(aim, unit))
             if not as_json:
                 echo(f"picture: {pictures[0]}, and as {pictures[1].suffix[1:].upper()}")
     except KeyboardInterrupt:
@@ -185,9 +211,10 @@ class _Task(NamedTuple):
 
     controller: str
     fixed: dict[str, Any]
-    search: "Search"
+    search: "Search | LeastPower"
     budget: float
     until: float
+    aim: "Aim"
 
     def is_done(self, found: "Proposal") -> bool:
         return self.search.is_warm and found.improvement <= self.until
@@ -195,10 +222,10 @@ class _Task(NamedTuple):
 
 def _measured(
     task: _Task, rig: "Rig", run: "SearchFolder", unit: str, err: bool
-) -> "tuple[bool, Trial | None, float]":
+) -> "tuple[bool, list[Trial], float]":
     """Measure candidates until it is done, after those that are there.
 
-    Returns False where a signal ended it before, the last candidate, and how long the fish of a
+    Returns False where a signal ended it before, all candidates, and how long the fish of a
     robot waited for the next one [s].
     """
     from fishd.lab.optimise.trials import trials
@@ -206,15 +233,17 @@ def _measured(
 
     search = task.search
     for each in run.done:
-        search.observe(each.parameters, each.thrust, each.error)
-    last = run.done[-1] if run.done else None
+        task.aim.observe(search, each)
+    measured = list(run.done)
+    last = measured[-1] if measured else None
+    observe = partial(task.aim.observe, search)
     before = last.passed if last else 0.0
     whole = True
     begin = time.monotonic()
     if last:
         echo(f"{run.path}: {counted(len(run.done), 'candidate')} there already", err=err)
     if last and task.is_done(search.proposal()):
-        return whole, last, 0.0
+        return whole, measured, 0.0
     try:
         with (
             interrupted_once(),
@@ -223,20 +252,29 @@ def _measured(
             showing(task.budget, "s", err=err) as show,
         ):
             show.at(before)
-            for each in trials(rig, task.controller, task.fixed, search, task.budget, last):
+            for each in trials(
+                rig, task.controller, task.fixed, search, task.budget, last, observe
+            ):
                 run.keep(each)
-                last = each
+                measured.append(each)
                 found = search.proposal()
                 shown = found if search.is_warm else None
-                show.done(told(search.trials, last, shown, unit), last.passed)
+                show.done(told(search.trials, each, shown, unit), each.passed)
                 if task.is_done(found):
                     break
     except KeyboardInterrupt:
         whole = False
     except (Disturbed, NoDaemon) as error:
         raise FishdError(f"{error}; to go on: {again(run.path)}") from None
-    waited = time.monotonic() - begin - ((last.passed if last else 0.0) - before)
-    return whole, last, max(0.0, waited)
+    waited = time.monotonic() - begin - ((measured[-1].passed if measured else 0.0) - before)
+    return whole, measured, max(0.0, waited)
+
+
+def _label(aim: "Aim", unit: str) -> str:
+    """Of the picture's axis."""
+    if aim.target is not None:
+        return "power (mW)"
+    return f"thrust (m{unit})" if aim.objective == "thrust" else f"thrust per watt (m{unit}/W)"
 
 
 @contextlib.contextmanager

@@ -1,14 +1,19 @@
 """What `fishctl optimise` says: each candidate as it was measured, and the best in the end."""
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
 from fishd.cli.output import counted, echo
+from fishd.core.console import power_words
 
 if TYPE_CHECKING:
-    from fishd.lab.optimise.search import Proposal
+    from fishd.lab.optimise.aim import Aim
+    from fishd.lab.optimise.least_power import LeastPower
+    from fishd.lab.optimise.search import Proposal, Search
     from fishd.lab.optimise.trials import Trial
 
 
@@ -25,17 +30,30 @@ class Optimum(Struct, frozen=True):
     error: float
     """Half of its 95 % interval [N]."""
     improvement: float
-    """Expected of another trial, as a share of the thrust."""
+    """Expected of another trial, as a share of what is searched."""
     trials: int
     ticks_swum: int
     seconds: float
     """In the tank, rest included [s]."""
+    objective: str = "thrust"
+    target: float | None = None
+    """The thrust that was to be reached [N]."""
+    power: float | None = None
+    """Electrical power of the servo [W]; null where it is not known."""
+    power_error: float | None = None
+    """Half of its 95 % interval [W]."""
+    thrust_per_watt: float | None = None
+    """[N/W]"""
+    thrust_per_watt_error: float | None = None
+    """Half of its 95 % interval [N/W]."""
     thinking: float | None = None
     """How long the fish of a robot waited besides while candidates were chosen, this time [s]."""
     true_thrust: float | None = None
     """There, of a simulated fish [N]."""
     efficiency: float | None = None
     """That over the thrust of the best square wave."""
+    true_power: float | None = None
+    """There, of a simulated servo [W]."""
 
 
 def told(number: int, trial: "Trial", best: "Proposal | None", unit: str) -> str:
@@ -47,6 +65,8 @@ def told(number: int, trial: "Trial", best: "Proposal | None", unit: str) -> str
         f"{number}: {_spelled(trial.parameters)}: {trial.thrust * 1e3:.2f} ± "
         f"{trial.error * 1e3:.2f} m{unit}"
     )
+    if math.isfinite(trial.power):
+        measured += f" for {power_words(trial.power)}"
     if best is None:
         return measured
     more = f"another may give {best.improvement:.1%} more"
@@ -57,17 +77,41 @@ def _spelled(parameters: dict[str, float]) -> str:
     return " ".join(f"{name}={value:.4g}" for name, value in parameters.items())
 
 
-def optimum_of(name: str, trials: int, last: "Trial", found: "Proposal") -> Optimum:
-    """last: of these trials"""
+def optimum_of(
+    name: str,
+    measured: "Sequence[Trial]",
+    search: "Search | LeastPower",
+    found: "Proposal",
+    aim: "Aim",
+) -> Optimum:
+    """What a search found; measured: all that it knows of"""
+    from fishd.lab.objective import per_watt
+
+    last = measured[-1]
+    force = [(each.parameters, each.thrust, each.error) for each in measured]
+    thrust, error = search.alike(force).expected(found.parameters)
+    power = power_error = None
+    if all(math.isfinite(each.power) for each in measured):
+        taken = [(each.parameters, each.power, each.power_error) for each in measured]
+        power, power_error = search.alike(taken).expected(found.parameters)
+    gives, gives_error = per_watt(thrust, error, power, power_error)
+    if aim.objective == "thrust-per-watt" and aim.target is None:
+        gives, gives_error = found.value, found.error
     return Optimum(
         controller=name,
         parameters=found.parameters,
         low=found.low,
         high=found.high,
-        thrust=found.thrust,
-        error=found.error,
+        thrust=thrust,
+        error=error,
         improvement=found.improvement,
-        trials=trials,
+        trials=len(measured),
+        objective=aim.objective if aim.target is None else "least-power",
+        target=aim.target,
+        power=power,
+        power_error=power_error,
+        thrust_per_watt=gives,
+        thrust_per_watt_error=gives_error,
         ticks_swum=last.swum,
         seconds=last.passed,
     )
@@ -80,10 +124,19 @@ def say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
         interval = f"[{found.low[name]:.4g}, {found.high[name]:.4g}]"
         echo(f"best {name} of {found.controller}: {value:.4g}{symbol} {interval}")
     echo(f"thrust there: {found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} m{unit}")
-    if found.true_thrust is not None:
+    if found.power is not None and found.power_error is not None:
+        gives, error = found.thrust_per_watt or 0.0, found.thrust_per_watt_error or 0.0
         echo(
-            f"true thrust there: {found.true_thrust * 1e3:.2f} mN, {found.efficiency:.1%} of the "
-            "best square wave"
+            f"power there: {found.power * 1e3:.0f} ± {found.power_error * 1e3:.0f} mW, "
+            f"{gives * 1e3:.2f} ± {error * 1e3:.2f} m{unit} per W"
+        )
+    if found.target is not None and found.thrust < found.target:
+        echo(f"fishctl: no parameters are known that give {found.target * 1e3:g} m{unit}", err=True)
+    if found.true_thrust is not None:
+        taking = "" if found.true_power is None else f" for {power_words(found.true_power)}"
+        echo(
+            f"true thrust there: {found.true_thrust * 1e3:.2f} mN{taking}, "
+            f"{found.efficiency:.1%} of the best square wave"
         )
     thinking = "" if found.thinking is None else f"; {found.thinking:.0f} s of thinking besides"
     echo(

@@ -12,6 +12,7 @@ from fishd.cli.free_swim_options import SETTLE, SwimmerOptions, swimmer_options
 from fishd.cli.options import ControllerGroup, json_option
 from fishd.cli.output import echo, echo_rows, print_json, spelled, warn_of_fin
 from fishd.config import Config, load
+from fishd.core.console import power_words
 from fishd.core.errors import MissingPackage
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
         ),
         *_chosen(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
+        *_power(report),
         ("frequency", f"{report.frequency:.3f} Hz{_half_beats(report, config.tick)}"),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
         (
@@ -147,6 +149,14 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
             f"{report.real_time_factor:.0f} × real time",
         ),
     ]
+
+
+def _power(report: "Report") -> list[tuple[str, str]]:
+    """Into the servo, by its loss model; and what a watt of it gives."""
+    if not report.mean_power:
+        return []
+    per_watt = report.mean_thrust * 1e3 / report.mean_power
+    return [("power", f"{power_words(report.mean_power)} into the servo: {per_watt:.3g} mN per W")]
 
 
 def _until(report: "Report", settle: float) -> str:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from fishd.cli.output import measured, spelled, time_of_day
 from fishd.core import text
-from fishd.core.console import thrust_words
+from fishd.core.console import power_words, thrust_words
 from fishd.core.signals import Event, Status, Tick
 
 SPAN = 5.0
@@ -121,10 +121,11 @@ class View:
             thrust=tick.thrust,
             thrust_error=None if tick.thrust_error is UNSET else tick.thrust_error,
         )
-        speed = tick.speed
+        speed, power = tick.speed, self.status.power
         figures = {
             **({"speed": f"{speed * 1e3:.1f} mm/s"} if isinstance(speed, float) else {}),
             "thrust": thrust_words(known),
+            **({} if power is None else {"power": power_words(power)}),
             "tail beat": f"{tick.frequency:.2f} Hz",
             **({} if self.status.robot == "swimmer" else self._timing()),
             "lost": f"{self._lost}",

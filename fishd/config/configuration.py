@@ -3,6 +3,7 @@
 Each section is a struct of the part that it configures; this module only puts them together.
 """
 
+import math
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,16 +16,22 @@ from fishd.config import consistency as config_checks
 from fishd.config import drivers
 from fishd.config.overrides import apply_overrides
 from fishd.control.estimators.base import EstimatorSettings
-from fishd.controllers.base import ChatterSettings, Limits
+from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, leaves, note, unit, without_empty_sections
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 from fishd.hardware.servo.pigpio import PigpioSettings
-from fishd.hardware.settings import ForceSensorSettings, PanelSettings, ServoSettings
+from fishd.hardware.settings import (
+    ForceSensorSettings,
+    PanelSettings,
+    PowerMeterSettings,
+    ServoSettings,
+)
 from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.plant.dwell import shortest_dwell
 from fishd.virtual.plant.parameters import PlantParameters
 
 SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
@@ -156,6 +163,13 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     servo: Annotated[ServoSettings, note("The tail servo; not for a simulated fish.")] = (
         PigpioSettings(driver="pigpio")
     )
+    power_meter: Annotated[
+        PowerMeterSettings | None,
+        note(
+            "The power meter of the servo, where there is one; null without. Not for a simulated "
+            "fish, whose servo has a model."
+        ),
+    ] = None
     panel: Annotated[
         PanelSettings, note("E-stop button and status light, where there are any.")
     ] = PanelSettings()
@@ -184,6 +198,11 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return self.robot in ("pi", "virtual-pi")
 
     @property
+    def driver_settings(self) -> drivers.Chosen:
+        """What its sections of drivers say."""
+        return drivers.Chosen(self.force_sensor, self.servo, self.power_meter)
+
+    @property
     def limits(self) -> Limits:
         """What controllers must respect."""
         return Limits(
@@ -191,9 +210,23 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             tick=self.tick,
             scaled=self.estimator.kind != "lateral_force",
             virtual=self.lockstep or self.robot == "swimmer",
+            dwell=self._dwell,
             chatter=self.chatter,
             tethered=self.robot != "swimmer",
+            thrust_coefficient=(
+                self.plant.thrust_coefficient if self.estimator.kind == "observer" else None
+            ),
         )
+
+    @property
+    def _dwell(self) -> float:
+        """Shortest time between two reversals of a policy [s]."""
+        if self.chatter.dwell != "auto":
+            return self.chatter.dwell
+        if self.robot == "swimmer":  # whose muscles are no servo
+            return DWELL
+        shortest = min(shortest_dwell(self.plant, self.amplitude_limit), LONGEST_DWELL)
+        return round(math.ceil(shortest / self.tick - 1e-9) * self.tick, 9)
 
 
 def service_file() -> Path | None:
@@ -239,12 +272,13 @@ def _check(config: Config) -> None:
     checks = config_checks
     checks.check_start(config.start.controller, config.start.parameters, config.limits)
     checks.check_addresses(config.telemetry.address, config.control.address)
-    sensor, servo = config.force_sensor, config.servo
-    drivers.check_drivers(config.robot, config.tick, sensor, servo)
+    servo = config.servo
+    drivers.check_drivers(config.robot, config.tick, config.driver_settings)
     checks.check_neutral(servo)
     drivers.check_plant(config.plant)
     checks.check_pulses(servo, config.amplitude_limit)
-    checks.check_pins(drivers.claims_of(sensor, servo), config.panel)
+    checks.check_i2c_addresses(config.driver_settings.sections())
+    checks.check_pins(drivers.claims_of(config.driver_settings), config.panel)
     checks.check_lockstep(config.robot, config.lockstep)
     checks.check_estimator(config.robot, config.estimator.kind, config.plant)
     checks.check_virtual_pi(config.virtual_pi)

@@ -115,6 +115,21 @@ def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> N
             raise Problem((section, key), f"GPIO {pin} is taken by {by} already")
 
 
+def check_i2c_addresses(settings: Mapping[str, Any]) -> None:
+    """No two chips have the same address. settings: of the drivers, by their sections"""
+    taken: dict[tuple[int, int], str] = {}
+    for section, each in settings.items():
+        bus, address = (getattr(each, key, None) for key in ("bus", "address"))
+        if isinstance(bus, int) and isinstance(address, int):
+            by = taken.setdefault((bus, address), section)
+            if by != section:
+                raise Problem(
+                    (section, "address"),
+                    f"{address:#04x} on /dev/i2c-{bus} is that of {by} already: each chip needs "
+                    "an address of its own",
+                )
+
+
 def check_lockstep(robot: str, lockstep: bool) -> None:
     """Lockstep needs a simulated fish: only its time can stand still."""
     if lockstep and robot == "swimmer":

@@ -1,4 +1,4 @@
-"""The sections whose keys depend on a name in them: `force_sensor`, `servo` and `plant`.
+"""The sections whose keys depend on a name: `force_sensor`, `servo`, `power_meter` and `plant`.
 
 The name is that of a driver, or of the plant that swims; packages beside fishd may offer others.
 """
@@ -18,9 +18,9 @@ from fishd.core.plugins import Plugins
 from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest, shown
 from fishd.hardware.driver import Claim, Driver
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
+from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS
 from fishd.hardware.servo.pigpio import PigpioSettings
-from fishd.hardware.settings import ForceSensorSettings, ServoSettings
+from fishd.hardware.settings import ForceSensorSettings, PowerMeterSettings, ServoSettings
 from fishd.virtual.plant.parameters import TETHERED, PlantParameters
 from fishd.virtual.plant.registry import PLANTS
 
@@ -30,9 +30,10 @@ class Choice(NamedTuple):
 
     plugins: Plugins[Any]
     """Where it is found by name."""
-    default: str
+    default: str | None
+    """None: the section may be left out."""
     settings: type[Struct]
-    """The keys with the default."""
+    """The keys with the default; without one, those that all have."""
     key: str
     """The key that names it."""
     page: str
@@ -44,9 +45,24 @@ CHOICES = {
         FORCE_SENSORS, "ads1115", Ads1115Settings, "driver", "writing-a-driver.md"
     ),
     "servo": Choice(SERVOS, "pigpio", PigpioSettings, "driver", "writing-a-driver.md"),
+    "power_meter": Choice(POWER_METERS, None, PowerMeterSettings, "driver", "writing-a-driver.md"),
     "plant": Choice(PLANTS, TETHERED, PlantParameters, "model", "writing-a-plant.md"),
 }
 """By section."""
+VIRTUAL_PI = {"force_sensor": "ads1115", "servo": "pigpio", "power_meter": "ina219' or 'ina226"}
+"""What a virtual Pi has, by their drivers."""
+
+
+class Chosen(NamedTuple):
+    """The settings of each section, of its driver."""
+
+    force_sensor: ForceSensorSettings
+    servo: ServoSettings
+    power_meter: PowerMeterSettings | None
+
+    def sections(self) -> dict[str, Any]:
+        """Those that there are, by name."""
+        return {name: found for name, found in self._asdict().items() if found is not None}
 
 
 def convert_sections(
@@ -96,22 +112,20 @@ def keys() -> list[str]:
     ]
 
 
-def check_drivers(
-    robot: str, tick: float, sensor: ForceSensorSettings, servo: ServoSettings
-) -> None:
+def check_drivers(robot: str, tick: float, chosen: Chosen) -> None:
     """What each driver itself demands of its settings, and that the robot has its hardware.
 
     tick: period of the loop [s]
     """
     if robot in ("simulated", "swimmer"):  # whose loop may be faster than any hardware
         tick = math.inf
-    for section, settings in (("force_sensor", sensor), ("servo", servo)):
+    for section, settings in chosen.sections().items():
         driver: type[Driver[Any]] = driver_of(section, settings.driver)
         if robot == "virtual-pi" and not driver.on_virtual_pi:
             raise Problem(
                 (section, "driver"),
-                f"'{settings.driver}' is not valid: the virtual Pi has an ADS1115 and pigpiod; "
-                f"'{CHOICES[section].default}' is needed",
+                f"'{settings.driver}' is not valid: the virtual Pi has an ADS1115, pigpiod and an "
+                f"INA219 or INA226; '{VIRTUAL_PI[section]}' is needed",
             )
         _check(section, settings.driver, partial(driver.check, settings, tick))
 
@@ -139,11 +153,11 @@ def _check(section: str, name: str, demands: Callable[[], None]) -> None:
         raise Problem((section,), what) from error
 
 
-def claims_of(sensor: ForceSensorSettings, servo: ServoSettings) -> dict[str, tuple[Claim, ...]]:
+def claims_of(chosen: Chosen) -> dict[str, tuple[Claim, ...]]:
     """What the drivers use alone, by their sections."""
     return {
         section: driver_of(section, settings.driver).claims(settings)
-        for section, settings in (("force_sensor", sensor), ("servo", servo))
+        for section, settings in chosen.sections().items()
     }
 
 
@@ -159,11 +173,13 @@ def _settings(section: str, name: str) -> type[Struct]:
 def _convert(section: str, data: Any, elsewhere: Callable[[], list[str]]) -> Any:
     plugins, default, _, key, _ = CHOICES[section]
     if data is None:
+        if default is None:
+            return None
         data = {}
     if not isinstance(data, Mapping):
         what = f"{shown(data)} is not valid: a section (a mapping of keys to values) is needed"
         raise Problem((section,), what)
-    name = data.get(key, default)
+    name = data.get(key, default) or None
     if not isinstance(name, str):
         raise Problem((section, key), f"one of {', '.join(plugins.names())} is needed")
     target = _settings(section, name)

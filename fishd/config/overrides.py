@@ -23,7 +23,9 @@ def _apply(data: dict[str, Any], override: str) -> tuple[str, ...]:
         raise ConfigError(f"--set {override}: write KEY=VALUE, such as plant.omega0=10")
     section = data
     for key in keys[:-1]:
-        section = section.setdefault(key, {})
+        if section.get(key) is None:
+            section[key] = {}
+        section = section[key]
         if not isinstance(section, dict):
             raise ConfigError(f"--set {override}: {key} is a single value, not a section")
     section[keys[-1]] = _value(text.strip(), dotted, override)

@@ -6,7 +6,7 @@ import msgspec
 from msgspec import Struct
 
 from fishd.control.reporting import Reporter
-from fishd.controllers.base import Controller, Limits
+from fishd.controllers.base import Controller, Likeness, Limits
 from fishd.controllers.hold import Hold, HoldParameters
 from fishd.controllers.quantities import quantities_of, values_of
 from fishd.core import text
@@ -27,8 +27,8 @@ class ActiveController:
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
         self.parameters = _plain(self.controller)
         """Its parameters, as JSON has them."""
-        self.wave = (self.name, self.parameters)
-        """The two, as another object after each change."""
+        self.wave = _wave(self.name, self.controller, self.parameters)
+        """Which kind of wave it makes, as another object after each change."""
         self.quantities: dict[str, float] = {}
         """Its own, as of its latest update; empty where it has none to show."""
         self.quantity_units: dict[str, str] = {}
@@ -42,7 +42,7 @@ class ActiveController:
         units = {each.name: each.unit for each in quantities_of(type(controller))}
         former, self.parameters = self.controller, _plain(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
-        self.wave = (name, self.parameters)
+        self.wave = _wave(name, controller, self.parameters)
         self.quantities, self.quantity_units = {}, units
         self.dispose(former, f"the controller before {name}")
 
@@ -78,7 +78,7 @@ class ActiveController:
         """Give it new, already checked parameters; raises what it raises."""
         contained(self.controller.retune, parameters)
         self.parameters = _plain(self.controller)
-        self.wave = (self.name, self.parameters)
+        self.wave = _wave(self.name, self.controller, self.parameters)
         self._reporter.controller("parameters", self.name, self.parameters)
 
     def warm_up(self) -> None:
@@ -103,6 +103,16 @@ def told(error: ControllerFault) -> tuple[str, Successor | None]:
         return contained(look)
     except Exception:
         return "controller-error", None
+
+
+def _wave(
+    name: str, controller: Controller[Any], parameters: dict[str, Any]
+) -> tuple[str, dict[str, Any]]:
+    """Waves that are equal are of one kind, though not always of one size."""
+    like = type(controller).swims_like
+    if not isinstance(like, Likeness):
+        return name, parameters
+    return like.name, {key: each for key, each in parameters.items() if key not in like.but_for}
 
 
 def _plain(controller: Controller[Any]) -> dict[str, Any]:

@@ -13,10 +13,12 @@ from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
 from fishd.control.estimators.base import Estimator
+from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.reporting import Publisher, Reporter
 from fishd.control.servo_output import ServoOutput
+from fishd.control.servo_power import ServoPower
 from fishd.control.statistics import Statistics
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits
@@ -42,6 +44,8 @@ class Turn(NamedTuple):
     measurement: Measurement
     observation: Observation
     marks: tuple[float, float, float]
+    power: float | None
+    """Mean electrical power of the servo since the previous tick, where it is known [W]."""
 
 
 class ControlLoop:
@@ -67,6 +71,7 @@ class ControlLoop:
         self.reporter = Reporter(clock, publisher)
         self.active = ActiveController(limits, self.reporter)
         self.servo = ServoOutput(robot, clock.monotonic)
+        self.power = ServoPower(robot, self.reporter, limits.tick)
         self.seq = 0
         """Number of the latest tick."""
         self.applied = 0.0
@@ -74,9 +79,12 @@ class ControlLoop:
         self.neutral_for = 0.0
         """How long the instruction angle has been zero [s]."""
         self.thrust = thrust
+        self.lateral_sign = LateralSign()
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self._estimator = estimator
+        self.found_leak = estimator.found_leak
+        """As of the estimator, at the latest tick [s]."""
         self._now = clock.monotonic
         self._notify = notify
         self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
@@ -112,10 +120,12 @@ class ControlLoop:
                 self._fail("controller-error", f"controller {name} cannot begin", error)
         self._attend_panel(slot)
         measurement = self._read(slot)
+        power = self.power.read(slot.deadline)
         read = self._now()
-        self.observation = observation = self._estimate(measurement, slot, dt)
-        self._follow_thrust(observation)
-        return Turn(slot, measurement, observation, (started, read, self._now()))
+        observation = self._follow_thrust(self._estimate(measurement, slot, dt))
+        self.observation = observation
+        self._watch_sign(observation)
+        return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
         """Second half of a tick: let the controller choose, drive the servo, publish."""
@@ -230,16 +240,31 @@ class ControlLoop:
             fx, fy, angle = measurement.fx, measurement.fy, self.applied
             return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
 
-    def _follow_thrust(self, observation: Observation) -> None:
-        """Only a display hangs on this: where it fails, it begins anew."""
+    def _follow_thrust(self, observation: Observation) -> Observation:
+        """Add what is known of the thrust; where that fails, it begins anew."""
         if self.supervisor.sensor_lost:
-            return
+            return observation
         try:
+            if self._estimator.found_leak != self.found_leak:
+                self.found_leak = self._estimator.found_leak
+                self.thrust.forget_factor()
             running = self.supervisor.mode is Mode.RUNNING
             self.thrust.update(observation, running, self.active.wave)
+            known = self.thrust.factor
         except ArithmeticError as error:
             self.reporter.problem("the thrust cannot be told, and is found anew", error)
             self.thrust.forget()
+            known = None
+        if known is None:
+            return observation
+        return replace(observation, thrust_factor=known[0], thrust_factor_error=known[1])
+
+    def _watch_sign(self, observation: Observation) -> None:
+        """Notice, when the tail sets off, that F_y is reversed."""
+        if self.supervisor.sensor_lost or not self.limits.tethered:
+            return
+        if self.lateral_sign.update(observation) and self.lateral_sign.reversed:
+            self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

@@ -88,9 +88,12 @@ class Reporter:
 
         now: the time after the servo was driven [s, monotonic]
         """
-        slot, measurement, observation, marks = turn
+        slot, measurement, observation, marks, power = turn
         thrust, error = loop.known_thrust
         extremes = measurement.extremes
+        swims = loop.supervisor.mode is Mode.RUNNING
+        factor = observation.thrust_factor if swims else None
+        factor_error = observation.thrust_factor_error if swims else None
         truth = loop.robot.truth() if loop.robot.truth else None
         course = truth.course if truth else None
         self._publisher.tick(
@@ -126,6 +129,10 @@ class Reporter:
                 y=course.y if course else UNSET,
                 speed=course.speed if course else UNSET,
                 heading=course.heading if course else UNSET,
+                thrust_factor=UNSET if factor is None else factor,
+                thrust_factor_error=UNSET if factor_error is None else factor_error,
+                power=UNSET if power is None else power,
+                leak=UNSET if loop.found_leak is None else loop.found_leak,
             )
         )
 

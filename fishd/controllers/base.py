@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 from msgspec import Meta, Struct
 
@@ -11,23 +11,22 @@ from fishd.core.errors import ParameterError
 from fishd.core.schema import note, unit
 from fishd.core.signals import Observation
 
-LONGEST_DWELL = 2.0
-"""[s]"""
+DWELL, LONGEST_DWELL = 0.2, 2.0
+"""Of a fish whose servo is that of Fu et al., and the longest there may be [s]."""
 
 
 class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What becomes of a policy that reverses too fast."""
 
     dwell: Annotated[
-        float,
+        Annotated[float, Meta(ge=0, le=LONGEST_DWELL)] | Literal["auto"],
         unit(
             "s",
             "Shortest time between two reversals of ppo, in whole ticks, rounded up; those that "
-            "would come sooner are held back. 0 holds none back.",
-            ge=0,
-            le=LONGEST_DWELL,
+            "would come sooner are held back. 0 holds none back; auto: what the servo of section "
+            "plant takes for a reversal.",
         ),
-    ] = 0.2
+    ] = "auto"
     patience: Annotated[
         float, unit("s", "Who insists on such reversals for so long loses command.", ge=0.2, le=600)
     ] = 2.0
@@ -51,10 +50,24 @@ class Limits(Struct, frozen=True):
     """The fin velocity is in rad/s, by the model of the fish, not up to an unknown scale."""
     virtual: bool = False
     """Time stands still while a controller thinks, so it may wait for others as long as it must."""
+    dwell: float = DWELL
+    """Shortest time between two reversals of a policy; 0 holds none back [s]."""
     chatter: ChatterSettings = ChatterSettings()
-    """What becomes of a policy that reverses too fast."""
+    """What becomes of a policy that reverses too fast; the dwell that holds is the one above."""
     tethered: bool = True
     """The fish hangs from its force sensor, so that F_x is its thrust."""
+    thrust_coefficient: float | None = None
+    """K of the fish that the observer believes in: thrust over the mean square of its fin velocity
+    [N s²/rad²]; None where the fin velocity is of no model."""
+
+
+class Likeness(NamedTuple):
+    """Of the wave of a controller to that of another one."""
+
+    name: str
+    """Of the other one."""
+    but_for: frozenset[str]
+    """Parameters that the other one has not, and that are not of the kind of wave."""
 
 
 P = TypeVar("P", bound=Struct)
@@ -70,6 +83,8 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[Struct]]
+    swims_like: ClassVar[Likeness | None] = None
+    """What is known of the thrust of that other controller's wave holds for this one's, too."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Raises TypeError where its quantities cannot be shown."""

@@ -1,6 +1,7 @@
 """Holds back reversals that come too soon, and gives command away where a policy insists on them.
 
-`ppo` and `remote` pass their commands through it; `swing` and the waveforms do not.
+`ppo` and `remote` pass their commands through it, and whoever learns; `swing` and the waveforms do
+not.
 """
 
 import math
@@ -18,34 +19,28 @@ MOST = 0.5
 _ROUNDING = 1e-3  # in ticks; a sum of ticks is not exact
 
 
-class DwellLimit:
+class Dwell:
     """Lets a command change its side of neutral no sooner than the dwell after it last did.
 
     Within a side it may do what it likes. What is held back stays at the angle of before, or goes
     to neutral where it wants to rest there.
     """
 
-    def __init__(self, dwell: float, limits: Limits, amplitude: float) -> None:
-        """Builds who may take over, so that no tick has to.
-
-        dwell: the shortest time between two reversals [s]; 0 holds nothing back
-        amplitude: Φ of the controller that is limited, and of the one that may take over [rad]
+    def __init__(self, dwell: float, tick: float, amplitude: float) -> None:
         """
-        settings = limits.chatter
+        dwell: the shortest time between two reversals [s]; 0 holds nothing back
+        tick: period of the loop [s]
+        amplitude: Φ of who is limited [rad]
+        """
         self.dwell = dwell
-        self._tick = limits.tick
+        self.held = False
+        """Was a reversal held back, in the latest tick?"""
+        self._tick = tick
         self._resting = RESTING * amplitude
-        self._patience = max(1, round(settings.patience / limits.tick))
-        self._successor: tuple[str, Controller[Any]] | None = None
-        if settings.fallback == "swing":
-            self._successor = "swing", Swing(SwingParameters(amplitude=amplitude), limits)
         self._angle = 0.0
         self._side = 0.0
         self._elapsed = 0.0
         """Since the last reversal [s]."""
-        self._held: deque[bool] = deque()
-        """Was a reversal held back? Of the latest ticks."""
-        self._count = 0
 
     def activate(self, angle: float) -> None:
         """Begin at the present angle [rad], as if the tail had reversed just now."""
@@ -53,24 +48,55 @@ class DwellLimit:
         self._side = math.copysign(1.0, angle) if angle else 0.0
 
     def apply(self, angle: float, dt: float) -> float:
-        """The angle to command [rad], `dt` s after the one before.
+        """The angle to command [rad], `dt` s after the one before."""
+        self._elapsed += dt
+        self.held = False
+        if not (self.dwell and math.isfinite(angle)):
+            return angle
+        side = math.copysign(1.0, angle) if angle else self._side
+        if side != self._side:
+            if self._side and self._elapsed < self.dwell - _ROUNDING * self._tick:
+                self.held = abs(angle) > self._resting
+                angle = self._angle if self.held else 0.0
+            else:
+                self._side, self._elapsed = side, 0.0
+        self._angle = angle
+        return angle
+
+
+class DwellLimit(Dwell):
+    """A dwell that loses patience with who insists on reversals that it holds back."""
+
+    def __init__(self, dwell: float, limits: Limits, amplitude: float) -> None:
+        """Builds who may take over, so that no tick has to.
+
+        dwell: as for `Dwell`
+        amplitude: Φ of the controller that is limited, and of the one that may take over [rad]
+        """
+        super().__init__(dwell, limits.tick, amplitude)
+        settings = limits.chatter
+        self._patience = max(1, round(settings.patience / limits.tick))
+        self._successor: tuple[str, Controller[Any]] | None = None
+        if settings.fallback == "swing":
+            self._successor = "swing", Swing(SwingParameters(amplitude=amplitude), limits)
+        self._held: deque[bool] = deque()
+        """`held`, of the latest ticks."""
+        self._count = 0
+
+    @property
+    def share(self) -> float:
+        """In what share of the latest ticks, as many as patience has, a reversal was held back."""
+        return self._count / self._patience
+
+    def apply(self, angle: float, dt: float) -> float:
+        """As `Dwell.apply`.
 
         Raises `ControllerFault` with the code `chatter`, and who takes over if anyone does, once
         reversals were held back for too long.
         """
-        self._elapsed += dt
-        if not (self.dwell and math.isfinite(angle)):
-            return angle
-        side = math.copysign(1.0, angle) if angle else self._side
-        held = False
-        if side != self._side:
-            if self._side and self._elapsed < self.dwell - _ROUNDING * self._tick:
-                held = abs(angle) > self._resting
-                angle = self._angle if held else 0.0
-            else:
-                self._side, self._elapsed = side, 0.0
-        self._angle = angle
-        self._watch(held)
+        angle = super().apply(angle, dt)
+        if self.dwell and math.isfinite(angle):
+            self._watch(self.held)
         return angle
 
     def _watch(self, held: bool) -> None:

@@ -32,6 +32,7 @@ _found: Plugins[Controller[Any]] = Plugins(
         "sine": "fishd.controllers.waveform:Sine",
         "triangle": "fishd.controllers.waveform:Triangle",
         "swing": "fishd.controllers.swing:Swing",
+        "thrust": "fishd.controllers.thrust:Thrust",
         "excitation": "fishd.controllers.excitation:Excitation",
         "ppo": "fishd.controllers.policy.controller:Ppo",
         "remote": "fishd.controllers.remote.controller:Remote",

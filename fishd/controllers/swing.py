@@ -1,6 +1,5 @@
 """`swing`: reverse when the fin slows down. The paper's model-free control (Fu et al.)."""
 
-from collections import deque
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
@@ -8,21 +7,16 @@ from msgspec import Meta, Struct
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
 from fishd.controllers.criterion_search import BEGIN, LADDER, CriterionSearch, Phase, Rung
 from fishd.controllers.quantities import quantity
+from fishd.controllers.reversal import Reversal
 from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
-
-REFRACTORY = 0.05
-"""Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
-
 
 LONGEST_TICK = 0.15
 """Of C auto: with longer ones a half beat has two or three, and its ripple cannot be told [s]."""
 BLIND = 4
 """With a lead, so many half beats come first that C = 0.6 ends: the speed of a fin that only begins
 to swing is not foreseen."""
-SLOPE_OVER = 0.05
-"""The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
 
 
 class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,14 +76,9 @@ class Swing(Controller[SwingParameters]):
 
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
-        self._direction = 1.0
-        self._top_speed = 0.0  # since the last reversal
-        self.top_speed = 0.0
-        self.reversal_speed = 0.0
-        self.since_reversal = 0.0
-        ticks = max(1, round(SLOPE_OVER / limits.tick))
-        self._velocities: deque[float] = deque(maxlen=ticks + 1)
+        self._reversal = Reversal(limits)
         self._reversals = 0 if parameters.lead else BLIND
+        self._show()
         self._search: CriterionSearch | None = None
         self.retune(parameters)
 
@@ -130,36 +119,22 @@ class Swing(Controller[SwingParameters]):
 
     def activate(self, observation: Observation) -> None:
         """Push on towards the side of the present angle; from rest, towards plus."""
-        self._direction = 1.0 if observation.instruction_angle >= 0 else -1.0
+        self._reversal.begin(observation.instruction_angle)
 
     def update(self, observation: Observation) -> float:
         """Plus or minus the amplitude [rad]."""
         rung = self._rung(observation)
-        self.since_reversal += observation.dt
-        parameters = self.parameters
-        speed = self._direction * self._ahead(observation, rung.lead)
-        slowed = self._top_speed > 0.0 and speed <= rung.C * self._top_speed
-        self._top_speed = max(self._top_speed, speed)
-        settled = self.since_reversal > REFRACTORY * parameters.longest_half_period
-        # Half a tick early is nearer to the longest half period than half a tick late.
-        overdue = self.since_reversal + 0.5 * self.limits.tick > parameters.longest_half_period
-        reverses = (slowed and settled) or overdue
-        if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
-            self.top_speed = self._top_speed
-        if reverses:
-            self._direction = -self._direction
-            self._top_speed = 0.0
-            self.since_reversal = 0.0
-            self._reversals += 1
-        self.reversal_speed = rung.C * self.top_speed
-        return self._direction * amplitude_of(parameters, self.limits)
+        longest = self.parameters.longest_half_period
+        before = self._reversal.direction
+        self._reversal.update(observation, rung.C, rung.lead, longest)
+        self._reversals += self._reversal.direction != before
+        self._show()
+        return self._reversal.direction * amplitude_of(self.parameters, self.limits)
 
-    def _ahead(self, observation: Observation, lead: float) -> float:
-        """The fin velocity `lead` s from now, if it goes on changing as it does."""
-        self._velocities.append(observation.fin_velocity)
-        change = self._velocities[-1] - self._velocities[0]
-        elapsed = observation.dt * max(1, len(self._velocities) - 1)
-        return observation.fin_velocity + lead * change / elapsed
+    def _show(self) -> None:
+        self.top_speed = self._reversal.top_speed
+        self.reversal_speed = self._reversal.reversal_speed
+        self.since_reversal = self._reversal.since_reversal
 
     def _rung(self, observation: Observation) -> Rung:
         """When to reverse: as the parameter says, or as the search has found."""
@@ -167,7 +142,7 @@ class Swing(Controller[SwingParameters]):
             foresees = self._reversals >= BLIND
             return Rung(self.parameters.C, self.parameters.lead) if foresees else LADDER[BEGIN]
         assert self._search
-        self._search.update(observation.fx, observation.dt, self._direction)
+        self._search.update(observation.fx, observation.dt, self._reversal.direction)
         rung = self._search.rung
         self.criterion, self.lead = rung
         self.searching = float(self._search.phase is not Phase.WATCH)

@@ -17,7 +17,7 @@ _LONGEST = 5000
 
 
 def status_line(status: Status) -> str:
-    """Mode, controller, frequency, mean thrust, lateness, missed ticks, and a servo not reached.
+    """Mode, controller, frequency, mean thrust, power, lateness, missed ticks, a servo not reached.
 
     Of a swimmer its speed at that instant, instead of a thrust.
     """
@@ -29,8 +29,9 @@ def status_line(status: Status) -> str:
     got = f"thrust {thrust_words(status):>16}"
     if status.speed is not None:
         got = f"speed {status.speed * 1e3:6.1f} mm/s"
+    power = "" if status.power is None else f"  power {power_words(status.power):>8}"
     return (
-        f"{what:<16} {status.frequency:5.2f} Hz  {got}  "
+        f"{what:<16} {status.frequency:5.2f} Hz  {got}{power}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
         f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
     )
@@ -43,6 +44,11 @@ def thrust_words(status: Status) -> str:
         return f"– {unit}"
     thrust, error = status.thrust * 1e3, status.thrust_error
     return f"{thrust:.2f} ± {'?' if error is None else f'{error * 1e3:.2f}'} {unit}"
+
+
+def power_words(power: float) -> str:
+    """Electrical power [W]: `1.23 W`."""
+    return f"{power:.2f} W" if power >= 0.995 else f"{power * 1e3:.0f} mW"
 
 
 def run(command: click.Command, name: str) -> int:

@@ -66,6 +66,11 @@ class Observation(Struct, frozen=True, gc=False):
     """Mean longitudinal force over the latest whole tail beats [N]."""
     frequency: float
     """Tail-beat frequency, from the reversals of the instruction angle; 0 when not beating [Hz]."""
+    thrust_factor: float | None = None
+    """Thrust over the mean square of `fin_velocity`, as rests or a measurement have shown it [N];
+    None while not known."""
+    thrust_factor_error: float | None = None
+    """Half of its 95 % interval [N]."""
 
 
 class Course(Struct, frozen=True, gc=False):
@@ -172,6 +177,29 @@ class Tick(Struct, frozen=True, gc=False):
     heading: Annotated[
         float | UnsetType, unit("rad", "True heading of the front body, against −x.")
     ] = UNSET
+    thrust_factor: Annotated[
+        float | UnsetType,
+        unit(
+            "N",
+            "Thrust over the mean square of `fin_velocity`, as rests or a measurement have shown "
+            "it; absent while not known, and where no controller swims.",
+        ),
+    ] = UNSET
+    thrust_factor_error: Annotated[float | UnsetType, unit("N", "Half of its 95 % interval.")] = (
+        UNSET
+    )
+    power: Annotated[
+        float | UnsetType,
+        unit(
+            "W",
+            "Mean electrical power of the servo since the previous tick; absent without a power "
+            "meter, or while it cannot be read.",
+        ),
+    ] = UNSET
+    leak: Annotated[
+        float | UnsetType,
+        unit("s", "The leak in use, with `estimator.leak: auto`; absent with a number."),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]
@@ -183,6 +211,7 @@ EventKind = Literal[
     "fault",
     "overrun",
     "servo",
+    "power",
     "calibration",
     "gateway",
     "mark",
@@ -216,6 +245,8 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "empty",
     ),
     ("servo", "info", "a servo that could not be reached can be reached again", "empty"),
+    ("power", "warning", "the power meter cannot be read; the fish swims on", "empty"),
+    ("power", "info", "a power meter that could not be read can be read again", "empty"),
     ("calibration", "info", "another calibration was saved and is used now", "`file`"),
     (
         "calibration",
@@ -223,6 +254,7 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "a trial of a calibration ended, and the one before it is used again",
         "empty",
     ),
+    ("calibration", "warning", "when the tail set off, F_y was seen to be reversed", "empty"),
     (
         "gateway",
         "warning",
@@ -366,6 +398,20 @@ class Status(Struct, frozen=True):
     speed: Annotated[
         float | None, unit("m/s", "As in `tick`; null for a fish that is tethered.")
     ] = None
+    power: Annotated[
+        float | None,
+        unit("W", "Mean of `power` over the last 2 s; null where it is not known."),
+    ] = None
     boot: Annotated[
         str, note("Names this start of fishd's machine, from which its monotonic clock counts.")
     ] = ""
+    fy_reversed: Annotated[
+        bool | None,
+        note(
+            "Is F_y reversed against the tail, as it was seen when the tail set off from rest? "
+            "null while it was not seen."
+        ),
+    ] = None
+    leak: Annotated[
+        float | None, unit("s", "As in `tick`; null where `estimator.leak` is a number.")
+    ] = None

@@ -202,8 +202,10 @@ class CalibrationRequests:
         sensor.recalibrate(calibration)
         if _matrix(before) == _matrix(calibration):
             self._loop.thrust.forget_zero()
+            self._loop.lateral_sign.rest()
         else:
             self._loop.thrust.forget()
+            self._loop.lateral_sign.forget()
         return self._used()
 
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:

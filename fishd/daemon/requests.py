@@ -120,7 +120,7 @@ class Operations:
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
-            degraded=loop.robot.degraded(),
+            degraded=self._degraded(),
             counters={**loop.robot.counters(), **self._counters()},
             realtime=self._realtime,
             telemetry=self._telemetry,
@@ -136,6 +136,16 @@ class Operations:
             clock=self._clock.monotonic(),
             boot=self._boot,
             speed=self._speed(),
+            power=loop.power.mean,
+            fy_reversed=loop.lateral_sign.reversed,
+            leak=loop.found_leak,
+        )
+
+    def _degraded(self) -> tuple[str, ...]:
+        loop = self._loop
+        return (
+            *loop.robot.degraded(),
+            *filter(None, [loop.power.trouble, loop.lateral_sign.complaint]),
         )
 
     def _speed(self) -> float | None:

@@ -189,6 +189,8 @@ class TrialCalibration:
 
     def _put(self, calibration: ServoCalibration) -> None:
         parts = calibrated_parts(self._loop)
+        if parts.servo.calibration.direction != calibration.direction:
+            self._loop.lateral_sign.forget()
         parts.servo.recalibrate(calibration)
         parts.recalibrated(calibration)
         self._loop.guard.restrict(*parts.servo.reach)

@@ -82,6 +82,12 @@ class Robot:
     """What keeps this robot from being as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
     """Errors that were survived, such as failed I2C transfers, since start."""
+    power: Callable[[float], float] | None = None
+    """Mean electrical power of the servo since it was asked last [W]; None without a power meter.
+
+    Asked after each read of the sensor with the start of the tick [s, monotonic]; never blocks.
+    Raises `SensorError` where it is not known.
+    """
     countdown: float = math.inf
     """How long the servo goes on without a write before it ends its pulses by itself [s]."""
 

@@ -1,4 +1,4 @@
-"""What a driver of a force sensor or of a servo is. docs/writing-a-driver.md works through two.
+"""What a driver of a force sensor, a servo or a power meter is; see docs/writing-a-driver.md.
 
 A driver knows one kind of hardware and nothing else: calibration, limits, windows, staleness,
 suspicion and reconnecting are above it, the same for all.
@@ -12,7 +12,12 @@ from fishd.core.clock import Clock
 from fishd.core.foreign_code import contained
 from fishd.core.schema import Problem, note, unit
 from fishd.hardware.checks import Check, Machine, Result
-from fishd.hardware.settings import ForceSensorSettings, Gpio, ServoSettings
+from fishd.hardware.settings import (
+    ForceSensorSettings,
+    Gpio,
+    PowerMeterSettings,
+    ServoSettings,
+)
 
 __all__ = [
     "Check",
@@ -24,6 +29,9 @@ __all__ = [
     "LastResort",
     "Machine",
     "Pair",
+    "PowerMeterDriver",
+    "PowerMeterSettings",
+    "PowerSample",
     "Problem",
     "Result",
     "ServoDriver",
@@ -33,8 +41,10 @@ __all__ = [
     "unit",
 ]
 
-S = TypeVar("S", bound=ForceSensorSettings | ServoSettings)
+S = TypeVar("S", bound=ForceSensorSettings | ServoSettings | PowerMeterSettings)
+T = TypeVar("T", bound=ForceSensorSettings | PowerMeterSettings)
 F = TypeVar("F", bound=ForceSensorSettings)
+P = TypeVar("P", bound=PowerMeterSettings)
 V = TypeVar("V", bound=ServoSettings)
 
 
@@ -57,7 +67,7 @@ def pin(gpio: int, what: str, key: str = "gpio") -> Claim:
 
 
 class Driver(ABC, Generic[S]):
-    """What the two kinds have in common: all of it can be asked without the hardware."""
+    """What all kinds have in common: all of it can be asked without the hardware."""
 
     Settings: ClassVar[type[Any]]
     """Its keys: a frozen msgspec struct, a subclass of that of its kind."""
@@ -110,19 +120,15 @@ class Pair(NamedTuple):
     """Why the two cannot be believed, as they are at an end of the range; empty where they can."""
 
 
-class ForceSensorDriver(Driver[F]):
-    """Delivers pairs of samples. One thread calls `open`, `sample` and `close`."""
+class SampledDriver(Driver[T]):
+    """Delivers samples. One thread calls `open`, `sample` and `close`."""
 
     transport: ClassVar[str] = "sensor"
     """What errors are counted as: `i2c` makes `i2c_errors`."""
     settling: float = 0.0
     """How long to leave the hardware alone after an error [s]."""
-    raw_unit: ClassVar[str] = "V"
-    """Unit of the pairs, in which forces are shown until the sensor is calibrated."""
-    names: tuple[str, str] = ("F_x", "F_y")
-    """What messages call the two, such as `F_x (channel A0-A1)`."""
 
-    def __init__(self, settings: F, clock: Clock) -> None:
+    def __init__(self, settings: T, clock: Clock) -> None:
         """Import what is needed; open nothing yet. clock: the only one to look at and sleep by."""
         self.settings = settings
         self.clock = clock
@@ -137,8 +143,8 @@ class ForceSensorDriver(Driver[F]):
         """Make ready to sample; raises anything, and is tried again a little later."""
 
     @abstractmethod
-    def sample(self) -> Pair | None:
-        """The next pair, or None where it is not complete yet.
+    def sample(self) -> Any:
+        """The next sample, a `Pair` or a `PowerSample`, or None where it is not complete yet.
 
         Takes a few milliseconds at most: it sleeps in `clock.sleep`, and must sleep or transfer
         something before it returns None. Raises anything, which `explain` puts into words; after
@@ -153,10 +159,51 @@ class ForceSensorDriver(Driver[F]):
         """One line about what went wrong, and what to check."""
         return str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
 
+
+class ForceSensorDriver(SampledDriver[F]):
+    """Delivers pairs of samples."""
+
+    raw_unit: ClassVar[str] = "V"
+    """Unit of the pairs, in which forces are shown until the sensor is calibrated."""
+    names: tuple[str, str] = ("F_x", "F_y")
+    """What messages call the two, such as `F_x (channel A0-A1)`."""
+
+    @abstractmethod
+    def sample(self) -> Pair | None:
+        """The next pair, or None where it is not complete yet; as of every `SampledDriver`."""
+
     @classmethod
     @abstractmethod
     def pair_rate(cls, settings: F) -> float:
         """Pairs per second that healthy hardware delivers, at the least."""
+
+
+class PowerSample(NamedTuple):
+    """What a power meter says."""
+
+    time: float
+    """When it was read [s, monotonic]."""
+    power: float
+    """Mean electrical power into the servo over the latest time that the meter measured [W]."""
+    clipped: str = ""
+    """Why it cannot be believed, as it is at an end of the range; empty where it can."""
+
+
+class PowerMeterDriver(SampledDriver[P]):
+    """Delivers the electrical power of the servo, where the robot has a meter for it."""
+
+    def __init__(self, settings: P, clock: Clock, interval: float) -> None:
+        """interval: `sample` is called once in this time, and tells the mean over as long [s]"""
+        super().__init__(settings, clock)
+        self.interval = interval
+
+    @abstractmethod
+    def sample(self) -> PowerSample:
+        """Read the meter: a few short transfers, as it measures by itself.
+
+        It need not wait: it is not called before its time. Raises anything, as of every
+        `SampledDriver`.
+        """
 
 
 class LastResort(NamedTuple):

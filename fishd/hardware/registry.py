@@ -7,7 +7,7 @@ from typing import Any
 from fishd.core import text
 from fishd.core.errors import FishdError, MissingPackage, StartupError, UnknownDriver
 from fishd.core.plugins import Plugins
-from fishd.hardware.driver import ForceSensorDriver, ServoDriver
+from fishd.hardware.driver import ForceSensorDriver, PowerMeterDriver, ServoDriver
 
 FORCE_SENSORS: Plugins[ForceSensorDriver[Any]] = Plugins(
     "force-sensor driver",
@@ -29,10 +29,22 @@ SERVOS: Plugins[ServoDriver[Any]] = Plugins(
     },
     UnknownDriver,
 )
+POWER_METERS: Plugins[PowerMeterDriver[Any]] = Plugins(
+    "power-meter driver",
+    "fishd.power_meters",
+    PowerMeterDriver,
+    "Settings",
+    {
+        "ina219": "fishd.hardware.power_meter.ina219:Ina219",
+        "ina226": "fishd.hardware.power_meter.ina226:Ina226",
+    },
+    UnknownDriver,
+)
 
 PACKAGES = {
     "adafruit_ads1x15": "adafruit-circuitpython-ads1x15",
     "adafruit_bus_device": "adafruit-circuitpython-busdevice",
+    "adafruit_ina219": "adafruit-circuitpython-ina219",
     "adafruit_extended_bus": "adafruit-extended-bus",
     "Adafruit_PureIO": "Adafruit-PureIO",
     "board": "Adafruit-Blinka",

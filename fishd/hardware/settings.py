@@ -1,4 +1,4 @@
-"""What every force sensor and every servo is configured by, and the operator's panel.
+"""What every force sensor, servo and power meter is configured by, and the operator's panel.
 
 A driver adds keys of its own in a subclass beside its code.
 """
@@ -60,6 +60,12 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def calibrated(self, calibration: ServoCalibration) -> Self:
         """The settings with what a calibration says instead."""
         return msgspec.structs.replace(self, **_found(calibration))
+
+
+class PowerMeterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The power meter of the servo; which further keys there are, its driver decides."""
+
+    driver: Annotated[str, note("What reads the meter: the name of a driver.")] = ""
 
 
 class PanelSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

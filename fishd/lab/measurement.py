@@ -3,15 +3,16 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
+from fishd.lab.objective import per_watt
 from fishd.lab.rig import Rig, refuse_lost
 
 SWIM, REST = 6.0, 2.75
@@ -38,6 +39,8 @@ class Sample(NamedTuple):
     """Instruction angle from this tick on [rad]."""
     swims: bool
     """Is the fish told to swim?"""
+    watts: float = math.nan
+    """Mean electrical power of the servo since the tick before [W]; NaN where it is not known."""
 
 
 class Measured(NamedTuple):
@@ -65,6 +68,10 @@ class Measured(NamedTuple):
     """Of all forces: `N`; that of the sensor where it is not calibrated."""
     remark: str
     """Why the thrust may be wrong by more than its error; empty where nothing speaks for that."""
+    watts: float | None = None
+    """Electrical power of the servo while it swims [W]; None where it is not known."""
+    watts_error: float | None = None
+    """Half of its 95 % interval, by how beats differ [W]."""
 
 
 def measure(
@@ -102,7 +109,14 @@ def measure(
 def samples_of(ticks: Iterable[Tick]) -> list[Sample]:
     """What a measurement needs to know of these."""
     return [
-        Sample(each.seq, each.fx, each.fin_velocity, each.phi_c, each.mode == "running")
+        Sample(
+            each.seq,
+            each.fx,
+            each.fin_velocity,
+            each.phi_c,
+            each.mode == "running",
+            math.nan if each.power is UNSET else each.power,
+        )
         for each in ticks
     ]
 
@@ -125,10 +139,19 @@ class Summary(Struct, frozen=True):
     """How long it took, rests included [s]."""
     force_unit: str
     remark: str
+    power: float | None = None
+    """Electrical power of the servo while it swims [W]; null where it is not known."""
+    power_error: float | None = None
+    """Half of its 95 % interval [W]."""
+    thrust_per_watt: float | None = None
+    """[N/W]"""
+    thrust_per_watt_error: float | None = None
+    """Half of its 95 % interval [N/W]."""
 
 
 def summary(found: Measured, tick: float) -> Summary:
     """What fits in a line, or in JSON; tick: period of the loop [s]."""
+    ratio, ratio_error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
     return Summary(
         found.controller,
         dict(found.parameters),
@@ -140,6 +163,10 @@ def summary(found: Measured, tick: float) -> Summary:
         len(found.ticks) * tick,
         found.unit,
         found.remark,
+        found.watts,
+        found.watts_error,
+        ratio,
+        ratio_error,
     )
 
 
@@ -220,7 +247,20 @@ def evaluate(
         ticks=[],
         unit="N",
         remark=_remark(kept),
+        **_watts(swimming, _spread(apart, True, "watts")),
     )
+
+
+def _watts(swimming: Sequence["_Block"], spread: float) -> dict[str, float]:
+    """The power of these blocks and its error; nothing where it is not known of each.
+
+    spread: variance of the power of a second [W² s]
+    """
+    lasting = sum(block.lasts for block in swimming)
+    mean = sum(block.watts * block.lasts for block in swimming) / lasting
+    if not math.isfinite(mean):
+        return {}
+    return {"watts": mean, "watts_error": 1.96 * math.sqrt(spread / lasting)}
 
 
 def _together(kept: Sequence[list["_Block"]]) -> list[list["_Block"]]:
@@ -236,11 +276,13 @@ def _joined(blocks: Sequence["_Block"]) -> "_Block":
     if len(blocks) == 1:
         return blocks[0]
     lasts = np.array([block.lasts for block in blocks])
-    time, force, power = np.average(
-        [(block.time, block.force, block.power) for block in blocks], axis=0, weights=lasts
+    time, force, power, watts = np.average(
+        [(block.time, block.force, block.power, block.watts) for block in blocks],
+        axis=0,
+        weights=lasts,
     )
     beats = sum(block.beats for block in blocks)
-    return _Block(time, lasts.sum(), force, power, beats, blocks[0].swims)
+    return _Block(time, lasts.sum(), force, power, beats, blocks[0].swims, watts)
 
 
 def _remark(kept: Sequence[Sequence["_Block"]]) -> str:
@@ -265,6 +307,7 @@ class _Block(NamedTuple):
     power: float
     beats: float
     swims: bool
+    watts: float
 
 
 def _phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
@@ -304,6 +347,7 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
             power=sum(each.fin_velocity**2 for each in window) / len(window),
             beats=counted if beating else 0,
             swims=swims,
+            watts=sum(each.watts for each in window) / len(window),
         )
 
 
@@ -318,14 +362,14 @@ def _reversals(phase: list[Sample]) -> list[int]:
     return found
 
 
-def _spread(found: Sequence[_Block], swims: bool) -> float:
-    """Variance of the force of a second of swimming or rest, from block to block [N² s].
+def _spread(found: Sequence[_Block], swims: bool, of: Literal["force", "watts"] = "force") -> float:
+    """Variance of the force or the power of a second, from block to block [N² s or W² s].
 
     By neighbours, so that hardly any drift is in it.
     """
     steps = [
-        (other.force - one.force) ** 2 / (1.0 / one.lasts + 1.0 / other.lasts)
+        (getattr(other, of) - getattr(one, of)) ** 2 / (1.0 / one.lasts + 1.0 / other.lasts)
         for one, other in pairwise(found)
         if one.swims == other.swims == swims and other.time - one.time < 2.0 * one.lasts
     ]
-    return max(sum(steps) / max(1, len(steps)), 1e-12)
+    return max(float(sum(steps)) / max(1, len(steps)), 1e-12)

@@ -102,7 +102,8 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
         policy.features_extractor, FlattenExtractor
     ):
         raise PolicyError(f"{path}: {type(policy).__name__} is not an MlpPolicy of PPO or A2C")
-    card = make_card(env.config, TrainingSettings(), env.features, "a SwimEnv", 0, None, note)
+    seen = TrainingSettings(environment=env.settings)
+    card = make_card(env.config, seen, env.features, "a SwimEnv", 0, None, note)
     past = replace(
         card.provenance,
         algorithm=type(model).__name__,
@@ -148,7 +149,7 @@ def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
     mirrored = isinstance(extractor, PictureExtractor) and extractor.mirrored
     if isinstance(extractor, PictureExtractor):
         parts, picture = ["features"], "eye"
-        width = extractor.single - len(perception.features)
+        width = extractor.single - perception.numbers
         if mirrored:
             ends = {"begin": [-1], "end": [np.iinfo(np.int64).min], "rows": [2], "back": [-1]}
             constants |= {f"flip_{name}": np.array(value) for name, value in ends.items()}
@@ -165,7 +166,7 @@ def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
         nodes.append(helper.make_node("Concat", [INPUT, "negated"], ["numbers"], axis=0))
         others = ["numbers"]
     nodes.append(helper.make_node("Concat", [*parts, *others], ["given"], axis=1))
-    return Sight(nodes, constants, "given", width + len(perception.features), mirrored)
+    return Sight(nodes, constants, "given", width + perception.numbers, mirrored)
 
 
 def _evaluated(
@@ -215,7 +216,7 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
     random = np.random.default_rng(0)
     stacks = _stacks(file.card)
     number = len(stacks) or _PROBES
-    rows = random.normal(0.0, 1.5, (number, len(file.card.observation))).astype(np.float32)
+    rows = random.normal(0.0, 1.5, (number, file.card.numbers)).astype(np.float32)
     worst = 0.0
     for index, row in enumerate(rows):
         network.row[:] = row

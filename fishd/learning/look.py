@@ -18,7 +18,7 @@ from fishd.camera.pilot import Pilot
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers.policy import opening
-from fishd.controllers.policy.card import Layout
+from fishd.controllers.policy.card import Card, History
 from fishd.controllers.policy.file import OUTPUT, PolicyFile
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -81,7 +81,7 @@ def look(
     frames = np.stack([stack[0] for _, stack in seen])
     mean = frames.mean(axis=0)
     chosen = [seen[k] for k in np.linspace(0, len(seen) - 1, STACKS).astype(int)]
-    sensitivity = _sensitivity(_uncut(file), chosen, mean, Layout(file.card.observation))
+    sensitivity = _sensitivity(_uncut(file), chosen, mean, file.card)
     if not sensitivity.any():
         raise PolicyError(f"{file.path}: nothing in the pictures moves it")
     return Looked(mean, sensitivity, find_motion(frames).energy > 0.0)
@@ -115,15 +115,16 @@ def _uncut(file: PolicyFile) -> Network:
     return Network(file._replace(content=model.SerializeToString()))
 
 
-def _sensitivity(network: Network, seen: list[Seen], mean: Floats, features: Layout) -> Floats:
+def _sensitivity(network: Network, seen: list[Seen], mean: Floats, card: Card) -> Floats:
     """See `Looked.sensitivity`: each pixel has the mean of the patches that hide it."""
     size = len(mean)
     patch = max(2, size // PATCH)
     begins = np.unique(np.linspace(0, size - patch, 2 * PATCH - 1).round().astype(int))
     hidden = mean.round().astype(np.uint8)
     squares = np.zeros((len(begins), len(begins)))
+    history = History(card.observation, card.window, network.row)
     for observation, stack in seen:
-        features.write(observation, network.row)
+        history.push(observation)
         whole = np.stack(stack)
         network.frames[:] = whole
         action = network.run()

@@ -149,12 +149,12 @@ def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None
     )
 
 
-def make_policy(ppo: PpoSettings, features: int, eye: Eye | None = None) -> ActorCriticPolicy:
+def make_policy(ppo: PpoSettings, numbers: int, eye: Eye | None = None) -> ActorCriticPolicy:
     """The networks alone, as `make_learner` makes them.
 
-    features: number of inputs beside what the eye gives
+    numbers: of inputs beside what the eye gives
     """
-    observation, action = spaces(features + (eye.outputs if eye else 0))
+    observation, action = spaces(numbers + (eye.outputs if eye else 0))
     return _kind(ppo, eye)(observation, action, lambda _: ppo.learning_rate, **_shape(ppo, eye))
 
 
@@ -231,7 +231,7 @@ class DeterministicPolicy:
 
     def __init__(self, policy: ActorCriticPolicy, perception: Perception, amplitude: float) -> None:
         """amplitude: Φ [rad]"""
-        self._perception = perception
+        self._perception = perception.anew()
         self._amplitude = amplitude
         self._latest = self._blind = 0.0
         self._policy = policy

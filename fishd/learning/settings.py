@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from fishd.camera.frames import StackSettings
-from fishd.controllers.policy.card import COMMANDS, FeatureName
+from fishd.controllers.policy.card import COMMANDS, LONGEST_HISTORY, FeatureName
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
@@ -17,7 +17,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 
 SMALLEST = {"modes": 16, "cnn": 68, "nature": 36}
 """Size of a frame that leaves something after all convolutions of an eye's network [px]."""
-Share = Annotated[float, Meta(ge=0, lt=1)]
+Share = Annotated[float, Meta(ge=0, le=9)]
 
 
 class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -27,6 +27,23 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         tuple[FeatureName, ...],
         note("What the agent sees, in order; forces only where `see` permits them."),
     ] = ("fy", "fy_rate", "instruction_angle", "previous_angle", "fin_velocity")
+    history: Annotated[
+        int,
+        unit(
+            "ticks",
+            "It sees them of the latest so many ticks, newest first: what a servo's delay or play "
+            "does to a fish does not show in one.",
+            ge=1,
+            le=LONGEST_HISTORY,
+        ),
+    ] = 1
+    relative: Annotated[
+        bool,
+        note(
+            "Each but the angles is divided by its rms over this history, so that weak and strong "
+            "fish look alike; needs a history of 2 or more."
+        ),
+    ] = False
     force_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         unit("N", "F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant."),
@@ -35,7 +52,24 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         unit("N", "F_x whose reward is `reward_scale`; null: the best square wave's thrust."),
     ] = None
+    own_fish: Annotated[
+        bool,
+        note(
+            "Where fish are randomised, thrust_scale: null is the best square wave's thrust of "
+            "each, so that a weak one counts as much, and chatter.dwell: auto is that of each."
+        ),
+    ] = False
     reward_scale: Annotated[float, note("Reward for thrust_scale.", gt=0, le=1000)] = 0.3
+    power_price: Annotated[
+        float,
+        unit(
+            "N/W",
+            "Thrust that a watt of the servo must give at the least: the reward is of F_x less "
+            "this times the power. In simulation only: agents of a fishd are not told the power.",
+            ge=0,
+            le=1000,
+        ),
+    ] = 0.0
     episode: Annotated[int, unit("ticks", "Steps of an episode.", ge=2)] = 768
     longest_start: Annotated[
         int,
@@ -43,6 +77,18 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             "ticks", "An episode begins after up to so many ticks at a random angle.", ge=0, le=1000
         ),
     ] = 10
+    dwell: Annotated[
+        bool, note("Reversals that ppo would hold back (chatter.dwell) are held back here, too.")
+    ] = True
+    held_cost: Annotated[
+        float,
+        note(
+            "Share of reward_scale that a tick costs in which one is held back, so that policies "
+            "do not lean on it.",
+            ge=0,
+            le=10,
+        ),
+    ] = 0.5
 
 
 class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -88,6 +134,24 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     noise: Share = 0.0
     offset: Annotated[
         float, unit("N", "Offset of F_y, uniform in ±offset about the configured one.", ge=0, le=10)
+    ] = 0.0
+    servo_lag: Share = 0.0
+    thrust_coefficient: Share = 0.0
+    lateral_drag: Share = 0.0
+    servo_delay: Annotated[
+        float, unit("s", "Uniform, from the configured one to so much more.", ge=0, le=0.4)
+    ] = 0.0
+    servo_dead_zone: Annotated[
+        float, unit("rad", "Uniform, from the configured one to so much more.", ge=0, le=0.5)
+    ] = 0.0
+    backlash: Annotated[
+        float, unit("rad", "Uniform, from the configured one to so much more.", ge=0, le=0.5)
+    ] = 0.0
+    servo_reaction: Annotated[
+        float, unit("N s^2/rad", "Uniform in ±this about the configured one.", ge=0, le=0.05)
+    ] = 0.0
+    rotation: Annotated[
+        float, unit("rad", "Uniform in ±this about the configured one.", ge=0, le=1.5)
     ] = 0.0
     fish: Annotated[
         tuple[PlantParameters, ...],
@@ -152,12 +216,19 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     others: Annotated[
         int,
         note(
-            "In simulation, so many other fish are tried too, at the edges of the randomisation "
-            "and shaken first; the policy counts as the best that does best on its worst fish.",
+            "In simulation, so many other fish are tried too, of the randomisation and shaken "
+            "first; the policy counts as the best that does best on its worst fish.",
             ge=0,
             le=100,
         ),
     ] = 0
+    others_from: Annotated[
+        Literal["edges", "range"],
+        note(
+            "Where in the randomisation these are: every parameter at one end of its range, or "
+            "anywhere in it, as the fish of the episodes."
+        ),
+    ] = "edges"
 
 
 class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -223,6 +294,11 @@ def _check(settings: TrainingSettings) -> None:
             ("ppo", "symmetric"),
             "true is not valid where environment.observation has fx, which is the same for a "
             "mirrored fish; false is needed",
+        )
+    if settings.environment.relative and settings.environment.history < 2:
+        raise Problem(
+            ("environment", "relative"),
+            "true is not valid with environment.history: 1; an rms over 2 ticks or more is needed",
         )
     seen = settings.environment.observation
     if len(set(seen)) < len(seen):

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any, Self
 
 import zmq
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from fishd import __version__
@@ -99,6 +100,7 @@ class Replay:
             seq=tick.seq,
             missed=tick.missed,
             phi_c=tick.phi_c,
+            power=None if tick.power is UNSET else tick.power,
             pid=os.getpid(),
             telemetry=self.telemetry,
             name=f"replay of {self._run.name}",

@@ -9,7 +9,7 @@ or before ticks that are missing, has a past that nobody knows.
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
 from fishd.assembly import build_estimator
@@ -197,6 +197,8 @@ class _Rerun:
         return replace(
             again,
             previous_angle=self._before,
+            thrust_factor=_known(tick.thrust_factor),
+            thrust_factor_error=_known(tick.thrust_factor_error),
             **{name: getattr(tick, name) for name in ESTIMATES},
         )
 
@@ -263,3 +265,7 @@ class _Rerun:
                 break
         start = self._config.start
         return dict(start.parameters) if start.controller == tick.controller else {}
+
+
+def _known(value: float | UnsetType) -> float | None:
+    return None if value is UNSET else value

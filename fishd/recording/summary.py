@@ -47,6 +47,8 @@ class Summary(Struct, frozen=True):
     It is the mean of that of the ticks: the errors of one recording are those of one zero, and do
     not average out.
     """
+    power: float | None = None
+    """Mean electrical power of the servo while a controller swam; None where not known [W]."""
     swimming: dict[str, int] = {}
     """Ticks in mode running, by controller."""
     force_unit: str = "N"
@@ -77,6 +79,7 @@ class TickHead(Struct, frozen=True, gc=False):
     thrust: float
     frequency: float
     thrust_error: float | UnsetType = UNSET
+    power: float | UnsetType = UNSET
     time: float = 0.0
 
 
@@ -92,6 +95,7 @@ class Tally:
         self._impulse = 0.0
         self._known_ticks = 0
         self._thrust = self._error = 0.0
+        self._energy, self._metered = 0.0, 0
         self._swimming: dict[str, int] = {}
         self._force_unit = "N"
         self._frames = self._frame_gaps = self._frames_lost = 0
@@ -121,6 +125,9 @@ class Tally:
                 self._known_ticks += 1
                 self._thrust += tick.thrust
                 self._error += tick.thrust_error
+            if tick.power is not UNSET:
+                self._energy += tick.power
+                self._metered += 1
             self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
         if last is None:
             self._first_t = tick.t
@@ -193,6 +200,7 @@ class Tally:
             restarts=self._restarts,
             thrust=thrust,
             thrust_error=error,
+            power=self._energy / self._metered if self._metered else None,
             swimming=dict(self._swimming),
             force_unit=self._force_unit,
             frames=self._frames,

@@ -56,6 +56,7 @@ class Beats:
             fin_amplitude=sums.peaks / sums.halves,
             mean_angle=mean,
             squareness=mean / rms if rms else 0.0,
+            power=None if math.isnan(sums.energy) else sums.energy / sums.duration,
             half_beats=(sums.shortest, sums.longest) if frequency else (0, 0),
         )
 
@@ -68,6 +69,7 @@ class BeatMeans(NamedTuple):
     fin_amplitude: float  # rad
     mean_angle: float  # of |φ_c|, rad
     squareness: float  # mean |φ_c| over rms φ_c
+    power: float | None  # electrical, of the servo, W; None for a fish without a motor
     half_beats: tuple[int, int]  # shortest and longest, ticks
     thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
 
@@ -89,6 +91,7 @@ def _deviation(beats: Sequence[tuple[float, float]]) -> float:
 class _Sums:
     def __init__(self) -> None:
         self.duration = self.impulse = self.peaks = self.angle = self.angle_squared = 0.0
+        self.energy = 0.0
         self.halves = 0
         self.shortest, self.longest = sys.maxsize, 0
         self._peak = 0.0
@@ -97,6 +100,7 @@ class _Sums:
     def add(self, angle: float, window: TrueWindow) -> None:
         self.duration += window.duration
         self.impulse += window.thrust * window.duration
+        self.energy += window.power * window.duration
         self.angle += abs(angle) * window.duration
         self.angle_squared += angle**2 * window.duration
         self._peak = max(self._peak, window.fin_peak)
@@ -111,7 +115,8 @@ class _Sums:
         self._ticks = 0
 
     def __iadd__(self, other: "_Sums") -> "_Sums":
-        for name in ("duration", "impulse", "peaks", "angle", "angle_squared", "halves"):
+        sums = ("duration", "impulse", "energy", "peaks", "angle", "angle_squared", "halves")
+        for name in sums:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.shortest = min(self.shortest, other.shortest)
         self.longest = max(self.longest, other.longest)

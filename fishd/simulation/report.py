@@ -33,6 +33,8 @@ class Report(Struct, frozen=True):
     """Φ: that of the controller, and of the best square wave it is compared with [rad]."""
     mean_thrust: float
     """[N]"""
+    mean_power: float | None
+    """Electrical power of the servo [W]; None for a plant without a motor."""
     frequency: float
     """Tail beats per second; 0 when the tail does not beat [Hz]."""
     half_beats: tuple[int, int]
@@ -148,6 +150,7 @@ def judge(
         parameters=msgspec.structs.asdict(controller.parameters),
         amplitude=amplitude,
         mean_thrust=means.thrust,
+        mean_power=means.power,
         frequency=means.frequency,
         half_beats=means.half_beats,
         fin_amplitude=means.fin_amplitude,

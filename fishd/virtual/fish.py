@@ -11,7 +11,7 @@ from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.window import VoltageWatch
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
 from fishd.virtual.plant.base import PlantWindow, TrueWindow, Window
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.parameters import TETHERED, PlantParameters
 from fishd.virtual.plant.registry import open_plant
 
 
@@ -20,7 +20,7 @@ class SimulatedFish:
 
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
-        self.fish = open_plant(plant)
+        self.fish = open_plant(plant, settings.motor)
         self.window: Window = PlantWindow(tick, 0.0, 0.0, 0.0, 0.0, 0.0)
         """The latest window with its true mean forces; nothing happens before the first read."""
         self._imperfections = Imperfections(settings, tick)
@@ -74,7 +74,11 @@ class SimulatedFish:
         self._fin_speed = state.alpha_rate
         # Where the fin has not turned, it is at the end that it has gone furthest.
         peak = window.fin_peak if turned else abs(state.alpha)
-        return TrueWindow(window.duration, window.thrust, peak)
+        return TrueWindow(window.duration, window.thrust, peak, window.power)
+
+    def power(self, now: float) -> float:
+        """Mean electrical power of the servo over the latest window, which ended `now` [W]."""
+        return self.window.power
 
     def write(self, angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""
@@ -95,4 +99,11 @@ class SimulatedFish:
 
     def robot(self) -> Robot:
         """This fish as the loop sees it."""
-        return Robot(name="simulated", sensor=self, servo=self, truth=self.truth, tared=self)
+        return Robot(
+            name="simulated",
+            sensor=self,
+            servo=self,
+            truth=self.truth,
+            tared=self,
+            power=self.power if self.fish.parameters.model == TETHERED else None,
+        )

@@ -11,10 +11,11 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from fishd.core.schema import note, unit
+from fishd.virtual.plant.parameters import MotorSettings
 
 
 class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How imperfect the simulated rig is."""
+    """How imperfect the simulated rig is, and what its servo draws."""
 
     noise: Annotated[
         float, unit("N", "Noise of each force, rms of the mean over one tick.", ge=0, le=1)
@@ -105,6 +106,9 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     seed: Annotated[
         int, note("Same seed, same noise, drift, hum and spikes, to the last bit.", ge=0)
     ] = 0
+    motor: Annotated[MotorSettings, note("The motor of the servo: what power it needs.")] = (
+        MotorSettings()
+    )
 
 
 class Imperfections:

@@ -10,10 +10,10 @@ from rigs.policy_files import FLIP, of_pixels, seeing_card, velocity_follower, w
 
 from fishd.camera.frames import Stack
 from fishd.camera.pilot import HOLD, Pilot
-from fishd.controllers.base import ChatterSettings, Limits
+from fishd.controllers.base import Limits
 from fishd.core.errors import ControllerFault, PolicyError
 
-LIMITS = Limits(0.42, 0.05, chatter=ChatterSettings(dwell=0.0))
+LIMITS = Limits(0.42, 0.05, dwell=0.0)
 TICK = 0.05
 
 
@@ -64,7 +64,7 @@ def test_a_policy_of_forces_needs_no_frames(tmp_path: Path) -> None:
 
 
 def test_it_reverses_no_sooner_than_ppo_would(tmp_path: Path) -> None:
-    pilot = Pilot(str(write(tmp_path, FLIP)), replace(LIMITS, chatter=ChatterSettings(dwell=0.2)))
+    pilot = Pilot(str(write(tmp_path, FLIP)), replace(LIMITS, dwell=0.2))
     angle = 0.42
     given = [angle := pilot.angle(observe(angle)) for _ in range(12)]
     assert given == pytest.approx([0.42] * 3 + [-0.42] * 4 + [0.42] * 4 + [-0.42])

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from rigs.policy_files import write
 from rigs.processes import fishctl
 
 
@@ -66,7 +67,8 @@ def test_policies_without_the_packages_that_they_need_are_said_to_be_left_out(
     assert all(line == line.rstrip() for line in done.stdout.splitlines())
 
 
-def test_it_is_said_that_another_controller_took_over_from_a_policy() -> None:
-    done = run("default-fish", "--seconds", "20", "--set", "plant.cable_slack=0.2")
+def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Path) -> None:
+    shaking = str(write(tmp_path))
+    done = run(shaking, "--seconds", "20")
     assert done.returncode == 0
-    assert "fishctl: default-fish: another took over: ppo gave up: " in done.stderr
+    assert f"fishctl: {shaking}: another took over: ppo gave up: " in done.stderr

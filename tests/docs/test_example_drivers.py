@@ -80,11 +80,11 @@ class LoadCells:
 
     def run(self, seconds: float) -> list[Pair]:
         """What comes in, in so long a time."""
-        self.sampler.pairs.clear()
+        self.sampler.samples.clear()
         until = self.clock.now + seconds
         while self.clock.now < until:
             self.sampler.step()
-        return list(self.sampler.pairs)
+        return list(self.sampler.samples)
 
     def __enter__(self) -> "LoadCells":
         self.gpio.__enter__()

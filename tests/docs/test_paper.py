@@ -60,7 +60,7 @@ def test_the_free_swimmer_still_swims_as_in_figure_6() -> None:
     found, row = figure_6.swim(case), figure_6.row_of(case)
     assert row
     assert found.speed == pytest.approx(1e-3 * row["speed_mm_per_s"], rel=0.03)
-    assert found.beat_frequency == pytest.approx(3.0)
+    assert found.beat_frequency == pytest.approx(3.0, rel=1e-3)  # a beat ends on a tick
 
 
 @pytest.mark.parametrize(

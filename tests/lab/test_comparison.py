@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs.pictures import letters_of
+from rigs.policy_files import write
 
 from fishd.config import load
 from fishd.core.errors import FishdError, ParameterError, UnknownController
@@ -40,9 +41,9 @@ def test_the_runs_of_a_contestant_differ_in_noise_and_give_the_interval_of_their
     assert compare(config, ["swing"], 20.0, 5.0)[0][0].error is None
 
 
-def test_it_is_said_that_another_controller_took_over_from_a_policy() -> None:
-    config = load(None, ["plant.cable_slack=0.2"])
-    (policy, swing), _ = compare(config, [parse("default-fish"), parse("swing")], 20.0, 5.0)
+def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Path) -> None:
+    shaking = parse(str(write(tmp_path)))
+    (policy, swing), _ = compare(load(None), [shaking, parse("swing")], 20.0, 5.0)
     assert "it wanted to reverse sooner than 0.2 s after its last reversal" in policy.fallbacks[0]
     assert (policy.faults, swing.fallbacks) == ([], [])
 

@@ -86,6 +86,8 @@ def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path
     config = load(file)
     written = asdict(config.plant) | asdict(config.simulation)
     assert set(found.plant) == set(asdict(config.plant)) - {"model"}  # that of the paper
+    ratio = found["thrust_coefficient"].value / found["lateral_drag"].value
+    assert config.estimator.leak == pytest.approx(ratio, rel=1e-3)
     for each in found.estimates:
         assert abs(written[each.name] - each.value) <= 0.01 * (each.high - each.low), each.name
 

@@ -36,7 +36,7 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
     assert best.parameters == pytest.approx({"frequency": 1.7, "amplitude": 0.3}, rel=0.15)
     for name, truth in (("frequency", 1.7), ("amplitude", 0.3)):
         assert best.low[name] <= truth <= best.high[name]
-    assert best.thrust == pytest.approx(0.02, abs=2.0 * best.error)
+    assert best.value == pytest.approx(0.02, abs=2.0 * best.error)
 
 
 def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> None:
@@ -70,7 +70,7 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     assert swum <= 360
     truth = simulate(config, "square", found.parameters).mean_thrust
     assert truth >= 0.97 * BEST
-    assert found.thrust == pytest.approx(truth, abs=2.0 * found.error)
+    assert found.value == pytest.approx(truth, abs=2.0 * found.error)
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert "the budget of 22 s is used" in done.stderr
     assert "true thrust there" in done.stdout
     rows = (folder / "trials.csv").read_text().splitlines()
-    assert rows[0] == "frequency,thrust,error,swum,passed"
+    assert rows[0] == "frequency,thrust,error,power,power_error,swum,passed"
     passed = float(rows[-1].rpartition(",")[2])
     run = open_run(folder / "search.mcap")
     assert len(run.ticks) == round(passed / 0.05)
@@ -145,8 +145,8 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     begun = Begun("simulation", "square", {}, {"frequency": (1.0, 3.0)}, 0, {})
     folder = SearchFolder(tmp_path, begun)
     table = tmp_path / "trials.csv"
-    whole = table.read_text() + "1.25,0.02,0.001,40,12.5\n"
-    table.write_text(whole + "2.0,0.023,0.001,80,24.7")  # of 24.75
+    whole = table.read_text() + "1.25,0.02,0.001,0.5,0.01,40,12.5\n"
+    table.write_text(whole + "2.0,0.023,0.001,0.7,0.01,80,24.7")  # of 24.75
     folder = SearchFolder(tmp_path, begun)
     assert [each.parameters for each in folder.done] == [{"frequency": 1.25}]
     assert table.read_text() == whole

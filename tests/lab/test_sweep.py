@@ -325,8 +325,9 @@ def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> Non
 @pytest.mark.usefixtures("_no_worker_stays")
 def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
-    slack = ("--set", "plant.cable_slack=0.2", "--settle", "15")
-    done = swept(tmp_path / "run", "ppo", "--policy", "default-fish", *slack)
+    from rigs.policy_files import write
+
+    done = swept(tmp_path / "run", "ppo", "--policy", str(write(tmp_path)), "--settle", "15")
     assert done.returncode == 1
     assert "no thrust: ppo gave up" in done.stdout
     assert done.stdout.endswith("points.csv\n")

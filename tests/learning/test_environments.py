@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from msgspec.structs import replace
 from rigs.processes import Daemon
 from rigs.swimming import BRIEF, Resting, brief_job
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
@@ -15,6 +16,7 @@ from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import ConfigError, NoDaemon
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
@@ -114,6 +116,37 @@ def test_an_action_beyond_its_space_is_clipped() -> None:
     assert env.latest.instruction_angle == 0.42  # type: ignore[attr-defined]
 
 
+def applied(settings: EnvironmentSettings, *overrides: str) -> tuple[str, float]:
+    """Which side was applied in each of twelve ticks in which the other one was wanted, and reward.
+
+    The reward is without that of thrust, for a fish that has none to speak of.
+    """
+    config = load(None, [*STILL, *overrides])
+    env = SwimEnv(SimulatedLink(config), config, replace(settings, thrust_scale=1e9))
+    env.reset(seed=1)
+    env.swim(0.42)
+    sides, rewards = "", 0.0
+    for _ in range(12):
+        wanted = -np.sign([env.latest.instruction_angle])
+        rewards += float(env.step(wanted)[1])
+        sides += "+" if env.latest.instruction_angle > 0 else "-"
+    return sides, rewards
+
+
+def test_a_reversal_that_ppo_would_hold_back_is_held_back_and_costs() -> None:
+    settings = EnvironmentSettings(longest_start=0, reward_scale=2.0, held_cost=0.25)
+    sides, reward = applied(settings)
+    assert sides == "+++----++++-"
+    assert reward == pytest.approx(-9 * 0.5, abs=1e-6)
+    assert applied(settings, "plant.servo_delay=0.08")[0] == "++++-----+++"  # dwell 0.25 s
+    assert applied(settings, "chatter.dwell=0")[0] == "-+-+-+-+-+-+"
+
+
+def test_a_training_may_do_without_the_shortest_dwell() -> None:
+    sides, reward = applied(EnvironmentSettings(longest_start=0, dwell=False))
+    assert (sides, reward) == ("-+-+-+-+-+-+", pytest.approx(0.0, abs=1e-6))
+
+
 def test_a_step_before_the_first_episode_and_after_the_end_says_what_is_wrong() -> None:
     env = gymnasium.make("fishd/Swim-v0").unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
@@ -184,3 +217,31 @@ def test_without_a_fishd_it_says_where_it_looked(tmp_path: Path) -> None:
 def test_no_policy_learns_from_a_fin_velocity_that_it_will_not_be_shown() -> None:
     with pytest.raises(ConfigError, match="observer is not possible with fin_velocity"):
         gymnasium.make("fishd/Swim-v0", overrides=("estimator.kind=observer",))
+
+
+def test_power_with_a_price_is_taken_off_the_reward() -> None:
+    config, rewards = load(None), []
+    for price in (0.0, 0.01):
+        link, settings = SimulatedLink(config), EnvironmentSettings(power_price=price)
+        env = SwimEnv(link, config, settings)
+        env.reset(seed=1)
+        rewards.append(env.step(np.array([1.0], np.float32))[1])
+        power = link.step(0.42).power
+        assert power is not None
+        assert power > 0.06
+    assert rewards[1] < rewards[0] - 0.3 * 0.01 * 0.06 / env.best_thrust
+
+
+class Unmetered(SimulatedLink):
+    """A fish whose power nobody knows."""
+
+    def step(self, angle: float) -> StepResult:
+        return super().step(angle)._replace(power=None)
+
+
+def test_power_that_is_not_known_can_have_no_price() -> None:
+    config = load(None)
+    env = SwimEnv(Unmetered(config), config, EnvironmentSettings(power_price=0.01, longest_start=0))
+    env.reset(seed=1)
+    with pytest.raises(ConfigError, match=r"environment\.power_price: the power of the servo"):
+        env.step(np.array([1.0], np.float32))

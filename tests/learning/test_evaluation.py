@@ -127,7 +127,7 @@ def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
 
 def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Path) -> None:
     settings = TrainingSettings(
-        steps=384,
+        steps=768,
         randomisation=Randomisation(omega0=0.2, coupling=0.2),
         evaluation=EvaluationSettings(seconds=8.0, settle=3.0, others=3),
     )

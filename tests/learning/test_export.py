@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from fishd.cli.main import fishctl
 from fishd.controllers import registry
-from fishd.controllers.base import ChatterSettings, Limits
+from fishd.controllers.base import Limits
 from fishd.controllers.policy.card import Layout
 from fishd.controllers.policy.file import read
 from fishd.core.errors import ParameterError, PolicyError
@@ -47,9 +47,7 @@ def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
 ) -> None:
     assert trained.best
     found = export(trained.best, tmp_path / "policy.onnx")
-    controller = registry.create(
-        "ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, chatter=ChatterSettings(dwell=0.0))
-    )
+    controller = registry.create("ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, dwell=0.0))
     policy, perception = checkpoints.load_policy(trained.best)
     decide = DeterministicPolicy(policy, perception, 0.42)
     draw = np.random.default_rng(1)

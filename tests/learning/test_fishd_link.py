@@ -75,9 +75,9 @@ def losing(message: str) -> Iterator[None]:
         yield
 
 
-def history(link: Link, steps: int, pause_every: int) -> list[tuple[bytes, float, int]]:
+def course(link: Link, steps: int, pause_every: int, ticks: int) -> list[tuple[bytes, float, int]]:
     """What an agent sees that acts at random, always in the same way."""
-    env = SwimEnv(link, load(None, FISH), EnvironmentSettings(episode=100))
+    env = SwimEnv(link, load(None, FISH), EnvironmentSettings(episode=100, history=ticks))
     draw = np.random.default_rng(4)
     seen = [(env.reset(seed=3)[0].tobytes(), 0.0, 0)]
     for step in range(1, steps + 1):
@@ -92,15 +92,17 @@ def history(link: Link, steps: int, pause_every: int) -> list[tuple[bytes, float
     return seen
 
 
-@pytest.mark.parametrize("pause_every", [0, 64], ids=["without pauses", "with pauses"])
+@pytest.mark.parametrize(
+    ("pause_every", "ticks"), [(0, 8), (64, 1)], ids=["with a history", "with pauses"]
+)
 def test_a_fishd_in_lockstep_gives_the_numbers_of_a_fish_in_process(
-    tmp_path: Path, pause_every: int
+    tmp_path: Path, pause_every: int, ticks: int
 ) -> None:
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
     settings = ("lockstep=true", "start.controller=remote", agent, *FISH)
     with running(tmp_path, *sets(*settings)) as daemon:  # its first tick waits for the agent
-        there = history(FishdLink(daemon.endpoint), 300, pause_every)
-    assert there == history(SimulatedLink(load(None, FISH)), 300, pause_every)
+        there = course(FishdLink(daemon.endpoint), 300, pause_every, ticks)
+    assert there == course(SimulatedLink(load(None, FISH)), 300, pause_every, ticks)
 
 
 def test_it_swims_a_fishd_in_real_time_and_leaves_it_at_rest(daemon: Daemon, fish: Fish) -> None:
@@ -111,7 +113,7 @@ def test_it_swims_a_fishd_in_real_time_and_leaves_it_at_rest(daemon: Daemon, fis
         told: dict[float, float] = {}
         for n in range(20):
             angle = 0.02 * (n + 1)
-            found, lost = link.step(angle)
+            found, lost, _ = link.step(angle)
             if not lost:
                 told[before.fx] = angle
                 assert found.time == pytest.approx(before.time + 0.1)

@@ -19,7 +19,12 @@ from fishd.learning.env.environment import features, thrust_scale
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
-from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
+from fishd.learning.settings import (
+    EnvironmentSettings,
+    EvaluationSettings,
+    PpoSettings,
+    TrainingSettings,
+)
 from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.progress import Display
 from fishd.learning.train.training import Training, train
@@ -50,15 +55,21 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return all(bool((one[name] == other[name]).all()) for name in one)
 
 
-def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path) -> None:
-    settings = TrainingSettings(evaluation=EvaluationSettings(seconds=10.0, settle=5.0))
+@pytest.mark.parametrize("dwell", [False, True])
+def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path, dwell: bool) -> None:
+    settings = TrainingSettings(
+        environment=EnvironmentSettings(dwell=dwell),
+        evaluation=EvaluationSettings(seconds=10.0, settle=5.0),
+    )
     job = replace(brief_job(tmp_path / "run"), settings=replace(settings, steps=1024))
     outcome = train(job)
     assert (outcome.ended, outcome.steps) == ("finished", 1024)
     assert outcome.best_evaluation
     assert outcome.best_evaluation.efficiency > 0.9
     untrained = rows(job.folder / "progress.csv")[0]
-    assert outcome.best_evaluation.thrust > 3.0 * float(untrained["thrust"])
+    # Who moves at random, but not too fast, swims not that badly.
+    better = 1.2 if dwell else 3.0
+    assert outcome.best_evaluation.thrust > better * float(untrained["thrust"])
 
 
 def test_the_same_seed_gives_the_same_numbers_and_another_does_not(
@@ -253,7 +264,8 @@ def test_a_fish_that_is_lost_ends_the_run_with_a_checkpoint_and_the_reason(tmp_p
 
 
 def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
-    job = brief_job(tmp_path / "run", steps=192)
+    environment = EnvironmentSettings(held_cost=0.0)  # so that the reward is that of the thrust
+    job = brief_job(tmp_path / "run", steps=192, environment=environment)
     link = Resting(job)
     training = Training(job, link, Display(), lambda: False)
     training.run()

@@ -25,6 +25,7 @@ def rerun_of(rig: Rig, path: Path) -> Rerun:
         ("square", {"frequency": 1.63}, {"frequency": 2.2}),
         ("sine", {"frequency": 1.63}, {"amplitude": 0.2}),
         ("hold", {"angle": 0.2}, {"angle": -0.1}),
+        ("thrust", {"target": 0.01}, {"target": 0.015}),
         ("ppo", {"policy": "default-fish"}, {}),
     ],
 )
@@ -53,6 +54,15 @@ def test_every_command_and_every_estimate_comes_out_to_the_last_bit(
     assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
 
 
+def test_a_thrust_that_was_held_by_a_measured_factor_is_held_by_it_again(tmp_path: Path) -> None:
+    rig = Rig("simulation.noise=0.002")
+    rig.loop.thrust.calibrate(68.0, 0.5)
+    rig.start("thrust", target=0.01)
+    rig.run_for(10)
+    stretch = rerun_of(rig, tmp_path / "run").stretches[0]
+    assert (stretch.equal, stretch.ticks) == (200, 200)
+
+
 def test_the_model_based_estimator_is_rerun_too_and_sees_another_fish_where_asked(
     tmp_path: Path,
 ) -> None:
@@ -72,7 +82,7 @@ def test_a_change_of_the_code_would_be_found(
     rig = Rig()
     rig.start("swing")
     rig.run_for(5)
-    monkeypatch.setattr("fishd.controllers.swing.REFRACTORY", 0.4)
+    monkeypatch.setattr("fishd.controllers.reversal.REFRACTORY", 0.4)
     (stretch,) = rerun_of(rig, tmp_path / "run").stretches
     assert stretch.equal < stretch.ticks
     assert stretch.largest == pytest.approx(0.84)

@@ -8,7 +8,8 @@ from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampled_sensor import SampledSensor, Sampler
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+from fishd.hardware.sampler import Sampler
 from rigs.ads1115_board import Board
 
 TICK = 0.05
@@ -28,7 +29,7 @@ class ForceRig(Board):
         """A driver that somebody else calls."""
         return Ads1115(Ads1115Settings(**settings), self.clock)
 
-    def sampler(self, **settings: Any) -> Sampler:
+    def sampler(self, **settings: Any) -> Sampler[Pair]:
         """A sampler that somebody else steps."""
         return Sampler(self.sensor_driver(**settings), self.clock)
 
@@ -81,15 +82,15 @@ def measurements(found: list[Measurement | str]) -> list[Measurement]:
     return [item for item in found if isinstance(item, Measurement)]
 
 
-def take_pairs(sampler: Sampler, rig: ForceRig, seconds: float) -> list[Pair]:
+def take_pairs(sampler: Sampler[Pair], rig: ForceRig, seconds: float) -> list[Pair]:
     """What a sampler delivers in so long a time from now on."""
-    sampler.pairs.clear()
+    sampler.samples.clear()
     found: list[Pair] = []
     end = rig.clock.now + seconds
     while rig.clock.now < end:
         sampler.step()
-        while sampler.pairs:
-            found.append(sampler.pairs.popleft())
+        while sampler.samples:
+            found.append(sampler.samples.popleft())
     return found
 
 

@@ -156,7 +156,13 @@ class Wrapped:
         """What reached the servo: angles, and None for a release."""
 
     def robot(self) -> Robot:
-        return Robot(name="wrapped", sensor=self, servo=self, truth=self._robot.truth)
+        return Robot(
+            name="wrapped",
+            sensor=self,
+            servo=self,
+            truth=self._robot.truth,
+            power=self._robot.power,
+        )
 
     def read(self, now: float) -> Measurement:
         if self.read_error:

@@ -22,7 +22,7 @@ ELSEWHERE = {
         "servo_lag",
         "thrust_coefficient",
     },
-    "simulation": {"drift_period", "drift_rate", "hum_frequency", "sample_rate", "seed"},
+    "simulation": {"drift_period", "drift_rate", "hum_frequency", "motor", "sample_rate", "seed"},
 }
 """What is no imperfection, or belongs to one that is there."""
 

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -201,11 +202,14 @@ def test_the_half_beats_that_were_swum_are_said() -> None:
     assert "half beats" not in run("hold").stdout.splitlines()[2]
 
 
-def test_the_heading_says_that_another_controller_swam() -> None:
-    policy = ("ppo", "--policy", "default-fish", "--set", "plant.cable_slack=0.2")
+def test_the_heading_says_that_another_controller_swam(tmp_path: Path) -> None:
+    from rigs.policy_files import write  # which needs the extra 'policy'
+
+    shaking = write(tmp_path)
+    policy = ("ppo", "--policy", str(shaking))
     heading = run(*policy).stdout.splitlines()[0]
     assert re.fullmatch(
-        r"controller  ppo policy=default-fish until \d\.\d\d s, then swing; "
+        rf"controller  ppo policy={re.escape(str(shaking))} until \d\.\d\d s, then swing; "
         "whose figures these are",
         heading,
     )

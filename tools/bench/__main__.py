@@ -22,6 +22,7 @@ NAMES = (
     "swing",
     "adapt",
     "harsh",
+    "thrust",
     "camera",
     "swimmer",
 )

@@ -7,13 +7,12 @@ Each fish swims a minute from rest in virtual time, with each seed of the noise:
 import statistics
 from argparse import Namespace
 from collections.abc import Iterable
-from itertools import pairwise
 from typing import NamedTuple
 
 from common.report import Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.controllers import registry
-from fishd.core.signals import Event, Tick
+from fishd.lab.compare.survey import Reversals
 from fishd.simulation import judge
 
 DOCUMENT = "policies.md"
@@ -58,34 +57,6 @@ class Swum(NamedTuple):
     fast: float
     """Longest stretch of reversals less than `FAST` apart [s]."""
     fell_back: bool
-
-
-class Reversals:
-    """A publisher that notes when the instruction angle changed its side."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-        self._side = 0.0
-
-    def tick(self, tick: Tick) -> None:
-        """Note a reversal."""
-        if tick.phi_c * self._side < 0.0:
-            self.times.append(tick.t)
-        self._side = tick.phi_c or self._side
-
-    def event(self, event: Event) -> None:
-        """Drop."""
-
-    def longest(self, apart: float) -> float:
-        """The longest stretch of reversals that follow within less than a time [s]."""
-        longest = begun = 0.0
-        for before, now in pairwise(self.times):
-            begun = begun or before
-            if now - before < apart:
-                longest = max(longest, now - begun)
-            else:
-                begun = 0.0
-        return longest
 
 
 def swim(config: Config, name: str, parameters: dict[str, str]) -> Swum:

@@ -13,9 +13,10 @@ from typing import Any
 
 import yaml
 
-from bench.swing import Case, Shares, measured, percent
+from bench.swing import Shares, measured, percent
 from common.report import DOCS, Options, Report, table
 from fishd.config import load
+from fishd.lab.other_fish import OtherFish
 from fishd.virtual.plant.optimum import best_square_wave
 
 DOCUMENT = "concepts.md"
@@ -39,7 +40,7 @@ NAMES = {
 """The keys of each."""
 
 
-def cases(file: Path, amplitude: float) -> list[Case]:
+def cases(file: Path, amplitude: float) -> list[OtherFish]:
     """None of them, each alone, all of them; amplitude: Φ, the first override of each [rad]"""
     sections = yaml.safe_load(file.read_text(encoding="utf-8"))
     values = {
@@ -51,9 +52,9 @@ def cases(file: Path, amplitude: float) -> list[Case]:
     if named != set(values):
         raise ValueError(f"{file} and NAMES differ by {sorted(named ^ set(values))}")
 
-    def case(name: str, keys: Any) -> Case:
+    def case(name: str, keys: Any) -> OtherFish:
         own = (f"{key}={values[key]!r}" for key in keys)
-        return Case(name, (f"amplitude_limit={amplitude}", *own))
+        return OtherFish(name, (f"amplitude_limit={amplitude}", *own))
 
     alone = [case(name, keys) for name, keys in NAMES.items()]
     return [case("none", ()), *alone, case("all of them", values)]
@@ -76,7 +77,7 @@ def measure(options: Namespace) -> Report:
     return Report({"bench harsh": table(head, rows)}, figures)
 
 
-def row(case: Case, shares: Shares) -> list[str]:
+def row(case: OtherFish, shares: Shares) -> list[str]:
     """Of the table."""
     config = load(None, case.overrides)
     best = best_square_wave(config.plant, config.amplitude_limit)

@@ -5,6 +5,7 @@ the best square wave of the same fish and amplitude.
 
     efficiency   learning curves: several settings, ten seeds each; draws docs/learning-curves.png
     transfer     policies for one fish on sixteen others
+    harsh        the policy that is shipped, and swing, on rigs that delay, play and react
     speed        environment and inference, on one core
 """
 
@@ -21,9 +22,11 @@ from bench.learning_curves import learning_curves
 from bench.policy import policy_file
 from bench.trainings import Row, Trained, rig, settings_of, several
 from common.report import DOCS, Options, Report, progress, spread, table
-from fishd.config import Config
+from fishd.config import Config, load
 from fishd.controllers import registry
-from fishd.lab.compare.contestants import best_on_grid
+from fishd.lab.compare.contestants import best_on_grid, parse
+from fishd.lab.compare.survey import survey
+from fishd.lab.other_fish import CHANGES, harsh_fish
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.simulated_link import SimulatedLink
@@ -35,6 +38,7 @@ FIGURE = DOCS / "learning-curves.png"
 MILESTONES = (1000, 2000, 3000, 5000, 8000, 20_000)
 """Control steps."""
 ENOUGH, AT_END = 0.97, 0.99
+SECONDS, SETTLE = 60.0, 10.0
 STALLED = 0.5
 """A policy of less efficiency than this counts as stalled."""
 
@@ -134,9 +138,44 @@ def transfer(options: Namespace) -> str:
     return f"{of_seeds}\n\n{table(heads, lines)}"
 
 
+def harsh(options: Namespace) -> str:
+    """What `fishctl learn evaluate --fish harsh` shows, for three contestants."""
+    changes, random = list(CHANGES), list(harsh_fish())
+    configs = [(fish, load(None, fish.overrides)) for fish in (*changes, *random)]
+    contestants = [parse(text) for text in ("default-fish", "swing:C=0.6", "swing:C=auto")]
+    found = survey(configs, contestants, SECONDS, SETTLE)
+    rows = [
+        [fish.name, *(f"{100 * one.fish[row].efficiency:.1f}" for one in found)]
+        for row, fish in enumerate(changes)
+    ]
+    others = [one.fish[len(changes) :] for one in found]
+    for name, pick in (("median", statistics.median), ("worst", min)):
+        figures = [pick(swum.efficiency for swum in row) for row in others]
+        rows.append(
+            [f"{len(random)} harsh fish, {name}", *(f"{100 * share:.1f}" for share in figures)]
+        )
+    lost = [sum(swum.fallback is not None for swum in one.fish) for one in found]
+    rows.append(["another took over, runs", *map(str, lost)])
+    shaken = [max(swum.shaken for swum in one.fish) for one in found]
+    rows.append(["reversals in consecutive ticks, at most, s", *(f"{s:.1f}" for s in shaken)])
+    heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in found)])
+    return f"Efficiency in %, of a minute whose first 10 s do not count:\n\n{table(heads, rows)}"
+
+
 def speed(options: Namespace) -> str:
     """Steps of the environment per second, and time of an inference, on one core."""
-    config, settings = rig(), TrainingSettings()
+    config = rig()
+    lines = []
+    for name, file in (
+        ("default settings", None),
+        ("`learning-harsh.yaml`", "learning-harsh.yaml"),
+    ):
+        lines.append(f"- environment, {name}, {steps_per_second(config, settings_of(file))}")
+    return "\n".join((*lines, f"- {inference(config)}"))
+
+
+def steps_per_second(config: Config, settings: TrainingSettings) -> str:
+    """Of the environment with random actions, on one core; always the configured fish."""
     env = SwimEnv(SimulatedLink(config), config, settings.environment)
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10_000, 1)).astype(np.float32)
@@ -147,12 +186,9 @@ def speed(options: Namespace) -> str:
             if env.step(action)[3]:
                 env.reset()
         rates.append(len(actions) / (time.perf_counter() - begun))
-    return "\n".join(
-        (
-            f"- environment, full loop in process, one core: {max(rates):.0f} steps/s "
-            f"(best of five times {len(actions)} steps; slowest {min(rates):.0f})",
-            f"- {inference(config)}",
-        )
+    return (
+        f"full loop in process, one core: {max(rates):.0f} steps/s "
+        f"(best of five times {len(actions)} steps; slowest {min(rates):.0f})"
     )
 
 
@@ -170,7 +206,7 @@ def inference(config: Config) -> str:
     return f"the controller `ppo`, observation to angle: {median:.1f} µs, p99 {tail:.1f} µs"
 
 
-PARTS = {"efficiency": efficiency, "transfer": transfer, "speed": speed}
+PARTS = {"efficiency": efficiency, "transfer": transfer, "harsh": harsh, "speed": speed}
 
 
 OPTIONS: Options = {

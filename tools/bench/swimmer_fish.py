@@ -70,9 +70,12 @@ def swum(cell: float, step: float) -> Swum:
 
 
 def order(values: Sequence[float]) -> tuple[float, float]:
-    """Observed order and Richardson's limit of three values, each at half the size of the last."""
+    """Observed order and Richardson's limit of three values, each at half the size of the last.
+
+    Not a number where their differences do not become smaller.
+    """
     first, second = values[1] - values[0], values[2] - values[1]
-    if first * second <= 0.0 or abs(second) >= abs(first):
+    if first * second <= 0.0 or abs(second) > 0.9 * abs(first):
         return math.nan, math.nan
     found = math.log2(first / second)
     return found, values[2] + second / (2.0**found - 1.0)

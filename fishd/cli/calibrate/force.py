@@ -12,6 +12,7 @@ from fishd.cli.options import endpoint_option
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core import text
+from fishd.core.calibration import ForceCalibration
 from fishd.hardware.force_sensor.calibration_fit import (
     Fit,
     Load,
@@ -79,7 +80,8 @@ def force(
             "one of the two"
         )
     with Fish(endpoint) as fish:
-        limit = fish.calibrations().force_limit  # refused where there is nothing to calibrate
+        present = fish.calibrations()  # refused where there is nothing to calibrate
+        limit = present.force_limit
         load_files.check_limit(steps, limit)
         try:
             if measured:
@@ -88,6 +90,9 @@ def force(
                 dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
                 fitted = _fitted_with_help(dialogue)
+            seen = fish.status().fy_reversed
+            if doubt := _doubtful_sign(seen, present.force, fitted.calibration):
+                echo(f"warning: {doubt}", err=True)
             good = yes or click.confirm("Use this calibration from now on, and save it?")
         except (click.Abort, KeyboardInterrupt):
             echo("\nnothing was changed", err=True)
@@ -98,6 +103,28 @@ def force(
         saved = fish.calibrate_force(fitted.calibration)
     echo(text.line(f"in use, and saved in {saved.force_file}"))
     return 0
+
+
+def _doubtful_sign(
+    reversed_now: bool | None, present: ForceCalibration, new: ForceCalibration
+) -> str:
+    """Why the sign of F_y is not to be believed, by what the tail did last; empty if it may be.
+
+    reversed_now: is F_y reversed with the present calibration? None where nobody knows
+    """
+    same = present.yx * new.yx + present.yy * new.yy > 0.0
+    if reversed_now is None or same is not reversed_now:
+        return ""
+    if reversed_now:
+        return (
+            "F_y is reversed, as was seen when the tail last set off, and this calibration leaves "
+            "it so: were +y and -y interchanged? If not, the servo turns the wrong way: "
+            "'fishctl calibrate servo'"
+        )
+    return (
+        "this calibration turns F_y round, which was right when the tail last set off: were +y and "
+        "-y interchanged?"
+    )
 
 
 def _fitted(names: list[str], loads: list[Load]) -> Fit:

@@ -16,6 +16,7 @@ import msgspec
 from fishd import assembly
 from fishd.client import Fish
 from fishd.config import Config
+from fishd.config.drivers import CHOICES
 from fishd.core.addresses import find_control, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.plugins import Plugins
@@ -24,7 +25,6 @@ from fishd.core.signals import Status, Tick
 from fishd.core.unix_sockets import is_deserted
 from fishd.hardware import ownership
 from fishd.hardware.checks import Machine, Result, skipped
-from fishd.hardware.registry import FORCE_SENSORS, SERVOS
 
 INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
 """Mends a missing driver."""
@@ -193,12 +193,9 @@ class Context(Machine):
 
     @property
     def drivers(self) -> tuple[tuple[str, Plugins[Any], Any], ...]:
-        """Section, kind and settings of the two drivers."""
-        config = self.config
-        return (
-            ("force_sensor", FORCE_SENSORS, config.force_sensor),
-            ("servo", SERVOS, config.servo),
-        )
+        """Section, kind and settings of each driver: sensor, servo, and a power meter if any."""
+        chosen = self.config.driver_settings.sections()
+        return tuple((name, CHOICES[name].plugins, settings) for name, settings in chosen.items())
 
 
 def sudo_unless(uid: int) -> str:

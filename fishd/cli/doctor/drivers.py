@@ -27,14 +27,18 @@ _LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
 
 def checks(context: Context) -> tuple[Check, ...]:
     """All of them, for the drivers of the configuration."""
-    _, sensor, sensor_settings = context.drivers[0]
-    _, servo, servo_settings = context.drivers[1]
+    (_, sensor, sensor_settings), (_, servo, servo_settings), *others = context.drivers
     of_servo = servo.find(servo_settings.driver).checks(servo_settings)
     return (
         Check("drivers", drivers),
         *sensor.find(sensor_settings.driver).checks(sensor_settings),
         Check("force", force),
         *(of_servo or (Check("servo", servo_opens),)),
+        *(
+            check
+            for _, meter, settings in others
+            for check in meter.find(settings.driver).checks(settings)
+        ),
         Check("gpio pins", pins, ("pi",)),
     )
 
@@ -161,7 +165,7 @@ def pins(context: Context) -> Result | None:
     wanted = {config.panel.estop_gpio: "panel.estop_gpio", config.panel.led_gpio: "panel.led_gpio"}
     wanted |= {
         pin: f"{section}.{claim.key}"
-        for section, claims in claims_of(config.force_sensor, config.servo).items()
+        for section, claims in claims_of(config.driver_settings).items()
         for claim in claims
         for pin in claim.pins
         if claim.key != "bus"  # whose pins the kernel drives

@@ -12,6 +12,7 @@ from fishd.cli.options import json_option
 from fishd.cli.output import counted, echo, print_json
 from fishd.cli.recording.choice import damage, folder_option
 from fishd.core import text
+from fishd.core.console import power_words
 from fishd.core.errors import RecordingError
 from fishd.recording.folder import Glance, glances, runs_folder
 from fishd.recording.summary import Summary
@@ -29,7 +30,8 @@ def runs(folder: Path | None, as_json: bool) -> int:
 
     'thrust' is the mean while it swam, in mN unless another unit is told, with its 95 % interval.
     Where the zero of the sensor was never known, it is the mean force as measured, drift
-    and offset included, ± ?. 'lost' are ticks that fishd made and that are not in the file.
+    and offset included, ± ?. 'power' went into the servo meanwhile. 'lost' are ticks that fishd
+    made and that are not in the file.
     """
     place = folder or runs_folder()
     found = list(glances(place))
@@ -64,7 +66,7 @@ def _print(found: list[Glance]) -> None:
 
     table = Table(box=None, pad_edge=False)
     table.add_column("run", overflow="fold")
-    for head in ("began", "length", "thrust", "ticks", "lost", "marks"):
+    for head in ("began", "length", "thrust", "power", "ticks", "lost", "marks"):
         table.add_column(head, justify="right", no_wrap=True)
     for head in ("swam", "about"):
         table.add_column(head, overflow="fold")
@@ -75,6 +77,7 @@ def _print(found: list[Glance]) -> None:
             _began(glance.about.get("started", "")),
             _length(summary.duration),
             _thrust(summary),
+            "–" if summary.power is None else power_words(summary.power),
             str(summary.ticks),
             str(summary.lost),
             str(summary.marks),

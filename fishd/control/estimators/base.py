@@ -3,11 +3,14 @@
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.control.estimators.tail_beat import TailBeat
 from fishd.core.schema import note, unit
 from fishd.core.signals import Measurement, Observation
+
+LEAK, LONGEST_LEAK = 0.3, 100.0
+"""K/K_d is 0.323 s for the fish of Fu et al.; and the longest that is taken [s]."""
 
 
 class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -22,14 +25,13 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         ),
     ] = "lateral_force"
     leak: Annotated[
-        float,
+        Annotated[float, Meta(gt=0, le=LONGEST_LEAK)] | Literal["auto"],
         unit(
             "s",
-            "Of lateral_force: time constant by which the integral of the lateral force forgets.",
-            gt=0,
-            le=100,
+            "Of lateral_force: time constant by which the integral of the lateral force forgets; "
+            "K/K_d is right. auto: begin with 0.3, and find what goes with F_x.",
         ),
-    ] = 0.3
+    ] = LEAK
     bias_time: Annotated[
         float,
         unit(
@@ -115,6 +117,11 @@ class Estimator(ABC):
             thrust=self._beat.thrust,
             frequency=self._beat.frequency,
         )
+
+    @property
+    def found_leak(self) -> float | None:
+        """The leak in use [s], where that is for the estimator to find; else None."""
+        return None
 
     @abstractmethod
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:

@@ -7,7 +7,8 @@ sensor would integrate to a lie; a slow average of the force finds it and takes 
 
 import math
 
-from fishd.control.estimators.base import Estimator, EstimatorSettings
+from fishd.control.estimators.base import LEAK, Estimator, EstimatorSettings
+from fishd.control.estimators.leak_search import LeakSearch
 from fishd.core.signals import Measurement
 
 
@@ -17,8 +18,15 @@ class LateralForceEstimator(Estimator):
     def __init__(self, settings: EstimatorSettings) -> None:
         super().__init__()
         self._settings = settings
+        self._leak = LEAK if settings.leak == "auto" else settings.leak
+        self._search = LeakSearch(LEAK, settings.bias_time) if settings.leak == "auto" else None
         self._bias: float | None = None
         self._fin_velocity = 0.0
+
+    @property
+    def found_leak(self) -> float | None:
+        """As `Estimator.found_leak`."""
+        return self._search.leak if self._search else None
 
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
         """As `Estimator.fin_velocity`; about K times the fin velocity [N s]."""
@@ -26,6 +34,9 @@ class LateralForceEstimator(Estimator):
         if self._bias is None:
             self._bias = fy
         self._bias -= math.expm1(-dt / self._settings.bias_time) * (fy - self._bias)
-        self._fin_velocity *= math.exp(-dt / self._settings.leak)
+        if self._search:
+            self._search.update(measurement.fx, fy, self._bias, dt)
+            self._leak = self._search.leak
+        self._fin_velocity *= math.exp(-dt / self._leak)
         self._fin_velocity -= (fy - self._bias) * dt
         return self._fin_velocity

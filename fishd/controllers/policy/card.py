@@ -4,6 +4,8 @@ The card travels inside the ONNX file, so that a network is never run without it
 another tick, for another amplitude or on other pictures than it was trained for.
 """
 
+import math
+from collections.abc import Callable
 from operator import attrgetter
 from typing import Annotated, Any, Literal
 
@@ -34,6 +36,12 @@ FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle"
 
 COMMANDS = ("instruction_angle", "previous_angle")
 """Those that are known without any sensor."""
+
+LONGEST_HISTORY = 64
+"""[ticks]"""
+
+SMALLEST_RMS = 0.02
+"""With `relative`, less than this is like this: noise of a fish at rest stays small [scale]."""
 
 _TOO_DEEP = "its card is JSON that is nested too deeply"
 
@@ -97,6 +105,72 @@ class Layout:
             row[place] = value(observation) * factor
 
 
+class Window(Struct, frozen=True):
+    """Of which ticks a network is given the features."""
+
+    ticks: int = 1
+    span: float = 0.0
+    """That many of them [s]."""
+    relative: bool = False
+    """Is each but the commands divided by its rms over these ticks, too?"""
+
+
+ONE_TICK = Window()
+
+
+class History:
+    """The network's input from the latest ticks: the features of the newest first.
+
+    Ticks from before the beginning are like the first one. A tick that comes again is the same one,
+    and one that is older than the latest, or so much newer that nothing of the history is left,
+    begins anew: after a reset, a pause or a gap nobody has to tell.
+    """
+
+    def __init__(
+        self,
+        features: tuple[Feature, ...],
+        window: Window = ONE_TICK,
+        row: NDArray[np.float32] | None = None,
+    ) -> None:
+        """
+        window: of which ticks
+        row: where the input goes, shape (ticks × features,); by default to an array of its own
+        """
+        self._layout = Layout(features)
+        self._window = window
+        self.row = np.zeros(window.ticks * len(features), np.float32) if row is None else row
+        """The input, dimensionless."""
+        self._given = self.row.reshape(window.ticks, len(features))
+        self._seen = np.zeros_like(self._given) if window.relative else self._given
+        self._factors = np.ones(len(features), np.float32)
+        self._forces = [k for k, each in enumerate(features) if each.name not in COMMANDS]
+        self._time = -math.inf
+        self.push: Callable[[Observation], None] = self._only if window.ticks == 1 else self._next
+        """Take the observation of a tick."""
+
+    def forget(self) -> None:
+        """Begin anew with the next observation."""
+        self._time = -math.inf
+
+    def _only(self, observation: Observation) -> None:
+        self._layout.write(observation, self.row)
+
+    def _next(self, observation: Observation) -> None:
+        seen, passed = self._seen, observation.time - self._time
+        if passed > 0.0:
+            seen[1:] = seen[:-1]
+        self._layout.write(observation, seen[0])
+        if not 0.0 <= passed < self._window.span:
+            seen[1:] = seen[0]
+        self._time = observation.time
+        if self._window.relative:
+            squares = np.einsum("ij,ij->j", seen, seen).tolist()
+            for place in self._forces:
+                rms = math.sqrt(squares[place] / len(seen))
+                self._factors[place] = 1.0 / max(rms, SMALLEST_RMS)
+            np.multiply(seen, self._factors, out=self._given)
+
+
 class Provenance(Struct, frozen=True, kw_only=True):
     """Where a policy comes from; for people only."""
 
@@ -129,6 +203,10 @@ class Card(Struct, frozen=True, kw_only=True):
     format: int = FORMAT
     observation: tuple[Feature, ...]
     """The numbers that the network is given, in order."""
+    history: Annotated[int, Meta(ge=1, le=LONGEST_HISTORY)] = 1
+    """Of how many ticks it is given these numbers, the newest first."""
+    relative: bool = False
+    """Is each but the commands divided by its rms over these ticks, too?"""
     pictures: StackSettings | None = None
     """The frames that it is given; None where it sees none."""
     tick: Positive
@@ -136,6 +214,16 @@ class Card(Struct, frozen=True, kw_only=True):
     amplitude: Positive
     """Φ: an output of ±1 is an instruction angle of ±Φ [rad]."""
     provenance: Provenance
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers the network is given, beside pictures."""
+        return len(self.observation) * self.history
+
+    @property
+    def window(self) -> Window:
+        """Of which ticks."""
+        return Window(self.history, self.history * self.tick, self.relative)
 
     @property
     def sees(self) -> str:

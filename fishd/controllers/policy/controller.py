@@ -46,17 +46,18 @@ class Ppo(Controller[PpoParameters]):
 
     Parameters = PpoParameters
     action: float = quantity("1", "What the network put out, before it is cut to -1 to 1.")
+    held: float = quantity("1", "In what share of the latest ticks a reversal was held back.")
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Reads, checks and warms up the policy."""
-        from fishd.controllers.policy.card import Layout
+        from fishd.controllers.policy.card import History
 
         self.parameters = parameters  # without super(), which would do all of it twice
         self.limits = limits
         card, self._network = _open(parameters, limits)
-        self._write = Layout(card.observation).write
+        self._history = History(card.observation, card.window, self._network.row)
         self._amplitude = card.amplitude
-        self._limit = DwellLimit(limits.chatter.dwell, limits, card.amplitude)
+        self._limit = DwellLimit(limits.dwell, limits, card.amplitude)
         self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
@@ -67,6 +68,8 @@ class Ppo(Controller[PpoParameters]):
     def activate(self, observation: Observation) -> None:
         """Take over as if the tail had reversed just now."""
         self._limit.activate(observation.instruction_angle)
+        self._history.forget()
+        self._latest = observation
 
     def retune(self, parameters: PpoParameters) -> None:
         """Refuse: another policy must be loaded and warmed up outside the loop."""
@@ -90,12 +93,14 @@ class Ppo(Controller[PpoParameters]):
         self.action = action = self._choose(observation)
         if math.isfinite(action):
             action = max(-1.0, min(1.0, action))
-        return self._limit.apply(self._amplitude * action, observation.dt)
+        angle = self._limit.apply(self._amplitude * action, observation.dt)
+        self.held = self._limit.share
+        return angle
 
     def _choose(self, observation: Observation) -> float:
         """What the network puts out."""
         network = self._network
-        self._write(observation, network.row)
+        self._history.push(observation)
         return network.run()
 
 

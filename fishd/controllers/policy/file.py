@@ -138,7 +138,7 @@ def inputs_of(card: Card) -> list[_Form]:
     if card.pictures:
         found.append((FRAMES, "uint8", (1, *card.pictures.shape)))
     if card.observation:
-        found.append((INPUT, "float32", (1, len(card.observation))))
+        found.append((INPUT, "float32", (1, card.numbers)))
     return found
 
 

@@ -42,7 +42,7 @@ def to_onnx(
     """The file: layers with the activation between them, and the last output clipped to [-1, 1].
 
     Inputs `frames` (uint8, 1 × frames × size × size; where the card has pictures) and `observation`
-    (float32, 1 × features; where it has any), output `action` (float32, 1 × 1).
+    (float32, 1 × features of all ticks; where it has any), output `action` (float32, 1 × 1).
 
     sight: needed for a card with pictures
 
@@ -52,7 +52,7 @@ def to_onnx(
     from onnx import TensorProto, helper, numpy_helper
 
     kinds = {"uint8": TensorProto.UINT8, "float32": TensorProto.FLOAT}
-    sight = sight or Sight([], {}, file.INPUT, len(card.observation))
+    sight = sight or Sight([], {}, file.INPUT, card.numbers)
     nodes, constants = list(sight.nodes), dict(sight.constants)
     width = _add_layers(nodes, constants, layers, activation, sight)
     graph = helper.make_graph(

@@ -53,11 +53,11 @@ class Network:
         card = policy.card
         pictures = card.pictures.shape if card.pictures else (0, 0, 0)
         frames = np.zeros((1, *pictures), np.uint8)
-        inputs = np.zeros((1, len(card.observation)), np.float32)
+        inputs = np.zeros((1, card.numbers), np.float32)
         self.frames: NDArray[np.uint8] = frames[0]
         """The pictures, shape (frames, size, size), newest first; of none where it sees none."""
         self.row: NDArray[np.float32] = inputs[0]
-        """The other numbers, shape (features,)."""
+        """The other numbers, shape (`card.numbers`,)."""
         self._output = np.zeros((1, 1), np.float32)
         try:
             self._session = _session(policy.content)

@@ -5,92 +5,18 @@ In virtual time there is no thread: a read samples until its clock has come to t
 
 import math
 import threading
-from collections import deque
-from contextlib import suppress
+from collections.abc import Callable
 from typing import Any
 
 from msgspec.structs import replace
 
-from fishd.core import text
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import Clock
 from fishd.core.errors import SensorError
-from fishd.core.foreign_code import contained
 from fishd.core.signals import Measurement
 from fishd.hardware.driver import ForceSensorDriver, Pair, survived
 from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
-
-REMEMBERED = 4096
-"""Pairs that are kept until somebody takes them; the oldest are dropped."""
-FEW = 3
-"""After so many failures in a row the hardware is opened anew."""
-LONGEST_PAUSE = 0.5
-"""Between two attempts [s]."""
-_SHORTEST_PAUSE = 1e-3
-
-
-class Sampler:
-    """Owns a driver; only one thread may call it, save for what says otherwise."""
-
-    def __init__(self, driver: ForceSensorDriver[Any], clock: Clock) -> None:
-        """Opens nothing yet."""
-        self._driver = driver
-        self._clock = clock
-        self.pairs: deque[Pair] = deque(maxlen=REMEMBERED)
-        """What came in, for another thread to take with `popleft`."""
-        self.trouble = ""
-        """Why the latest attempt failed, one line; empty if it did not. For any thread."""
-        self.errors = 0
-        """Attempts that failed, since start. For any thread."""
-        self.reconnects = 0
-        """How often the hardware was opened anew and samples came again. For any thread."""
-        self.ready_at = -math.inf
-        """No attempt begins earlier [s, monotonic]."""
-        self._failures = 0
-        self._open = False
-
-    def step(self) -> None:
-        """Make one attempt; never raises. Takes as long as it takes, on its clock."""
-        wait = self.ready_at - self._clock.monotonic()
-        if wait > 0.0:
-            self._clock.sleep(wait)
-        try:
-            if not self._open:
-                contained(self._driver.open)
-                self._open = True
-            pair = contained(self._driver.sample)
-        except Exception as error:  # the layers of drivers raise all kinds
-            self._recover(error)
-        else:
-            if pair is not None:
-                self.pairs.append(pair)
-                self.reconnects += self._failures >= FEW
-                self._failures = 0
-                self.trouble = ""
-
-    def close(self) -> None:
-        """Let go of the hardware; never raises, may be called twice."""
-        self._open = False
-        with suppress(Exception):
-            contained(self._driver.close)
-
-    def _recover(self, error: Exception) -> None:
-        """Leave the hardware time to settle, and more after several failures."""
-        self.trouble = self._explained(error)
-        self.errors += 1
-        self._failures += 1
-        pause = max(self._driver.settling, _SHORTEST_PAUSE)
-        if self._failures >= FEW:
-            self.close()
-            pause = min(LONGEST_PAUSE, pause * 2.0 ** min(self._failures - FEW, 10))
-        self.ready_at = self._clock.monotonic() + pause
-
-    def _explained(self, error: Exception) -> str:
-        try:
-            return contained(self._driver.explain, error)
-        except Exception:  # the words are lost, not the reason
-            return text.named(error)
-
+from fishd.hardware.sampler import Sampler
 
 HOLD = 2.2e-3
 """How long before a read all conversions have ended, at most an eighth of a tick [s].
@@ -115,12 +41,14 @@ class SampledSensor:
         *,
         threaded: bool,
         tick: float,
+        beside: Callable[[], None] = lambda: None,
     ) -> None:
         """Begin to sample; hardware that is missing may come later.
 
         clock: of the driver; in virtual time one of its own, which reads move on
         threaded: sample in a thread, which needs a clock that moves by itself
         tick: time between two reads [s]
+        beside: called again and again in virtual time, for what else uses its clock
         """
         self.calibration = calibration
         """What turns voltages into forces."""
@@ -128,10 +56,11 @@ class SampledSensor:
         self._tick = tick
         self._hold = min(HOLD, 0.125 * tick)
         self._step_time = 0.0
+        self._beside = beside
         self._place = driver.place
         self._transport = driver.transport
         self._driver = driver
-        self._sampler = Sampler(driver, clock)
+        self._sampler: Sampler[Pair] = Sampler(driver, clock)
         self._evaluation = WindowEvaluation(driver.settings, driver.names, driver.raw_unit)
         self._latest: Measurement | None = None
         self._watches: list[VoltageWatch] = []
@@ -210,7 +139,7 @@ class SampledSensor:
 
         In virtual time the driver may have run ahead: what ended after `now` is for the next read.
         """
-        pairs = self._sampler.pairs
+        pairs = self._sampler.samples
         count = len(pairs)
         if self._thread is None:
             count = sum(pair.time <= now for pair in pairs)
@@ -220,6 +149,7 @@ class SampledSensor:
         """Sample until `now` as the thread would have done."""
         clock, sampler = self._clock, self._sampler
         while max(clock.monotonic(), sampler.ready_at) <= now - self._hold - self._step_time:
+            self._beside()
             self._step()
         clock.sleep(now - clock.monotonic())
 

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config, Start
+from fishd.control.reporting import Publisher
 from fishd.core.signals import Tick
 from fishd.lab.compare.contestants import Contestant, build, parse, refusal
 from fishd.lab.compare.seeing import SeeingController
@@ -57,6 +58,12 @@ class Standing(Struct, frozen=True, kw_only=True):
     """Why another controller took over in runs, if one did; the figures are those of both."""
     runs: list[Report] = []
     """Of a simulated fish."""
+    power: float | None = None
+    """Electrical power of the servo [W]; None where it is not known."""
+    thrust_per_watt: float | None = None
+    """[N/W]"""
+    thrust_per_watt_error: float | None = None
+    """Half of its 95 % interval [N/W]; None for one run in simulation."""
 
 
 def compare(
@@ -82,22 +89,41 @@ def compare(
     for contestant in chosen:
         if error := refusal(config, contestant):
             raise error
-    limits, seen = replace(config.limits, virtual=True), camera or SimulatedCameraSettings()
+    seen = camera or SimulatedCameraSettings()
     standings, traces, swum = [], [], count(1)
-    for label, name, parameters in chosen:
+    for contestant in chosen:
         reports = []
         for run in range(runs):
             noise = replace(config.simulation, seed=config.simulation.seed + run)
-            fish = replace(config, simulation=noise, start=Start())
+            fish = replace(config, simulation=noise)
             light = replace(seen, seed=seen.seed + run)
-            controller = build(Contestant(label, name, parameters), limits, light)
-            watch = controller.watch if isinstance(controller, SeeingController) else _nothing
             end = _End(config.tick)
-            reports.append(judge(fish, name, controller, seconds, settle, end, watch))
+            reports.append(swim(fish, contestant, seconds, settle, end, light))
             progress(next(swum) * seconds)
-        standings.append(_standing(label, reports))
+        standings.append(_standing(contestant.label, reports))
         traces.append(trace(end.ticks))
     return standings, traces
+
+
+def swim(
+    config: Config,
+    contestant: Contestant,
+    seconds: float,
+    settle: float,
+    publisher: Publisher,
+    camera: SimulatedCameraSettings,
+) -> Report:
+    """Let one swim the fish of `config` once, from rest.
+
+    publisher: gets each tick
+    camera: what shows the fish to a policy that sees it
+
+    Raises as `compare` does.
+    """
+    controller = build(contestant, replace(config.limits, virtual=True), camera)
+    watch = controller.watch if isinstance(controller, SeeingController) else _nothing
+    fish = replace(config, start=Start())
+    return judge(fish, contestant.controller, controller, seconds, settle, publisher, watch)
 
 
 def _nothing(_: VirtualRun) -> None:
@@ -118,6 +144,8 @@ def trace(ticks: Sequence[Tick]) -> Trace:
 
 def _standing(label: str, reports: list[Report]) -> Standing:
     thrusts = [report.mean_thrust for report in reports]
+    powers = [report.mean_power for report in reports if report.mean_power is not None]
+    per_watt = [report.mean_thrust / report.mean_power for report in reports if report.mean_power]
     return Standing(
         contestant=label,
         controller=reports[0].controller,
@@ -132,6 +160,9 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         faults=[report.reason.message for report in reports if report.reason],
         fallbacks=[report.fallback.message for report in reports if report.fallback],
         runs=reports,
+        power=fmean(powers) if powers else None,
+        thrust_per_watt=fmean(per_watt) if per_watt else None,
+        thrust_per_watt_error=error_of_mean(per_watt),
     )
 
 

@@ -11,6 +11,7 @@ from fishd.core.signals import Tick
 from fishd.lab.compare.comparison import Standing, Trace, error_of_mean, trace
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.measurement import Measured, measure, plan
+from fishd.lab.objective import per_watt
 from fishd.lab.rig import Rig, is_of_one
 
 
@@ -85,7 +86,7 @@ def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
     angles = [abs(tick.phi_c) for run in runs for tick in run.ticks if tick.mode == "running"]
     mean = sum(angles) / len(angles)
     rms = math.sqrt(sum(angle**2 for angle in angles) / len(angles))
-    return Standing(
+    standing = Standing(
         contestant=label,
         controller=runs[0].controller,
         parameters=dict(runs[0].parameters),
@@ -96,6 +97,25 @@ def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
         fullness=mean / rig.amplitude,
         squareness=mean / rms if rms else 0.0,
     )
+    return replace(standing, **_power(runs))
+
+
+def _power(runs: list[Measured]) -> dict[str, float]:
+    """Power and thrust for each watt, as the thrust; nothing where not every run knows it."""
+    found = [
+        (run.watts, *per_watt(run.thrust, run.error, run.watts, run.watts_error)) for run in runs
+    ]
+    known = [(watts, gave, error) for watts, gave, error in found if watts and gave and error]
+    if len(known) < len(runs):
+        return {}
+    weights = [1.0 / error**2 for _, _, error in known]
+    total = sum(weights)
+    gave = [each for _, each, _ in known]
+    return {
+        "power": sum(watts for watts, _, _ in known) / len(known),
+        "thrust_per_watt": sum(w * each for w, each in zip(weights, gave, strict=True)) / total,
+        "thrust_per_watt_error": max(1.0 / math.sqrt(total), error_of_mean(gave) or 0.0),
+    }
 
 
 def _trace(run: Measured) -> Trace:

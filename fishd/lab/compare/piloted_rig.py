@@ -55,7 +55,7 @@ class PilotedRig(LiveRig):
         if controller != "ppo" or not sees_pictures(policy, self._limits):
             return super().swim(controller, parameters, seconds)
         agent = self._agent_of(str(policy))
-        dwell = self._limits.chatter.dwell
+        dwell = self._limits.dwell
         asked = {"agent": agent.address, "dwell": dwell}
         try:
             found = super().swim("remote", asked, seconds)
@@ -90,7 +90,7 @@ class _PilotThread:
         self.problem: FishdError | None = None
         """Why the fish is kept at neutral, if it is."""
         # fishd itself holds back reversals that come too soon, as it does for ppo.
-        free = replace(limits, chatter=replace(limits.chatter, dwell=0.0))
+        free = replace(limits, dwell=0.0)
         with ExitStack() as stack:
             self._pilot = Pilot(policy, free)
             pictures = self._pilot.card.pictures

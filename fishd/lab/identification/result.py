@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from fishd.control.estimators.base import LONGEST_LEAK
 from fishd.lab.identification.response import Array
 
 UNITS = {
@@ -116,8 +117,15 @@ class Identification:
         rig = {name: self[name].value for name in OF_THE_RIG}
         return {**rig, "noise": max(channel.noise for channel in self.channels)}
 
+    @property
+    def leak(self) -> float | None:
+        """The `estimator.leak` that restores the fin velocity, K/K_d [s]; None without a drag."""
+        drag = self["lateral_drag"].value
+        leak = self["thrust_coefficient"].value / drag if drag > 0.0 else LONGEST_LEAK
+        return leak if 0.0 < leak < LONGEST_LEAK else None
+
     def to_yaml(self, origin: str = "") -> str:
-        """Both sections, as a file that `fishd --config` reads.
+        """Both sections and the leak, as a file that `fishd --config` reads.
 
         origin: what it was identified from, for a comment
         """
@@ -127,6 +135,8 @@ class Identification:
         lines += [self._line(name, value) for name, value in self.plant.items()]
         lines += ["simulation:"]
         lines += [self._line(name, value) for name, value in self.simulation.items()]
+        if leak := self.leak:
+            lines += ["estimator:", f"  leak: {leak:.4g}  # s, K/K_d"]
         return "\n".join(lines) + "\n"
 
     def to_builtins(self) -> dict[str, Any]:

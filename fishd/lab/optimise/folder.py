@@ -24,7 +24,7 @@ from fishd.recording.writer import RunWriter
 
 BEGUN, TRIALS, RECORDING = "search.json", "trials.csv", "search.mcap"
 _TICKS = [base * 10.0**k for k in range(-4, 4) for base in (1, 2, 3, 5)]
-_COLUMNS = ("thrust", "error", "swum", "passed")
+_COLUMNS = ("thrust", "error", "power", "power_error", "swum", "passed")
 
 
 class Begun(Struct, frozen=True):
@@ -40,6 +40,9 @@ class Begun(Struct, frozen=True):
     config: dict[str, Any]
     """The fish, as plain data."""
     force_unit: str = "N"
+    objective: str = "thrust"
+    target: float | None = None
+    """The thrust that was to be reached, where the least power was searched [N]."""
     version: str = __version__
 
 
@@ -105,6 +108,8 @@ def _read(path: Path, head: tuple[str, ...]) -> list[Trial]:
             {name: row[name] for name in names},
             row["thrust"],
             row["error"],
+            row["power"],
+            row["power_error"],
             int(row["swum"]),
             row["passed"],
         )
@@ -113,9 +118,11 @@ def _read(path: Path, head: tuple[str, ...]) -> list[Trial]:
 
 
 def draw(
-    folder: Path, search: Search, found: Proposal, units: Mapping[str, str], force_unit: str
+    folder: Path, search: Search, found: Proposal, units: Mapping[str, str], label: str
 ) -> list[Path]:
     """The candidates over each parameter, and what is expected of one; PNG and SVG.
+
+    label: of the objective, in thousandths of its unit
 
     Raises `FishdError` where a file cannot be written.
     """
@@ -146,7 +153,7 @@ def draw(
                 axis.xaxis.set_minor_formatter("")
             unit = units.get(each.name, "")
             axis.set_xlabel(f"{each.name} ({unit})" if unit not in ("", "1") else each.name)
-        axes[0].set_ylabel(f"thrust (m{force_unit})")
+        axes[0].set_ylabel(label)
         axes[-1].legend()
         save(figure, paths[1])
     return paths

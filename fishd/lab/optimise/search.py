@@ -1,6 +1,7 @@
 """Where to measure next, and what seems best: Bayesian optimisation of noisy measurements.
 
-A Gaussian process stands for the thrust over the parameters; each measurement comes with its own
+A Gaussian process stands for the objective over the parameters, a thrust unless another is said
+(`fishd.lab.objective`); each measurement comes with its own
 error. What is measured next is where the expected improvement is largest (Jones et al., J. Glob.
 Optim. 13 (1998) 455), over the best that the process expects at what was measured, since that is
 noisy (Huang et al., J. Glob. Optim. 34 (2006) 441).
@@ -9,7 +10,7 @@ noisy (Huang et al., J. Glob. Optim. 34 (2006) 441).
 import contextlib
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -75,19 +76,19 @@ class Range(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """Where the Gaussian process expects the most thrust, among what can be measured."""
+    """Where the Gaussian process expects the most, among what can be measured."""
 
     parameters: dict[str, float]
     low: dict[str, float]
     """Of each parameter, the 95 % interval of where the maximum lies: it would there in as many of
     the curves that go with what was measured."""
     high: dict[str, float]
-    thrust: float
-    """[N]"""
+    value: float
+    """Of the objective; [N] where that is the thrust."""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half of its 95 % interval."""
     improvement: float
-    """Largest expected improvement by another trial, as a share of `thrust`."""
+    """Largest expected improvement by another trial, as a share of `value`."""
 
 
 class Search:
@@ -118,10 +119,31 @@ class Search:
         self._possible = self._fill()
         self._variances: list[float] = []
 
+    def alike(self, observed: Iterable[tuple[Mapping[str, float], float, float]]) -> "Search":
+        """Another one over the same ranges, that knows of these values and errors instead."""
+        other = Search(self.ranges, self._seed)
+        for each in observed:
+            other.observe(*each)
+        return other
+
     @property
     def trials(self) -> int:
         """How many candidates were measured."""
         return len(self._variances)
+
+    @property
+    def is_filled(self) -> bool:
+        """Were those measured that fill the ranges?"""
+        return self.trials >= len(self._first)
+
+    @property
+    def tried(self) -> Array:
+        """Where it was measured, as numbers from 0 to 1; (trials, parameters)."""
+        return np.array(self._library.space.params)
+
+    def places(self) -> Array:
+        """What can be measured, or fills it, and what was, as such numbers; (n, parameters)."""
+        return np.vstack((self._possible, self.tried))
 
     @property
     def is_warm(self) -> bool:
@@ -130,21 +152,21 @@ class Search:
 
     def suggest(self) -> dict[str, float]:
         """The next candidate: first some that fill the ranges, then what promises most."""
-        if self.trials < len(self._first):
-            return self._parameters(self._untried(self._first[self.trials]))
+        if not self.is_filled:
+            return self.parameters_at(self._untried(self._first[self.trials]))
         if any(each.values for each in self.ranges):
             gain, _ = self._gain(self._possible)
-            return self._parameters(self._possible[int(np.argmax(gain))])
+            return self.parameters_at(self._possible[int(np.argmax(gain))])
         self._fit_noise()
         found = self._library.suggest()
-        return self._parameters(np.array([found[name] for name in self._names]))
+        return self.parameters_at(np.array([found[name] for name in self._names]))
 
-    def observe(self, parameters: Mapping[str, float], thrust: float, error: float) -> None:
-        """Take what a candidate gave [N], and half of its 95 % interval [N]."""
+    def observe(self, parameters: Mapping[str, float], value: float, error: float) -> None:
+        """Take what a candidate gave, and half of its 95 % interval."""
         share = {each.name: each.share(parameters[each.name]) for each in self.ranges}
-        self._variances.append(max(error / 1.96, 1e-3 * abs(thrust), 1e-9) ** 2)
+        self._variances.append(max(error / 1.96, 1e-3 * abs(value), 1e-9) ** 2)
         with contextlib.redirect_stdout(None):  # where it prints that a candidate came again
-            self._library.register(params=share, target=thrust)
+            self._library.register(params=share, target=value)
 
     def proposal(self) -> Proposal:
         """What seems best now; there must have been a trial."""
@@ -159,13 +181,19 @@ class Search:
         low = np.quantile(tops, 0.025, axis=0, method="lower")
         high = np.quantile(tops, 0.975, axis=0, method="higher")
         return Proposal(
-            self._parameters(shares[best]),
-            self._parameters(np.minimum(low, shares[best])),
-            self._parameters(np.maximum(high, shares[best])),
+            self.parameters_at(shares[best]),
+            self.parameters_at(np.minimum(low, shares[best])),
+            self.parameters_at(np.maximum(high, shares[best])),
             float(mean[best]),
             1.96 * math.sqrt(max(float(covariance[best, best]), 1e-18)),
             float(gain.max() / abs(mean[best])),
         )
+
+    def expected(self, parameters: Mapping[str, float]) -> tuple[float, float]:
+        """What is expected there, and half of its 95 % interval; there must have been a trial."""
+        place: Array = np.array([[each.share(parameters[each.name]) for each in self.ranges]])
+        mean, covariance = self.expectation(place)
+        return float(mean[0]), 1.96 * math.sqrt(max(float(covariance[0, 0]), 0.0))
 
     def measured(self, name: str) -> tuple[list[float], list[float], list[float]]:
         """The values of a parameter that were tried, and their thrusts and errors [N]."""
@@ -178,12 +206,12 @@ class Search:
     def curve(self, points: int = 200) -> tuple[Array, Array, Array]:
         """Of one parameter: its values, the thrust, and half of its 95 % interval [N]."""
         shares = np.linspace(0.0, 1.0, points)
-        mean, covariance = self._expected(shares[:, None])
+        mean, covariance = self.expectation(shares[:, None])
         values = np.array([self.ranges[0].between(float(share)) for share in shares])
         return values, mean, 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
-    def _expected(self, shares: Array) -> tuple[Array, Array]:
-        """The thrust at these places, and its covariance."""
+    def expectation(self, shares: Array) -> tuple[Array, Array]:
+        """What is expected at such places, (n,), and its covariance, (n, n)."""
         self._fit_noise()
         places = [dict(zip(self._names, map(float, place), strict=True)) for place in shares]
         return cast(tuple[Array, Array], self._library.predict(places, return_cov=True))
@@ -191,7 +219,7 @@ class Search:
     def _gain(self, shares: Array) -> tuple[Array, tuple[Array, Array]]:
         """The improvement expected at these places [N]; the thrust there, and its covariance."""
         places: Array = np.vstack((shares, self._library.space.params))
-        mean, covariance = self._expected(places)
+        mean, covariance = self.expectation(places)
         deviation: Array = np.sqrt(np.maximum(np.diag(covariance), 1e-18))
         self._acquisition.y_max = mean[-self.trials :].max()
         n = len(shares)
@@ -225,7 +253,8 @@ class Search:
         new = [each for each in self._possible if not np.any(np.isclose(tried, each[0]))]
         return min(new or self._possible, key=lambda each: abs(float(each[0] - share[0])))
 
-    def _parameters(self, shares: Array) -> dict[str, float]:
+    def parameters_at(self, shares: Array) -> dict[str, float]:
+        """What a place stands for."""
         return {
             each.name: each.value(float(share))
             for each, share in zip(self.ranges, shares, strict=True)

@@ -1,7 +1,7 @@
 """Measures the candidates of a search on a rig: the fish swims with each, and rests in between."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from fishd.control.estimators.live_thrust import SWIM_SETTLES
@@ -9,6 +9,7 @@ from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.measurement import REST, evaluate, samples_of
+from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig, refuse_lost
 
@@ -37,6 +38,10 @@ class Trial(NamedTuple):
     """[N]"""
     error: float
     """Half of its 95 % interval [N]."""
+    power: float
+    """Electrical power of the servo [W]; NaN where it is not known."""
+    power_error: float
+    """Half of its 95 % interval [W]."""
     swum: int
     """Ticks of swimming so far."""
     passed: float
@@ -47,11 +52,12 @@ def trials(
     rig: Rig,
     controller: str,
     fixed: Mapping[str, Any],
-    search: Search,
+    search: Search | LeastPower,
     budget: float,
     before: Trial | None = None,
+    observe: Callable[[Trial], None] | None = None,
 ) -> Iterator[Trial]:
-    """Measure candidates on a rig for as long as the budget lasts; `search` knows of each.
+    """Measure candidates on a rig for as long as the budget lasts.
 
     The fish swims with a candidate, and rests; its thrust is what swimming adds to the force,
     beside a drift that is told apart by the rests before and after (`fishd.lab.measurement`).
@@ -59,6 +65,7 @@ def trials(
     fixed: parameters that are not searched
     budget: time in the tank [s]
     before: the last one of a search that is gone on with, which `search` knows already
+    observe: told of each candidate, for `search` to know it; by default, its thrust
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
     rest: list[Tick] = []
@@ -79,8 +86,16 @@ def trials(
         found = evaluate(samples_of(ticks), rig.tick, settles)
         swum += len(swim)
         passed += length + REST
-        search.observe(candidate, found.thrust, found.error)
-        yield Trial(candidate, found.thrust, found.error, swum, passed)
+        power, power_error = (
+            math.nan if each is None else each for each in (found.watts, found.watts_error)
+        )
+        trial = Trial(candidate, found.thrust, found.error, power, power_error, swum, passed)
+        if observe:
+            observe(trial)
+        else:
+            assert isinstance(search, Search)
+            search.observe(candidate, trial.thrust, trial.error)
+        yield trial
         rest = after
 
 

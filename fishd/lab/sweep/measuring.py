@@ -15,6 +15,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import amplitude_of
 from fishd.core.errors import FishdError
 from fishd.lab.measurement import measure
+from fishd.lab.objective import per_watt
 from fishd.lab.parallel import Stop
 from fishd.lab.rig import Rig, is_of_one
 from fishd.lab.sweep.grid import Point
@@ -120,12 +121,17 @@ def swim(
         return Result(seconds=seconds, trouble=trouble.message)
     means = beats.means()
     best = best_square_wave(config.plant, amplitude_of(controller.parameters, config.limits))
+    error = _half_width(means.thrust_deviation, beats.count)
+    watts = means.power or math.nan
     return Result(
         thrust=means.thrust,
-        error=_half_width(means.thrust_deviation, beats.count),
+        error=error,
         beat_frequency=means.frequency,
         efficiency=means.thrust / best.thrust if best.thrust > 0.0 else None,
         fin_amplitude=means.fin_amplitude,
+        power=means.power,
+        thrust_per_watt=means.thrust / watts,
+        thrust_per_watt_error=None if error is None else error / watts,
         seconds=seconds,
     )
 
@@ -144,10 +150,14 @@ def on_rig(point: Point, rig: Rig, seconds: float, progress: Callable[[float], N
         if not is_of_one(error):
             raise
         return Result(trouble=str(error))
+    gave, gave_error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
     return Result(
         thrust=found.thrust,
         error=found.error,
         beat_frequency=found.frequency,
+        power=found.watts,
+        thrust_per_watt=gave,
+        thrust_per_watt_error=gave_error,
         seconds=len(found.ticks) * rig.tick,
     )
 

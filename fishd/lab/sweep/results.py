@@ -20,6 +20,12 @@ class Result(Struct, frozen=True):
     """Thrust over that of the best square wave; of a simulated fish."""
     fin_amplitude: float | None = None
     """Largest fin angle of a half beat, mean [rad]; of a simulated fish."""
+    power: float | None = None
+    """Electrical power of the servo [W]; None where it is not known."""
+    thrust_per_watt: float | None = None
+    """[N/W]"""
+    thrust_per_watt_error: float | None = None
+    """Half of its 95 % interval [N/W]; of a simulated fish, as if its power had none."""
     seconds: float = 0.0
     """How long it swam and rested [s]."""
     trouble: str = ""

@@ -3,8 +3,10 @@
 | | | |
 |---|---|---|
 | observation | F_y, Ḟ_y, φ_c, its predecessor, fin velocity | each over its scale (`features`) |
+| | of the latest `history` ticks | newest first |
 | action | φ_c/Φ in [-1, 1] | applied from the tick that it answers until the next |
-| reward | `reward_scale` · F_x / `thrust_scale` | of the mean F_x in the tick that followed |
+| reward | `reward_scale` · (F_x − `power_price` · P) / `thrust_scale` | of the tick that followed |
+| | −`reward_scale` · `held_cost` | in a tick in which the shortest dwell held a reversal back |
 
 An episode is truncated after `episode` steps, and never terminates: a fish has no goal to reach.
 """
@@ -21,7 +23,8 @@ from numpy.typing import NDArray
 
 from fishd.camera.frames import Stack
 from fishd.config import Config, check_tethered
-from fishd.controllers.policy.card import Feature, FeatureName
+from fishd.controllers.dwell import Dwell
+from fishd.controllers.policy.card import Feature, FeatureName, Window
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost
@@ -122,8 +125,13 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.features = features(config, settings)
         self.settings = settings
         self.eye = eye
-        self.perception = Perception(self.features, eye)
+        window = Window(settings.history, settings.history * config.tick, settings.relative)
+        self.perception = Perception(self.features, eye, window)
         self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
+        self._price, self._cost = settings.power_price, 0.0  # N/W, N
+        shortest = config.limits.dwell if settings.dwell else 0.0
+        self._dwell = Dwell(shortest, link.tick, link.amplitude)
+        self._held_cost = settings.held_cost * settings.reward_scale
         self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
         """Mean thrust of the best square wave of the configured fish [N]."""
@@ -159,6 +167,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         super().reset(seed=seed)
         draw = self.np_random
         self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
+        self.perception.forget()
+        if self.settings.own_fish and self.link.config:
+            self._suit(self.link.config)
         self._begun = True
         self._steps = 0
         self._await_frames()
@@ -166,7 +177,14 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         lost = sum(
             self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
         )
+        self._dwell.activate(self.latest.instruction_angle)
         return self._seen(), self._info(lost)
+
+    def _suit(self, fish: Config) -> None:
+        """Reward the thrust of this fish by its own best, and hold reversals back as it needs."""
+        self._reward_per_newton = self.settings.reward_scale / thrust_scale(fish, self.settings)
+        shortest = fish.limits.dwell if self.settings.dwell else 0.0
+        self._dwell = Dwell(shortest, self.link.tick, self.link.amplitude)
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Apply an instruction angle for one tick.
@@ -177,21 +195,37 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._check_open()
         if not self._begun:
             raise ResetNeeded("no episode has begun: call reset before step")
-        lost = self.advance(_share(action) * self.link.amplitude)
+        lost = self.swim(_share(action) * self.link.amplitude)
         self._steps += 1
-        reward = self._reward_per_newton * self.latest.fx
+        reward = self._reward_per_newton * (self.latest.fx - self._cost)
+        reward -= self._held_cost * self._dwell.held
         info = self._info(lost)
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
         return self._seen(), reward, False, truncated, info
 
+    def swim(self, angle: float) -> int:
+        """Swim one tick at an angle [rad], or at that of before where it would reverse too soon.
+
+        Gives the number of ticks lost. Raises `LinkLost`.
+        """
+        return self.advance(self._dwell.apply(angle, self.link.tick))
+
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
 
-        Raises `LinkLost`.
+        Raises `LinkLost`, and `ConfigError` where power has a price, but is not known.
         """
         before = self.latest.time
-        self.latest, lost = self.link.step(angle)
+        self.latest, lost, power = self.link.step(angle)
+        if self._price:
+            if power is None:
+                raise ConfigError(
+                    "environment.power_price: the power of the servo is not known here: learn in "
+                    "simulation, or set it to 0"
+                )
+            self._cost = self._price * power
+        self.perception.note(self.latest)
         if self.eye and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before
@@ -263,7 +297,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             return
         begun, began = self.latest.time, time.monotonic()
         while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
-            self.latest, _ = self.link.step(0.0)
+            self.latest = self.link.step(0.0).observation
             if self._look():
                 return
         raise LinkLost(

@@ -48,6 +48,9 @@ class FishdLink:
     tick on: then all numbers are those of a `SimulatedLink`, bit by bit.
     """
 
+    config: Config | None
+    """None: which fish swims is not known."""
+
     def __init__(
         self,
         endpoint: str | None = None,
@@ -97,6 +100,7 @@ class FishdLink:
         """When the latest observation came [s, monotonic]."""
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
+        self.config = None
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
         """The observation that the next action answers; the fish swims on from where it is.

@@ -6,6 +6,7 @@ One step of an agent: it sends an instruction angle, one tick passes, it receive
 from typing import NamedTuple, Protocol
 
 from fishd.camera.frames import Stack
+from fishd.config import Config
 from fishd.core.errors import FishdError
 from fishd.core.signals import Observation
 
@@ -20,6 +21,8 @@ class StepResult(NamedTuple):
     observation: Observation
     lost: int = 0
     """Ticks since the previous observation in which another angle than the action was applied."""
+    power: float | None = None
+    """Mean electrical power of the servo since then [W]; None where it is not known."""
 
 
 class Link(Protocol):
@@ -29,6 +32,10 @@ class Link(Protocol):
     """Period of the loop [s]."""
     amplitude: float
     """Φ [rad]"""
+
+    @property
+    def config(self) -> Config | None:
+        """The fish that swims now, where that is known."""
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
         """Acquire control, if it is not held yet; the observation that the next action answers.

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.frames import Stack
-from fishd.controllers.policy.card import Feature, Layout
+from fishd.controllers.policy.card import ONE_TICK, Feature, History, Window
 from fishd.core.signals import Observation
 from fishd.learning.eyes.base import Eye
 
@@ -12,22 +12,44 @@ from fishd.learning.eyes.base import Eye
 class Perception:
     """Turns an observation, and a stack of frames, into the network's input."""
 
-    def __init__(self, features: tuple[Feature, ...], eye: Eye | None = None) -> None:
+    def __init__(
+        self,
+        features: tuple[Feature, ...],
+        eye: Eye | None = None,
+        window: Window = ONE_TICK,
+    ) -> None:
+        """window: of which ticks the features are"""
         self.features = features
         self.eye = eye
-        self._layout = Layout(features)
+        self.window = window
+        self._history = History(features, window)
+        self.numbers = len(self._history.row)
+        """How many numbers the network is given beside what the eye gives."""
         self._seen = eye.outputs if eye else 0
-        self.inputs = self._seen + len(features)
-        """How many numbers the network is given."""
+        self.inputs = self._seen + self.numbers
+        """How many it is given in all."""
+
+    def anew(self) -> "Perception":
+        """The same for another swim: with a history of its own."""
+        return Perception(self.features, self.eye, self.window)
+
+    def forget(self) -> None:
+        """Another fish comes: begin the history anew."""
+        self._history.forget()
+
+    def note(self, observation: Observation) -> None:
+        """Take a tick into the history; `vector` does that, too, and once more does no harm."""
+        self._history.push(observation)
 
     def vector(self, observation: Observation, stack: Stack | None = None) -> NDArray[np.float32]:
         """The input, shape (inputs,); stack: needed where there is an eye."""
+        self._history.push(observation)
         if self.eye is None:
-            return self._layout.vector(observation)
+            return self._history.row.copy()
         row = np.empty(self.inputs, np.float32)
         if stack is None or not self.eye.is_fitted:
             row[: self._seen] = 0.0
         else:
             row[: self._seen] = self.eye.see(stack)
-        self._layout.write(observation, row[self._seen :])
+        row[self._seen :] = self._history.row
         return row

@@ -21,7 +21,10 @@ from fishd.learning.settings import Randomisation
 from fishd.virtual.fish import SimulatedFish
 
 _VARIED = ("omega0", "xi", "servo_speed", "coupling")
+_VARIED_TOO = ("servo_lag", "thrust_coefficient", "lateral_drag")
 """Parameters of the plant that a randomisation has a share for."""
+_ADDED = ("servo_delay", "servo_dead_zone", "backlash")
+"""Those that become larger by up to the randomisation."""
 
 
 def drawn(config: Config, spread: Randomisation, seed: int) -> Config:
@@ -55,10 +58,15 @@ def _varied(
     changed = {name: varied(getattr(plant, name), getattr(spread, name)) for name in _VARIED}
     noise = varied(rig.noise, spread.noise)
     offset_y = rig.offset_y + spread.offset * place()
+    changed |= {name: varied(getattr(plant, name), getattr(spread, name)) for name in _VARIED_TOO}
+    for name in _ADDED:
+        changed[name] = getattr(plant, name) + 0.5 * (1.0 + place()) * getattr(spread, name)
+    changed["servo_reaction"] = plant.servo_reaction + spread.servo_reaction * place()
+    rotation = rig.rotation + spread.rotation * place()
     return replace(
         config,
         plant=replace(plant, **changed),
-        simulation=replace(rig, noise=noise, offset_y=offset_y, seed=noise_seed),
+        simulation=replace(rig, noise=noise, offset_y=offset_y, rotation=rotation, seed=noise_seed),
     )
 
 
@@ -154,7 +162,7 @@ class SimulatedLink:
         reason = self._loop.supervisor.reason
         if reason:
             raise LinkLost(f"the loop is in {self._loop.supervisor.mode}: {reason.message}")
-        return StepResult(self._turn.observation)
+        return StepResult(self._turn.observation, power=self._turn.power)
 
     def look(self) -> Stack | None:
         """What the simulated camera shows."""

@@ -185,10 +185,10 @@ def load_policy(checkpoint: Path) -> tuple[ActorCriticPolicy, Perception]:
     if eye:
         load_eye(eye, checkpoint)
     with _readable(checkpoint / MODEL) as parameters:
-        policy = make_policy(settings.ppo, len(card.observation), eye)
+        policy = make_policy(settings.ppo, card.numbers, eye)
         policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
-    return policy, Perception(card.observation, eye)
+    return policy, Perception(card.observation, eye, card.window)
 
 
 def load_eye(eye: Eye, checkpoint: Path) -> None:

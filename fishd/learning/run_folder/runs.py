@@ -124,6 +124,8 @@ def make_card(
     libraries = {name: version(name) for name in _LIBRARIES}
     return Card(
         observation=features,
+        history=settings.environment.history,
+        relative=settings.environment.relative,
         pictures=settings.camera.stack if settings.see != "force" else None,
         tick=config.tick,
         amplitude=config.amplitude_limit,

@@ -146,7 +146,7 @@ class RunRecorder:
                     f"{checkpoint}: its {key} is {theirs.get(key)}, that of this training is "
                     f"{here}; eye and networks must be alike"
                 )
-        for what in ("observation", "tick", "amplitude"):
+        for what in ("observation", "history", "relative", "tick", "amplitude"):
             if getattr(card, what) != getattr(own, what):
                 raise CheckpointError(
                     f"{checkpoint}: its {what}, with scales, differs from that of this training; "

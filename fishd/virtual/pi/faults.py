@@ -22,6 +22,7 @@ FAULTS: dict[str, str] = {
     "brown-out": "ADS1115: registers reset and conversion lost; happens at once",
     "frozen-code": "ADS1115: each input repeats its last code",
     "clipped": "ADS1115: every code is at full scale",
+    "meter-unplugged": "INA219, INA226: without power or wires (error 121); back at reset",
     "pigpiod-gone": "pigpiod: dead; connections closed, pulses stopped, scripts lost",
     "pigpiod-frozen": "pigpiod: stopped; answers nothing, scripts stand still, pulses go on",
     "pigpiod-restart": "pigpiod: killed and started again; happens at once",

@@ -1,6 +1,6 @@
 """What the configuration says about the virtual Pi: how its parts are wired to the fish."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Struct
 
@@ -35,6 +35,11 @@ class VirtualPiSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     adc_noise: Annotated[
         float, unit("1", "Noise of a conversion, rms, in steps of the ADC.", ge=0, le=100)
     ] = 1.0
+    power_meter: Annotated[
+        Literal["ina219", "ina226"] | None,
+        note("Chip that measures the servo's power, at 0x40 on the same bus; null for none."),
+    ] = "ina219"
+    shunt: Annotated[float, unit("ohm", "Its shunt.", ge=1e-4, le=10)] = 0.1
     pigpio_port: Annotated[
         int, note("TCP port of its pigpiod; 0 takes a free one.", ge=0, le=65535)
     ] = 8888

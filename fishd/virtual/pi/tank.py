@@ -5,6 +5,7 @@ It swims lazily: it catches up with the time when the chip converts, or when som
 
 import math
 import threading
+from collections import deque
 from collections.abc import Callable
 
 from fishd.core.signals import Truth
@@ -17,6 +18,8 @@ from fishd.virtual.plant.registry import open_plant
 STEP = 1e-4
 """Time moves in whole multiples of this [s], so that few different lengths of time occur: the fish
 remembers what it computed for each."""
+_REMEMBERED = 1000  # windows; the force sensor makes some 1000 in a second
+_LATE = 0.02  # by how much the fish may lag behind who asks for its power, s
 _PIECE = 200  # longest stretch swum at once, in steps: one servo frame
 _WARMED_UP = 40  # stretches up to this many steps are met all the time
 _ROUNDING = 1e-7  # a frame that begins with a step has begun by then [s]
@@ -44,7 +47,7 @@ class Tank:
         self._pulse = pulse
         self._imperfections = Imperfections(imperfections, tick)
         self._weights = tuple(_weights(name, settings) for name in _INPUTS)
-        self._fish = open_plant(plant)
+        self._fish = open_plant(plant, imperfections.motor)
         for steps in range(1, _WARMED_UP + 1):
             self._fish.advance(None, steps * STEP, 1)
         self._start = start
@@ -52,6 +55,9 @@ class Tank:
         self._conversion = (0.0, 0.0)
         self._steps = 0
         self._impulse = 0.0
+        self._energy = self._spent = 0.0
+        self._past: deque[tuple[int, float]] = deque([(self._now, 0.0)], _REMEMBERED)
+        """Steps, and what the servo had taken from the start until then [J]."""
         self._fin_peak = 0.0
         self._lock = threading.Lock()
 
@@ -78,6 +84,30 @@ class Tank:
         with self._lock:
             self._swim(_steps(time))
 
+    def power(self, begin: float, end: float) -> float:
+        """Mean electrical power of the servo from `begin` to `end` [s], recently [W].
+
+        A conversion of the force sensor may be under way, for which the fish has yet to swim: the
+        power is then that of a time as long, up to where the fish is.
+        """
+        with self._lock:
+            self._swim(_steps(end - _LATE))
+            last = min(self._now, _steps(end))
+            first = min(last - 1, last - (_steps(end) - _steps(begin)))
+            taken = self._taken(last) - self._taken(first)
+        return taken / ((last - first) * STEP)
+
+    def _taken(self, step: int) -> float:
+        """What the servo had taken until a step of late [J]."""
+        after = self._past[-1]
+        for before in reversed(self._past):
+            if before[0] <= step:
+                length = after[0] - before[0]
+                share = (step - before[0]) / length if length else 0.0
+                return before[1] + share * (after[1] - before[1])
+            after = before
+        return after[1]
+
     def truth(self) -> Truth:
         """The true state at the end of the latest conversion."""
         with self._lock:
@@ -94,8 +124,9 @@ class Tank:
         with self._lock:
             duration = self._steps * STEP
             thrust = self._impulse / duration if duration else 0.0
-            window = TrueWindow(duration, thrust, self._fin_peak)
-            self._steps, self._impulse = 0, 0.0
+            power = self._energy / duration if duration else 0.0
+            window = TrueWindow(duration, thrust, self._fin_peak, power)
+            self._steps, self._impulse, self._energy = 0, 0.0, 0.0
             self._fin_peak = abs(self._fish.state.alpha)
         return window
 
@@ -109,6 +140,9 @@ class Tank:
             window = self._fish.advance(angle, (end - self._now) * STEP, 1)
             self._steps += end - self._now
             self._now = end
+            self._energy += (energy := window.power * window.duration)
+            self._spent += energy
+            self._past.append((self._now, self._spent))
             impulse_x += window.thrust * window.duration
             impulse_y += window.lateral_force * window.duration
             state = self._fish.state

@@ -14,12 +14,15 @@ from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.ads1115 import Ads1115Chip
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.i2c import I2cBus
+from fishd.virtual.pi.ina import CHIPS
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 from fishd.virtual.pi.pins import Pins
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import Tank
 from fishd.virtual.plant.parameters import PlantParameters
 
+POWER_METER = 0x40
+"""Address of the power meter."""
 _LONGEST_CONVERSION = 0.2  # of the slowest data rate, and a little more [s]
 
 
@@ -90,6 +93,12 @@ class VirtualPi:
             clock, self.tank.volts, self.faults, settings.adc_noise, seed=seed + 2
         )
         self.bus.attach(settings.address, self.chip)
+        if settings.power_meter:
+            supply = imperfections.motor.voltage
+            meter = CHIPS[settings.power_meter]
+            self.bus.attach(
+                POWER_METER, meter(clock, self.tank.power, self.faults, supply, settings.shunt)
+            )
         self.pins = Pins()
         """The header as rpi-lgpio sees it."""
         self._clock = clock

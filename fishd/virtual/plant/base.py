@@ -1,5 +1,6 @@
 """What a plant is: a fish on its force sensor, as equations. docs/writing-a-plant.md adds one."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
@@ -62,6 +63,10 @@ class Window(Protocol):
     def fin_peak(self) -> float:
         """Largest |α| within the window [rad]."""
 
+    @property
+    def power(self) -> float:
+        """Mean electrical power of the servo [W]; NaN for a fish without a motor."""
+
 
 class PlantWindow(Struct, frozen=True):
     """A window whose numbers are all known at once."""
@@ -72,6 +77,7 @@ class PlantWindow(Struct, frozen=True):
     sampled_thrust: float
     sampled_lateral_force: float
     fin_peak: float
+    power: float = math.nan
 
 
 class TrueWindow(NamedTuple):
@@ -83,6 +89,8 @@ class TrueWindow(NamedTuple):
     """Mean F_x [N]."""
     fin_peak: float
     """Largest |α| [rad]."""
+    power: float = math.nan
+    """Mean electrical power of the servo [W]; NaN for a fish without a motor."""
 
 
 class Plant(ABC, Generic[P]):

@@ -121,3 +121,48 @@ def of_the_paper(parameters: PlantParameters) -> PlantParameters:
         thrust_coefficient=p.thrust_coefficient,
         lateral_drag=p.lateral_drag,
     )
+
+
+class MotorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The motor in the simulated servo; the defaults are round figures of a standard servo."""
+
+    voltage: Annotated[float, unit("V", "Supply of the servo, U.", gt=0.0, le=60.0)] = 6.0
+    idle_current: Annotated[
+        float, unit("A", "What its electronics draw, with pulses and without.", ge=0.0, le=10.0)
+    ] = 0.01
+    no_load_current: Annotated[
+        float,
+        unit(
+            "A",
+            "What it draws beside that at its highest speed without a load, i₀; in proportion at "
+            "lower ones.",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 0.2
+    stall_current: Annotated[
+        float, unit("A", "What it draws when it is held fast.", gt=0.0, le=100.0)
+    ] = 2.0
+    stall_torque: Annotated[
+        float, unit("N m", "Torque at the wheel when it is held fast.", gt=0.0, le=100.0)
+    ] = 1.0
+    rotor_inertia: Annotated[
+        float,
+        unit(
+            "kg m^2",
+            "Moment of inertia of rotor and gears, at the wheel: that of the rotor times the "
+            "square of the gears' ratio.",
+            ge=0.0,
+            le=1.0,
+        ),
+    ] = 1e-3
+    tail_inertia: Annotated[
+        float,
+        unit(
+            "kg m^2",
+            "Moment of inertia I of the tail about its hinge, with the water that it moves; its "
+            "torque on the wheel is λ I ω₀² (λφ − α), that is λ I (α̈ + ξω₀α̇).",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 1.3e-3

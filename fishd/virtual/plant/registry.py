@@ -8,7 +8,7 @@ from fishd.core.errors import FishLost, StartupError, UnknownPlant
 from fishd.core.foreign_code import contained
 from fishd.core.plugins import Plugins
 from fishd.virtual.plant.base import Plant, Window
-from fishd.virtual.plant.parameters import TETHERED, PlantParameters
+from fishd.virtual.plant.parameters import TETHERED, MotorSettings, PlantParameters
 
 PLANTS: Plugins[Plant[Any]] = Plugins(
     "plant",
@@ -21,13 +21,17 @@ PLANTS: Plugins[Plant[Any]] = Plugins(
 )
 
 
-def open_plant(parameters: PlantParameters) -> Plant[Any]:
+def open_plant(parameters: PlantParameters, motor: MotorSettings | None = None) -> Plant[Any]:
     """A fish with these parameters, at rest.
 
+    motor: of the servo, where its power is of interest; plants of other packages have none
     Raises `UnknownPlant`, and `StartupError` where that of another package cannot begin.
     """
-    kind = PLANTS.find(parameters.model)
-    return kind(parameters) if parameters.model == TETHERED else _Contained(kind, parameters)
+    kind: Any = PLANTS.find(parameters.model)
+    if parameters.model == TETHERED:
+        fish: Plant[Any] = kind(parameters, motor=motor)
+        return fish
+    return _Contained(kind, parameters)
 
 
 class _Contained(Plant[PlantParameters]):

@@ -16,7 +16,8 @@ from msgspec import Struct
 from fishd.virtual.plant.base import REST, Plant, PlantState
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
 from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
-from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.motor import Motor
+from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 
 # Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
 # the last it stands, both to the last digit; in between, segments shorten towards the transition.
@@ -35,6 +36,7 @@ class FinWindow(Struct, frozen=True, eq=False):
 
     Attributes:
         course: the segments of the window and the fin's response in each, for `fin_peak`.
+        power: mean electrical power of the servo, W; NaN where the fish has no motor.
     """
 
     duration: float
@@ -43,6 +45,7 @@ class FinWindow(Struct, frozen=True, eq=False):
     sampled_thrust: float
     sampled_lateral_force: float
     course: Sequence[tuple[Segment, Vector]]
+    power: float = math.nan
 
     @property
     def fin_peak(self) -> float:
@@ -61,7 +64,13 @@ class TetheredFish(Plant[PlantParameters]):
 
     Settings = PlantParameters
 
-    def __init__(self, parameters: PlantParameters, state: PlantState = REST) -> None:
+    def __init__(
+        self,
+        parameters: PlantParameters,
+        state: PlantState = REST,
+        motor: MotorSettings | None = None,
+    ) -> None:
+        """motor: of the servo, where its power is of interest"""
         super().__init__(parameters)
         self.state = state
         self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
@@ -76,6 +85,9 @@ class TetheredFish(Plant[PlantParameters]):
         self._brakes = bool(self._drag or self._side_drag)
         self._momentum = 0.0
         """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
+        self._motor = Motor(motor, parameters) if motor else None
+        self._pulls = True
+        """Did the wheel move the tail in the latest segment?"""
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> FinWindow:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
@@ -104,6 +116,7 @@ class TetheredFish(Plant[PlantParameters]):
             sum(w.sampled_thrust for w in windows),
             sum(w.sampled_lateral_force for w in windows),
             [segment for w in windows for segment in w.course],
+            sum(w.power * w.duration for w in windows) / duration,
         )
 
     def _swim(
@@ -134,6 +147,8 @@ class TetheredFish(Plant[PlantParameters]):
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
         braking = sampled_braking = 0.0
         momentum = self._momentum
+        motor = self._motor if angle is not None else None
+        energy = motor.begin(lag) if motor else 0.0
         for segment in segments:
             cause[0], cause[1] = alpha, rate
             lag = self._drive(segment, command, lag)
@@ -151,7 +166,13 @@ class TetheredFish(Plant[PlantParameters]):
                 integral, total = segment.sums.dot(np.abs(rates) * rates).tolist()
                 braking += integral
                 sampled_braking += total
+            if motor:
+                energy += motor.spent(segment, response if self._pulls else None)
 
+        power = math.nan
+        if self._motor:
+            self._motor.end(lag if motor else 0.0)
+            power = self._motor.idle + energy / duration
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
         inertia, drag = p.thrust_coefficient, p.lateral_drag
         reaction = self._momentum - momentum
@@ -170,6 +191,7 @@ class TetheredFish(Plant[PlantParameters]):
             -(inertia * sampled_acceleration + drag * sampled_rate + sampled_braking) / samples
             + reaction / whole,
             course,
+            power,
         )
 
     def _cut_at_turns(
@@ -227,6 +249,8 @@ class TetheredFish(Plant[PlantParameters]):
             later = relax(lag, segment.length / self._servo_time)
         if p.servo_reaction:
             self._react(segment, nodes)
+        if self._motor:
+            self._motor.turn(nodes)
         cause[2] = p.coupling * command
         if not self.cables.taut:
             self._pull(segment, command, lag, later)
@@ -239,6 +263,7 @@ class TetheredFish(Plant[PlantParameters]):
         moves, angle = self.cables.pull(
             command - p.servo_lag * halfway, command - p.servo_lag * later
         )
+        self._pulls = moves
         if moves:
             cause[2] = p.coupling * (command - angle)
         else:

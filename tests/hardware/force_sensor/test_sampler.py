@@ -121,9 +121,9 @@ def test_no_pair_is_made_of_samples_from_before_and_after_an_error() -> None:
         sampler.step()
         rig.faults.clear()
         rig.volts["A0-A1"] = 0.75
-        while not sampler.pairs:
+        while not sampler.samples:
             sampler.step()
-        assert volts(sampler.pairs[0]) == pytest.approx((0.75, -0.25), abs=STEP)
+        assert volts(sampler.samples[0]) == pytest.approx((0.75, -0.25), abs=STEP)
 
 
 def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for(rig: ForceRig) -> None:

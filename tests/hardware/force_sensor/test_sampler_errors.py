@@ -11,8 +11,8 @@ from rigs.ads1115_board import ABSENT_BUS
 from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 
 from fishd.core.errors import MissingPackage
-from fishd.hardware.force_sensor.sampled_sensor import LONGEST_PAUSE
 from fishd.hardware.registry import driver_packages
+from fishd.hardware.sampler import LONGEST_PAUSE
 from fishd.virtual.pi.i2c import Message
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 

@@ -1,0 +1,124 @@
+"""The verb that lets policies and controllers swim many other fish."""
+
+import statistics
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fishd.cli.completion import complete_contestant
+from fishd.cli.config import fish_options
+from fishd.cli.lab_progress import showing
+from fishd.cli.options import json_option
+from fishd.cli.output import echo, print_json
+from fishd.config import load
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fishd.lab.compare.survey import Surveyed, Swum
+
+WIDE = 1000
+"""Columns of a table in a file or a pipe, where nothing is wrapped."""
+
+
+@click.command()
+@click.argument(
+    "contestants",
+    nargs=-1,
+    required=True,
+    metavar="POLICY|CONTROLLER...",
+    shell_complete=complete_contestant,
+)
+@click.option(
+    "--fish",
+    "which",
+    type=click.Choice(["changes", "random", "harsh"]),
+    default="harsh",
+    show_default=True,
+    help="changes: one imperfection of a rig at a time; random: twenty fish with all of them, in "
+    "random sizes; harsh: both.",
+)
+@click.option(
+    "--seconds", type=float, default=60.0, show_default=True, help="Length of each run [s]."
+)
+@click.option(
+    "--settle",
+    type=float,
+    default=10.0,
+    show_default=True,
+    help="Time of it before figures are taken [s].",
+)
+@fish_options
+@json_option
+def evaluate(
+    contestants: tuple[str, ...],
+    which: str,
+    seconds: float,
+    settle: float,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Let policies and controllers swim many other fish, in virtual time.
+
+    A contestant is a policy by name or file, or a controller with parameters, as for `fishctl
+    compare`. Figures are shares of each fish's own best square wave, of its true thrust. The fish
+    differ from the configured one, by the keys that --json tells. "another took over" counts the
+    runs in which a policy lost command because it insisted on reversing too fast; "shaken" is the
+    longest stretch of reversals in consecutive ticks.
+    Exit status 1 when a run ends in mode fault.
+    """
+    from fishd.lab import other_fish
+    from fishd.lab.compare.contestants import parse
+    from fishd.lab.compare.survey import survey
+
+    chosen = [parse(text) for text in contestants]
+    fish = list(other_fish.CHANGES) if which != "random" else []
+    singles = len(fish)
+    fish += other_fish.harsh_fish() if which != "changes" else ()
+    configs = [(each, load(file, (*overrides, *each.overrides))) for each in fish]
+    with showing(len(chosen) * len(fish) * seconds, "s swum") as bar:
+        found = survey(configs, chosen, seconds, settle, bar.at)
+    if as_json:
+        print_json(found)
+    else:
+        from rich.console import Console
+
+        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(found, singles))
+    faults = [(one, swum) for one in found for swum in one.fish if swum.fault]
+    for one, swum in faults:
+        echo(f"fishctl: {one.contestant}: {swum.fish}: ended in fault: {swum.fault}", err=True)
+    return 1 if faults else 0
+
+
+def _table(found: "list[Surveyed]", singles: int) -> "Table":
+    """A row for each of the first fish, so many as `singles`; figures of all the others."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column("fish", overflow="fold")
+    for one in found:
+        table.add_column(one.contestant, justify="right", overflow="fold")
+    for row in range(singles):
+        swums = [one.fish[row] for one in found]
+        table.add_row(swums[0].fish, *(f"{swum.efficiency:.1%}" for swum in swums))
+    others = [one.fish[singles:] for one in found]
+    if others[0]:
+        what = f"{len(others[0])} harsh fish"
+        table.add_row(
+            f"{what}, median",
+            *(f"{statistics.median(swum.efficiency for swum in row):.1%}" for row in others),
+        )
+        table.add_row(
+            f"{what}, worst", *(f"{min(swum.efficiency for swum in row):.1%}" for row in others)
+        )
+
+    def of_all(name: str, figure: "Callable[[list[Swum]], str]") -> None:
+        table.add_row(name, *(figure(one.fish) for one in found))
+
+    of_all("another took over", lambda row: f"{sum(swum.fallback is not None for swum in row)}")
+    of_all("shaken, at most", lambda row: f"{max(swum.shaken for swum in row):.1f} s")
+    return table

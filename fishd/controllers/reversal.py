@@ -1,0 +1,75 @@
+"""When the tail is to reverse: as the fin slows down. For controllers that swim as `swing` does."""
+
+from collections import deque
+
+from fishd.controllers.base import Limits
+from fishd.core.signals import Observation
+
+REFRACTORY = 0.05
+"""Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
+FIRST_PUSH = 0.2
+"""Who begins from neutral does not reverse sooner: until the servo acts, all speed is noise [s]."""
+SLOPE_OVER = 0.05
+"""The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
+
+
+class Reversal:
+    """Which way to push: the other one once the fin slows to a fraction C of its top speed."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.top_speed = 0.0
+        """The fin's highest in a half beat: of this one, once past it; before, of the last."""
+        self.reversal_speed = 0.0
+        """C times that."""
+        self.since_reversal = 0.0
+        """[s]"""
+        self._tick = limits.tick
+        self._direction = 1.0
+        self._first = False
+        """Has it begun from neutral, and not reversed yet?"""
+        self._top_speed = 0.0  # since the last reversal
+        ticks = max(1, round(SLOPE_OVER / limits.tick))
+        self._velocities: deque[float] = deque(maxlen=ticks + 1)
+
+    @property
+    def direction(self) -> float:
+        """1 or -1."""
+        return self._direction
+
+    def begin(self, angle: float) -> None:
+        """Push on towards the side of this angle; from 0, towards plus."""
+        self._direction = 1.0 if angle >= 0 else -1.0
+        self._first = angle == 0.0
+
+    def update(self, observation: Observation, C: float, lead: float, longest: float) -> None:
+        """Take in a tick.
+
+        C: share of the top speed
+        lead: the speed that counts is foreseen so far ahead [s]
+        longest: half period after which it reverses in any case [s]
+        """
+        self.since_reversal += observation.dt
+        speed = self._direction * self._ahead(observation, lead)
+        slowed = self._top_speed > 0.0 and speed <= C * self._top_speed
+        self._top_speed = max(self._top_speed, speed)
+        # Half a tick early is nearer to the longest half period than half a tick late.
+        nearly = self.since_reversal + 0.5 * self._tick
+        settled = self.since_reversal > REFRACTORY * longest
+        if self._first:
+            settled = settled and nearly > FIRST_PUSH
+        overdue = nearly > longest
+        reverses = (slowed and settled) or overdue
+        if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
+            self.top_speed = self._top_speed
+        if reverses:
+            self._direction, self._first = -self._direction, False
+            self._top_speed = 0.0
+            self.since_reversal = 0.0
+        self.reversal_speed = C * self.top_speed
+
+    def _ahead(self, observation: Observation, lead: float) -> float:
+        """The fin velocity `lead` s from now, if it goes on changing as it does."""
+        self._velocities.append(observation.fin_velocity)
+        change = self._velocities[-1] - self._velocities[0]
+        elapsed = observation.dt * max(1, len(self._velocities) - 1)
+        return observation.fin_velocity + lead * change / elapsed

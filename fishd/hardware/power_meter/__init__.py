@@ -1,0 +1,1 @@
+"""The power meters: what the servo takes from its supply."""

@@ -1,0 +1,54 @@
+"""The INA219, through its Adafruit driver."""
+
+import os
+from typing import Any
+
+from fishd.core.clock import Clock
+from fishd.hardware.power_meter.ina import Ina, InaSettings
+
+SHUNT_STEP = 10e-6
+"""[V]"""
+SUPPLY_STEP = 4e-3
+"""[V]"""
+CONVERSION = 532e-6
+"""Of either voltage at 12 bits; the shunt's is averaged over some of them [s]."""
+
+
+class Ina219Settings(InaSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The INA219 in the servo's supply; common boards have a shunt of 0.1 Ω."""
+
+
+class Ina219(Ina[Ina219Settings]):
+    """An INA219 on the I2C bus; up to 3.2 A with a shunt of 0.1 Ω."""
+
+    Settings = Ina219Settings
+    packages = ("adafruit-blinka", "adafruit-circuitpython-ina219", "adafruit-extended-bus")
+    chip = "INA219"
+    full_scale = 0.32
+    _chip: Any
+
+    def __init__(self, settings: Ina219Settings, clock: Clock, interval: float) -> None:
+        """Raises ImportError where the library is not installed."""
+        from adafruit_ina219 import INA219
+
+        super().__init__(settings, clock, interval)
+        self._library = INA219
+
+    def set_up(self, bus: Any) -> None:
+        """As the library does, but with the shunt averaged, so that no current goes unseen."""
+        try:
+            self._chip = self._library(bus, self.settings.address)
+        except ValueError as error:  # with which the library says that nothing answers
+            number = getattr(error.__context__, "errno", None)
+            if number is None:
+                raise
+            raise OSError(number, os.strerror(number)) from None
+        doublings = 1
+        while doublings < 7 and (2**doublings + 1) * CONVERSION < self.least:
+            doublings += 1
+        self._chip.shunt_adc_resolution = 0x8 | doublings  # 2, 4 … 128 samples
+
+    def volts(self) -> tuple[float, float]:
+        """As `Ina.volts`."""
+        chip = self._chip
+        return chip.raw_bus_voltage * SUPPLY_STEP, chip.raw_shunt_voltage * SHUNT_STEP

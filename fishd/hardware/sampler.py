@@ -1,0 +1,84 @@
+"""Samples a driver, and opens it anew where it fails."""
+
+import math
+from collections import deque
+from contextlib import suppress
+from typing import Any, Generic, TypeVar
+
+from fishd.core import text
+from fishd.core.clock import Clock
+from fishd.core.foreign_code import contained
+from fishd.hardware.driver import Pair, PowerSample, SampledDriver
+
+X = TypeVar("X", Pair, PowerSample)
+
+REMEMBERED = 4096
+"""Samples that are kept until somebody takes them; the oldest are dropped."""
+FEW = 3
+"""After so many failures in a row the hardware is opened anew."""
+LONGEST_PAUSE = 0.5
+"""Between two attempts [s]."""
+_SHORTEST_PAUSE = 1e-3
+
+
+class Sampler(Generic[X]):
+    """Owns a driver; only one thread may call it, save for what says otherwise."""
+
+    def __init__(self, driver: SampledDriver[Any], clock: Clock) -> None:
+        """Opens nothing yet."""
+        self._driver = driver
+        self._clock = clock
+        self.samples: deque[X] = deque(maxlen=REMEMBERED)
+        """What came in, for another thread to take with `popleft`."""
+        self.trouble = ""
+        """Why the latest attempt failed, one line; empty if it did not. For any thread."""
+        self.errors = 0
+        """Attempts that failed, since start. For any thread."""
+        self.reconnects = 0
+        """How often the hardware was opened anew and samples came again. For any thread."""
+        self.ready_at = -math.inf
+        """No attempt begins earlier [s, monotonic]."""
+        self._failures = 0
+        self._open = False
+
+    def step(self) -> None:
+        """Make one attempt; never raises. Takes as long as it takes, on its clock."""
+        wait = self.ready_at - self._clock.monotonic()
+        if wait > 0.0:
+            self._clock.sleep(wait)
+        try:
+            if not self._open:
+                contained(self._driver.open)
+                self._open = True
+            sample = contained(self._driver.sample)
+        except Exception as error:  # the layers of drivers raise all kinds
+            self._recover(error)
+        else:
+            if sample is not None:
+                self.samples.append(sample)
+                self.reconnects += self._failures >= FEW
+                self._failures = 0
+                self.trouble = ""
+
+    def close(self) -> None:
+        """Let go of the hardware; never raises, may be called twice."""
+        self._open = False
+        with suppress(Exception):
+            contained(self._driver.close)
+
+    def _recover(self, error: Exception) -> None:
+        """Leave the hardware time to settle, and more after several failures."""
+        self.trouble = self._explained(error)
+        self.errors += 1
+        self._failures += 1
+        pause = max(self._driver.settling, _SHORTEST_PAUSE)
+        if self._failures >= FEW:
+            self.close()
+            pause = min(LONGEST_PAUSE, pause * 2.0 ** min(self._failures - FEW, 10))
+        self.ready_at = self._clock.monotonic() + pause
+
+    def _explained(self, error: Exception) -> str:
+        try:
+            return contained(self._driver.explain, error)
+        except Exception:  # the words are lost, not the reason
+            return text.named(error)

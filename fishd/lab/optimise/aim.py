@@ -1,0 +1,49 @@
+"""What a search is for: thrust, thrust for each watt, or a thrust at the least power."""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+from fishd.core.errors import ParameterError
+from fishd.lab.objective import per_watt
+from fishd.lab.optimise.least_power import LeastPower
+from fishd.lab.optimise.search import Range, Search
+from fishd.lab.optimise.trials import Trial
+
+
+class Aim(NamedTuple):
+    """What is looked for."""
+
+    objective: Literal["thrust", "thrust-per-watt"] = "thrust"
+    """What is to be the most, unless there is a target."""
+    target: float | None = None
+    """The thrust that is to be reached at the least power [N]."""
+
+    def search(self, ranges: Sequence[Range], seed: int) -> Search | LeastPower:
+        """One that looks for it; raises `ParameterError`."""
+        if self.target is not None:
+            return LeastPower(ranges, self.target, seed)
+        return Search(ranges, seed)
+
+    def observe(self, search: Search | LeastPower, trial: Trial) -> None:
+        """Tell a search what a candidate is worth.
+
+        Raises `ParameterError` where that needs the power, and it is not known.
+        """
+        thrust = trial.thrust, trial.error
+        if self.objective == "thrust" and self.target is None:
+            assert isinstance(search, Search)
+            search.observe(trial.parameters, *thrust)
+            return
+        if not (math.isfinite(trial.power) and trial.power > 0.0):
+            raise ParameterError(
+                "this needs the power of the servo, and the fish has no power meter that can be "
+                "read: power_meter in its configuration, docs/power.md"
+            )
+        if isinstance(search, LeastPower):
+            search.observe(trial.parameters, thrust, (trial.power, trial.power_error))
+            return
+        value, error = per_watt(*thrust, trial.power, trial.power_error)
+        assert value is not None
+        assert error is not None
+        search.observe(trial.parameters, value, error)

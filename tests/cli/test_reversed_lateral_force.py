@@ -1,0 +1,71 @@
+"""A reversed F_y as an operator meets it: in status, in doctor, and in calibrate force."""
+
+from pathlib import Path
+
+import pytest
+from rigs.doctor_process import doctor
+from rigs.operator_rig import Bench
+from rigs.processes import Daemon, wait_until
+
+from fishd.client import Fish
+from fishd.core.calibration import ForceCalibration
+
+LINE = "F_y is reversed: it pushed the way in which the tail set off, so swing and policies fail"
+
+
+def loads(folder: Path, sign: int) -> str:
+    """A file of loads that were measured, with +y and -y interchanged for sign -1."""
+    forces = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
+    rows = "".join(f"{x},{y},{x},{sign * y}\n" for x, y in forces)
+    file = folder / f"loads{sign}.csv"
+    file.write_text(f"fx_N,fy_N,vx_V,vy_V\n{rows}")
+    return str(file)
+
+
+@pytest.fixture
+def interchanged(rig: Bench, daemon: Daemon) -> Daemon:
+    """A fishd that was calibrated with +y and -y interchanged, and has swum since."""
+    with Fish(daemon.endpoint) as fish:
+        fish.calibrate_force(ForceCalibration(yy=-1.0, loads=5))
+        assert fish.status().fy_reversed is None
+        seq = fish.status().seq
+        wait_until(lambda: fish.status().seq > seq + 50)
+        fish.set_controller("square", frequency=1.0)
+        wait_until(lambda: fish.status().fy_reversed is not None)
+        fish.stop()
+    return daemon
+
+
+def test_status_doctor_and_calibrate_force_say_it_and_the_right_calibration_ends_it(
+    rig: Bench, interchanged: Daemon
+) -> None:
+    shown = " ".join(interchanged.fishctl("status").stdout.split())
+    assert LINE in shown
+    assert "fishctl calibrate force" in shown
+    _, findings = doctor(rig.folder, *rig.settings)
+    level, message = findings["daemon"]
+    assert level == "warning"
+    assert LINE in message
+
+    again = interchanged.fishctl("calibrate", "force", "--loads", loads(rig.folder, -1), "--yes")
+    assert "F_y is reversed, as was seen when the tail last set off, and this calibration" in (
+        again.stderr
+    )
+    right = interchanged.fishctl("calibrate", "force", "--loads", loads(rig.folder, 1), "--yes")
+    assert right.stderr == ""
+    assert LINE not in interchanged.fishctl("status").stdout
+
+
+def test_a_calibration_that_would_turn_a_right_force_round_is_doubted(
+    rig: Bench, daemon: Daemon
+) -> None:
+    with Fish(daemon.endpoint) as fish:
+        seq = fish.status().seq
+        wait_until(lambda: fish.status().seq > seq + 50)
+        fish.set_controller("square", frequency=1.0)
+        wait_until(lambda: fish.status().fy_reversed is not None)
+        assert fish.status().fy_reversed is False
+        fish.stop()
+        wait_until(lambda: fish.status().phi_c == 0.0)
+    ended = daemon.fishctl("calibrate", "force", "--loads", loads(rig.folder, -1), "--yes")
+    assert "turns F_y round, which was right when the tail last set off" in ended.stderr

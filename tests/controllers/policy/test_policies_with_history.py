@@ -1,0 +1,123 @@
+"""Policies that see the latest ticks: what they are given, from when on, and where."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from rigs.harness import LIMITS, Rig, observe
+from rigs.policy_files import card, linear, random_layers, write
+
+from fishd.camera.pilot import Pilot
+from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.controllers.policy.card import Card, Feature, FeatureName, History, Window
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import PolicyError
+from fishd.core.signals import Observation
+
+FREE = Limits(LIMITS.amplitude, LIMITS.tick, dwell=0.0)
+
+
+def remembering(ticks: int, *features: tuple[FeatureName, float], relative: bool = False) -> Card:
+    return replace(card(*features), history=ticks, relative=relative)
+
+
+def seen(tick: int, angle: float = 0.0, fy: float = 0.0) -> Observation:
+    return replace(observe(angle), time=100.0 + 0.05 * tick, fy=fy)
+
+
+def history(ticks: int, relative: bool = False) -> History:
+    features = (Feature("fy", 0.1), Feature("instruction_angle", 0.42))
+    return History(features, Window(ticks, 0.05 * ticks, relative))
+
+
+def test_a_network_sees_the_latest_ticks_newest_first(tmp_path: Path) -> None:
+    path = write(tmp_path, to_onnx(linear(0.0, 0.0, 1.0), "tanh", remembering(3)))
+    controller = registry.create("ppo", {"policy": str(path)}, FREE)
+    angles = [0.1, 0.2, -0.3, 0.4, -0.1]
+    controller.activate(seen(0, angles[0]))
+    given = [controller.update(seen(tick, angle)) for tick, angle in enumerate(angles)]
+    assert given == pytest.approx([0.1, 0.1, 0.1, 0.2, -0.3], abs=1e-6)
+
+
+def test_a_policy_that_is_active_again_has_forgotten_what_it_saw(tmp_path: Path) -> None:
+    path = write(tmp_path, to_onnx(linear(0.0, 1.0), "tanh", remembering(2)))
+    controller = registry.create("ppo", {"policy": str(path)}, FREE)
+    controller.update(seen(0, 0.3))
+    controller.activate(seen(1, -0.2))
+    assert controller.update(seen(1, -0.2)) == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_warm_ups_are_no_ticks_of_the_history(tmp_path: Path) -> None:
+    path = write(tmp_path, to_onnx(linear(0.0, 0.0, 1.0), "tanh", remembering(3)))
+    controller = registry.create("ppo", {"policy": str(path)}, FREE)
+    given = []
+    for tick, angle in enumerate([0.1, 0.2, -0.3, 0.4]):
+        controller.warm_up()
+        given.append(controller.update(seen(tick, angle)))
+        controller.warm_up()
+    assert given == pytest.approx([0.1, 0.1, 0.1, 0.2], abs=1e-6)
+
+
+def test_in_the_loop_it_swims_as_its_network_answers_to_the_ticks(tmp_path: Path) -> None:
+    features: tuple[tuple[FeatureName, float], ...] = (("fy", 0.02), ("instruction_angle", 0.42))
+    layers = random_layers(8, 16, 1)
+    path = write(tmp_path, to_onnx(layers, "tanh", remembering(4, *features)))
+    rig = Rig("simulation.noise=1e-3", "chatter.dwell=0", "slew_limit=null")
+    rig.start("ppo", policy=str(path))
+    ticks = rig.run(60)
+    rows = [(now.fy / 0.02, before.phi_c / 0.42) for before, now in pairwise(ticks)]
+    (first, bias), (last, offset) = layers
+    for k in range(3, len(rows)):
+        row = np.array(rows[k - 3 : k + 1])[::-1].ravel()
+        action = float((last @ np.tanh(first @ row + bias) + offset)[0])
+        wanted = 0.42 * max(-1.0, min(1.0, action))
+        assert ticks[k + 1].phi_c == pytest.approx(wanted, abs=1e-5)
+
+
+def test_a_policy_outside_of_the_loop_answers_alike(tmp_path: Path) -> None:
+    features: tuple[tuple[FeatureName, float], ...] = (("fy", 0.02), ("instruction_angle", 0.42))
+    content = to_onnx(random_layers(8, 16, 1), "tanh", remembering(4, *features, relative=True))
+    path = write(tmp_path, content)
+    controller, pilot = registry.create("ppo", {"policy": str(path)}, FREE), Pilot(str(path), FREE)
+    random = np.random.default_rng(0)
+    for tick in range(20):
+        observation = seen(tick, *random.normal(0.0, (0.3, 0.1)).tolist())
+        assert controller.update(observation) == pilot.angle(observation)
+
+
+def test_a_tick_that_comes_again_is_the_same_one_and_after_a_gap_the_history_begins_anew() -> None:
+    latest = history(3)
+    for tick in (0, 1, 1, 2):
+        latest.push(seen(tick, 0.042 * tick))
+    assert latest.row[1::2].tolist() == pytest.approx([0.2, 0.1, 0.0])
+    latest.push(seen(4, 0.42))  # one tick was missed
+    assert latest.row[1::2].tolist() == pytest.approx([1.0, 0.2, 0.1])
+    latest.push(seen(8, -0.42))
+    assert latest.row[1::2].tolist() == pytest.approx([-1.0] * 3)
+    latest.push(seen(6, 0.21))  # another fish
+    assert latest.row[1::2].tolist() == pytest.approx([0.5] * 3)
+
+
+def test_relative_forces_are_those_of_any_strength_and_angles_stay_as_they_are() -> None:
+    weak, strong = history(4, relative=True), history(4, relative=True)
+    for tick, force in enumerate((0.01, 0.03, -0.02, 0.05)):
+        weak.push(seen(tick, 0.21, force))
+        strong.push(seen(tick, 0.21, 20.0 * force))
+    assert weak.row.tolist() == pytest.approx(strong.row.tolist(), rel=1e-6)
+    assert np.sqrt(np.mean(weak.row[::2] ** 2)) == pytest.approx(1.0)
+    assert weak.row[1::2].tolist() == pytest.approx([0.5] * 4)
+
+
+def test_relative_noise_of_a_fish_at_rest_stays_small() -> None:
+    resting = history(4, relative=True)
+    for tick in range(8):
+        resting.push(seen(tick, 0.0, 1e-4 * (-1.0) ** tick))
+    assert np.abs(resting.row).max() == pytest.approx(0.05)
+
+
+def test_a_network_of_another_size_than_its_card_says_is_refused() -> None:
+    with pytest.raises(PolicyError, match=r"do not fit 3 inputs"):
+        to_onnx(linear(1.0, 1.0), "tanh", remembering(3))

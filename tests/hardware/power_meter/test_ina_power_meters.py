@@ -1,0 +1,128 @@
+"""The INA219 through its true library and the INA226, on chips of registers on a virtual bus."""
+
+import errno
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from rigs.ads1115_board import ABSENT_BUS, Board
+
+from fishd.core.errors import SensorError
+from fishd.hardware.power_meter.ina import Ina
+from fishd.hardware.power_meter.ina219 import Ina219, Ina219Settings
+from fishd.hardware.power_meter.ina226 import Ina226, Ina226Settings
+from fishd.hardware.power_meter.sampled_power import SampledPower, interval_of
+from fishd.virtual.pi.ina import CHIPS
+
+TICK = 0.05
+
+
+class MeterRig(Board):
+    """A power meter beside the ADS1115, and a servo that takes what a test says."""
+
+    def __init__(self, kind: str, shunt: float) -> None:
+        super().__init__()
+        self.kind, self.shunt = kind, shunt
+        self.watts: Any = lambda time: 1.5
+        self.meter_chip = CHIPS[kind](self.clock, self.mean, self.faults, 6.0, shunt)
+        self.bus.attach(0x40, self.meter_chip)
+        self.index = 0
+
+    def mean(self, begin: float, end: float) -> float:
+        """Of the power [W]."""
+        steps = [begin + (k + 0.5) / 200 * (end - begin) for k in range(200)]
+        return sum(map(self.watts, steps)) / 200
+
+    def driver(self, **settings: Any) -> Ina[Any]:  # type: ignore[override]
+        given = {"bus": ABSENT_BUS, "shunt": self.shunt, **settings}
+        if self.kind == "ina219":
+            return Ina219(Ina219Settings(**given), self.clock, interval_of(TICK))
+        return Ina226(Ina226Settings(**given), self.clock, interval_of(TICK))
+
+    def meter(self) -> SampledPower:
+        return SampledPower(self.driver(), self.clock, threaded=False, tick=TICK)
+
+    def tick(self, meter: SampledPower) -> float:
+        """A tick as in virtual time: the meter is looked after all the time, then read."""
+        self.index += 1
+        while self.clock.monotonic() < self.index * TICK:
+            meter.catch_up()
+            self.clock.sleep(1e-3)
+        return meter.read(self.index * TICK)
+
+
+@pytest.fixture(params=[("ina219", 0.1), ("ina226", 0.01)], ids=["ina219", "ina226"])
+def rig(request: pytest.FixtureRequest) -> Iterator[MeterRig]:
+    with MeterRig(*request.param) as made:
+        yield made
+
+
+def test_it_tells_the_power_into_the_servo_to_a_step_of_its_own(rig: MeterRig) -> None:
+    meter = rig.meter()
+    rig.tick(meter)
+    step = 6.0 * rig.meter_chip.shunt_step / rig.shunt
+    assert rig.tick(meter) == pytest.approx(1.5, abs=step)
+    meter.close()
+
+
+def test_it_tells_what_flows_back_as_negative(rig: MeterRig) -> None:
+    rig.watts = lambda time: -0.3
+    meter = rig.meter()
+    rig.tick(meter)
+    assert rig.tick(meter) == pytest.approx(-0.3, rel=0.01)
+
+
+def test_short_bursts_go_unseen_in_no_part_of_a_tick(rig: MeterRig) -> None:
+    # 10 W for 2 ms in each 47 ms: nothing that is in step with the ticks.
+    rig.watts = lambda time: 10.0 if time % 0.047 < 0.002 else 0.0
+    meter = rig.meter()
+    rig.tick(meter)
+    powers = [rig.tick(meter) for _ in range(400)]
+    assert sum(powers) / len(powers) == pytest.approx(10.0 * 2 / 47, rel=0.03)
+
+
+def test_a_meter_that_is_not_there_says_where_it_was_looked_for(rig: MeterRig) -> None:
+    rig.faults.inject("meter-unplugged")
+    meter = rig.meter()
+    with pytest.raises(SensorError, match=f"nothing answers at 0x40.* of the {rig.kind.upper()}"):
+        rig.tick(meter)
+
+
+def test_a_meter_that_was_unplugged_is_set_up_anew(rig: MeterRig) -> None:
+    meter = rig.meter()
+    rig.tick(meter)
+    rig.faults.inject("meter-unplugged", 1.0)
+    for _ in range(10):
+        with pytest.raises(SensorError, match="nothing answers"):
+            rig.tick(meter)
+    for _ in range(40):
+        try:
+            power = rig.tick(meter)
+        except SensorError:
+            continue
+    assert power == pytest.approx(1.5, rel=0.01)
+    assert meter.counters()["i2c_power_reconnects"] == 1
+
+
+def test_a_current_beyond_the_range_is_not_believed(rig: MeterRig) -> None:
+    rig.watts = lambda time: 6.0 * 40.0
+    meter = rig.meter()
+    with pytest.raises(SensorError, match="a smaller one is needed"):
+        [rig.tick(meter) for _ in range(3)]
+
+
+def test_a_closed_meter_says_so_and_can_be_closed_twice(rig: MeterRig) -> None:
+    meter = rig.meter()
+    rig.tick(meter)
+    meter.close()
+    meter.close()
+    with pytest.raises(SensorError, match="is closed"):
+        meter.read(1.0)
+
+
+def test_another_chip_at_its_address_is_told_from_an_ina226() -> None:
+    with MeterRig("ina219", 0.1) as rig:
+        driver = Ina226(Ina226Settings(bus=ABSENT_BUS), rig.clock, 0.0125)
+        with pytest.raises(OSError, match="says that it is none") as caught:
+            driver.open()
+        assert caught.value.errno == errno.ENODEV

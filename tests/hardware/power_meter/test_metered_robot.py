@@ -1,0 +1,126 @@
+"""A whole robot with a power meter: on a virtual Pi, in real threads, and in the configuration."""
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from fishd.assembly import parts_of
+from fishd.config import load
+from fishd.core.clock import SystemClock
+from fishd.core.errors import ConfigError, SensorError
+from fishd.hardware.driver import PowerMeterDriver, PowerMeterSettings, PowerSample
+from fishd.hardware.power_meter.sampled_power import SampledPower
+from fishd.simulation import KeepingPublisher, VirtualRun, simulate
+
+VIRTUAL_PI = Path("config/virtual-pi.yaml")
+METER = "power_meter.driver=ina219"
+
+
+@pytest.mark.parametrize("chip", ["ina219", "ina226"])
+def test_a_virtual_pi_tells_the_power_that_its_servo_truly_takes(chip: str) -> None:
+    config = load(
+        VIRTUAL_PI,
+        [f"power_meter.driver={chip}", f"virtual_pi.power_meter={chip}"]
+        + [f"{key}.shunt=0.02" for key in ("power_meter", "virtual_pi")],
+    )
+    truth = simulate(config, "square", {"frequency": 1.6667}, 20).mean_power
+    publisher = KeepingPublisher()
+    with VirtualRun(config, publisher) as run:
+        run.set_controller("square", {"frequency": 1.6667})
+        for _ in range(400):
+            run.tick()
+    powers = [tick.power for tick in publisher.ticks[160:]]
+    assert sum(powers) / len(powers) == pytest.approx(truth, rel=0.05)
+
+
+def test_the_force_sensor_loses_few_samples_to_the_power_meter() -> None:
+    counts = []
+    for overrides in ([], ["power_meter=null"]):
+        publisher = KeepingPublisher()
+        with VirtualRun(load(VIRTUAL_PI, overrides), publisher) as run:
+            for _ in range(100):
+                run.tick()
+        counts.append(sum(tick.samples for tick in publisher.ticks[1:]))
+    assert counts[0] > 0.94 * counts[1]
+
+
+class Stuck(PowerMeterDriver[PowerMeterSettings]):
+    """A meter whose transfers hang."""
+
+    Settings = PowerMeterSettings
+    place = "a stuck meter"
+
+    def open(self) -> None:
+        """There it is."""
+
+    def sample(self) -> PowerSample:
+        """Hang."""
+        time.sleep(0.3)
+        return PowerSample(self.clock.monotonic(), 1.0)
+
+    def close(self) -> None:
+        """Gone."""
+
+
+def test_a_meter_that_hangs_does_not_delay_a_read() -> None:
+    clock = SystemClock()
+    driver = Stuck(PowerMeterSettings(driver="stuck"), clock, 0.0125)
+    with ExitStack() as stack:
+        meter = SampledPower(driver, clock, threaded=True, tick=0.05)
+        stack.callback(meter.close)
+        time.sleep(0.05)
+        begun = time.perf_counter()
+        with pytest.raises(SensorError, match="a stuck meter has not delivered"):
+            meter.read(clock.monotonic())
+        assert time.perf_counter() - begun < 0.05
+
+
+def test_a_thread_reads_the_meter_of_a_robot_in_real_time() -> None:
+    class Steady(Stuck):
+        def sample(self) -> PowerSample:
+            return PowerSample(self.clock.monotonic(), 2.5)
+
+    clock = SystemClock()
+    driver = Steady(PowerMeterSettings(driver="steady"), clock, 0.0125)
+    with ExitStack() as stack:
+        meter = SampledPower(driver, clock, threaded=True, tick=0.05)
+        stack.callback(meter.close)
+        time.sleep(0.1)
+        assert meter.read(clock.monotonic()) == 2.5
+
+
+def test_a_meter_at_the_address_of_the_force_sensor_is_refused() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(None, ["robot=pi", METER, "power_meter.address=0x48"])
+    assert str(caught.value) == (
+        "--set power_meter.address=0x48: power_meter.address: 0x48 on /dev/i2c-1 is that of "
+        "force_sensor already: each chip needs an address of its own"
+    )
+
+
+def test_a_bus_of_its_own_is_claimed_and_one_that_the_force_sensor_has_once_only() -> None:
+    for bus, expected in ((1, ["fishd-i2c-1"]), (3, ["fishd-i2c-1", "fishd-i2c-3"])):
+        config = load(None, ["robot=pi", METER, f"power_meter.bus={bus}"])
+        names = [part.path.name for part in parts_of(config)]
+        assert [name for name in names if "i2c" in name] == expected
+
+
+@pytest.mark.parametrize(
+    ("override", "complaint"),
+    [
+        ("power_meter.shunt=0.1", "power_meter.driver: one of ina219, ina226 is needed"),
+        ("power_meter.driver=ina218", "no power-meter driver is named 'ina218', did you mean"),
+        (f"{METER}5", "no power-meter driver is named 'ina2195'"),
+    ],
+)
+def test_a_wrong_power_meter_is_told_in_one_line(override: str, complaint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(None, [override])
+    assert complaint in str(caught.value)
+
+
+def test_without_the_section_there_is_no_power_meter() -> None:
+    assert load(None, ["robot=pi"]).power_meter is None
+    assert load(None, ["robot=pi", "power_meter=null"]).power_meter is None

@@ -1,0 +1,83 @@
+"""Contestants on many fish, and the verb that shows them: `fishctl learn evaluate`."""
+
+import json
+from pathlib import Path
+
+import pytest
+from rigs.policy_files import write
+from rigs.processes import fishctl
+
+from fishd.config import load
+from fishd.lab.compare.contestants import Contestant, parse
+from fishd.lab.compare.survey import survey
+from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish
+from fishd.simulation import simulate
+
+BRIEF = ("--seconds", "8", "--settle", "3")
+
+
+def test_each_fish_is_swum_as_by_itself() -> None:
+    fish = (OtherFish("slow", ("plant.omega0=8",)), harsh(7))
+    configs = [(one, load(None, one.overrides)) for one in fish]
+    swing, square = survey(configs, [parse("swing:C=0.5"), parse("square:frequency=1.7")], 8.0, 3.0)
+    assert [swum.fish for swum in square.fish] == ["slow", "harsh 7"]
+    for (_, config), swum in zip(configs, swing.fish, strict=True):
+        alone = simulate(config, "swing", {"C": 0.5}, 8.0, 3.0)
+        assert (swum.efficiency, swum.thrust) == (alone.efficiency, alone.mean_thrust)
+    assert swing.worst.efficiency <= swing.median
+
+
+def test_it_tells_who_shook_the_servo_and_who_lost_command(tmp_path: Path) -> None:
+    policy = Contestant("flip", "ppo", {"policy": str(write(tmp_path))})
+    free, limited = CHANGES[0], OtherFish("limited", ())
+    configs = [(free, load(None, ["chatter.dwell=0"])), (limited, load(None))]
+    (flip,) = survey(configs, [policy], 8.0, 3.0)
+    shaken, held = flip.fish
+    assert (shaken.shaken, shaken.fallback) == (pytest.approx(8.0, abs=0.2), None)
+    assert held.shaken == 0.0
+    assert held.fallback is not None
+    assert held.fallback.startswith("ppo gave up")
+
+
+def test_the_harsh_fish_are_twenty_and_always_the_same() -> None:
+    fish = harsh_fish()
+    assert len({one.overrides for one in fish}) == 20
+    assert fish == harsh_fish()
+    assert 8.0 <= load(None, fish[3].overrides).plant.omega0 <= 18.0
+
+
+def test_the_verb_has_a_column_for_each_contestant() -> None:
+    done = fishctl(
+        "learn", "evaluate", "swing", "square:frequency=1.7", "--fish", "changes", *BRIEF
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    head, *rows = done.stdout.splitlines()
+    assert head.split() == ["fish", "swing", "square:frequency=1.7"]
+    assert [row.rpartition("%")[0] != "" for row in rows[: len(CHANGES)]] == [True] * len(CHANGES)
+    assert rows[-2].split() == ["another", "took", "over", "0", "0"]
+
+
+def test_the_verb_tells_programs_every_fish() -> None:
+    done = fishctl("learn", "evaluate", "hold", "--seconds", "2", "--settle", "1", "--json")
+    (hold,) = json.loads(done.stdout)
+    assert hold["contestant"] == "hold"
+    assert [row["fish"] for row in hold["fish"][-2:]] == ["harsh 318", "harsh 319"]
+    assert "plant.servo_delay=0.02" in hold["fish"][3]["overrides"]
+    assert len(hold["fish"]) == len(CHANGES) + 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "status"),
+    [
+        ((), "Missing argument 'POLICY|CONTROLLER...'", 2),
+        (("swim",), "'swim' is not a controller, named policy or .onnx file; ", 1),
+        (("swing", "--set", "amplitude_limit=x"), "amplitude_limit", 78),
+        (("swing", "--fish", "tame"), "'tame' is not one of 'changes', 'random', 'harsh'", 2),
+    ],
+)
+def test_a_wrong_evaluation_is_said_to_be_one(
+    arguments: tuple[str, ...], message: str, status: int
+) -> None:
+    done = fishctl("learn", "evaluate", *arguments)
+    assert message in done.stderr
+    assert (done.stdout, done.returncode) == ("", status)

@@ -1,0 +1,156 @@
+"""Agents that see the latest ticks, and fish whose rig delays, plays and reacts."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from rigs.swimming import BRIEF, brief_job
+
+from fishd.config import load
+from fishd.controllers.policy.file import read
+from fishd.core.signals import Observation
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.evaluation import in_simulation, worst_of_others
+from fishd.learning.env.simulated_link import SimulatedLink, drawn
+from fishd.learning.export import export
+from fishd.learning.run_folder.checkpoints import CheckpointError
+from fishd.learning.settings import (
+    EnvironmentSettings,
+    EvaluationSettings,
+    Randomisation,
+    TrainingSettings,
+)
+from fishd.learning.train.training import train
+from fishd.simulation import simulate
+
+CONFIG = load(None, ["simulation.noise=0.001"])
+HARSH = Randomisation(
+    servo_lag=0.6,
+    thrust_coefficient=0.6,
+    lateral_drag=2.0,
+    servo_delay=0.08,
+    servo_dead_zone=0.05,
+    backlash=0.1,
+    servo_reaction=3e-3,
+    rotation=0.17,
+)
+REMEMBERING = EnvironmentSettings(
+    observation=("fy", "instruction_angle"), history=4, relative=True, longest_start=0
+)
+
+
+def act(env: SwimEnv, share: float) -> np.ndarray:
+    return env.step(np.full(1, share, np.float32))[0]
+
+
+def test_the_agent_sees_the_latest_ticks_newest_first() -> None:
+    env = SwimEnv(SimulatedLink(CONFIG), CONFIG, replace(REMEMBERING, relative=False))
+    first, _ = env.reset(seed=1)
+    assert env.observation_space.shape == first.shape == (8,)
+    assert first.reshape(4, 2).tolist() == [first[:2].tolist()] * 4
+    shares = [0.25, 0.5, 1.0, 0.75, 0.125]
+    for share in shares:
+        seen = act(env, share)
+    assert seen[1::2].tolist() == shares[:0:-1]
+
+
+def test_another_episode_begins_with_another_history() -> None:
+    env = SwimEnv(SimulatedLink(CONFIG), CONFIG, REMEMBERING)
+    env.reset(seed=1)
+    act(env, 1.0)
+    first, _ = env.reset(seed=2)
+    assert first[1::2].tolist() == [0.0] * 4
+
+
+def test_a_file_with_a_history_swims_as_the_policy_that_was_trained(tmp_path: Path) -> None:
+    job = brief_job(tmp_path / "run", environment=REMEMBERING)
+    outcome = train(job)
+    assert outcome.checkpoint
+    found = export(outcome.checkpoint, tmp_path / "policy.onnx", force=True)
+    card = read(found.path).card
+    assert (card.history, card.relative, card.numbers) == (4, True, 8)
+    seed = job.config.simulation.seed + 1  # as the evaluation at the export
+    free = replace(
+        job.config,
+        simulation=replace(job.config.simulation, seed=seed),
+        chatter=replace(job.config.chatter, dwell=0.0),
+    )
+    report = simulate(free, "ppo", {"policy": str(found.path)}, 4.0, 2.0)
+    assert report.efficiency == pytest.approx(found.evaluation.efficiency, abs=1e-3)
+
+
+def test_a_training_begins_only_with_a_policy_of_the_same_history(tmp_path: Path) -> None:
+    parent = train(brief_job(tmp_path / "first", environment=REMEMBERING)).checkpoint
+    longer = replace(REMEMBERING, history=5)
+    with pytest.raises(CheckpointError, match="its history, with scales, differs"):
+        train(brief_job(tmp_path / "second", environment=longer, parent=parent))
+
+
+def test_the_rigs_of_a_randomisation_are_anywhere_in_its_range() -> None:
+    fish = [drawn(CONFIG, HARSH, seed) for seed in range(40)]
+    for name, most in (("servo_delay", 0.08), ("servo_dead_zone", 0.05), ("backlash", 0.1)):
+        values = [getattr(one.plant, name) for one in fish]
+        assert 0.0 < min(values) < 0.2 * most < 0.8 * most < max(values) < most
+    for name, most in (("servo_lag", 1.6), ("thrust_coefficient", 1.6), ("lateral_drag", 3.0)):
+        shares = [getattr(one.plant, name) / getattr(CONFIG.plant, name) for one in fish]
+        assert 1.0 / most < min(shares) < 0.9 < 1.1 < max(shares) < most
+    assert min(one.plant.servo_reaction for one in fish) < -1e-3
+    assert max(one.simulation.rotation for one in fish) > 0.1
+
+
+def test_the_fish_of_a_training_are_those_of_before_where_nothing_new_varies() -> None:
+    spread = Randomisation(omega0=0.2, offset=0.01)
+    before = drawn(CONFIG, spread, 3)
+    after = drawn(CONFIG, replace(spread, backlash=0.1), 3)
+    assert after.plant == replace(before.plant, backlash=after.plant.backlash)
+    assert after.simulation == before.simulation
+
+
+def test_a_weak_fish_is_rewarded_as_a_strong_one_for_its_own_best() -> None:
+    def reward(own: bool, coefficient: float) -> float:
+        config = load(None, ["simulation.noise=0", f"plant.thrust_coefficient={coefficient}"])
+        settings = replace(REMEMBERING, own_fish=own)
+        env = SwimEnv(SimulatedLink(config), CONFIG, settings)
+        env.reset(seed=1)
+        return sum(float(env.step(np.full(1, (-1.0) ** (k // 6)))[1]) for k in range(60))
+
+    assert reward(False, 5e-3) == pytest.approx(0.5 * reward(False, 10e-3), rel=1e-3)
+    assert reward(True, 5e-3) == pytest.approx(reward(True, 10e-3), rel=1e-3)
+
+
+def test_who_leans_on_the_shortest_dwell_is_worth_nothing_among_fish_of_the_range() -> None:
+    def six_ticks(seen: Observation, stack: object) -> float:
+        return 0.42 * (-1.0) ** (round(seen.time / 0.05) // 6)
+
+    def every_tick(seen: Observation, stack: object) -> float:
+        return 0.42 * (-1.0) ** round(seen.time / 0.05)
+
+    chosen = EvaluationSettings(seconds=8.0, settle=3.0, others=3, others_from="range")
+    settings = TrainingSettings(randomisation=Randomisation(backlash=0.1), evaluation=chosen)
+    assert in_simulation(CONFIG, six_ticks, chosen).efficiency > 0.9
+    assert worst_of_others(CONFIG, six_ticks, settings) > 0.7
+    assert worst_of_others(CONFIG, every_tick, settings) == 0.0
+
+
+def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
+    chosen = replace(BRIEF.evaluation, others=2, others_from="range")
+    environment = replace(REMEMBERING, own_fish=True, episode=32)
+    job = brief_job(
+        tmp_path / "run", environment=environment, randomisation=HARSH, evaluation=chosen
+    )
+    latest = train(job).latest_evaluation
+    assert latest
+    assert latest.worst is not None
+    assert latest.worst <= latest.efficiency
+
+
+def test_a_fish_of_its_own_is_held_back_by_its_own_shortest_dwell() -> None:
+    def reversals(own: bool) -> int:
+        late = load(None, ["plant.servo_delay=0.08"])  # whose dwell is 0.25 s
+        env = SwimEnv(SimulatedLink(late), CONFIG, replace(REMEMBERING, own_fish=own))
+        env.reset(seed=1)
+        sides = [act(env, -np.sign(env.latest.instruction_angle) or 1.0)[1] for _ in range(41)]
+        return int(np.count_nonzero(np.diff(np.sign(sides))))
+
+    assert (reversals(False), reversals(True)) == (10, 8)
