@@ -76,7 +76,7 @@ _SYMBOLS = {
     metavar="NAME,...",
     help="What to fit; the rest is as in the configuration. [default: omega0, xi, "
     "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_drag, servo_delay, backlash, "
-    "rotation; also: cable_slack, servo_dead_zone]",
+    "rotation; also: cable_slack, servo_dead_zone, servo_reaction]",
 )
 @click.option(
     "--to",

@@ -56,6 +56,7 @@ VERBS = {
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
         "swimmer": Verb("swimmer", "swimmer", "Draw a fish that swims freely, and its wake."),
+        "adapt": Verb("adapt", "adapt", "Find a new fish's best gait: fit, train, measure."),
         "learn": Verb("learn", "learn", "Train policies, and write them to files."),
         "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
     },

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
-from fishd.controllers.criterion_search import CriterionSearch, Phase, Rung
+from fishd.controllers.criterion_search import BEGIN, LADDER, CriterionSearch, Phase, Rung
 from fishd.controllers.quantities import quantity
 from fishd.controllers.reversal import Reversal
 from fishd.core.errors import ParameterError
@@ -14,6 +14,9 @@ from fishd.core.signals import Observation
 
 LONGEST_TICK = 0.15
 """Of C auto: with longer ones a half beat has two or three, and its ripple cannot be told [s]."""
+BLIND = 4
+"""With a lead, so many half beats come first that C = 0.6 ends: the speed of a fin that only begins
+to swing is not foreseen."""
 
 
 class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -40,6 +43,16 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=10,
         ),
     ] = 1.0
+    lead: Annotated[
+        float,
+        unit(
+            "s",
+            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does; the "
+            "first two beats are with C = 0.6. C auto finds its own.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
 
 
 class Swing(Controller[SwingParameters]):
@@ -64,6 +77,7 @@ class Swing(Controller[SwingParameters]):
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._reversal = Reversal(limits)
+        self._reversals = 0 if parameters.lead else BLIND
         self._show()
         self._search: CriterionSearch | None = None
         self.retune(parameters)
@@ -77,6 +91,12 @@ class Swing(Controller[SwingParameters]):
         super().check(parameters, limits)
         if parameters.C != "auto":
             return
+        if parameters.lead:
+            raise ParameterError(
+                f"lead: {parameters.lead:g} s is not valid with C auto, which finds its own; leave "
+                "it out, or give C a number in [0, 1]",
+                ("lead",),
+            )
         if not limits.tethered:
             raise ParameterError(
                 "C: auto goes by the ripple of F_x, which is the thrust of a tethered fish only; a "
@@ -105,7 +125,9 @@ class Swing(Controller[SwingParameters]):
         """Plus or minus the amplitude [rad]."""
         rung = self._rung(observation)
         longest = self.parameters.longest_half_period
+        before = self._reversal.direction
         self._reversal.update(observation, rung.C, rung.lead, longest)
+        self._reversals += self._reversal.direction != before
         self._show()
         return self._reversal.direction * amplitude_of(self.parameters, self.limits)
 
@@ -117,7 +139,8 @@ class Swing(Controller[SwingParameters]):
     def _rung(self, observation: Observation) -> Rung:
         """When to reverse: as the parameter says, or as the search has found."""
         if self.parameters.C != "auto":
-            return Rung(self.parameters.C)
+            foresees = self._reversals >= BLIND
+            return Rung(self.parameters.C, self.parameters.lead) if foresees else LADDER[BEGIN]
         assert self._search
         self._search.update(observation.fx, observation.dt, self._reversal.direction)
         rung = self._search.rung

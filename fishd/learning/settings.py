@@ -13,6 +13,7 @@ from fishd.controllers.policy.card import COMMANDS, LONGEST_HISTORY, FeatureName
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
+from fishd.virtual.plant.parameters import PlantParameters
 
 SMALLEST = {"modes": 16, "cnn": 68, "nature": 36}
 """Size of a frame that leaves something after all convolutions of an eye's network [px]."""
@@ -152,6 +153,13 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     rotation: Annotated[
         float, unit("rad", "Uniform in ±this about the configured one.", ge=0, le=1.5)
     ] = 0.0
+    fish: Annotated[
+        tuple[PlantParameters, ...],
+        note(
+            "Each episode swims one of these, varied as above, instead of the configured fish: "
+            "sections `plant`, such as those of the cloud that `fishctl adapt` draws."
+        ),
+    ] = ()
 
 
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

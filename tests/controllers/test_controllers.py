@@ -132,7 +132,7 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
         (
             {"frequency": 0.6},
             "^unknown parameter 'frequency' of controller swing; "
-            "it has: C, amplitude, longest_half_period$",
+            "it has: C, amplitude, longest_half_period, lead$",
         ),
         (
             {"amplitud": 0.2},

@@ -9,6 +9,7 @@ from rigs.harness import LIMITS, Rig, commands, observe
 
 from fishd.config import load
 from fishd.controllers import registry
+from fishd.core.errors import ParameterError
 from fishd.simulation import simulate
 
 IMPERFECT = ["simulation.noise=1e-3", "simulation.offset_y=0.02", "simulation.drift=0.02"]
@@ -35,6 +36,20 @@ def test_it_reverses_when_the_speed_falls_to_that_share_of_the_last_maximum() ->
 def test_only_the_shape_of_the_fin_velocity_counts() -> None:
     speeds = [0.0, 0.3, 0.9, 1.0, 0.7, 0.4, -0.2, -0.8, -1.0, -0.7, -0.2, 0.4, 1.0, 0.3]
     assert feed(speeds) == feed([1e-6 * v for v in speeds]) == feed([1e6 * v for v in speeds])
+
+
+def test_with_a_lead_it_reverses_before_the_fin_slows_down_once_two_beats_are_over() -> None:
+    beat = [0.1, 0.6, 0.9, 1.0, 1.05, 1.0, 0.5]
+    speeds = [sign * speed for sign in (1, -1, 1, -1, 1, -1) for speed in beat]
+    early = reversals(feed(speeds, C=0.95, lead=0.1))
+    late = reversals(feed(speeds, C=0.6))
+    assert early[:4] == late[:4]
+    assert early[4] < late[4]
+
+
+def test_c_auto_finds_its_own_lead() -> None:
+    with pytest.raises(ParameterError, match=r"lead: 0.1 s is not valid with C auto"):
+        registry.create("swing", {"C": "auto", "lead": 0.1}, LIMITS)
 
 
 def test_without_any_sign_of_slowing_down_it_reverses_after_the_longest_half_period() -> None:

@@ -22,7 +22,7 @@ def test_set_parameter_offers_the_parameters_of_the_running_controller(daemon: D
     daemon.fishctl("set-controller", "swing")
     to = ("--endpoint", daemon.endpoint)
     assert offered(*to, "set-parameter", "") == [
-        "plain,C", "plain,amplitude", "plain,longest_half_period"
+        "plain,C", "plain,amplitude", "plain,longest_half_period", "plain,lead"
     ]  # fmt: skip
     assert offered("set-parameter", *to, "C", "0.3", "am") == ["plain,amplitude"]
     assert offered(*to, "set-parameter", "C", "") == ["plain,auto"]

@@ -47,7 +47,7 @@ def test_parameters_change_together_or_not_at_all(daemon: Daemon, words: tuple[s
     done = daemon.fishctl("set-parameter", "frequency", "2")
     assert done.stderr == (
         "fishctl: unknown parameter 'frequency' of controller swing; "
-        "it has: C, amplitude, longest_half_period [bad-parameter]\n"
+        "it has: C, amplitude, longest_half_period, lead [bad-parameter]\n"
     )
     done = daemon.fishctl("set-parameter", "c", "0.5")
     assert "unknown parameter 'c' of controller swing; did you mean 'C'?" in done.stderr

@@ -13,7 +13,14 @@ from rigs.harness import Rig
 from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.frames import frame
-from fishd.lab.identification import Estimate, Identification, Unidentifiable, experiment, identify
+from fishd.lab.identification import (
+    DEFAULT,
+    Estimate,
+    Identification,
+    Unidentifiable,
+    experiment,
+    identify,
+)
 from fishd.lab.identification.response import Drive, response
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.plant.parameters import PlantParameters
@@ -134,16 +141,26 @@ def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
 
 
 def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) -> None:
-    config = load(None, (*REAL, "plant.servo_reaction=1e-4", "plant.quadratic_drag=1e-3"))
+    config = load(None, (*REAL, "plant.servo_reaction=1e-7", "plant.quadratic_drag=1e-3"))
     found = identify(table, start=config.plant, rig=config.simulation, fit=["omega0", "xi"])
     assert found["rotation"].value == config.simulation.rotation
     assert not found["rotation"].fitted
     assert found["omega0"].low < 11.0 < found["omega0"].high
     assert all(channel.white for channel in found.channels)
-    assert found.plant["servo_reaction"] == 1e-4
-    assert "servo_reaction is as in the configuration" in found.remarks[0]
+    assert found.plant["servo_reaction"] == 1e-7
     assert found.plant["quadratic_drag"] == 1e-3
-    assert "quadratic_drag is as in the configuration" in found.remarks[1]
+    assert "quadratic_drag is as in the configuration" in found.remarks[0]
+
+
+def test_the_reaction_of_the_servo_is_found_where_it_is_asked_for() -> None:
+    change = ("plant.servo_reaction=-0.002", "plant.servo_dead_zone=0.02")
+    with VirtualRig(load(None, (*REAL, *change))) as rig:
+        table = experiment(rig, 60.0)
+    found = identify(table, fit=(*DEFAULT, "servo_reaction", "servo_dead_zone"))
+    assert all(channel.white for channel in found.channels)
+    assert found["servo_reaction"].value == pytest.approx(-0.002, rel=0.02)
+    assert found["servo_dead_zone"].value == pytest.approx(0.02, abs=1e-3)
+    assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
 
 
 def width(found: Identification) -> float:
@@ -194,6 +211,7 @@ def test_a_name_that_cannot_be_fitted_is_refused(table: pd.DataFrame) -> None:
         PlantParameters(servo_delay=0.023),
         PlantParameters(servo_delay=0.05, backlash=0.03),
         PlantParameters(cable_slack=0.03, servo_dead_zone=0.02),
+        PlantParameters(servo_delay=0.03, servo_reaction=5e-3),
     ],
 )
 def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> None:
@@ -203,10 +221,10 @@ def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> N
     fish = TetheredFish(plant)
     windows = [fish.advance(angle, TICK, 10) for angle in commands]
     drive = Drive(**{name: getattr(plant, name) for name in Drive.__dataclass_fields__})
-    a, b, c = response(drive, commands, np.arange(len(commands) + 1), TICK, 10)
+    a, b, c, d = response(drive, commands, np.arange(len(commands) + 1), TICK, 10)
     inertia, drag, scale = plant.thrust_coefficient, plant.lateral_drag, plant.coupling
     fx = inertia * scale * scale * a
-    fy = inertia * scale * b + drag * scale * c
+    fy = inertia * scale * b + drag * scale * c + plant.servo_reaction * d
     # Far below the noise of 1 mN; play is lost and found between two points of the grid.
     assert fx == pytest.approx([w.sampled_thrust for w in windows], abs=2e-5)
     assert fy == pytest.approx([w.sampled_lateral_force for w in windows], abs=1e-4)

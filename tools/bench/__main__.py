@@ -20,6 +20,7 @@ NAMES = (
     "identification",
     "estimators",
     "swing",
+    "adapt",
     "harsh",
     "thrust",
     "camera",

@@ -30,7 +30,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-DEFAULT = (*DRIVE, *FORCES)
+DEFAULT = tuple(name for name in (*DRIVE, *FORCES) if name != "servo_reaction")
 """What is fitted unless something else is asked for."""
 POSSIBLE = tuple(BOUNDS)
 
@@ -50,6 +50,8 @@ _SMOOTH = 5.0
 """For the drift that is shown [s]."""
 _SINGULAR = 1e-10
 """Information below this share of the largest is none."""
+SIGNED = ("servo_reaction", "rotation")
+"""These may be negative."""
 OFFSETS = ("offset_x", "offset_y")
 _STRETCHES = (4, 5)
 """Into how many stretches runs are cut, whose means tell how well the mean of a drift is known."""
@@ -257,7 +259,7 @@ def _estimate(name: str, value: float, spread: dict[str, float]) -> Estimate:
     if name in LOGARITHMIC:  # a share, and so the interval is not symmetric
         error = min(error, _UNKNOWN)
         return Estimate(name, value, value * float(np.exp(-error)), value * float(np.exp(error)))
-    low = value - error if name == "rotation" else max(0.0, value - error)
+    low = value - error if name in SIGNED else max(0.0, value - error)
     return Estimate(name, value, low, value + error)
 
 
@@ -339,4 +341,4 @@ def _at_end(name: str, value: float) -> bool:
     low, high = BOUNDS[name]
     if name in LOGARITHMIC:
         return value < 1.001 * low or value > 0.999 * high
-    return value >= 0.999 * high or (name == "rotation" and value <= 0.999 * low)
+    return value >= 0.999 * high or (name in SIGNED and value <= 0.999 * low)

@@ -19,7 +19,7 @@ from fishd.lab.identification.response import Array, Drive, response
 
 DRIVE = ("omega0", "xi", "servo_speed", "servo_lag", "servo_delay", "backlash")
 """What shapes the motion of the fin: the response is simulated for each."""
-FORCES = ("coupling", "thrust_coefficient", "lateral_drag", "rotation")
+FORCES = ("coupling", "thrust_coefficient", "lateral_drag", "servo_reaction", "rotation")
 """What scales and turns the forces of a motion."""
 BOUNDS = {
     "omega0": (0.5, 200.0),
@@ -33,6 +33,7 @@ BOUNDS = {
     "coupling": (1e-3, 10.0),
     "thrust_coefficient": (1e-8, 10.0),
     "lateral_drag": (0.0, 10.0),
+    "servo_reaction": (-0.1, 0.1),
     "rotation": (-1.5, 1.5),
 }
 """Where a fit looks, in the units of the configuration."""
@@ -222,6 +223,7 @@ def _seen(values: dict[str, float], moved: Array) -> Array:
     scale, inertia, drag = (values[n] for n in ("coupling", "thrust_coefficient", "lateral_drag"))
     fx = inertia * scale * scale * moved[0]
     fy = inertia * scale * moved[1] + drag * scale * moved[2]
+    fy = fy + values["servo_reaction"] * moved[3]
     cos, sin = np.cos(values["rotation"]), np.sin(values["rotation"])
     return np.stack((cos * fx - sin * fy, sin * fx + cos * fy))
 

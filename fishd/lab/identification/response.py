@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from fishd.virtual.plant.tethered import REACTION_TIME
+
 Array = NDArray[np.float64]
 
 _FINEST = 0.0025
@@ -49,9 +51,10 @@ class Drive:
 def response(
     drive: Drive, commands: Array, ends: NDArray[np.int_], tick: float, samples: int
 ) -> Array:
-    """Window means of [−α α̈, −α̈, −α̇] for λ = 1, of shape (3, len(ends) − 1).
+    """Window means of [−α α̈, −α̈, −α̇, −φ̈] for λ = 1, of shape (4, len(ends) − 1).
 
-    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third.
+    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third +
+    J · the fourth, which is smoothed as the mount of the servo does.
 
     commands: φ_c in each slot of one period [rad], from the start on
     ends: slots at whose starts windows end; the first one begins where the first window does
@@ -64,7 +67,7 @@ def response(
     h = tick / steps
     before = _EARLIER + math.ceil(drive.servo_delay / tick - 1e-9)
     held = np.concatenate((np.full(before, commands[0]), commands))
-    pull = _pull(drive, held, steps, tick)
+    pull, turning = _pull(drive, held, steps, tick)
     alpha, rate = _fin(drive, pull, h)
     # Slot k of the commands begins at k·tick; its command acts from grid point (k + before)·steps
     # on, which is servo_delay later. So its first sample is at this grid point:
@@ -85,11 +88,25 @@ def response(
     minus = drive.xi * drive.omega0 * v + drive.omega0**2 * (a - pulled)
     sums = np.stack((a * minus, minus, -v)).reshape(3, slots, samples).sum(axis=2)
     means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
-    return means
+    edges = 2.0 * (before * steps - drive.servo_delay / h + ends * steps)
+    passed_on = np.interp(edges, np.arange(turning.size), _smoothed(turning, 0.5 * h))
+    return np.vstack((means, -np.diff(passed_on) / (tick * np.diff(ends))))
 
 
-def _pull(drive: Drive, held: Array, steps: int, tick: float) -> Array:
-    """What drives the fin, in wheel angle [rad], at the grid points and half way between them."""
+def _smoothed(speed: Array, step: float) -> Array:
+    """A speed as the servo's mount passes it on, from rest; its samples are `step` s apart."""
+    decay = math.exp(-step / REACTION_TIME)
+    # Exact for a speed that changes evenly between two samples.
+    old = (1.0 - decay) * REACTION_TIME / step - decay
+    smoothed: Array = lfilter([1.0 - decay - old, old], [1.0, -decay], speed)
+    return smoothed
+
+
+def _pull(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Array]:
+    """What drives the fin, in wheel angle [rad], and how fast the wheel turns [rad/s].
+
+    Both at the grid points and half way between them.
+    """
     speed, lag = drive.servo_speed, drive.servo_lag
     dead, play = drive.servo_dead_zone, drive.backlash
     decay = math.exp(-speed * tick / lag)
@@ -115,7 +132,7 @@ def _pull(drive: Drive, held: Array, steps: int, tick: float) -> Array:
     pull = np.append(wheel.ravel(), tail if play else phi)
     if drive.cable_slack:
         pull = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
-    return pull
+    return pull, np.append(speed * np.tanh(left.ravel()), 0.0)
 
 
 def _fin(drive: Drive, pull: Array, h: float) -> tuple[Array, Array]:

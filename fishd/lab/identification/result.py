@@ -27,7 +27,7 @@ UNITS = {
     "offset_y": "N",
 }
 """What is estimated, in the order of tables; the names are those of the configuration."""
-UNKNOWN_TO_FITS = ("servo_reaction", "quadratic_drag", "lateral_quadratic_drag")
+UNKNOWN_TO_FITS = ("quadratic_drag", "lateral_quadratic_drag")
 """What only the configuration knows."""
 OF_THE_RIG = ("rotation", "offset_x", "offset_y")
 """What belongs into the section `simulation`, not `plant`."""

@@ -218,7 +218,6 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         """
         before = self.latest.time
         self.latest, lost, power = self.link.step(angle)
-        self.perception.note(self.latest)
         if self._price:
             if power is None:
                 raise ConfigError(
@@ -226,6 +225,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
                     "simulation, or set it to 0"
                 )
             self._cost = self._price * power
+        self.perception.note(self.latest)
         if self.eye and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before

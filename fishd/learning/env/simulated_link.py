@@ -30,12 +30,19 @@ _ADDED = ("servo_delay", "servo_dead_zone", "backlash")
 def drawn(config: Config, spread: Randomisation, seed: int) -> Config:
     """A fish and a rig from anywhere in the range, to train on for a fish that is not known."""
     draw = np.random.default_rng(seed)
+    if spread.fish:
+        config = replace(config, plant=spread.fish[int(draw.integers(len(spread.fish)))])
     return _varied(config, spread, lambda: draw.uniform(-1.0, 1.0), int(draw.integers(2**31)))
 
 
 def at_edge(config: Config, spread: Randomisation, seed: int) -> Config:
-    """A fish and a rig with every varied parameter at one end of its range, to evaluate on."""
+    """A fish and a rig with every varied parameter at one end of its range, to evaluate on.
+
+    Of a list of fish it is the one of this number, from the beginning again after the last.
+    """
     draw = np.random.default_rng(seed)
+    if spread.fish:
+        config = replace(config, plant=spread.fish[seed % len(spread.fish)])
     return _varied(config, spread, lambda: float(draw.choice((-1.0, 1.0))), config.simulation.seed)
 
 

@@ -27,7 +27,8 @@ _FIN_REACH = 3.0  # segment length, in units of the fin's shortest time, that N 
 _LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all segment long
 _ROUNDING = 1e-9  # a window of exactly one servo time constant stays one segment
 _DRAG_STEP = 0.05  # longest segment with quadratic drag, s
-_REACTION_TIME = 0.01  # of the mount that passes the servo's reaction on to the sensor, s
+REACTION_TIME = 0.01
+"""Of the mount that passes the servo's reaction on to the sensor [s]."""
 
 
 class FinWindow(Struct, frozen=True, eq=False):
@@ -271,9 +272,9 @@ class TetheredFish(Plant[PlantParameters]):
     def _react(self, segment: Segment, lags: Vector) -> None:
         """Add what the wheel's acceleration passes on during the segment; lags: at its nodes."""
         p = self.parameters
-        left = np.exp((NODES - 1.0) * (segment.length / _REACTION_TIME))
-        pushed = float((WEIGHTS * left).dot(np.tanh(lags))) * segment.length / _REACTION_TIME
-        self._momentum *= math.exp(-segment.length / _REACTION_TIME)
+        left = np.exp((NODES - 1.0) * (segment.length / REACTION_TIME))
+        pushed = float((WEIGHTS * left).dot(np.tanh(lags))) * segment.length / REACTION_TIME
+        self._momentum *= math.exp(-segment.length / REACTION_TIME)
         self._momentum -= p.servo_reaction * p.servo_speed * pushed
 
     def _cuts(self, command: float, phi: float, lag: float, duration: float) -> list[float]:
@@ -298,7 +299,7 @@ class TetheredFish(Plant[PlantParameters]):
         if duration <= _GRADED_FROM * self._servo_time:
             longest = min(longest, self._servo_time)
         if self.parameters.servo_reaction:
-            longest = min(longest, 5.0 * _REACTION_TIME)
+            longest = min(longest, 5.0 * REACTION_TIME)
         if self._brakes:
             longest = min(longest, _DRAG_STEP)
         instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]

@@ -1,0 +1,262 @@
+"""All steps of an adaptation in their order; each is done once, and kept as it is done."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, Protocol
+
+from fishd.config import Config
+from fishd.core.errors import FishdError
+from fishd.lab.identification import experiment
+from fishd.lab.measurement import REST, measure
+from fishd.lab.optimise.trials import Trial
+from fishd.lab.rig import Rig, is_of_one
+from fishd.learning.adapt import steps as do
+from fishd.learning.adapt.practice import TRIES, practise, simulated
+from fishd.learning.adapt.state import FISH, POLICY, AdaptFolder, Contender, State
+from fishd.learning.adapt.tank import Tank
+from fishd.learning.adapt.verdict import SQUARE, judge
+from fishd.simulation import simulate
+
+
+class Show(Protocol):
+    """What a person sees of it, as `fishd.cli.lab_progress.Lines` is."""
+
+    def done(self, line: str, amount: float) -> None:
+        """Say what was done; amount: tank time used [s]."""
+
+    def at(self, amount: float, found: str = "") -> None:
+        """Say how much tank time is used [s], and what goes on."""
+
+    def warn(self, line: str) -> None:
+        """Say a line of what is wrong."""
+
+
+class Gait(NamedTuple):
+    """Who takes part in the comparison."""
+
+    name: str
+    controller: str
+    parameters: dict[str, Any]
+
+
+class Adaptation:
+    """One fish, from its first swim to the verdict."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        config: Config,
+        run: AdaptFolder,
+        tank_time: float,
+        steps: int,
+        seed: int,
+        show: Show,
+    ) -> None:
+        """
+        rig: the fish, which the caller has entered
+        config: its loop; of its plant and rig nothing is used
+        tank_time: for all that needs the fish, rests included [s]; `steps.LEAST` at least
+        steps: of the training
+        """
+        self._rig = rig
+        self._config = config
+        self._run = run
+        self._tank_time = tank_time
+        self._steps = steps
+        self._seed = seed
+        self._show = show
+        self._doing = ""
+        self._tank = Tank(rig, run.state.tank_time, lambda used: show.at(used, self._doing))
+
+    def run(self) -> State:
+        """Do what is not done yet.
+
+        Raises `Unidentifiable`, `FishdError` where the tank time is used up, `Disturbed`,
+        `NoDaemon` and `ConfigError`; what was measured before is kept.
+        """
+        state = self._run.state
+        self._show.at(self._tank.used)
+        if state.excitation is None:
+            self._excite(state)
+        if state.fitted is None:
+            self._fit(state)
+        if state.swing is None:
+            self._settle_swing(state)
+        if state.square is None:
+            self._search(state)
+        if state.trained is None:
+            self._practise(state)
+        if state.verdict is None:
+            self._contest(state)
+            state.verdict = judge(state.contenders)
+            self._keep()
+        return state
+
+    def _excite(self, state: State) -> None:
+        seconds = do.BUDGET["excitation"] * self._tank_time
+        path = self._run.recording("excitation")
+        with self._in_tank("excitation", "excitation"), self._tank.recorded(path, _NOTE):
+            experiment(self._tank, seconds)
+        state.excitation = path.name
+        self._done(f"excitation: {seconds:.0f} s of it are in {path.name}")
+
+    def _fit(self, state: State) -> None:
+        assert state.excitation
+        self._show.at(self._tank.used, "fitting a fish to it; the fish rests")
+        path = self._run.path / state.excitation
+        found, state.fitted = do.fit(path, self._tank.amplitude, self._seed)
+        self._run.write(FISH, found.to_yaml("fishctl adapt"))
+        explained = " and ".join(f"{channel.explained:.1%}" for channel in found.channels)
+        self._done(f"fit: it explains {explained} of F_x and F_y")
+        for remark in found.remarks:
+            self._show.warn(f"fishctl: careful: {remark}")
+
+    def _settle_swing(self, state: State) -> None:
+        seconds = do.BUDGET["swing"] * self._tank_time - REST
+        path = self._run.recording("swing")
+        with self._in_tank("swing", "swing --C auto"), self._tank.recorded(path, _NOTE):
+            state.swing = do.settle_swing(self._tank, seconds)
+        found = state.swing
+        lead = f", {found.lead * 1e3:.0f} ms ahead" if found.lead else ""
+        unsure = "" if found.settled else "; its search was not over"
+        self._done(f"swing --C auto: C = {found.C:g}{lead}{unsure}")
+
+    def _search(self, state: State) -> None:
+        assert state.fitted
+        search = do.square_waves(state.fitted, self._tank, self._seed)
+        budget = max(do.BUDGET["search"] * self._tank_time, do.least_search(self._tank, search))
+
+        def keep(trial: Trial) -> None:
+            state.trials.append(trial)
+            state.tank_time = self._tank.used
+            self._keep()
+
+        path = self._run.recording("search")
+        with self._in_tank("search", "searching square waves"), self._tank.recorded(path, _NOTE):
+            do.search_square_waves(self._tank, search, budget, tuple(state.trials), keep)
+        state.square, told = do.best_of(search, state.trials, state.fitted, self._tank.amplitude)
+        tried = f"{len(state.trials)} square waves tried"
+        agree = "they agree with" if told else "whatever"
+        does = "" if told else " says"
+        self._done(f"search: {tried}; best at {state.square:.4g} Hz, {agree} the fit{does}")
+
+    def _practise(self, state: State) -> None:
+        assert state.fitted
+
+        def progress(done: int) -> None:
+            again, step = divmod(done - 1, self._steps)
+            more = f", once more ({again + 1} of {TRIES})" if again else ""
+            doing = f"training, {step + 1} of {self._steps} steps{more}; the fish rests"
+            self._show.at(self._tank.used, doing)
+
+        state.trained = found = practise(
+            self._config, state.fitted, self._run.path, self._steps, self._seed, progress
+        )
+        if found.refused:
+            self._keep()
+            self._show.warn(f"fishctl: careful: no policy takes part: {found.refused}")
+            return
+        worst = "" if found.worst is None else f", {found.worst:.1%} on the worst tried"
+        cloud = f"{len(state.fitted.cloud)} fish of the fit's errors"
+        self._done(f"training on {cloud}: {found.efficiency:.1%} in simulation{worst}")
+
+    def gaits(self, state: State) -> list[Gait]:
+        """Who takes part."""
+        assert state.swing
+        assert state.square
+        swing = {"C": state.swing.C} | ({"lead": state.swing.lead} if state.swing.lead else {})
+        found = [
+            Gait("swing", "swing", swing),
+            Gait(SQUARE, "square", {"frequency": state.square}),
+        ]
+        if state.trained and not state.trained.refused:
+            policy = str((self._run.path / POLICY).absolute())
+            found.insert(0, Gait("policy", "ppo", {"policy": policy}))
+        return found
+
+    def _contest(self, state: State) -> None:
+        known = {one.name for one in state.contenders} | set(state.left_out)
+        todo = [gait for gait in self.gaits(state) if gait.name not in known]
+        left = self._tank_time - self._tank.used
+        needed = sum(do.least_measurement(gait.parameters) for gait in todo)
+        if left < needed:
+            raise FishdError(
+                f"{max(0.0, left):.0f} s are left of the tank time, and the comparison needs "
+                f"{needed:.0f} s: a larger --tank-time goes on with it"
+            )
+        for index, gait in enumerate(todo):
+            rest = sum(do.least_measurement(other.parameters) for other in todo[index + 1 :])
+            left = self._tank_time - self._tank.used
+            seconds = min(left / (len(todo) - index), left - rest)
+            self._measure(state, gait, max(seconds, do.least_measurement(gait.parameters)))
+
+    def _measure(self, state: State, gait: Gait, seconds: float) -> None:
+        path = self._run.recording(f"measured-{gait.name}")
+        try:
+            with (
+                self._in_tank("comparison", f"measuring {gait.name}"),
+                self._tank.recorded(path, _NOTE),
+            ):
+                found = measure(self._tank, gait.controller, gait.parameters, seconds)
+        except FishdError as error:
+            if not is_of_one(error) or gait.name == SQUARE:
+                raise
+            state.left_out[gait.name] = str(error)
+            self._keep()
+            self._show.warn(f"fishctl: {gait.name}: left out: {error}")
+            return
+        state.contenders.append(
+            Contender(
+                name=gait.name,
+                controller=gait.controller,
+                parameters=gait.parameters,
+                thrust=found.thrust,
+                error=found.error,
+                frequency=found.frequency,
+                seconds=seconds,
+                remark=found.remark,
+                expected=self._expected(state, gait),
+                **_truth(self._config, self._rig, gait),
+            )
+        )
+        measured = f"{1e3 * found.thrust:.2f} ± {1e3 * found.error:.2f} mN"
+        self._done(f"{gait.name}: {measured} at {found.frequency:.3f} Hz")
+        if found.remark:
+            self._show.warn(f"fishctl: {gait.name}: {found.remark}")
+
+    def _expected(self, state: State, gait: Gait) -> float:
+        """The thrust of a gait on the identified fish [N]."""
+        assert state.fitted
+        config = simulated(self._config, state.fitted)
+        return simulate(config, gait.controller, gait.parameters).mean_thrust
+
+    @contextmanager
+    def _in_tank(self, step: str, doing: str) -> Iterator[None]:
+        """Whatever ends a step, the time that the fish has swum for it is written down."""
+        state, begun = self._run.state, self._tank.used
+        self._doing = doing
+        try:
+            yield
+        finally:
+            spent = self._tank.used - begun
+            state.spent[step] = state.spent.get(step, 0.0) + spent
+            state.tank_time = self._tank.used
+            self._keep()
+
+    def _keep(self) -> None:
+        self._run.keep()
+
+    def _done(self, line: str) -> None:
+        self._keep()
+        self._show.done(line, self._tank.used)
+
+
+_NOTE = "fishctl adapt"
+
+
+def _truth(config: Config, rig: Rig, gait: Gait) -> dict[str, float]:
+    """What is known of a simulated fish alone."""
+    if rig.source != "simulation":
+        return {}
+    swum = simulate(config, gait.controller, gait.parameters)
+    return {"true_thrust": swum.mean_thrust, "true_efficiency": swum.efficiency}

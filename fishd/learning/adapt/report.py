@@ -1,0 +1,211 @@
+"""The report of an adaptation: one picture, and one page that needs no network."""
+
+import base64
+import csv
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
+from fishd.lab.identification.result import OF_THE_RIG, UNITS
+from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State
+from fishd.learning.adapt.verdict import NAMES, SQUARE, spelled
+from fishd.learning.run_folder.tables import EVALUATIONS
+from fishd.virtual.plant.optimum import square_wave
+
+_COLOURS = {"policy": BLUE, "swing": GREEN, SQUARE: ORANGE}
+_STYLE = """body { font: 15px/1.5 sans-serif; margin: 2em auto; max-width: 60em; padding: 0 1em; }
+table { border-collapse: collapse; margin: 1em 0; } th { text-align: left; }
+td, th { border-bottom: 1px solid #ddd; padding: 0.2em 1em 0.2em 0; }
+img { max-width: 100%; } .claim { font-size: 1.3em; } code { background: #f3f3f3; }"""
+
+
+def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
+    """Draw the picture and write the page; the paths of both.
+
+    amplitude: Φ [rad]; again: the command line that lets the winner swim
+    Raises `FishdError` where one cannot be written.
+    """
+    picture = run.path / PICTURE
+    trained = run.state.trained.folder if run.state.trained else ""
+    evaluations = run.path / (trained or TRAINING) / EVALUATIONS
+    draw(run.state, evaluations, amplitude, picture)
+    run.write(PAGE, page(run.state, picture.read_bytes(), again))
+    return picture, run.path / PAGE
+
+
+def draw(state: State, evaluations: Path, amplitude: float, path: Path) -> None:
+    """Fit, search, training and comparison, a panel each."""
+    assert state.fitted
+    with drawn(path, (10.0, 7.0)) as figure:
+        (fit, search), (training, contest) = figure.subplots(2, 2)
+        _draw_fit(fit, state.fitted)
+        _draw_search(search, state, amplitude)
+        _draw_training(training, evaluations)
+        _draw_contest(contest, state)
+
+
+def _draw_fit(axis: Any, fitted: Fitted) -> None:
+    """How well each parameter is known."""
+    shown = [
+        (name, 50.0 * (each["high"] - each["low"]) / abs(each["value"]))
+        for name, each in fitted.found["estimates"].items()
+        if each.get("fitted", True) and each["value"] and name not in OF_THE_RIG
+    ]
+    places = np.arange(len(shown))[::-1]
+    axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
+    axis.set_yticks(places, [name for name, _ in shown])
+    axis.set_xscale("log")
+    axis.set_xlabel("half of the 95 % interval, % of the value")
+    axis.set_title("the fish, as fitted")
+
+
+def _draw_search(axis: Any, state: State, amplitude: float) -> None:
+    """Square waves as tried, and those of the identified fish."""
+    assert state.fitted
+    tried = [trial.parameters["frequency"] for trial in state.trials]
+    frequencies = np.geomspace(0.9 * min(tried), 1.1 * max(tried), 60)
+    curves = [
+        [1e3 * square_wave(plant, amplitude, f).thrust for f in frequencies.tolist()]
+        for plant in state.fitted.cloud[:8]
+    ]
+    for curve in curves[1:]:
+        axis.plot(frequencies, curve, color=GREY, linewidth=0.6)
+    axis.plot(frequencies, curves[0], color=BLACK, label="identified fish, and its cloud")
+    axis.errorbar(
+        tried, [1e3 * trial.thrust for trial in state.trials],
+        yerr=[1e3 * trial.error for trial in state.trials], fmt="o", color=ORANGE,
+        markersize=4, elinewidth=0.8, capsize=2, label="tried, 95 %",
+    )  # fmt: skip
+    axis.set_xlabel("frequency (Hz)")
+    axis.set_ylabel("thrust (mN)")
+    axis.set_title("square waves")
+    axis.legend(loc="lower right")
+
+
+def _draw_training(axis: Any, evaluations: Path) -> None:
+    """The policy on the identified fish, and on the worst of its cloud."""
+    axis.set_title("training in simulation")
+    axis.set_xlabel("steps")
+    axis.set_ylabel("% of the best square wave")
+    rows = _rows(evaluations)
+    if not rows:
+        axis.text(0.5, 0.5, "no evaluation", ha="center", transform=axis.transAxes)
+        return
+    steps = [float(row["steps"]) for row in rows]
+    for column, label, colour in (
+        ("efficiency", "identified fish", BLUE),
+        ("worst", "worst fish tried", PURPLE),
+    ):
+        values = [100.0 * float(row[column] or "nan") for row in rows]
+        axis.plot(steps, values, color=colour, marker=".", label=label)
+    axis.set_ylim(0.0, 105.0)
+    axis.legend(loc="lower right")
+
+
+def _rows(evaluations: Path) -> list[dict[str, str]]:
+    try:
+        with evaluations.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except OSError:
+        return []
+
+
+def _draw_contest(axis: Any, state: State) -> None:
+    """What was measured on the fish."""
+    for place, one in enumerate(state.contenders):
+        axis.errorbar(
+            1e3 * one.thrust, -place, xerr=1e3 * one.error, fmt="o", capsize=3,
+            color=_COLOURS[one.name],
+        )  # fmt: skip
+        if one.true_thrust is not None:
+            axis.plot(1e3 * one.true_thrust, -place, "x", color=BLACK, zorder=3)
+    axis.set_yticks(
+        [-place for place in range(len(state.contenders))], [one.name for one in state.contenders]
+    )
+    axis.set_ylim(0.5 - len(state.contenders), 0.5)
+    known = any(one.true_thrust is not None for one in state.contenders)
+    axis.set_xlabel("thrust, measured, 95 % (mN)" + ("; ×: true" if known else ""))
+    axis.set_title("in the tank")
+
+
+def page(state: State, picture: bytes, again: str) -> str:
+    """The page, with the picture in it."""
+    assert state.fitted
+    assert state.verdict
+    image = base64.b64encode(picture).decode()
+    remarks = [*state.fitted.found["remarks"]]
+    remarks += [f"{NAMES[name]} was left out: {why}" for name, why in state.left_out.items()]
+    remarks += [f"{NAMES[one.name]}: {one.remark}" for one in state.contenders if one.remark]
+    if state.trained and state.trained.refused:
+        remarks.append(f"no policy took part: {state.trained.refused}")
+    minutes = " + ".join(f"{seconds:.0f} s {step}" for step, seconds in state.spent.items())
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8"><title>fishctl adapt</title>',
+        f"<style>{_STYLE}</style></head><body>",
+        "<h1>A fish and its best gait</h1>",
+        f'<p class="claim">{escape(_sentence(state.verdict.claim))}</p>',
+        f"<p>{state.tank_time:.0f} s of tank time: {escape(minutes)}.</p>",
+        f"<p>To have it again: <code>{escape(again)}</code></p>",
+        f'<img alt="fit, search, training, comparison" src="data:image/png;base64,{image}">',
+        "<h2>In the tank</h2>",
+        _table(*_contenders(state)),
+        "<p>Efficiencies are over the best square wave that the search has found; their intervals "
+        "hold together in 95 % of cases.</p>",
+        "<h2>The fish</h2>",
+        _table(("", "value", "95 % interval", "unit"), _estimates(state.fitted)),
+        *([f"<h2>Careful</h2><ul>{''.join(map(_item, remarks))}</ul>"] if remarks else []),
+        "</body></html>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _sentence(words: str) -> str:
+    return f"{words[0].upper()}{words[1:]}."
+
+
+def _item(words: str) -> str:
+    return f"<li>{escape(words)}</li>"
+
+
+def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of the table of who was measured."""
+    assert state.verdict
+    known = any(one.true_thrust is not None for one in state.contenders)
+    head = ("gait", "thrust", "Hz", "efficiency", *(("true thrust",) if known else ()))
+    rows = []
+    for one in state.contenders:
+        share = state.verdict.others.get(one.name)
+        efficiency = "1"
+        if share:
+            efficiency = spelled(share)
+        row = [
+            NAMES[one.name] + (", the winner" if one.name == state.verdict.winner else ""),
+            f"{1e3 * one.thrust:.2f} ± {1e3 * one.error:.2f} mN",
+            f"{one.frequency:.3f}",
+            efficiency,
+        ]
+        if known:
+            true = one.true_thrust
+            row.append("" if true is None else f"{1e3 * true:.2f} mN")
+        rows.append(tuple(row))
+    return head, rows
+
+
+def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
+    return [
+        (name, f"{each['value']:.5g}", f"{each['low']:.5g} to {each['high']:.5g}", UNITS[name])
+        for name, each in fitted.found["estimates"].items()
+        if each.get("fitted", True)
+    ]
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"

@@ -1,0 +1,181 @@
+"""What an adaptation has found so far, and the folder that keeps it from step to step."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd import __version__
+from fishd.core import files
+from fishd.core.errors import ConfigError
+from fishd.core.files import FileProblem, write_atomically
+from fishd.lab.begun import begin
+from fishd.lab.optimise.trials import Trial
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.plant.parameters import PlantParameters
+
+BEGUN, STATE = "begun.json", "adapt.json"
+FISH, POLICY, TRAINING = "fish.yaml", "policy.onnx", "training"
+PICTURE, PAGE = "adapt.png", "adapt.html"
+RECORDED = ".mcap"
+
+
+class Begun(Struct, frozen=True):
+    """With what an adaptation began; a folder is gone on with only by the same."""
+
+    on: str
+    steps: int
+    seed: int
+    config: dict[str, Any]
+    """The fish, as plain data."""
+    version: str = __version__
+
+
+class Fitted(Struct, frozen=True, kw_only=True):
+    """The fish that explains the forces best, and those that do nearly as well."""
+
+    plant: PlantParameters
+    rig: SimulationSettings
+    offset: float
+    """Half of the range in which the offset of F_y may be while the fish swims [N]."""
+    cloud: tuple[PlantParameters, ...]
+    found: dict[str, Any]
+    """The estimates with their intervals, and remarks, as `fishctl identify --json` gives them."""
+
+
+class Rung(Struct, frozen=True):
+    """What `swing --C auto` has ended with."""
+
+    C: float
+    lead: float
+    """[s]"""
+    settled: bool
+    """Was the search over?"""
+
+
+class Trained(Struct, frozen=True, kw_only=True):
+    """How the policy did on the fish of the fit, or why there is none."""
+
+    steps: int
+    """Of all trainings."""
+    folder: str = ""
+    """Of the one that it is from."""
+    efficiency: float | None = None
+    """Over the best square wave of the identified fish."""
+    worst: float | None = None
+    """The same, of the worst fish of the cloud that were tried."""
+    refused: str = ""
+    """Why there is no policy, if so."""
+
+
+class Contender(Struct, frozen=True, kw_only=True):
+    """A gait, measured on the fish."""
+
+    name: str
+    """`policy`, `swing` or `square`"""
+    controller: str
+    parameters: dict[str, Any]
+    thrust: float
+    """[N]"""
+    error: float
+    """Half of its 95 % interval [N]."""
+    frequency: float
+    """[Hz]"""
+    seconds: float
+    """How long it was measured, rests included [s]."""
+    remark: str = ""
+    expected: float
+    """On the identified fish, in simulation [N]."""
+    true_thrust: float | None = None
+    """Of a simulated fish [N]."""
+    true_efficiency: float | None = None
+    """That over the thrust of the best of all square waves."""
+
+
+class Verdict(Struct, frozen=True, kw_only=True):
+    """Who has won, and by how much; efficiencies are over the best square wave found."""
+
+    winner: str
+    efficiency: float
+    low: float
+    """The 95 % interval of the winner's efficiency holds whoever of them all has won."""
+    high: float
+    others: dict[str, tuple[float, float, float]]
+    """Of each one but the square wave: efficiency, and its interval."""
+    told: bool
+    """Is it the winner by measurement alone? Else others did as well, as far as that tells."""
+    claim: str
+    """The same in a sentence."""
+
+
+class State(Struct, kw_only=True):
+    """What was found so far; what is None is still to be done."""
+
+    tank_time: float = 0.0
+    """Time in the tank so far, rests included, and what was measured in vain, too [s]."""
+    spent: dict[str, float] = {}
+    """Of that, what each step took [s]."""
+    excitation: str | None = None
+    """The recording that the fish is fitted to."""
+    fitted: Fitted | None = None
+    swing: Rung | None = None
+    trials: list[Trial] = []
+    """Square waves, as they were tried."""
+    square: float | None = None
+    """The frequency of the best of them [Hz]."""
+    trained: Trained | None = None
+    contenders: list[Contender] = []
+    left_out: dict[str, str] = {}
+    """Who could not be measured, and why."""
+    verdict: Verdict | None = None
+
+
+class AdaptFolder:
+    """A folder in which each step is kept as it is done; `state` has those that were there."""
+
+    def __init__(self, path: Path, begun: Begun) -> None:
+        """Makes the folder, or goes on with one; raises `ConfigError` where that is of another."""
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            begin(path / BEGUN, begun, "adaptation")
+        except OSError as error:
+            raise self._unwritable(error) from None
+        self.state = _read(path / STATE)
+
+    def keep(self) -> None:
+        """Write the state down; raises `ConfigError`."""
+        self.write(STATE, msgspec.json.format(msgspec.json.encode(self.state), indent=2))
+
+    def write(self, name: str, content: str | bytes) -> None:
+        """Write a file of the folder; raises `ConfigError`."""
+        try:
+            write_atomically(self.path / name, content)
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def recording(self, step: str) -> Path:
+        """A new name for the recording of a step; one that was broken off keeps its own."""
+        number, path = 1, self.path / f"{step}{RECORDED}"
+        while any(path.parent.glob(f"{path.name}*")):
+            number += 1
+            path = path.with_stem(f"{step}-{number}")
+        return path
+
+    def _unwritable(self, error: OSError) -> ConfigError:
+        where = error.filename or self.path
+        return ConfigError(
+            f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
+        )
+
+
+def _read(path: Path) -> State:
+    if not path.exists():
+        return State()
+    try:
+        return msgspec.json.decode(files.read(path, files.SETTINGS, "an adaptation"), type=State)
+    except (FileProblem, msgspec.MsgspecError) as error:
+        raise ConfigError(
+            f"{path}: not as this fishd ({__version__}) writes it: {error}; give another --folder"
+        ) from None

@@ -1,0 +1,140 @@
+"""The steps of an adaptation that need the fish: excitation, swing's search, square waves."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.stats import chi2
+
+from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
+from fishd.lab.measurement import REST, SWIM
+from fishd.lab.measurement import plan as plan_of
+from fishd.lab.optimise.search import Range, Search
+from fishd.lab.optimise.trials import Trial, lengths, trials, whole_ticks
+from fishd.learning.adapt.cloud import cloud, identified
+from fishd.learning.adapt.state import Fitted, Rung
+from fishd.learning.adapt.tank import Tank
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.plant.optimum import best_square_wave, square_wave
+
+FITTED = (*DEFAULT, "servo_dead_zone", "servo_reaction")
+"""What is fitted: all of a fish that a fit can find, but slack, which backlash stands for."""
+LEAST_EXPLAINED = 0.5
+"""A fish of which the fit explains less, of either force, is not the one that it describes."""
+AROUND = 2.0
+"""Square waves are searched from so many times below to above the best of the identified fish."""
+SLOWEST, FASTEST = 0.3, 8.0
+"""They are searched between these, whatever the fit says [Hz]."""
+DISAGREES = 0.01
+"""Square waves disagree with the identified fish where so few as good as it would miss so much."""
+BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
+"""Shares of the tank time; the comparison has the rest."""
+LEAST = 150.0
+"""The shortest tank time [s]: the excitation is 30 s then, the shortest that a fit takes."""
+
+
+def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, Fitted]:
+    """The fish of a recorded excitation, of which nothing is known before, and its cloud.
+
+    amplitude: Φ [rad]
+    Raises `Unidentifiable`, also where the best fit leaves half of a force unexplained.
+    """
+    found = identify([recording], fit=FITTED)
+    for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
+        if not channel.explained >= LEAST_EXPLAINED:
+            raise Unidentifiable(
+                f"the best fit explains {max(0.0, channel.explained):.0%} of {symbol} only: this "
+                "fish moves otherwise than the model of a tethered fish, or its forces are mostly "
+                "noise; see fishctl plot and fishctl identify with --plot"
+            )
+    plant = identified(found)
+    if not best_square_wave(plant, amplitude).thrust > 0.0:
+        raise Unidentifiable("the identified fish has no thrust")
+    offset, drift = found["offset_y"], found.channels[1].drift
+    fitted = Fitted(
+        plant=plant,
+        rig=msgspec.convert(found.simulation, SimulationSettings),
+        offset=max(offset.high - offset.value, 0.5 * drift),
+        cloud=cloud(found, seed),
+        found=found.to_builtins(),
+    )
+    return found, fitted
+
+
+def settle_swing(rig: Tank, seconds: float) -> Rung:
+    """Let `swing --C auto` search for so long; the C and the lead that it ends with."""
+    ticks = rig.swim("swing", {"C": "auto"}, seconds)
+    rig.rest(REST)
+    end = ticks[len(ticks) // 2 :]
+    shown = [tick.quantities for tick in end if tick.quantities]
+    watching = [each for each in shown if not each["searching"]]
+    # Of a search that goes on, the rung between the trials is the one that lasts longest.
+    rungs = Counter((each["criterion"], each["lead"]) for each in watching or shown)
+    (criterion, lead), _ = rungs.most_common(1)[0]
+    return Rung(criterion, lead, bool(watching))
+
+
+def square_waves(fitted: Fitted, rig: Tank, seed: int) -> Search:
+    """A search over the square waves of whole ticks around the best of the identified fish."""
+    best = best_square_wave(fitted.plant, rig.amplitude).frequency
+    best = min(FASTEST / AROUND, max(SLOWEST * AROUND, best))
+    low, high = best / AROUND, min(best * AROUND, 0.5 / rig.tick)
+    return Search([whole_ticks(Range("frequency", low, high), rig.tick)], seed)
+
+
+def search_square_waves(
+    rig: Tank,
+    search: Search,
+    budget: float,
+    before: Sequence[Trial],
+    keep: Callable[[Trial], None],
+) -> None:
+    """Try square waves until the budget is used [s].
+
+    before: those that were tried already; keep: called with each new one
+    """
+    for each in before:
+        search.observe(each.parameters, each.thrust, each.error)
+    for each in trials(rig, "square", {}, search, budget, before[-1] if before else None):
+        keep(each)
+
+
+def best_of(
+    search: Search, tried: Sequence[Trial], fitted: Fitted, amplitude: float
+) -> tuple[float, bool]:
+    """The frequency of the best square wave [Hz], and whether the identified fish has told it.
+
+    Where what was tried agrees with that fish, up to a factor, its curve says where the maximum is:
+    it stands on a whole excitation, and a few trials with noise tell less. Where it does not, the
+    search alone says so.
+    """
+    curve = {
+        frequency: square_wave(fitted.plant, amplitude, frequency).thrust
+        for frequency in search.ranges[0].values
+    }
+    expected = np.array([curve[each.parameters["frequency"]] for each in tried])
+    measured = np.array([each.thrust for each in tried])
+    weights = np.array([(1.96 / each.error) ** 2 for each in tried])
+    factor = (weights @ (expected * measured)) / (weights @ expected**2)
+    missed = weights @ (measured - factor * expected) ** 2
+    agrees = factor > 0.0 and chi2.sf(missed, max(1, len(tried) - 1)) > DISAGREES
+    if agrees:
+        return max(curve, key=lambda frequency: curve[frequency]), True
+    return search.proposal().parameters["frequency"], False
+
+
+def least_search(rig: Tank, search: Search) -> float:
+    """How long a search takes that tries the slowest wave once [s]."""
+    return 2.0 * REST + lengths({"frequency": search.ranges[0].values[0]})[1] + rig.tick
+
+
+def least_measurement(parameters: Mapping[str, Any]) -> float:
+    """The shortest time in which a gait can be measured, rests included [s]."""
+    frequency = float(parameters.get("frequency", 0.0))
+    swim = max(SWIM, 1.5 + 3.0 / frequency) if frequency else SWIM
+    seconds = 2.0 * swim + 3.0 * REST
+    plan_of(seconds + 1e-6, parameters)
+    return seconds + 1e-6

@@ -1,0 +1,216 @@
+"""`fishctl adapt`: what it draws, whom it lets win, and that nothing is measured twice."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+from rigs.virtual_daemon import VirtualDaemon
+
+from fishd.cli.adapt import command_of
+from fishd.client import Fish
+from fishd.config import Config, load
+from fishd.core.errors import ConfigError, FishdError
+from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
+from fishd.lab.optimise.trials import Trial
+from fishd.lab.rig import LiveRig, VirtualRig
+from fishd.learning.adapt import adaptation, report, steps
+from fishd.learning.adapt.adaptation import Adaptation
+from fishd.learning.adapt.cloud import WIDER, cloud
+from fishd.learning.adapt.state import AdaptFolder, Begun, Contender, Fitted, State, Trained
+from fishd.learning.adapt.tank import Tank
+from fishd.learning.adapt.verdict import judge
+from fishd.learning.env.simulated_link import at_edge, drawn
+from fishd.learning.settings import Randomisation
+from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.plant.optimum import square_wave
+from fishd.virtual.plant.parameters import PlantParameters
+
+PHI = 0.42
+
+
+def found(white: bool) -> Identification:
+    """ω₀ and ξ to 2 % and 4 %, with errors that go against each other."""
+    plain = msgspec.structs.asdict(PlantParameters())
+    known = [
+        Estimate("omega0", 12.5, 12.5 / 1.02, 12.5 * 1.02),
+        Estimate("xi", 1.2, 1.2 / 1.04, 1.2 * 1.04),
+        *(
+            Estimate(name, plain[name], plain[name], plain[name], fitted=False)
+            for name in ("coupling", "servo_speed", "servo_lag")
+        ),
+        Estimate("rotation", 0.1, 0.1, 0.1, fitted=False),
+    ]
+    channel = Channel("fx", 0.99, 1e-3, 0.0, white)
+    empty = np.zeros((2, 0))
+    return Identification(
+        tuple(known), (channel, channel), 56.0, 1, (), ("omega0", "xi"),
+        np.array([[1.0, -0.9], [-0.9, 1.0]]), Fit(np.zeros(0), empty, empty, empty),
+    )  # fmt: skip
+
+
+def test_a_cloud_has_the_errors_of_the_fit_and_how_they_go_together() -> None:
+    fish = cloud(found(white=True), count=4000)
+    assert (fish[0].omega0, fish[0].xi, fish[0].coupling) == (12.5, 1.2, 0.46)
+    logs = np.log([[each.omega0 / 12.5, each.xi / 1.2] for each in fish])
+    assert logs.std(axis=0) == pytest.approx(np.log([1.02, 1.04]) / 1.96, rel=0.05)
+    assert np.corrcoef(logs.T)[0, 1] == pytest.approx(-0.9, abs=0.02)
+    wide = np.log([each.omega0 / 12.5 for each in cloud(found(white=False), count=4000)])
+    assert wide.std() == pytest.approx(WIDER * logs[:, 0].std(), rel=0.01)
+
+
+def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
+    fish = cloud(found(white=True), count=5)
+    spread = Randomisation(fish=fish)
+    assert {drawn(Config(), spread, seed).plant for seed in range(60)} == set(fish)
+    assert [at_edge(Config(), spread, seed).plant for seed in range(5)] == list(fish)
+
+
+def contender(name: str, thrust: float, error: float, expected: float = 0.0) -> Contender:
+    return Contender(
+        name=name, controller="swing", parameters={}, thrust=thrust, error=error, frequency=1.7,
+        seconds=46.0, expected=expected,
+    )  # fmt: skip
+
+
+def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
+    told = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3, 1.0)])
+    assert (told.winner, told.told) == ("swing", True)
+    assert told.efficiency == pytest.approx(1.05)
+    # √2 · 1 % of relative error, for a single comparison
+    assert (told.low, told.high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
+    assert "swing as --C auto has found it wins: it thrusts 105.0 %" in told.claim
+
+
+def test_where_it_does_not_the_identified_fish_tells() -> None:
+    near = judge([contender("policy", 20.1e-3, 0.2e-3, 0.8), contender("square", 20e-3, 2e-4, 0.9)])
+    assert (near.winner, near.told, near.efficiency) == ("square", False, 1.0)
+    assert "the measurement does not tell" in near.claim
+
+
+def test_intervals_of_two_are_wider_than_that_of_one() -> None:
+    square, swing = contender("square", 20e-3, 0.2e-3), contender("swing", 21e-3, 0.2e-3)
+    one, two = judge([swing, square]), judge([contender("policy", 1e-3, 0.2e-3), swing, square])
+    assert two.high - two.low == pytest.approx(2.2414 / 1.96 * (one.high - one.low), rel=2e-3)
+
+
+def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
+    with pytest.raises(FishdError, match="too little to be told from nothing"):
+        judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)])
+
+
+FITTED = Fitted(
+    plant=PlantParameters(), rig=SimulationSettings(), offset=0.0, cloud=(PlantParameters(),),
+    found={},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("scale", "agrees"), [(lambda f: 0.9, True), (lambda f: f, False)])
+def test_the_fit_says_which_square_wave_is_best_unless_the_tank_disagrees(
+    scale: Any, agrees: bool
+) -> None:
+    with VirtualRig(Config()) as rig:
+        search = steps.square_waves(FITTED, Tank(rig, 0.0, lambda used: None), 0)
+    tried = []
+    for frequency in search.ranges[0].values:
+        thrust = scale(frequency) * square_wave(PlantParameters(), PHI, frequency).thrust
+        tried.append(Trial({"frequency": frequency}, thrust, 0.2e-3, 0, 0.0))
+        search.observe({"frequency": frequency}, thrust, 0.2e-3)
+    frequency, told = steps.best_of(search, tried, FITTED, PHI)
+    assert told == agrees
+    assert frequency == pytest.approx(10 / 6 if agrees else 2.0)
+
+
+class Quiet:
+    """Keeps the lines."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def done(self, line: str, amount: float) -> None:
+        self.lines.append(line)
+
+    def at(self, amount: float, found: str = "") -> None:
+        pass
+
+    def warn(self, line: str) -> None:
+        self.lines.append(line)
+
+
+def no_policy(*_: Any) -> Trained:
+    return Trained(steps=0, refused="nobody trains in this test")
+
+
+def folder(path: Path, seed: int = 0) -> AdaptFolder:
+    return AdaptFolder(path, Begun("robot", 640, seed, {}))
+
+
+class Stopped(BaseException):
+    """As Ctrl-C."""
+
+
+@pytest.mark.slow
+def test_what_was_measured_is_not_measured_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adaptation, "practise", no_policy)
+    path, config = tmp_path / "run", load("config/simulated.yaml")
+    daemon, show = VirtualDaemon(config), Quiet()
+
+    def go_on() -> State:
+        with LiveRig(cast(Fish, daemon)) as rig:
+            made = Adaptation(rig, config, folder(path), 160.0, 640, 0, show)
+            return made.run()
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise Stopped
+
+    monkeypatch.setattr(LiveRig, "describe", lambda self, writer: None)
+    with monkeypatch.context() as broken:
+        broken.setattr(steps, "search_square_waves", stop)
+        with pytest.raises(Stopped):
+            go_on()
+    kept = folder(path).state
+    assert daemon.status().mode == "idle"
+    assert kept.excitation == "excitation.mcap"
+    assert kept.fitted
+    assert kept.swing
+    assert kept.tank_time == pytest.approx(0.34 * 160.0, abs=0.2)
+    state = go_on()
+    assert state.verdict
+    assert state.tank_time == pytest.approx(160.0, abs=0.2)
+    assert sum(line.startswith("excitation") for line in show.lines) == 1
+    assert any("nobody trains" in line for line in show.lines)
+    assert {one.name for one in state.contenders} == {"swing", "square"}
+    for name, (value, low, high) in state.verdict.others.items():
+        assert 0.95 < value < 1.05, name
+        assert low < 1.0 < high
+    state.contenders[0] = msgspec.structs.replace(state.contenders[0], true_thrust=0.0257)
+    picture, page = report.write(folder(path), PHI, "fishctl set-controller <swing>")
+    assert picture.stat().st_size > 10_000
+    text = page.read_text(encoding="utf-8")
+    assert "fishctl set-controller &lt;swing&gt;" in text
+    assert state.verdict.winner in text
+    with pytest.raises(ConfigError, match="begun with seed = 0, now it is 1"):
+        folder(path, seed=1)
+
+
+def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> None:
+    fish = ["plant.thrust_coefficient=1e-6", "plant.lateral_drag=1e-6", "simulation.noise=0.01"]
+    config = load(None, fish)
+    run = folder(tmp_path / "run")
+    with (
+        VirtualRig(config) as rig,
+        pytest.raises(Unidentifiable, match=r"the best fit explains .* of F_x only"),
+    ):
+        Adaptation(rig, config, run, 150.0, 640, 0, Quiet()).run()
+    assert folder(run.path).state.excitation == "excitation.mcap"
+
+
+def test_the_last_line_says_what_to_type() -> None:
+    one = msgspec.structs.replace(
+        contender("square", 1.0, 0.1), controller="square", parameters={"frequency": 5.0 / 3.0}
+    )
+    assert command_of(one, "robot") == "fishctl set-controller square --frequency 1.66667"
+    assert command_of(one, "simulation").startswith("fishctl simulate square")

@@ -1,0 +1,171 @@
+"""`fishctl adapt` on harsh fish that differ from the model: is its winner good, and its claim true?
+
+The fish are those of the bench `swing`, of other seeds, each with everything that a real rig does,
+in random sizes. Each is adapted to in virtual time, by default in five minutes of tank time. The
+truth is the mean thrust of the simulated fish, which no step of it sees.
+"""
+
+import os
+import statistics
+from argparse import Namespace
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+
+from bench.swing import harsh, percent
+from common.report import Options, Report, progress, table
+from fishd.config import Start, load
+from fishd.lab.rig import VirtualRig
+from fishd.learning.adapt.adaptation import Adaptation
+from fishd.learning.adapt.state import AdaptFolder, Begun, Contender
+from fishd.learning.adapt.verdict import SQUARE
+from fishd.virtual.plant.optimum import best_square_wave
+
+DOCUMENT = "adapt.md"
+FIRST_SEED = 900
+"""Of the harsh fish; others were looked at while it was made."""
+FISH = 10
+
+
+class Adapted(Struct, frozen=True):
+    """One fish."""
+
+    seed: int
+    best: float
+    """Thrust of the best of all square waves [N]."""
+    winner: str
+    share: float
+    """True thrust of the winner over `best`."""
+    of_square: float
+    """True thrust of the square wave found, over `best`."""
+    claimed: tuple[float, float, float]
+    """Efficiency of the winner over the square wave found, and its interval."""
+    claims: dict[str, tuple[float, float, float, float]]
+    """Of each but the square wave: the same, and the truth."""
+    thrusts: dict[str, tuple[float, float, float]]
+    """Measured, half of the 95 % interval, true [N]."""
+    tank_time: float
+    """[s]"""
+
+
+class _Silent:
+    """Shows nothing."""
+
+    def done(self, line: str, amount: float) -> None:
+        """A step is done."""
+
+    def at(self, amount: float, found: str = "") -> None:
+        """It goes on."""
+
+    def warn(self, line: str) -> None:
+        """Something is to be said."""
+
+
+def adapted(task: tuple[int, int, float]) -> Adapted:
+    """Adapt to one fish; seed, steps of the training, tank time [s]."""
+    seed, steps, tank_time = task
+    config = replace(load(None, harsh(seed).overrides), start=Start())
+    with TemporaryDirectory() as folder, VirtualRig(config) as rig:
+        begun = Begun("simulation", steps, 0, msgspec.to_builtins(config))
+        run = AdaptFolder(Path(folder) / "adapt", begun)
+        state = Adaptation(rig, config, run, tank_time, steps, 0, _Silent()).run()
+    assert state.verdict
+    contenders = {one.name: one for one in state.contenders}
+    best = best_square_wave(config.plant, config.amplitude_limit).thrust
+    verdict, square = state.verdict, contenders[SQUARE]
+    progress(f"fish {seed}", verdict.claim)
+    return Adapted(
+        seed=seed,
+        best=best,
+        winner=verdict.winner,
+        share=truth(contenders[verdict.winner]) / best,
+        of_square=truth(square) / best,
+        claimed=(verdict.efficiency, verdict.low, verdict.high),
+        claims={
+            name: (*claim, truth(contenders[name]) / truth(square))
+            for name, claim in verdict.others.items()
+        },
+        thrusts={one.name: (one.thrust, one.error, truth(one)) for one in state.contenders},
+        tank_time=state.tank_time,
+    )
+
+
+def truth(one: Contender) -> float:
+    """Its true thrust [N]."""
+    assert one.true_thrust is not None
+    return one.true_thrust
+
+
+OPTIONS: Options = {
+    "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
+    "--first": {"type": int, "default": FIRST_SEED, "help": "seed of the first fish"},
+    "--fish": {"type": int, "default": FISH, "help": "how many"},
+    "--steps": {"type": int, "default": 6400, "help": "of each training"},
+    "--tank-time": {"type": float, "default": 300.0, "help": "of each fish [s]"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Two tables; half a minute for each fish."""
+    seeds = range(options.first, options.first + options.fish)
+    tasks = [(seed, options.steps, options.tank_time) for seed in seeds]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        found = list(pool.map(adapted, tasks))
+    head = (
+        "fish | best square wave, mN | winner | true thrust of the winner, % of that | of the "
+        "square wave found, % of that | winner over the square wave found, % | its truth, % | "
+        "tank time, s"
+    )
+    rows = [row(each) for each in found]
+    names = {"bench adapt": table(head, rows), "bench adapt summary": summary(found)}
+    return Report(names, [msgspec.to_builtins(each) for each in found])
+
+
+def row(one: Adapted) -> list[str]:
+    """Of the table."""
+    value, low, high = map(percent, one.claimed)
+    own = one.claims.get(one.winner)
+    return [
+        str(one.seed),
+        f"{1e3 * one.best:.2f}",
+        one.winner,
+        percent(one.share),
+        percent(one.of_square),
+        f"{value} [{low}, {high}]" if own else "100, itself",
+        percent(own[3]) if own else "100",
+        f"{one.tank_time:.0f}",
+    ]
+
+
+def summary(found: list[Adapted]) -> str:
+    """Medians, worst and coverage."""
+    shares = [each.share for each in found]
+    claims = [each.claims[each.winner] for each in found if each.winner in each.claims]
+    every = [claim for each in found for claim in each.claims.values()]
+    policies = [each.thrusts["policy"][2] / each.best for each in found if "policy" in each.thrusts]
+    winners = [each.thrusts[each.winner] for each in found]
+    rows = [
+        ["winner, of the best square wave, median", f"{percent(statistics.median(shares))} %"],
+        ["winner, of the best square wave, worst", f"{percent(min(shares))} %"],
+        ["policy, of the best square wave, median", f"{percent(statistics.median(policies))} %"],
+        ["policy, of the best square wave, worst", f"{percent(min(policies))} %"],
+        ["policies that took part", f"{len(policies)} of {len(found)}"],
+        ["interval of the winner's efficiency covers the truth", _covered(claims)],
+        ["the same, of everyone but the square wave", _covered(every)],
+        [
+            "interval of the winner's thrust covers the truth",
+            f"{sum(abs(value - true) <= error for value, error, true in winners)} of "
+            f"{len(winners)}",
+        ],
+        ["longest tank time", f"{max(each.tank_time for each in found):.0f} s"],
+    ]
+    return table("what | measured", rows)
+
+
+def _covered(claims: list[tuple[float, float, float, float]]) -> str:
+    covered = sum(low <= true <= high for _, low, high, true in claims)
+    return f"{covered} of {len(claims)}"
