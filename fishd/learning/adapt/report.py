@@ -66,7 +66,7 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
 def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     """Square waves as tried, and those of the identified fish."""
     assert state.fitted
-    tried = [trial.parameters["frequency"] for trial in state.trials]
+    tried = [trial.frequency for trial in state.trials]
     frequencies = np.geomspace(0.9 * min(tried), 1.1 * max(tried), 60)
     curves = [
         [1e3 * square_wave(plant, amplitude, f).thrust for f in frequencies.tolist()]
