@@ -13,12 +13,11 @@ from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
-from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import LiveRig, VirtualRig
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.cloud import WIDER, cloud
-from fishd.learning.adapt.state import AdaptFolder, Begun, Contender, Fitted, State, Trained
+from fishd.learning.adapt.state import AdaptFolder, Begun, Contender, Fitted, State, Trained, Tried
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import judge
 from fishd.learning.env.simulated_link import at_edge, drawn
@@ -115,7 +114,7 @@ def test_the_fit_says_which_square_wave_is_best_unless_the_tank_disagrees(
     tried = []
     for frequency in search.ranges[0].values:
         thrust = scale(frequency) * square_wave(PlantParameters(), PHI, frequency).thrust
-        tried.append(Trial({"frequency": frequency}, thrust, 0.2e-3, 0, 0.0))
+        tried.append(Tried(frequency, thrust, 0.2e-3, 0, 0.0))
         search.observe({"frequency": frequency}, thrust, 0.2e-3)
     frequency, told = steps.best_of(search, tried, FITTED, PHI)
     assert told == agrees

@@ -16,9 +16,10 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from bench.swing import harsh, percent
+from bench.swing import percent
 from common.report import Options, Report, progress, table
 from fishd.config import Start, load
+from fishd.lab.other_fish import harsh
 from fishd.lab.rig import VirtualRig
 from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.state import AdaptFolder, Begun, Contender

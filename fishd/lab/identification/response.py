@@ -67,7 +67,7 @@ def response(
     h = tick / steps
     before = _EARLIER + math.ceil(drive.servo_delay / tick - 1e-9)
     held = np.concatenate((np.full(before, commands[0]), commands))
-    pull, turning = _pull(drive, held, steps, tick)
+    pull, turned = _pull(drive, held, steps, tick)
     alpha, rate = _fin(drive, pull, h)
     # Slot k of the commands begins at k·tick; its command acts from grid point (k + before)·steps
     # on, which is servo_delay later. So its first sample is at this grid point:
@@ -89,21 +89,20 @@ def response(
     sums = np.stack((a * minus, minus, -v)).reshape(3, slots, samples).sum(axis=2)
     means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
     edges = 2.0 * (before * steps - drive.servo_delay / h + ends * steps)
-    passed_on = np.interp(edges, np.arange(turning.size), _smoothed(turning, 0.5 * h))
+    passed_on = np.interp(edges, np.arange(turned.size), _passed_on(turned, 0.5 * h))
     return np.vstack((means, -np.diff(passed_on) / (tick * np.diff(ends))))
 
 
-def _smoothed(speed: Array, step: float) -> Array:
-    """A speed as the servo's mount passes it on, from rest; its samples are `step` s apart."""
+def _passed_on(angles: Array, step: float) -> Array:
+    """The speed of the wheel as the servo's mount passes it on; its angles are `step` s apart."""
     decay = math.exp(-step / REACTION_TIME)
-    # Exact for a speed that changes evenly between two samples.
-    old = (1.0 - decay) * REACTION_TIME / step - decay
-    smoothed: Array = lfilter([1.0 - decay - old, old], [1.0, -decay], speed)
+    speeds = np.diff(angles, prepend=angles[0]) / step
+    smoothed: Array = lfilter([1.0 - decay], [1.0, -decay], speeds)
     return smoothed
 
 
 def _pull(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Array]:
-    """What drives the fin, in wheel angle [rad], and how fast the wheel turns [rad/s].
+    """What drives the fin, in wheel angle [rad], and the angle of the wheel itself.
 
     Both at the grid points and half way between them.
     """
@@ -127,12 +126,13 @@ def _pull(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Ar
     times = np.arange(2 * steps) * (0.5 * tick / steps)
     left = np.arcsinh(np.multiply.outer(np.array(sinhs), np.exp(times * (-speed / lag))))
     wheel = np.array(targets)[:, None] - lag * left
+    turned = np.append(wheel.ravel(), phi)
     if play:  # within a slot the wheel turns one way only
         wheel = np.clip(np.array(tails)[:, None], wheel - play, wheel + play)
     pull = np.append(wheel.ravel(), tail if play else phi)
     if drive.cable_slack:
         pull = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
-    return pull, np.append(speed * np.tanh(left.ravel()), 0.0)
+    return pull, turned
 
 
 def _fin(drive: Drive, pull: Array, h: float) -> tuple[Array, Array]:

@@ -8,11 +8,10 @@ from fishd.config import Config
 from fishd.core.errors import FishdError
 from fishd.lab.identification import experiment
 from fishd.lab.measurement import REST, measure
-from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import Rig, is_of_one
 from fishd.learning.adapt import steps as do
 from fishd.learning.adapt.practice import TRIES, practise, simulated
-from fishd.learning.adapt.state import FISH, POLICY, AdaptFolder, Contender, State
+from fishd.learning.adapt.state import FISH, POLICY, AdaptFolder, Contender, State, Tried
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import SQUARE, judge
 from fishd.simulation import simulate
@@ -126,7 +125,7 @@ class Adaptation:
         search = do.square_waves(state.fitted, self._tank, self._seed)
         budget = max(do.BUDGET["search"] * self._tank_time, do.least_search(self._tank, search))
 
-        def keep(trial: Trial) -> None:
+        def keep(trial: Tried) -> None:
             state.trials.append(trial)
             state.tank_time = self._tank.used
             self._keep()

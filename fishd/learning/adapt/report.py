@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
-from fishd.lab.identification.result import OF_THE_RIG, UNITS
+from fishd.lab.identification.fit import LOGARITHMIC
+from fishd.lab.identification.result import UNITS
 from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State
 from fishd.learning.adapt.verdict import NAMES, SQUARE, spelled
 from fishd.learning.run_folder.tables import EVALUATIONS
@@ -49,11 +50,11 @@ def draw(state: State, evaluations: Path, amplitude: float, path: Path) -> None:
 
 
 def _draw_fit(axis: Any, fitted: Fitted) -> None:
-    """How well each parameter is known."""
+    """How well those are known whose errors are shares; the others may be as good as zero."""
     shown = [
         (name, 50.0 * (each["high"] - each["low"]) / abs(each["value"]))
         for name, each in fitted.found["estimates"].items()
-        if each.get("fitted", True) and each["value"] and name not in OF_THE_RIG
+        if each.get("fitted", True) and name in LOGARITHMIC
     ]
     places = np.arange(len(shown))[::-1]
     axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
@@ -66,7 +67,7 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
 def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     """Square waves as tried, and those of the identified fish."""
     assert state.fitted
-    tried = [trial.parameters["frequency"] for trial in state.trials]
+    tried = [trial.frequency for trial in state.trials]
     frequencies = np.geomspace(0.9 * min(tried), 1.1 * max(tried), 60)
     curves = [
         [1e3 * square_wave(plant, amplitude, f).thrust for f in frequencies.tolist()]

@@ -11,7 +11,6 @@ from fishd.core import files
 from fishd.core.errors import ConfigError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.lab.begun import begin
-from fishd.lab.optimise.trials import Trial
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -52,6 +51,21 @@ class Rung(Struct, frozen=True):
     """[s]"""
     settled: bool
     """Was the search over?"""
+
+
+class Tried(Struct, frozen=True):
+    """A square wave of the search, as it was measured."""
+
+    frequency: float
+    """[Hz]"""
+    thrust: float
+    """[N]"""
+    error: float
+    """Half of its 95 % interval [N]."""
+    swum: int
+    """Ticks of swimming so far, in the search."""
+    passed: float
+    """Time since its beginning, rest included [s]."""
 
 
 class Trained(Struct, frozen=True, kw_only=True):
@@ -120,7 +134,7 @@ class State(Struct, kw_only=True):
     """The recording that the fish is fitted to."""
     fitted: Fitted | None = None
     swing: Rung | None = None
-    trials: list[Trial] = []
+    trials: list[Tried] = []
     """Square waves, as they were tried."""
     square: float | None = None
     """The frequency of the best of them [Hz]."""

@@ -1,5 +1,6 @@
 """The steps of an adaptation that need the fish: excitation, swing's search, square waves."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import Trial, lengths, trials, whole_ticks
 from fishd.learning.adapt.cloud import cloud, identified
-from fishd.learning.adapt.state import Fitted, Rung
+from fishd.learning.adapt.state import Fitted, Rung, Tried
 from fishd.learning.adapt.tank import Tank
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
@@ -89,21 +90,27 @@ def search_square_waves(
     rig: Tank,
     search: Search,
     budget: float,
-    before: Sequence[Trial],
-    keep: Callable[[Trial], None],
+    before: Sequence[Tried],
+    keep: Callable[[Tried], None],
 ) -> None:
     """Try square waves until the budget is used [s].
 
     before: those that were tried already; keep: called with each new one
     """
-    for each in before:
-        search.observe(each.parameters, each.thrust, each.error)
-    for each in trials(rig, "square", {}, search, budget, before[-1] if before else None):
-        keep(each)
+    last = None
+    for one in before:
+        nobody = math.nan, math.nan  # knows its electrical power
+        last = Trial(
+            {"frequency": one.frequency}, one.thrust, one.error, *nobody, one.swum, one.passed
+        )
+        search.observe(last.parameters, last.thrust, last.error)
+    for each in trials(rig, "square", {}, search, budget, last):
+        frequency = each.parameters["frequency"]
+        keep(Tried(frequency, each.thrust, each.error, each.swum, each.passed))
 
 
 def best_of(
-    search: Search, tried: Sequence[Trial], fitted: Fitted, amplitude: float
+    search: Search, tried: Sequence[Tried], fitted: Fitted, amplitude: float
 ) -> tuple[float, bool]:
     """The frequency of the best square wave [Hz], and whether the identified fish has told it.
 
@@ -115,7 +122,7 @@ def best_of(
         frequency: square_wave(fitted.plant, amplitude, frequency).thrust
         for frequency in search.ranges[0].values
     }
-    expected = np.array([curve[each.parameters["frequency"]] for each in tried])
+    expected = np.array([curve[each.frequency] for each in tried])
     measured = np.array([each.thrust for each in tried])
     weights = np.array([(1.96 / each.error) ** 2 for each in tried])
     factor = (weights @ (expected * measured)) / (weights @ expected**2)
