@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
+from rigs.policy_files import write
 
-from fishd.config import load
+from fishd.config import Config, load
 from fishd.core.errors import ParameterError, Refused
 from fishd.core.signals import Tick
 from fishd.lab.compare import LiveComparison, compare
@@ -76,14 +78,14 @@ def test_the_error_of_several_runs_is_what_they_are_known_to_or_how_they_differ(
     assert found.error == pytest.approx(expected, rel=1e-6)
 
 
-def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on() -> None:
-    config = load(None, ["plant.cable_slack=0.2"])
-    with VirtualRig(config) as rig:
-        live = LiveComparison(rig, ["swing:C=7", "default-fish", "swing"])
+def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: Path) -> None:
+    shaking = str(write(tmp_path))
+    with VirtualRig(Config()) as rig:
+        live = LiveComparison(rig, ["swing:C=7", shaking, "swing"])
         live.swim(25.0, runs=2)
     assert [standing.contestant for standing in live.standings()] == ["swing"]
     (one, refusal), (other, gave_up) = live.left_out
-    assert (one.label, other.label) == ("swing:C=7", "default-fish")
+    assert (one.label, other.label) == ("swing:C=7", shaking)
     assert "number in [0, 1]" in str(refusal)
     assert "ppo gave up" in str(gave_up)
 

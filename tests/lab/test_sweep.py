@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from rigs.policy_files import write
 from rigs.processes import fishctl, one_line
 
 from fishd.config import Config, load
@@ -136,23 +137,23 @@ def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured
     tmp_path: Path,
 ) -> None:
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
-    config = load(None, ["plant.cable_slack=0.2"])
+    config = Config()
     found = [
         Point("square", {"frequency": 50.0}),
-        Point("ppo", {"policy": "default-fish"}),
+        Point("ppo", {"policy": str(write(tmp_path))}),
         Point("hold", {}),
         Point("square", {"frequency": 1.5}),
     ]
     begun = Begun("robot", msgspec.to_builtins(config), {"seconds": 21.0})
     columns = ["controller", "parameters.frequency", "parameters.policy"]
-    folder = SweepFolder(tmp_path, begun, columns)
+    folder = SweepFolder(tmp_path / "sweep", begun, columns)
     assert on_robot(folder, found, VirtualRig(config), 21.0, nothing)
-    kept = SweepFolder(tmp_path, begun, columns).results
+    kept = SweepFolder(tmp_path / "sweep", begun, columns).results
     troubles = [kept[folder.key(point)].trouble for point in found]
     assert "frequency" in troubles[0]
     assert "ppo gave up" in troubles[1]
     assert troubles[2:] == ["", ""]
-    assert len(list((tmp_path / "ticks").iterdir())) == 4
+    assert len(list((tmp_path / "sweep" / "ticks").iterdir())) == 4
 
 
 @pytest.mark.parametrize("key", ["estimator.zero_drift", "a_key_of_then"])

@@ -13,8 +13,6 @@ from paper.runs import FOLDER, PLANT, Row, Run, column, read, swim_all, write
 NAME = "figure-3"
 AMPLITUDES = (0.05, 0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
 LEARNED = (0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
-SHIPPED = 0.42
-"""The amplitude of the policy that comes with fishd; the others are in docs/figures/policies."""
 NEAR = np.linspace(0.8, 1.2, 13)
 """Frequencies that are tried in the loop, over the best of the equations."""
 SECONDS, SETTLE = 40.0, 10.0
@@ -28,8 +26,6 @@ SEEN = "learned from pictures, in the loop"
 
 def policy(amplitude: float) -> str:
     """The policy that has learned to swim at an amplitude [rad]."""
-    if amplitude == SHIPPED:
-        return "default-fish"
     return str(DOCS / "figures" / "policies" / f"amplitude-{amplitude:.2f}.onnx")
 
 
