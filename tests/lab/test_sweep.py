@@ -138,6 +138,7 @@ def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured
 ) -> None:
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
     config = Config()
+    (tmp_path / "sweep").mkdir()
     found = [
         Point("square", {"frequency": 50.0}),
         Point("ppo", {"policy": str(write(tmp_path))}),
