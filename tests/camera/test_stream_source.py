@@ -27,6 +27,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.realtime
 def test_a_file_is_played_at_its_own_rate_again_and_again(tmp_path: Path, video: Path) -> None:
     with (
         running_camera(tmp_path, "source=stream", f"stream.url={video}") as camera,
