@@ -44,7 +44,10 @@ def envelope(time: Array, midlines: Array, since: float = 0.0) -> Envelope:
     time, midlines = time[later], midlines[later]
     begins = _beats(time, midlines)
     if len(begins) < 2:
-        raise FishdError("the tail does not beat once: there are no midlines of a whole beat")
+        raise FishdError(
+            f"the tail does not beat once after {since:g} s, which is when midlines begin to count "
+            "(--settle)"
+        )
     length = float(np.linalg.norm(np.diff(midlines[0], axis=0), axis=1).sum())
     beats = [_own_frame(beat) / length for beat in _at_phases(time, midlines, begins)]
     swings = [0.5 * (beat[..., 1].max(axis=0) - beat[..., 1].min(axis=0)) for beat in beats]
