@@ -180,6 +180,7 @@ def test_the_pause_asked_for_follows_the_longest_so_far(monkeypatch: pytest.Monk
     assert asked[-1] == 300.0
 
 
+@pytest.mark.realtime
 def test_the_environment_on_a_running_fishd_passes_both_checkers(daemon: Daemon) -> None:
     env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint).unwrapped
     try:
