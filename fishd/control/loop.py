@@ -263,8 +263,12 @@ class ControlLoop:
         """Notice, when the tail sets off, that F_y is reversed."""
         if self.supervisor.sensor_lost or not self.limits.tethered:
             return
-        if self.lateral_sign.update(observation) and self.lateral_sign.reversed:
-            self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
+        try:
+            if self.lateral_sign.update(observation) and self.lateral_sign.reversed:
+                self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
+        except ArithmeticError as error:
+            self.reporter.problem("the sign of F_y cannot be told, and is found anew", error)
+            self.lateral_sign.forget()
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

@@ -4,8 +4,9 @@ import dataclasses
 
 import pytest
 from msgspec.structs import replace
-from rigs.harness import Rig
+from rigs.harness import Rig, observe
 
+from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.core.signals import Measurement
 from fishd.hardware.base import ForceSensor, Robot
 from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH, harsh
@@ -69,6 +70,14 @@ def test_a_right_sign_is_no_event_and_no_complaint() -> None:
     assert started(rig) is False
     assert rig.loop.lateral_sign.complaint == ""
     assert "calibration" not in rig.recorder.kinds()
+
+
+def test_a_hang_as_the_tail_sets_off_shows_nothing() -> None:
+    sign = LateralSign()
+    for _ in range(100):
+        sign.update(replace(observe(), dt=0.05, instruction_angle=0.0))
+    assert not sign.update(replace(observe(), dt=5.0, instruction_angle=0.42))
+    assert sign.reversed is None
 
 
 def test_a_fish_that_did_not_rest_shows_nothing() -> None:

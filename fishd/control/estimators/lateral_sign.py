@@ -111,7 +111,7 @@ class _Push:
         self._side = math.copysign(1.0, angle)
         self._level, self._noise, self._rested = level, noise, rested
         self._over = False
-        self._time = self._pushed = 0.0
+        self._time = self._pushed = self._lasted = 0.0
         self._impulse = self._sum = self._size = 0.0
 
     def add(self, seen: Observation) -> bool:
@@ -132,7 +132,7 @@ class _Push:
     @property
     def reversed(self) -> bool | None:
         """What it showed; None where that is nothing."""
-        if self._pushed < SHORTEST - 1e-9:
+        if self._pushed < SHORTEST - 1e-9 or not self._lasted:  # or a hang took all of it
             return None
         lasted = self._lasted
         # Of the impulse, summed: white noise, and the error of the level that was taken off.

@@ -7,6 +7,7 @@ current and power, and alerts are not emulated.
 
 import errno
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -19,7 +20,7 @@ CONFIG, SHUNT, SUPPLY = range(3)
 _RESET_BIT = 0x8000
 
 
-class InaChip:
+class InaChip(ABC):
     """What the two have in common; put one on an `I2cBus`."""
 
     reset_config: ClassVar[int]
@@ -78,17 +79,17 @@ class InaChip:
             word = self._word(self._pointer)
         return (word.to_bytes(2, "big") + b"\xff" * length)[:length]
 
+    @abstractmethod
     def times(self, config: int) -> tuple[float, float]:
         """How long the shunt and the supply are converted, with all averaging [s]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def supply_word(self, volts: float) -> int:
         """The register of the supply."""
-        raise NotImplementedError
 
+    @abstractmethod
     def limit(self, config: int) -> int:
         """The largest code of the shunt."""
-        raise NotImplementedError
 
     def _word(self, pointer: int) -> int:
         if pointer not in (SHUNT, SUPPLY):
