@@ -47,19 +47,28 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--fast", action="store_true", help="only tests on the virtual clock, without processes"
     )
+    parser.addoption("--realtime", action="store_true", help="only tests that judge real time")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.option.fast:
         config.option.markexpr = "not slow and not realtime"
+    elif config.option.realtime:
+        config.option.markexpr = "realtime"
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """With --fast, slow modules are not even imported; single slow tests are marked `slow`."""
-    if not config.option.fast or collection_path.suffix != ".py":
+    """What has none of the tests that are asked for is not even imported.
+
+    With --fast, these are the slow modules; single slow tests are marked `slow`.
+    """
+    fast, realtime = config.option.fast, config.option.realtime
+    if not (fast or realtime) or not collection_path.match("test_*.py"):
         return None
-    whole = "end_to_end" in collection_path.parts
-    return whole or bool(SLOW.search(collection_path.read_text(encoding="utf-8"))) or None
+    text = collection_path.read_text(encoding="utf-8")
+    if realtime:
+        return "mark.realtime" not in text or None
+    return "end_to_end" in collection_path.parts or bool(SLOW.search(text)) or None
 
 
 def pytest_collection_finish() -> None:

@@ -36,5 +36,6 @@ def test_the_checked_layers_are_the_rooms() -> None:
     assert sorted(named) == sorted(path.stem for path in ROOMS.values())
 
 
+@pytest.mark.slow
 def test_few_arrows_run_between_the_rooms() -> None:
     assert len(arrows()) <= MOST_ARROWS

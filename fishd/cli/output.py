@@ -101,19 +101,3 @@ def _escaped(document: bytes) -> str:
         return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4))
 
     return re.sub(r"[^\x20-\x7e\n]", escape, document.decode())
-
-
-def choose(prompt: str, *words: str, suffix: str = ": ") -> str:
-    """Ask until the answer is one of `words`, of which an empty one stands for Enter alone."""
-
-    def chosen(answer: str) -> str:
-        word = answer.strip().lower()
-        if word in words:
-            return word
-        possible = " or ".join(each or "Enter" for each in words)
-        raise click.UsageError(f"{possible} is needed, not '{answer}'; Ctrl-C ends without saving")
-
-    answer: str = click.prompt(
-        prompt, default="", show_default=False, prompt_suffix=suffix, value_proc=chosen
-    )
-    return answer

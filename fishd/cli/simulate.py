@@ -173,7 +173,8 @@ def _chosen(report: "Report") -> list[tuple[str, str]]:
         return []
     found = report.quantities
     ahead = f", of the speed that is foreseen {found['lead']:g} s ahead" if found["lead"] else ""
-    return [("", f"C = {found['criterion']:g} at the end{ahead}")]
+    turns = ", in turn with another one" if found["halfway"] else ""
+    return [("", f"C = {found['criterion']:g} at the end{ahead}{turns}")]
 
 
 def _half_beats(report: "Report", tick: float) -> str:

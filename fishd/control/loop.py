@@ -322,6 +322,8 @@ class ControlLoop:
             if lost:
                 self.reporter.event("servo", "the servo can be reached again")
         except Exception as error:
+            if problem := self.servo.why_silent():  # in the write itself: so it failed
+                self.supervisor.fail("overrun", problem)
             self._fail("servo-link", "the servo cannot be driven", error)
             if latched and not lost:  # which the fault or the stop that is latched does not say
                 message = f"it may still have pulses, and cannot be released: {text.named(error)}"

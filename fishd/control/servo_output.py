@@ -25,8 +25,12 @@ class ServoOutput:
 
         It is at neutral, or has no pulses any more: it must not begin again by itself.
         """
+        return "" if not self.on or self.lost else self.why_silent()
+
+    def why_silent(self) -> str:
+        """One line if the latest write began longer ago than the countdown lasts; else empty."""
         silence = self._now() - self._written
-        if not self.on or self.lost or silence <= self._countdown:
+        if silence <= self._countdown:
             return ""
         return (
             f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral and "

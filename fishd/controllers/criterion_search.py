@@ -2,14 +2,17 @@
 
 What is compared is the ripple of F_x. A fin that swings as α = A sin ωt gives
 F_x = −Kαα̈ = ½KA²ω² (1 − cos 2ωt): the force ripples twice a beat, and by as much as its mean. The
-mean drifts with the sensor and the ripple does not. It is taken from the two halves of a beat laid
-upon each other, from reversal to reversal, so that what a turned sensor mixes in of F_y, which has
-the other sign in the other half, is gone; and so is the sign of F_y.
+mean drifts with the sensor and the ripple does not. What a turned sensor mixes in of F_y is taken
+off first, so the sign of F_y does not matter; and what comes once a beat does not count.
 """
 
 import math
+import statistics
 from enum import Enum
 from typing import NamedTuple
+
+Forces = tuple[float, float]
+"""F_x and F_y [N]."""
 
 
 class Rung(NamedTuple):
@@ -32,27 +35,38 @@ BEATS = 3
 """Whole beats by which a rung is judged, after one in which the fin settles."""
 CLEAR = 0.01
 """A rung is taken where its ripple is larger by this share than before and after it."""
+SURE = 1.0
+"""A trial is repeated while its gain is known no better than within so many standard errors,"""
+ROUNDS = 3
+"""but no more often than this."""
 WORSE = 0.8
 """After one beat with a ripple below this share a trial ends."""
-FASTER_RIPPLES = 0.15
-"""Gaits of equal thrust ripple more the faster they are, by a power of their frequency: 0.35 is the
-median of 80 pairs of gaits of 35 simulated fish, and less is safer for fish that hardly brake."""
+FALLEN = 0.5
+"""Below this share of its ripple a gait is lost: the tail only trembles."""
+LAUNCH = 4
+"""Half beats with the latest of all reversals, by which a lost gait is begun again."""
 SAME = 0.03
 """Half beats that differ by less than this share are the same gait; the next rung is tried."""
 PATIENCE = 40.0
 """Once all neighbours are worse, so long until one of them is tried again [s]."""
 CHANGED = 0.25
-"""With a ripple that differs by this share from what it was, it is another fish."""
-FURTHEST = 4
-NEIGHBOURS = (1, -1, 2, -2)
-"""Steps on the ladder that are tried, in this order."""
+"""With a ripple that differs by this share from what it was, it is another fish,"""
+CERTAIN = 3.0
+"""if it differs by so many standard errors, too."""
+FURTHEST = 8
+"""Half steps on the ladder that are looked beyond at most."""
+NEIGHBOURS = (2, -2, 4, -4, 1, -1)
+"""Half steps that are tried, in this order. Half way between two rungs, one side goes by the one
+and the other side by the other: where a half beat has few ticks, the best may lie between."""
 
 
 class Judgement(NamedTuple):
     """What the force says of some beats."""
 
-    merit: float
-    """The ripple, made comparable with that of other gaits."""
+    ripple: float
+    """Of F_x, rms [N]."""
+    error: float
+    """Its standard error [N]."""
     half_beat: float
     """Mean [s]."""
 
@@ -64,33 +78,54 @@ class Phase(Enum):
     TRIAL = "a trial"
     AFTER = "after a trial"
     WATCH = "watching"
+    LAUNCH = "beginning a lost gait again"
 
 
 class CriterionSearch:
     """Chooses the rung, told of the force in each tick."""
 
     def __init__(self) -> None:
+        from fishd.controllers.ripple import ripples  # with numpy, which fishctl does without
+
+        self._ripples = ripples
         self.ripple = 0.0
         """Of the latest beats [N]."""
-        self._rung = BEGIN
+        self._place = self._former = 2 * BEGIN  # on the ladder, in half steps; and the last one
+        self._avoided: set[int] = set()  # where a gait was lost, or is much worse
+        self._lost = 0.0  # ripple that a lost gait had
         self._trials = list(NEIGHBOURS)
         self._turn = 0
-        self._reference = self._trial = Judgement(0.0, 0.0)
+        self._reference = self._trial = Judgement(0.0, 0.0, 0.0)
+        self._gains: list[float] = []  # of this trial, in each round
+        self._noise = 0.0  # variance of their sum
         self._known = 0.0
         self._watched = 0.0
         self._side = 0.0
-        self._forces: list[float] = []
+        self._forces: list[Forces] = []
         self._begin(Phase.BEFORE)
 
     @property
     def rung(self) -> Rung:
         """To be used now."""
-        return LADDER[self._rung + (self._trials[0] if self.phase is Phase.TRIAL else 0)]
+        place = self._in_use
+        return LADDER[(place + 1) // 2 if self._side > 0.0 else place // 2]
 
-    def update(self, force: float, dt: float, side: float) -> None:
+    @property
+    def halfway(self) -> bool:
+        """Do the two sides go by two rungs?"""
+        return self._in_use % 2 == 1
+
+    @property
+    def _in_use(self) -> int:
+        """Where on the ladder, in half steps."""
+        if self.phase is Phase.LAUNCH:
+            return 0
+        return self._place + (self._trials[0] if self.phase is Phase.TRIAL else 0)
+
+    def update(self, fx: float, fy: float, dt: float, side: float) -> None:
         """Take in a tick.
 
-        force: mean F_x since the tick before [N]
+        fx, fy: mean forces since the tick before [N]
         dt: since then [s]
         side: sign of the command since then
         """
@@ -99,7 +134,7 @@ class CriterionSearch:
             if self._forces:
                 self._close_half(self._forces, dt * len(self._forces))
             self._side, self._forces = side, []
-        self._forces.append(force)
+        self._forces.append((fx, fy))
 
     def _begin(self, phase: Phase) -> None:
         self.phase = phase
@@ -107,39 +142,44 @@ class CriterionSearch:
         self._start_sums()
 
     def _start_sums(self) -> None:
-        self._last: list[float] | None = None
-        self._variances: list[float] = []
+        self._halves: list[list[Forces]] = []
         self._lasted = 0.0
 
-    def _close_half(self, forces: list[float], lasted: float) -> None:
+    def _close_half(self, forces: list[Forces], lasted: float) -> None:
         if self._skip:
             self._skip -= 1
             return
         self._lasted += lasted
-        if self._last:
-            self._variances.append(_variance(self._last, forces))
-        self._last = forces
-        if not self._variances:
+        self._halves.append(forces)
+        if len(self._halves) < 2:
             return
         gait = self._gait()
-        hopeless = self.phase is Phase.TRIAL and gait.merit < WORSE * self._reference.merit
-        if len(self._variances) >= 2 * BEATS - 1 or hopeless:
+        hopeless = self.phase is Phase.TRIAL and gait.ripple < WORSE * self._reference.ripple
+        wanted = LAUNCH if self.phase is Phase.LAUNCH else 2 * BEATS
+        if len(self._halves) >= wanted or hopeless:
             self._judge(gait)
 
     def _gait(self) -> Judgement:
         """As the half beats since the phase began show it."""
-        count = len(self._variances)
-        mean = sum(self._variances) / count
-        half_beat = self._lasted / (count + 1)
-        self.ripple = math.sqrt(mean)
-        return Judgement(self.ripple * half_beat**FASTER_RIPPLES, half_beat)
+        squares = self._ripples(self._halves)
+        middle = statistics.median(squares)
+        half_beat = self._lasted / len(self._halves)
+        self.ripple = math.sqrt(middle)
+        scatter = 1.25 * statistics.mean(abs(each - middle) for each in squares)
+        # Of the root. Each half beat is in two of them, so they count for two thirds; and a median
+        # is off by a fourth more than a mean.
+        error = (
+            0.5 * 1.25 * scatter * math.sqrt(1.5 / len(squares)) / self.ripple if middle else 0.0
+        )
+        return Judgement(self.ripple, error, half_beat)
 
     def _judge(self, gait: Judgement) -> None:
         """Go on, knowing the gait of a whole phase."""
         match self.phase:
+            case Phase.LAUNCH:
+                self._begin(Phase.BEFORE)
             case Phase.BEFORE:
-                self._reference = gait
-                self._try_next()
+                self._resume(gait)
             case Phase.TRIAL:
                 self._trial = gait
                 usual = self._reference.half_beat
@@ -152,24 +192,60 @@ class CriterionSearch:
             case Phase.WATCH:
                 self._watch(gait)
 
+    def _launch(self, lost: float) -> None:
+        """Begin a gait again that had this ripple [N]."""
+        self._lost = lost
+        self._begin(Phase.LAUNCH)
+
+    def _resume(self, gait: Judgement) -> None:
+        """Go on with trials where the gait is there; where it stays lost, look for another one."""
+        self._reference = gait
+        if gait.ripple < FALLEN * self._lost:
+            if self._place != self._former:
+                self._avoided.add(self._place)
+                self._place, self._trials = self._former, []
+                self._launch(self._lost)
+                return
+            self._search_anew()
+        self._lost = 0.0
+        self._try_next()
+
+    def _search_anew(self) -> None:
+        self._trials = list(NEIGHBOURS)
+        self._avoided.clear()
+
     def _decide(self, after: Judgement) -> None:
-        """Take the rung that was tried, or stay."""
+        """Take the rung that was tried, or stay; or try it once more."""
+        before, self._reference = self._reference, after
+        if after.ripple < FALLEN * before.ripple and self._trial.ripple < before.ripple:
+            self._avoided.add(self._place + self._trials.pop(0))
+            self._launch(before.ripple)
+            return
+        self._gains.append(self._trial.ripple - 0.5 * (before.ripple + after.ripple))
+        self._noise += self._trial.error**2 + 0.25 * (before.error**2 + after.error**2)
+        rounds = len(self._gains)
+        above = sum(self._gains) / rounds - CLEAR * after.ripple
+        if abs(above) < SURE * math.sqrt(self._noise) / rounds and rounds < ROUNDS:
+            self._begin(Phase.TRIAL)
+            return
         step = self._trials.pop(0)
-        usual = 0.5 * (self._reference.merit + after.merit)
-        if self._trial.merit > (1.0 + CLEAR) * usual:
-            self._rung += step
+        if above > 0.0:
+            self._former = self._place
+            self._place += step
             ahead = 1 if step > 0 else -1
             # What lies behind was worse; what was jumped over is not known.
-            self._trials = [ahead, 2 * ahead] + ([-ahead] if abs(step) > 1 else [])
+            behind = [-2 * ahead] if abs(step) > 2 else []
+            self._trials = [2 * ahead, 4 * ahead, *behind, 1, -1] if step % 2 == 0 else []
             self._begin(Phase.BEFORE)
         else:
-            self._reference = after
+            if self._trial.ripple < WORSE * after.ripple:
+                self._avoided.add(self._place + step)
             self._try_next()
 
     def _look_beyond(self) -> None:
         """This rung gives the gait that is in use: try the next one instead."""
         step = self._trials.pop(0)
-        further = step + (1 if step > 0 else -1)
+        further = step + (2 if step > 0 else -2)
         if further in self._trials:
             self._trials.remove(further)
         if abs(further) <= FURTHEST:
@@ -178,29 +254,28 @@ class CriterionSearch:
 
     def _try_next(self) -> None:
         """Begin a trial; watch where there is none left."""
-        while self._trials and not 0 <= self._rung + self._trials[0] < len(LADDER):
+        while self._trials and not self._may_try(self._place + self._trials[0]):
             self._trials.pop(0)
         if not self._trials:
-            self._known, self._watched = self._reference.merit, 0.0
+            self._known, self._watched = self._reference.ripple, 0.0
+        self._gains, self._noise = [], 0.0
         self._begin(Phase.TRIAL if self._trials else Phase.WATCH)
+
+    def _may_try(self, place: int) -> bool:
+        return 0 <= place <= 2 * (len(LADDER) - 1) and place not in self._avoided
 
     def _watch(self, gait: Judgement) -> None:
         """Search anew where the fish is another one; now and then try one neighbour."""
         self._reference = gait
-        if abs(gait.merit - self._known) > CHANGED * self._known:
-            self._trials = list(NEIGHBOURS)
+        if gait.ripple < FALLEN * self._known:
+            self._launch(self._known)
+        elif abs(gait.ripple - self._known) > max(CHANGED * self._known, CERTAIN * gait.error):
+            self._search_anew()
             self._try_next()
         elif self._watched > PATIENCE:
             self._trials = [NEIGHBOURS[self._turn]]
             self._turn = (self._turn + 1) % len(NEIGHBOURS)
             self._try_next()
         else:
-            self._known += 0.2 * (gait.merit - self._known)
+            self._known += 0.2 * (gait.ripple - self._known)
             self._start_sums()
-
-
-def _variance(one: list[float], other: list[float]) -> float:
-    """Of the mean of two half beats, tick by tick from their reversals [N²]."""
-    both = [0.5 * (a + b) for a, b in zip(one, other, strict=False)]
-    mean = sum(both) / len(both)
-    return sum((force - mean) ** 2 for force in both) / len(both)

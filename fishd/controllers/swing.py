@@ -71,6 +71,9 @@ class Swing(Controller[SwingParameters]):
     since_reversal: float = quantity("s", "Time since the last reversal.")
     criterion: float | None = quantity("1", "With C auto: the C in use, or on trial.")
     lead: float | None = quantity("s", "With C auto: how far ahead the speed is foreseen.")
+    halfway: float | None = quantity(
+        "1", "With C auto: 1 where the two sides of a beat go by two C, or leads, in turn; else 0."
+    )
     searching: float | None = quantity("1", "With C auto: 1 while others are tried, else 0.")
     ripple: float | None = quantity("N", "With C auto: ripple of F_x in the latest beats.")
 
@@ -113,7 +116,7 @@ class Swing(Controller[SwingParameters]):
         super().retune(parameters)
         if parameters.C != "auto":
             self._search = None
-            self.criterion = self.lead = self.searching = self.ripple = None
+            self.criterion = self.lead = self.halfway = self.searching = self.ripple = None
         elif self._search is None:
             self._search = CriterionSearch()
 
@@ -142,9 +145,12 @@ class Swing(Controller[SwingParameters]):
             foresees = self._reversals >= BLIND
             return Rung(self.parameters.C, self.parameters.lead) if foresees else LADDER[BEGIN]
         assert self._search
-        self._search.update(observation.fx, observation.dt, self._reversal.direction)
+        self._search.update(
+            observation.fx, observation.fy, observation.dt, self._reversal.direction
+        )
         rung = self._search.rung
         self.criterion, self.lead = rung
+        self.halfway = float(self._search.halfway)
         self.searching = float(self._search.phase is not Phase.WATCH)
         self.ripple = self._search.ripple
         return rung

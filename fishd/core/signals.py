@@ -71,6 +71,9 @@ class Observation(Struct, frozen=True, gc=False):
     None while not known."""
     thrust_factor_error: float | None = None
     """Half of its 95 % interval [N]."""
+    side_time: float = 0.0
+    """How long the instruction angle has been on its side of neutral, negative where it is; up to
+    2 s, and 0 at neutral [s]."""
 
 
 class Course(Struct, frozen=True, gc=False):

@@ -251,7 +251,18 @@ def evaluate(
     )
 
 
-def _watts(swimming: Sequence["_Block"], spread: float) -> dict[str, float]:
+def block_of(phase: Sequence[Sample], tick: float, settles: float) -> "Block | None":
+    """The whole beats of one swim, or the pieces of one rest, once it has settled, in one block.
+
+    tick: period of the loop [s]
+    settles: when it has [s]
+    None where nothing is left.
+    """
+    found = list(_blocks(phase, tick, 0, settles))
+    return _joined(found) if found else None
+
+
+def _watts(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
     """The power of these blocks and its error; nothing where it is not known of each.
 
     spread: variance of the power of a second [W² s]
@@ -263,7 +274,7 @@ def _watts(swimming: Sequence["_Block"], spread: float) -> dict[str, float]:
     return {"watts": mean, "watts_error": 1.96 * math.sqrt(spread / lasting)}
 
 
-def _together(kept: Sequence[list["_Block"]]) -> list[list["_Block"]]:
+def _together(kept: Sequence[list["Block"]]) -> list[list["Block"]]:
     """The same in longer blocks, each within its swim or rest, where there are too many."""
     each = math.ceil(sum(map(len, kept)) / MOST_BLOCKS)
     return [
@@ -272,7 +283,7 @@ def _together(kept: Sequence[list["_Block"]]) -> list[list["_Block"]]:
     ]
 
 
-def _joined(blocks: Sequence["_Block"]) -> "_Block":
+def _joined(blocks: Sequence["Block"]) -> "Block":
     if len(blocks) == 1:
         return blocks[0]
     lasts = np.array([block.lasts for block in blocks])
@@ -280,12 +291,12 @@ def _joined(blocks: Sequence["_Block"]) -> "_Block":
         [(block.time, block.force, block.power, block.watts) for block in blocks],
         axis=0,
         weights=lasts,
-    )
+    ).tolist()
     beats = sum(block.beats for block in blocks)
-    return _Block(time, lasts.sum(), force, power, beats, blocks[0].swims, watts)
+    return Block(time, float(lasts.sum()), force, power, beats, blocks[0].swims, watts)
 
 
-def _remark(kept: Sequence[Sequence["_Block"]]) -> str:
+def _remark(kept: Sequence[Sequence["Block"]]) -> str:
     """What speaks against a measurement, of the blocks of each swim and rest."""
     swims = [blocks for blocks in kept if len(blocks) > 1 and blocks[0].swims]
     rests = [block.power for blocks in kept[1:] for block in blocks if not block.swims]
@@ -300,14 +311,22 @@ def _remark(kept: Sequence[Sequence["_Block"]]) -> str:
     return ""
 
 
-class _Block(NamedTuple):
-    time: float  # of its middle, s
-    lasts: float  # s
-    force: float  # N
+class Block(NamedTuple):
+    """Some whole beats of a swim, or a piece of a rest."""
+
+    time: float
+    """Of its middle [s]."""
+    lasts: float
+    """[s]"""
+    force: float
+    """Mean F_x in it [N]."""
     power: float
+    """Mean square of `fin_velocity`, in the square of that quantity's unit."""
     beats: float
     swims: bool
+    """Did the fish swim? It rested where not."""
     watts: float
+    """Mean electrical power of the servo [W]; NaN where it is not known."""
 
 
 def _phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
@@ -316,7 +335,7 @@ def _phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
         yield list(phase)
 
 
-def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Iterator[_Block]:
+def _blocks(phase: Sequence[Sample], tick: float, first: int, settles: float) -> Iterator[Block]:
     """Whole beats of a swim, or pieces of a rest, once it has settled.
 
     first: index that time is counted from
@@ -340,7 +359,7 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
         counted, beats, begun = beats, 0, index
         if phase[end].seq - phase[start].seq != len(window):  # a tick was lost: no whole beats
             continue
-        yield _Block(
+        yield Block(
             time=(0.5 * (phase[start].seq + phase[end].seq) - first) * tick,
             lasts=len(window) * tick,
             force=sum(each.fx for each in window) / len(window),
@@ -351,7 +370,7 @@ def _blocks(phase: list[Sample], tick: float, first: int, settles: float) -> Ite
         )
 
 
-def _reversals(phase: list[Sample]) -> list[int]:
+def _reversals(phase: Sequence[Sample]) -> list[int]:
     """Where the instruction angle becomes positive."""
     side, found = 0.0, []
     for index, sample in enumerate(phase):
@@ -362,7 +381,7 @@ def _reversals(phase: list[Sample]) -> list[int]:
     return found
 
 
-def _spread(found: Sequence[_Block], swims: bool, of: Literal["force", "watts"] = "force") -> float:
+def _spread(found: Sequence[Block], swims: bool, of: Literal["force", "watts"] = "force") -> float:
     """Variance of the force or the power of a second, from block to block [N² s or W² s].
 
     By neighbours, so that hardly any drift is in it.

@@ -32,10 +32,9 @@ from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 
-TOLERANCE = 1e-5
-"""Largest difference between the outputs of the file and of the trained policy, as a share of Φ."""
-TOLERANCE_OF_PICTURES = 1e-4
-"""The same where thousands of pixels are summed, which each library does in an order of its own."""
+TOLERANCE = 1e-4
+"""Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
+pixels and large weights are summed, which each library does in an order of its own."""
 _PROBES = 1000
 _STACKS = 100
 """Of noise, and of a tail."""
@@ -226,7 +225,7 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
             seen = np.concatenate((perception.eye.see(stacks[index]), row))
         wanted, _ = policy.predict(seen, deterministic=True)
         worst = max(worst, abs(network.run() - float(wanted[0])))
-    if not worst <= (TOLERANCE_OF_PICTURES if perception.eye else TOLERANCE):
+    if not worst <= TOLERANCE:
         raise PolicyError(
             f"with this onnxruntime, the outputs of the file differ from those of the policy, by "
             f"up to {worst:.2g} of Φ; install another version of it"

@@ -23,6 +23,7 @@ from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
 from fishd.learning.picture_networks import HALF, PairExtractor, PictureExtractor
 from fishd.learning.settings import PpoSettings, TrainingSettings
+from fishd.learning.thrust_signal import ThrustSignal
 
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Weights, shape (outputs, inputs), and biases of each layer."""
@@ -102,16 +103,27 @@ class Rollout(RolloutBuffer):
     credited to the action, nor, through the advantages, to those before it.
     """
 
+    signal: ThrustSignal | None = None
+    """What finds the thrust in the measured forces; None: F_x is taken as it is."""
+    reward_per_newton = 0.0
+    """By which F_x is in the rewards [1/N]."""
+
     def reset(self) -> None:
         """Forget all steps."""
         super().reset()
         self.void = np.zeros(self.buffer_size, dtype=bool)
         """True for each void step."""
+        self.forces = np.zeros((self.buffer_size, 2))
+        """F_x and F_y, in the tick that each reward is of [N]."""
 
     def compute_returns_and_advantage(
         self, last_values: torch.Tensor, dones: NDArray[np.bool_]
     ) -> None:
         """As in PPO; the outcome of a void step equals its value, and it ends its episode."""
+        if self.signal:
+            fx, fy = self.forces[~self.void].T
+            cleaned = self.signal.of(fx, fy) - fx
+            self.rewards[~self.void, 0] += self.reward_per_newton * cleaned
         self.rewards[self.void] = self.values[self.void]
         super().compute_returns_and_advantage(last_values, dones)
 

@@ -26,7 +26,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     observation: Annotated[
         tuple[FeatureName, ...],
         note("What the agent sees, in order; forces only where `see` permits them."),
-    ] = ("fy", "fy_rate", "instruction_angle", "previous_angle", "fin_velocity")
+    ] = ("fy", "instruction_angle", "previous_angle", "fin_velocity", "side_time")
     history: Annotated[
         int,
         unit(
@@ -37,13 +37,6 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             le=LONGEST_HISTORY,
         ),
     ] = 1
-    relative: Annotated[
-        bool,
-        note(
-            "Each but the angles is divided by its rms over this history, so that weak and strong "
-            "fish look alike; needs a history of 2 or more."
-        ),
-    ] = False
     force_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
         unit("N", "F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant."),
@@ -162,12 +155,36 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ] = ()
 
 
+class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a policy learns of square waves before PPO begins, in simulation."""
+
+    rounds: Annotated[
+        int,
+        note(
+            "In each it swims other fish of the randomisation, more of them like the configured "
+            "one, and learns when the best square wave of each would reverse; 0 for none. In "
+            "simulation only: of a real fish that is not known.",
+            ge=0,
+            le=100,
+        ),
+    ] = 0
+    fish: Annotated[int, note("Fish of a round.", ge=1, le=100_000)] = 500
+    ticks: Annotated[int, unit("ticks", "For which each is swum.", ge=8, le=100_000)] = 120
+    epochs: Annotated[
+        int, note("Passes, after each round, over the ticks of all rounds so far.", ge=1, le=1000)
+    ] = 12
+    batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 1024
+    learning_rate: Annotated[
+        float, note("At first; it falls to 0 as a cosine does, in each round.", gt=0, le=1)
+    ] = 3e-3
+
+
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Hyper-parameters of PPO, named as stable-baselines3 names them."""
 
     n_steps: Annotated[int, note("Steps between two updates.", ge=2, le=1_000_000)] = 64
     batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 64
-    n_epochs: Annotated[int, note("Passes over the steps of an update.", ge=1, le=1000)] = 10
+    n_epochs: Annotated[int, note("Passes over the steps of an update.", ge=1, le=1000)] = 20
     gamma: Annotated[float, note("Discount factor.", ge=0, le=1)] = 0.95
     gae_lambda: Annotated[float, note("Bias against variance of the advantages.", ge=0, le=1)] = (
         0.95
@@ -185,6 +202,14 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     log_std_init: Annotated[
         float, note("Log of the exploration's deviation, in units of Φ.", ge=-5, le=3)
     ] = 2.5
+    clean_rewards: Annotated[
+        bool,
+        note(
+            "Learn without what a sensor adds to F_x: its drifting offset, spikes, and the share "
+            "of F_y that it has where it is turned. Where each episode swims another fish, it does "
+            "not apply."
+        ),
+    ] = True
     symmetric: Annotated[
         bool, note("Build into the networks that left and right are alike; not with F_x seen.")
     ] = True
@@ -207,12 +232,12 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         float,
         unit(
             "s",
-            "Its length on a robot, where the fish swims and rests in turn, so that a drift of the "
-            "force sensor is told apart.",
-            ge=21,
+            "Its length in a tank at most: policies that may be the best swim for some seconds "
+            "each, between rests.",
+            ge=8,
             le=3600,
         ),
-    ] = 30.0
+    ] = 13.0
     others: Annotated[
         int,
         note(
@@ -234,7 +259,9 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A whole training; the defaults suit the default fish."""
 
-    steps: Annotated[int, note("Control steps to learn from.", ge=1)] = 8000
+    steps: Annotated[
+        int, note("Control steps that PPO learns from; 0 after an imitation that is all.", ge=0)
+    ] = 8000
     seed: Annotated[int, note("Of networks, exploration and start.", ge=0, le=2**32 - 1)] = 0
     checkpoint_every: Annotated[int, note("Steps between checkpoints.", ge=1)] = 5000
     see: Annotated[Literal["force", "camera", "both"], note("What the agent sees of the fish.")] = (
@@ -243,6 +270,7 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     environment: EnvironmentSettings = EnvironmentSettings()
     camera: VisionSettings = VisionSettings()
     randomisation: Randomisation = Randomisation()
+    imitation: ImitationSettings = ImitationSettings()
     ppo: PpoSettings = PpoSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
 
@@ -284,6 +312,16 @@ def to_yaml(settings: TrainingSettings) -> str:
 def _check(settings: TrainingSettings) -> None:
     """Refuse values that are valid one by one but not together."""
     ppo, evaluation = settings.ppo, settings.evaluation
+    if not settings.steps and not settings.imitation.rounds:
+        raise Problem(
+            ("steps",), "0 is not valid without imitation.rounds: there is nothing to learn from"
+        )
+    if settings.imitation.rounds and settings.see != "force":
+        raise Problem(
+            ("imitation", "rounds"),
+            f"{settings.imitation.rounds} is not valid with see: {settings.see}; imitation is for "
+            "policies that see forces only: 0 is needed",
+        )
     if ppo.n_steps % ppo.batch_size:
         raise Problem(
             ("ppo", "batch_size"),
@@ -294,11 +332,6 @@ def _check(settings: TrainingSettings) -> None:
             ("ppo", "symmetric"),
             "true is not valid where environment.observation has fx, which is the same for a "
             "mirrored fish; false is needed",
-        )
-    if settings.environment.relative and settings.environment.history < 2:
-        raise Problem(
-            ("environment", "relative"),
-            "true is not valid with environment.history: 1; an rms over 2 ticks or more is needed",
         )
     seen = settings.environment.observation
     if len(set(seen)) < len(seen):

@@ -22,6 +22,7 @@ def swinging(settings: SimulatedCameraSettings, *, amplitude: float = 0.2) -> Pi
     return np.stack([painter.paint(*one) for one in zip(angles, rates, ticks, strict=True)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("rig", [DEFAULT, WEB, BAD])
 @pytest.mark.parametrize(("off", "tilt"), [(0.0, 0.0), (3.0, 0.02), (-3.0, -0.02), (6.5, 0.1)])

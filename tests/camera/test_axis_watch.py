@@ -48,6 +48,7 @@ def test_it_is_found_once_the_tail_has_moved_for_some_seconds_and_kept_while_it_
     assert watch.axis.offset == pytest.approx(found.offset, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [30.0, 60.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_rate_that_goes_with_the_beat_does_no_harm(rate: float, seed: int) -> None:

@@ -19,6 +19,7 @@ def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
     return [frame._replace(time=frame.time + late) for frame in frames]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [-0.01, 0.0, 0.04])
 @pytest.mark.parametrize(
     ("camera", "within"),
@@ -37,6 +38,7 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
     assert found.agreement > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other", ["plant.omega0=9", "plant.lateral_drag=0.1", "plant.servo_delay=0.05",
               "plant.thrust_coefficient=0.03", "simulation.rotation=0.05"]

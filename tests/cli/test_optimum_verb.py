@@ -28,6 +28,7 @@ def test_it_shows_the_best_square_wave_and_the_limits_of_the_configured_fish() -
     assert other["best_square"]["amplitude"] == [0.42]
 
 
+@pytest.mark.slow
 def test_optimal_control_is_told_and_drawn(tmp_path: Path) -> None:
     picture = tmp_path / "best.svg"
     done = invoke("--control", "--plot", str(picture), *QUICK)

@@ -20,12 +20,14 @@ def swum(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_film_is_painted_while_it_swims(swum: Path) -> None:
     with Image.open(swum / "wake.webp") as film:
         assert film.n_frames == 76  # the first and the last among them
         assert film.width == 600
 
 
+@pytest.mark.slow
 def test_the_wake_is_drawn_from_a_checkpoint(swum: Path, tmp_path: Path) -> None:
     words = ("swimmer", "wake", str(swum / "end.npz"), "--to", str(tmp_path))
     done = fishctl(*words)

@@ -21,6 +21,7 @@ def found(*overrides: str, seconds: float = 60.0, **parameters: object) -> float
     return float(leak)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [0.5, 2.0, 3.0, 10.0])
 @pytest.mark.parametrize("rotation", [0.0, 0.175])
 def test_it_finds_the_leak_of_a_fish_with_another_drag(times: float, rotation: float) -> None:
@@ -35,6 +36,7 @@ def test_noise_and_a_late_servo_with_play_do_not_mislead_it() -> None:
         assert found(drag, more) == pytest.approx(RIGHT / 3.0, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tick", [0.01, 0.02, 0.1])
 def test_it_does_so_at_other_ticks(tick: float) -> None:
     drag = f"plant.lateral_drag={3.0 * DRAG}"
@@ -64,6 +66,7 @@ def test_swing_then_reaches_what_it_reaches_on_the_default_fish() -> None:
     assert share["auto"].efficiency > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.1, 0.2, 0.42, 0.8])
 def test_on_the_default_fish_it_costs_no_thrust(amplitude: float) -> None:
     limit = f"amplitude_limit={amplitude}"

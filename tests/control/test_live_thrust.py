@@ -32,6 +32,7 @@ def test_nothing_is_known_of_a_fish_that_never_rested() -> None:
         assert ticks[-1].thrust == pytest.approx(TRUTH, abs=8e-3)  # as the sensor shows it
 
 
+@pytest.mark.slow
 def test_after_a_rest_of_three_seconds_it_holds_the_truth() -> None:
     for seed in range(10):
         with rig(seed) as fish:
@@ -41,6 +42,7 @@ def test_after_a_rest_of_three_seconds_it_holds_the_truth() -> None:
                 assert abs(thrust - TRUTH) < error < 5e-3
 
 
+@pytest.mark.slow
 def test_it_is_known_better_after_each_change_and_worse_with_time() -> None:
     with rig() as fish:
         fish.rest(3.0)

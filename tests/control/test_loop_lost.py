@@ -108,6 +108,21 @@ def test_a_hang_within_a_tick_is_noticed_before_its_angle_is_sent() -> None:
     assert robot.log == [None]
 
 
+def test_a_hang_in_the_very_write_that_fails_is_told_as_the_hang() -> None:
+    rig, robot = rig_with_countdown(0.2)
+    rig.start("square")
+    rig.run(2)
+
+    def doze(angle: float) -> None:
+        rig.clock.now += 0.3
+        raise ServoError("pigpiod has answered too late")
+
+    robot.write = doze  # type: ignore[method-assign]
+    assert rig.run(1)[-1].mode == "fault"
+    assert rig.loop.supervisor.reason
+    assert rig.loop.supervisor.reason.code == "overrun"
+
+
 def test_a_servo_that_waits_for_ever_goes_on_after_a_hang() -> None:
     rig = Rig()
     rig.start("square")

@@ -8,6 +8,7 @@ from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.criterion_search import BEGIN, LADDER
 from fishd.core.errors import ParameterError
+from fishd.lab.other_fish import harsh
 from fishd.simulation import simulate
 
 
@@ -17,6 +18,7 @@ def efficiency(
     return simulate(load(None, overrides), "swing", {"C": C}, seconds, settle).efficiency
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -30,6 +32,44 @@ def efficiency(
 def test_after_a_minute_it_is_near_the_best_where_a_fixed_criterion_is_not(change: str) -> None:
     assert efficiency(0.6, change) < 0.93
     assert efficiency("auto", change) > 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("servo_speed", [52.5, 2.625, 1.75])
+def test_it_is_near_the_best_whatever_the_servo_and_though_noise_is_as_large_as_its_trials(
+    servo_speed: float,
+) -> None:
+    assert efficiency("auto", f"plant.servo_speed={servo_speed}") > 0.97
+
+
+@pytest.mark.slow
+def test_where_the_best_half_beat_lies_between_two_numbers_of_ticks_the_sides_take_turns() -> None:
+    config = load(None, harsh(318).overrides)
+    whole = [simulate(config, "square", {"frequency": 10 / n}).efficiency for n in (3, 4, 5, 6)]
+    found = simulate(config, "swing", {"C": "auto"}, 120.0, 60.0)
+    assert max(whole) < 0.91
+    assert found.efficiency > 0.95
+    assert found.quantities["halfway"] == 1.0
+    assert found.half_beats == (4, 5)
+
+
+@pytest.mark.slow
+def test_a_gait_that_a_trial_has_lost_is_begun_again_and_that_trial_not_repeated() -> None:
+    config = load(None, harsh(652).overrides)
+    assert simulate(config, "swing", {"C": 0.95, "lead": 0.05}).efficiency < 0.1
+    assert efficiency("auto", *harsh(652).overrides) > 0.95
+
+
+@pytest.mark.slow
+def test_a_fish_that_only_trembles_with_the_first_criterion_is_made_to_swim() -> None:
+    assert efficiency(0.6, *harsh(303).overrides) < 0.1
+    assert efficiency("auto", *harsh(303).overrides) > 0.92
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_spikes_do_not_mislead_it(seed: int) -> None:
+    rig = ("simulation.spike_rate=1", "simulation.spike_size=0.5", f"simulation.seed={seed}")
+    assert efficiency("auto", *rig) > 0.98
 
 
 def test_on_the_model_the_search_costs_a_few_percent_at_most() -> None:

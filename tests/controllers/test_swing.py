@@ -117,6 +117,7 @@ def test_on_an_imperfect_rig_it_gets_most_of_the_best_thrust(ratio: float, least
     assert statistics.median(found) >= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change", ["omega0=5", "omega0=25", "xi=2.4", "coupling=1", "servo_speed=20"]
 )

@@ -12,6 +12,11 @@ POLICIES = [f"policy-{number:04d}-swim" for number in range(500)]
 KEYS = keys()
 
 
+def cost(function: Callable[[], object]) -> float:
+    """What it takes beside a sum of 10 000 numbers, some 0.2 ms, on a machine at rest."""
+    return fastest(function) / fastest(lambda: sum(range(10_000)))
+
+
 def fastest(function: Callable[[], object]) -> float:
     """What it takes on a machine that is not disturbed [s]."""
     times = []
@@ -25,15 +30,15 @@ def fastest(function: Callable[[], object]) -> float:
 @pytest.mark.parametrize(
     ("word", "words", "limit"),
     [
-        ("x" * 65536, ["status", "controllers"], 1e-4),
-        ("status" * 10_000, ["status", "controllers"], 1e-4),
-        ("servo.gpoi" * 10, KEYS, 1e-3),
-        ("policy-0123-swum", POLICIES, 3e-3),
+        ("x" * 65536, ["status", "controllers"], 2),
+        ("status" * 10_000, ["status", "controllers"], 2),
+        ("servo.gpoi" * 10, KEYS, 6),
+        ("policy-0123-swum", POLICIES, 15),
     ],
     ids=["64 kB", "64 kB of letters", "100 letters", "500 names"],
 )
-def test_a_suggestion_is_quick(word: str, words: list[str], limit: float) -> None:
-    assert fastest(lambda: nearest(word, words)) < limit
+def test_a_suggestion_is_quick(word: str, words: list[str], limit: int) -> None:
+    assert cost(lambda: nearest(word, words)) < limit
 
 
 def test_the_nearest_of_many_is_found() -> None:
@@ -57,4 +62,4 @@ def test_a_long_value_is_quoted_briefly_and_quickly(value: object) -> None:
         return str(problem.value)
 
     assert len(refuse()) < 150
-    assert fastest(refuse) < 5e-3
+    assert cost(refuse) < 10

@@ -199,6 +199,7 @@ def falsified(line: str) -> Iterator[str]:
             yield line.replace(said, contrary, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", quoted_messages())
 def test_a_dropped_word_or_a_negation_is_noticed(line: str) -> None:
     assert [wrong for wrong in falsified(line) if is_message(wrong)] == []

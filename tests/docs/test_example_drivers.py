@@ -104,6 +104,7 @@ def load_cells(_installed: None) -> Callable[..., LoadCells]:
     return lambda **settings: LoadCells(fishd_hx711, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [128, 64])
 @pytest.mark.parametrize(("x", "y"), [(1e-3, -2e-3), (-15e-3, 15e-3), (0.0, -1e-9)])
 def test_hx711_codes_of_24_bits_become_voltages_at_the_gain_that_was_asked_for(
@@ -363,6 +364,7 @@ def test_pca9685_the_last_resort_ends_pulses_though_neutral_is_refused(board: Se
     assert board.width == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_installed")
 def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path: Path) -> None:
     settings = ["servo.driver=pca9685", f"servo.bus={BUS}", f"force_sensor.bus={BUS}"]

@@ -63,6 +63,7 @@ def test_the_free_swimmer_still_swims_as_in_figure_6() -> None:
     assert found.beat_frequency == pytest.approx(3.0, rel=1e-3)  # a beat ends on a tick
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "row"),
     [

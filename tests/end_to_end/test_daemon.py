@@ -194,7 +194,7 @@ def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None
         assert not daemon.status().realtime
         status, _, errors = daemon.end()
     assert status == 0
-    assert errors.count("warning") == 1
+    assert errors.count("fishd.daemon.realtime") == 1
     assert "memory is not locked" in errors
     assert "no real-time scheduling" in errors
 
@@ -203,7 +203,7 @@ def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:
     modest = sets("realtime.priority=0", "realtime.lock_memory=false")
     with running(tmp_path, *modest) as daemon:
         assert not daemon.status().realtime
-        assert "warning" not in daemon.end()[2]
+        assert "fishd.daemon.realtime" not in daemon.end()[2]
 
 
 @pytest.mark.realtime

@@ -104,6 +104,7 @@ def test_the_picture_begins_with_an_upward_reversal() -> None:
     assert shown.time[-1] == pytest.approx(comparison.TRACE)
 
 
+@pytest.mark.slow
 def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path: Path) -> None:
     matplotlib = pytest.importorskip("matplotlib")
     from fishd.lab.compare.figures import draw

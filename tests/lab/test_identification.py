@@ -92,6 +92,7 @@ def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path
         assert abs(written[each.name] - each.value) <= 0.01 * (each.high - each.low), each.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [135.0, 180.0])
 def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(seconds: float) -> None:
     for seed in range(2):
@@ -107,6 +108,7 @@ def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> N
         experiment(rig, seconds)
 
 
+@pytest.mark.slow
 def test_the_configuration_has_no_digits_that_the_interval_does_not_know(
     table: pd.DataFrame, tmp_path: Path
 ) -> None:
@@ -152,6 +154,7 @@ def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) ->
     assert "quadratic_drag is as in the configuration" in found.remarks[0]
 
 
+@pytest.mark.slow
 def test_the_reaction_of_the_servo_is_found_where_it_is_asked_for() -> None:
     change = ("plant.servo_reaction=-0.002", "plant.servo_dead_zone=0.02")
     with VirtualRig(load(None, (*REAL, *change))) as rig:

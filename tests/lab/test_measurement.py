@@ -86,6 +86,7 @@ def test_swimming_alone_cannot_be_told_from_a_drift() -> None:
         drift.fit(blocks)
 
 
+@pytest.mark.slow
 def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() -> None:
     slow = replace(RIG, plant=replace(RIG.plant, xi=0.05))
     found = measured(slow, 60.0)

@@ -38,6 +38,7 @@ def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() ->
     assert found.thrust_per_watt == pytest.approx(gave, abs=2.0 * found.thrust_per_watt_error)
 
 
+@pytest.mark.slow
 def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
     config = load("config/virtual-pi.yaml", ["power_meter=null"])
     with VirtualRig(config) as rig:

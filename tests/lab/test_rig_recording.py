@@ -88,6 +88,7 @@ def test_forces_in_volts_are_never_called_newtons(tmp_path: Path) -> None:
         identify(path)
 
 
+@pytest.mark.slow
 def test_a_simulated_run_says_what_its_forces_are_in(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     words = ("--config", "config/virtual-pi.yaml", *sets(f"state_folder={tmp_path}"))

@@ -62,6 +62,7 @@ def test_named_policies_that_see_swim_where_none_is_named(
     assert "eye" in [one.label for one in default_contestants(Config())]
 
 
+@pytest.mark.slow
 def test_it_swims_on_a_virtual_pi_in_virtual_time_too(tmp_path: Path, eye: str) -> None:
     config = load(None, ["robot=virtual-pi", f"state_folder={tmp_path}"])
     found = compare(config, [eye], seconds=10.0, settle=5.0)[0][0]

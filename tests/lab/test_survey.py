@@ -57,6 +57,7 @@ def test_the_verb_has_a_column_for_each_contestant() -> None:
     assert rows[-2].split() == ["another", "took", "over", "0", "0"]
 
 
+@pytest.mark.slow
 def test_the_verb_tells_programs_every_fish() -> None:
     done = fishctl("learn", "evaluate", "hold", "--seconds", "2", "--settle", "1", "--json")
     (hold,) = json.loads(done.stdout)

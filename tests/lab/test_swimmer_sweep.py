@@ -144,6 +144,7 @@ def _no_worker_stays() -> Any:
     get_reusable_executor(reuse=True).shutdown(kill_workers=True)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_no_worker_stays")
 def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(tmp_path: Path) -> None:
     folder = tmp_path / "run"

@@ -85,7 +85,7 @@ def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
 def test_where_it_does_not_the_identified_fish_tells() -> None:
     near = judge([contender("policy", 20.1e-3, 0.2e-3, 0.8), contender("square", 20e-3, 2e-4, 0.9)])
     assert (near.winner, near.told, near.efficiency) == ("square", False, 1.0)
-    assert "the measurement does not tell" in near.claim
+    assert "the measurement does not tell it from the policy: on the" in near.claim
 
 
 def test_intervals_of_two_are_wider_than_that_of_one() -> None:

@@ -12,11 +12,9 @@ from fishd.config import load
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.compare.contestants import best_on_grid
-from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.evaluation import in_simulation, judge, on_link, worst_of_others
-from fishd.learning.env.simulated_link import SimulatedLink, at_edge, drawn
+from fishd.learning.env.evaluation import in_simulation, judge, worst_of_others
+from fishd.learning.env.simulated_link import at_edge, drawn
 from fishd.learning.settings import (
-    EnvironmentSettings,
     EvaluationSettings,
     Randomisation,
     TrainingSettings,
@@ -155,33 +153,3 @@ def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
     decide: Callable[[Observation], float], stalls: bool
 ) -> None:
     assert in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
-
-
-@pytest.mark.parametrize(
-    "drift", ["offset_x=0.02", "drift_rate=0.001", "drift=0.005", "drift_walk=0.0005"]
-)
-def test_on_a_robot_whatever_the_sensor_drifts_is_told_apart(drift: str) -> None:
-    config = load(None, [f"simulation.{drift}", "simulation.seed=3"])
-    env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings())
-    env.reset(seed=1)
-    found = on_link(env, square_of_six_ticks, EvaluationSettings(), lambda: False)
-    assert found
-    assert found.error
-    assert found.thrust == pytest.approx(square_wave(config.plant, 0.42, 1 / 0.6).thrust, abs=1e-3)
-    assert abs(found.efficiency - 1.0) < 0.04
-    assert found.frequency == pytest.approx(1 / 0.6, rel=0.03)
-
-
-@pytest.mark.parametrize(
-    "decide",
-    [lambda *_: 0.42, lambda seen, _: 0.2 + 0.1 * square_of_six_ticks(seen), lambda *_: 0.0],
-    ids=["holds still", "stays on one side", "at neutral"],
-)
-def test_on_a_robot_a_policy_that_does_not_beat_is_stalled_and_ends_no_training(
-    decide: Callable[[Observation], float],
-) -> None:
-    env = SwimEnv(SimulatedLink(CONFIG), CONFIG, EnvironmentSettings())
-    env.reset(seed=1)
-    found = on_link(env, decide, EvaluationSettings(), lambda: False)
-    assert found
-    assert found.stalled

@@ -73,7 +73,9 @@ def test_a_network_can_be_made_for_the_smallest_frames(eye: str, size: int) -> N
 
 @pytest.mark.parametrize("eye", ["cnn", "nature"])
 def test_a_network_that_sees_learns_from_whole_rollouts(tmp_path: Path, eye: str) -> None:
-    outcome = train(job_of(tmp_path / "run", eye))
+    job = job_of(tmp_path / "run", eye)
+    few = replace(job.settings.ppo, n_epochs=2)
+    outcome = train(replace(job, settings=replace(job.settings, ppo=few)))
     assert (outcome.ended, outcome.steps) == ("finished", 384)
     assert outcome.latest_evaluation
 

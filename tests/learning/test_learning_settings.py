@@ -58,12 +58,12 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
             "learning.yaml:3: ppo.batch_size: 64 is not valid: n_steps, 100, must be a multiple of "
             "it",
         ),
-        (
-            "environment:\n  relative: true\n",
-            "learning.yaml:2: environment.relative: true is not valid with environment.history: 1; "
-            "an rms over 2 ticks or more is needed",
-        ),
         ("ppo:\n  hidden: []\n", "learning.yaml:2: ppo.hidden: [] is not valid: "),
+        (
+            "evaluation:\n  on_robot: 5.0\n",
+            "learning.yaml:2: evaluation.on_robot: 5.0 is not valid: a number in [8, 3600] s is "
+            "needed",
+        ),
         (
             "evaluation:\n  seconds: 4.0\n",
             "evaluation.settle: 5 s is not valid: less than seconds, 4 s, is needed",

@@ -36,7 +36,7 @@ HARSH = Randomisation(
     rotation=0.17,
 )
 REMEMBERING = EnvironmentSettings(
-    observation=("fy", "instruction_angle"), history=4, relative=True, longest_start=0
+    observation=("fy", "instruction_angle"), history=4, longest_start=0
 )
 
 
@@ -45,7 +45,7 @@ def act(env: SwimEnv, share: float) -> np.ndarray:
 
 
 def test_the_agent_sees_the_latest_ticks_newest_first() -> None:
-    env = SwimEnv(SimulatedLink(CONFIG), CONFIG, replace(REMEMBERING, relative=False))
+    env = SwimEnv(SimulatedLink(CONFIG), CONFIG, REMEMBERING)
     first, _ = env.reset(seed=1)
     assert env.observation_space.shape == first.shape == (8,)
     assert first.reshape(4, 2).tolist() == [first[:2].tolist()] * 4
@@ -69,7 +69,7 @@ def test_a_file_with_a_history_swims_as_the_policy_that_was_trained(tmp_path: Pa
     assert outcome.checkpoint
     found = export(outcome.checkpoint, tmp_path / "policy.onnx", force=True)
     card = read(found.path).card
-    assert (card.history, card.relative, card.numbers) == (4, True, 8)
+    assert (card.history, card.numbers) == (4, 8)
     seed = job.config.simulation.seed + 1  # as the evaluation at the export
     free = replace(
         job.config,

@@ -157,6 +157,17 @@ def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> No
         assert [row["steps"] for row in rows(job.folder / name)] == ["64", "128", "192", "256"]
 
 
+def test_a_run_of_an_older_fishd_goes_on_with_the_columns_of_this_one(run: Path) -> None:
+    table = run / "evaluations.csv"
+    new = ("policy", "swam")
+    older = [{k: v for k, v in row.items() if k not in new} for row in rows(table)]
+    lines = [",".join(older[0]), *(",".join(row.values()) for row in older)]
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    resumed(run)
+    assert [(row["steps"], row["policy"]) for row in rows(table)] == [("64", ""), ("128", "128")]
+    assert [one.steps for one in read_evaluations(run)] == [64, 128]
+
+
 def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=256)
     said = []

@@ -265,7 +265,8 @@ def test_a_fish_that_is_lost_ends_the_run_with_a_checkpoint_and_the_reason(tmp_p
 
 def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
     environment = EnvironmentSettings(held_cost=0.0)  # so that the reward is that of the thrust
-    job = brief_job(tmp_path / "run", steps=192, environment=environment)
+    as_measured = replace(BRIEF.ppo, clean_rewards=False)
+    job = brief_job(tmp_path / "run", steps=192, environment=environment, ppo=as_measured)
     link = Resting(job)
     training = Training(job, link, Display(), lambda: False)
     training.run()
@@ -368,3 +369,11 @@ def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
         train(replace(job, on="robot", endpoint=fishd.endpoint, agent=elsewhere))
         taken = events.until(kind="controller")["data"]
     assert (taken["controller"], taken["parameters"]["agent"]) == ("remote", elsewhere)
+
+
+def test_what_is_stopped_before_it_begins_leaves_the_fish_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Training, "_reset", lambda _: pytest.fail("the fish swims"))
+    found = train(brief_job(tmp_path / "run"), stop=lambda: True)
+    assert (found.ended, found.steps) == ("interrupted", 0)

@@ -101,6 +101,7 @@ def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
             recover(writer.part)
 
 
+@pytest.mark.slow
 def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> None:
     rig = swum()
     path = recorded(rig, tmp_path / "run", flush_every=10)

@@ -19,7 +19,7 @@ from fishd.core.signals import Status
 
 FISHD = str(Path(sys.executable).with_name("fishd"))
 FISHCTL = str(Path(sys.executable).with_name("fishctl"))
-PATIENCE = 20.0
+PATIENCE = 60.0
 """How long anything may take before a test gives up on it [s]."""
 
 

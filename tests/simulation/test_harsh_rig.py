@@ -39,6 +39,7 @@ def test_it_has_every_imperfection_that_there_is(section: str, defaults: msgspec
     assert same == ELSEWHERE[section]
 
 
+@pytest.mark.slow
 def test_the_same_seed_swims_the_same_to_the_last_bit_and_another_one_does_not() -> None:
     def ticks(*overrides: str) -> list[tuple[float, ...]]:
         publisher = KeepingPublisher()
@@ -50,6 +51,7 @@ def test_the_same_seed_swims_the_same_to_the_last_bit_and_another_one_does_not()
     assert ticks("simulation.seed=1") != first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["simulated", "virtual-pi"])
 def test_a_square_wave_swims_on_it_as_well_as_its_frequency_permits(robot: str) -> None:
     config = load(FILE, [f"robot={robot}"])

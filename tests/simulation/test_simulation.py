@@ -141,6 +141,7 @@ def test_a_run_without_two_beats_has_no_spread() -> None:
     assert math.isnan(beats.means().thrust_deviation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("waveform", "fullness", "squareness"),
     [("square", 1.0, 1.0), ("sine", 2.0 / math.pi, 0.9003), ("triangle", 0.5, 0.8660)],

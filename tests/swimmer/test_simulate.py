@@ -283,7 +283,7 @@ def test_a_folder_that_goes_away_costs_its_files_and_not_the_swim(tmp_path: Path
     gone = tmp_path / "gone"
     gone.mkdir()
     files = ("--checkpoint", gone / "kept", "--checkpoint-every", "1", "--save", gone / "track.csv")
-    command = (FISHCTL, "simulate", "swing", "--seconds", "20", "--settle", "1", *OPTIONS, *files)
+    command = (FISHCTL, "simulate", "swing", "--seconds", "8", "--settle", "1", *OPTIONS, *files)
     swimming = subprocess.Popen(
         [str(word) for word in command],
         stdout=subprocess.PIPE,

@@ -20,6 +20,7 @@ def kinetic_energy(fish: Fish) -> float:
     return float(500.0 * grid.dx @ (u**2 + v**2) @ grid.dy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steering", [0, 1])
 def test_a_fish_that_stops_beating_comes_to_rest(steering: int) -> None:
     fish = Fish(coarse(f"swimmer.steering={steering}").swimmer)
@@ -35,6 +36,7 @@ def test_a_fish_that_stops_beating_comes_to_rest(steering: int) -> None:
     assert abs(fish.motion().tail_rate) < 0.05
 
 
+@pytest.mark.slow
 def test_the_water_gets_no_more_than_muscles_and_steering_give() -> None:
     fish = Fish(coarse().swimmer)
     swim(fish, 0.8, 2.5)

@@ -97,6 +97,7 @@ def test_a_spike_leaves_the_noise_as_it_was_and_decays_in_the_fin_velocity() -> 
     assert fooled[first + 20] < 0.2 * fooled[first]
 
 
+@pytest.mark.slow
 def test_on_a_virtual_pi_a_spike_is_one_bad_conversion() -> None:
     rig = ["simulation.noise=0", "simulation.spike_rate=2", "simulation.spike_size=0.2"]
     config = load(None, ["robot=virtual-pi", "virtual_pi.adc_noise=0", *rig])

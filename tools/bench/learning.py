@@ -5,6 +5,7 @@ the best square wave of the same fish and amplitude.
 
     efficiency   learning curves: several settings, ten seeds each; draws docs/learning-curves.png
     transfer     policies for one fish on sixteen others
+    tank         tank time of trainings on a robot, evaluations included
     harsh        the policy that is shipped, and swing, on rigs that delay, play and react
     speed        environment and inference, on one core
 """
@@ -20,6 +21,7 @@ from msgspec.structs import replace
 
 from bench.learning_curves import learning_curves
 from bench.policy import policy_file
+from bench.tank_time import tank
 from bench.trainings import Row, Trained, rig, settings_of, several
 from common.report import DOCS, Options, Report, progress, spread, table
 from fishd.config import Config, load
@@ -206,7 +208,13 @@ def inference(config: Config) -> str:
     return f"the controller `ppo`, observation to angle: {median:.1f} µs, p99 {tail:.1f} µs"
 
 
-PARTS = {"efficiency": efficiency, "transfer": transfer, "harsh": harsh, "speed": speed}
+PARTS = {
+    "efficiency": efficiency,
+    "transfer": transfer,
+    "tank": tank,
+    "harsh": harsh,
+    "speed": speed,
+}
 
 
 OPTIONS: Options = {

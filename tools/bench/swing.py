@@ -80,4 +80,4 @@ def measure(options: Namespace) -> Report:
 
 def percent(share: float) -> str:
     """With one decimal."""
-    return f"{100 * share:.1f}"
+    return f"{round(100 * share, 1) + 0.0:.1f}"  # no negative zero

@@ -10,6 +10,7 @@ from fishd.cli.calibrate.force_dialogue import Dialogue
 from fishd.cli.calibrate.load_files import NEWTONS
 from fishd.cli.options import endpoint_option
 from fishd.cli.output import echo
+from fishd.cli.prompts import input_interrupted
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.calibration import ForceCalibration
@@ -79,7 +80,7 @@ def force(
             f"--record keeps what is measured now, but {plan} holds loads measured earlier; give "
             "one of the two"
         )
-    with Fish(endpoint) as fish:
+    with Fish(endpoint) as fish, input_interrupted():
         present = fish.calibrations()  # refused where there is nothing to calibrate
         limit = present.force_limit
         load_files.check_limit(steps, limit)

@@ -10,7 +10,8 @@ import click
 
 from fishd.cli.calibrate import load_files
 from fishd.cli.calibrate.load_files import NEWTONS
-from fishd.cli.output import choose, echo
+from fishd.cli.output import echo
+from fishd.cli.prompts import choose
 from fishd.client import Fish
 from fishd.core.calibration import ForceSample
 from fishd.core.errors import Refused

@@ -13,7 +13,8 @@ from msgspec.structs import replace
 
 from fishd.cli.calibrate.servo_lease import renewed
 from fishd.cli.options import endpoint_option
-from fishd.cli.output import choose, echo
+from fishd.cli.output import echo
+from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.calibration import ServoCalibration
@@ -122,7 +123,7 @@ def servo(endpoint: str | None) -> None:
     rest. Nothing is saved before you say yes; on Ctrl-C or any error the calibration of before is
     in use again.
     """
-    with Fish(endpoint) as fish:
+    with Fish(endpoint) as fish, input_interrupted():
         before = fish.calibrations().servo
         tail = Tail(fish, before)
         lease = tail.begin_lease()

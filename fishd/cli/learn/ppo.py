@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fishd.learning.train.jobs import Job, Outcome
 
 IMPLAUSIBLE = 1.03
-"""Efficiencies above this are an error of measurement: the best square wave is the optimum."""
+"""Efficiencies surely above this are an error of measurement: the best square wave is optimal."""
 
 
 @click.command()
@@ -245,9 +245,10 @@ def report(outcome: "Outcome", job: "Job") -> int:
         )
         return INTERRUPTED
     click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time")
-    if outcome.best_evaluation:
-        click.echo(f"best: {described(outcome.best_evaluation).strip()}")
-        if outcome.best_evaluation.efficiency > IMPLAUSIBLE:
+    if found := outcome.best_evaluation:
+        click.echo(f"best: {described(found).strip()}")
+        off = found.error / found.thrust if found.error else 0.0
+        if found.efficiency * (1.0 - off) > IMPLAUSIBLE:
             click.echo(
                 "careful: that is more than the best square wave of the configured plant; the fish "
                 "is another one, or F_x is not calibrated, or it drifts"

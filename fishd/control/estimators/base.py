@@ -116,6 +116,7 @@ class Estimator(ABC):
             previous_angle=before,
             thrust=self._beat.thrust,
             frequency=self._beat.frequency,
+            side_time=self._beat.side_time,
         )
 
     @property

@@ -12,6 +12,8 @@ class TailBeat:
 
     _REST = 1.0
     """Time constant of the mean force while the tail does not beat [s]."""
+    _LONGEST = 2.0
+    """A tail that stays longer at one side does not beat [s]."""
 
     def __init__(self, span: float = 4.0) -> None:
         """`span` bounds the time that the means look back [s]; they cover at least one beat."""
@@ -24,6 +26,8 @@ class TailBeat:
         """Forget all beats, but not the mean force."""
         self._halves: deque[tuple[float, float]] = deque()  # (duration [s], impulse [N s])
         self._side = 0.0
+        self.side_time = 0.0
+        """How long the angle has been on its side of neutral, signed as it is; up to 2 s [s]."""
         self._open: tuple[float, float] | None = None
         self._longest = 0.0
         self.frequency = 0.0
@@ -41,6 +45,9 @@ class TailBeat:
             if self._side:
                 self._reverse()
             self._side = side
+        before = abs(self.side_time) if self.side_time * angle > 0.0 else 0.0
+        elapsed = min(before + duration, self._LONGEST)
+        self.side_time = math.copysign(elapsed, angle) if angle else 0.0
         if self._open is not None:
             elapsed, impulse = self._open
             self._open = (elapsed + duration, impulse + force * duration)

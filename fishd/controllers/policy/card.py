@@ -31,17 +31,16 @@ LONGEST = SETTINGS
 SAME_TICK = 1e-9
 """Largest difference between two ticks that are the same [s]."""
 
-FeatureName = Literal["fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle"]
+FeatureName = Literal[
+    "fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle", "side_time"
+]
 """Fields of `Observation` that a policy may see."""
 
-COMMANDS = ("instruction_angle", "previous_angle")
+COMMANDS = ("instruction_angle", "previous_angle", "side_time")
 """Those that are known without any sensor."""
 
 LONGEST_HISTORY = 64
 """[ticks]"""
-
-SMALLEST_RMS = 0.02
-"""With `relative`, less than this is like this: noise of a fish at rest stays small [scale]."""
 
 _TOO_DEEP = "its card is JSON that is nested too deeply"
 
@@ -111,8 +110,6 @@ class Window(Struct, frozen=True):
     ticks: int = 1
     span: float = 0.0
     """That many of them [s]."""
-    relative: bool = False
-    """Is each but the commands divided by its rms over these ticks, too?"""
 
 
 ONE_TICK = Window()
@@ -141,9 +138,6 @@ class History:
         self.row = np.zeros(window.ticks * len(features), np.float32) if row is None else row
         """The input, dimensionless."""
         self._given = self.row.reshape(window.ticks, len(features))
-        self._seen = np.zeros_like(self._given) if window.relative else self._given
-        self._factors = np.ones(len(features), np.float32)
-        self._forces = [k for k, each in enumerate(features) if each.name not in COMMANDS]
         self._time = -math.inf
         self.push: Callable[[Observation], None] = self._only if window.ticks == 1 else self._next
         """Take the observation of a tick."""
@@ -156,19 +150,13 @@ class History:
         self._layout.write(observation, self.row)
 
     def _next(self, observation: Observation) -> None:
-        seen, passed = self._seen, observation.time - self._time
+        seen, passed = self._given, observation.time - self._time
         if passed > 0.0:
             seen[1:] = seen[:-1]
         self._layout.write(observation, seen[0])
         if not 0.0 <= passed < self._window.span:
             seen[1:] = seen[0]
         self._time = observation.time
-        if self._window.relative:
-            squares = np.einsum("ij,ij->j", seen, seen).tolist()
-            for place in self._forces:
-                rms = math.sqrt(squares[place] / len(seen))
-                self._factors[place] = 1.0 / max(rms, SMALLEST_RMS)
-            np.multiply(seen, self._factors, out=self._given)
 
 
 class Provenance(Struct, frozen=True, kw_only=True):
@@ -205,8 +193,6 @@ class Card(Struct, frozen=True, kw_only=True):
     """The numbers that the network is given, in order."""
     history: Annotated[int, Meta(ge=1, le=LONGEST_HISTORY)] = 1
     """Of how many ticks it is given these numbers, the newest first."""
-    relative: bool = False
-    """Is each but the commands divided by its rms over these ticks, too?"""
     pictures: StackSettings | None = None
     """The frames that it is given; None where it sees none."""
     tick: Positive
@@ -223,7 +209,7 @@ class Card(Struct, frozen=True, kw_only=True):
     @property
     def window(self) -> Window:
         """Of which ticks."""
-        return Window(self.history, self.history * self.tick, self.relative)
+        return Window(self.history, self.history * self.tick)
 
     @property
     def sees(self) -> str:

@@ -13,7 +13,6 @@ NAMES = {
     "swing": "swing as --C auto has found it",
     SQUARE: "the best square wave found",
 }
-_UNTOLD = "; the measurement does not tell all of them apart, and on the identified fish it is best"
 _LEVEL = 0.05
 
 
@@ -50,7 +49,8 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
         high=high,
         others=shares,
         told=len(level) == 1,
-        claim=_claim(winner.name, shares) + ("" if len(level) == 1 else _UNTOLD),
+        claim=_claim(winner.name, shares)
+        + _untold([one.name for one in level if one is not winner]),
     )
 
 
@@ -80,6 +80,14 @@ def _claim(winner: str, shares: dict[str, tuple[float, float, float]]) -> str:
     return f"{NAMES[SQUARE]} wins: of its thrust has {others}"
 
 
+def _untold(names: Sequence[str]) -> str:
+    """From whom the measurement does not tell the winner, if from anyone."""
+    if not names:
+        return ""
+    others = " or from ".join(NAMES[name] for name in names)
+    return f"; the measurement does not tell it from {others}: on the identified fish it is best"
+
+
 def spelled(share: tuple[float, float, float]) -> str:
     """An efficiency with its interval."""
     value, low, high = share
@@ -88,4 +96,4 @@ def spelled(share: tuple[float, float, float]) -> str:
 
 def percent(share: float) -> str:
     """With one decimal."""
-    return f"{100.0 * share:.1f} %"
+    return f"{round(100.0 * share, 1) + 0.0:.1f} %"  # no negative zero

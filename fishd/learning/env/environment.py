@@ -74,6 +74,7 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
         "fin_velocity": force / omega0,  # the estimate is an integral of F_y
         "instruction_angle": config.amplitude_limit,
         "previous_angle": config.amplitude_limit,
+        "side_time": math.pi / omega0,
     }
     return tuple(Feature(name, scales[name]) for name in settings.observation)
 
@@ -100,10 +101,11 @@ def spaces(features: int) -> tuple[gymnasium.Space[Vector], gymnasium.Space[Vect
 class SwimEnv(gymnasium.Env[Vector, Vector]):
     """One fish that swims for thrust.
 
-    `info` of each step holds `thrust` (mean F_x in the tick that followed [N]), `lost` (ticks in
-    which another angle than the action was applied), `blind` (1 where the camera did not show that
-    tick) and `paused` (how long the fish has waited at neutral since the previous step [s], mostly
-    0). A step with `lost` or `blind` ends its episode: it is truncated.
+    `info` of each step holds `thrust` and `lateral_force` (mean F_x and F_y in the tick that
+    followed [N]), `lost` (ticks in which another angle than the action was applied), `blind` (1
+    where the camera did not show that tick) and `paused` (how long the fish has waited at neutral
+    since the previous step [s], mostly 0). A step with `lost` or `blind` ends its episode: it is
+    truncated.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
@@ -125,9 +127,10 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.features = features(config, settings)
         self.settings = settings
         self.eye = eye
-        window = Window(settings.history, settings.history * config.tick, settings.relative)
+        window = Window(settings.history, settings.history * config.tick)
         self.perception = Perception(self.features, eye, window)
-        self._reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
+        self.reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
+        """By which F_x is rewarded [1/N]."""
         self._price, self._cost = settings.power_price, 0.0  # N/W, N
         shortest = config.limits.dwell if settings.dwell else 0.0
         self._dwell = Dwell(shortest, link.tick, link.amplitude)
@@ -182,7 +185,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
     def _suit(self, fish: Config) -> None:
         """Reward the thrust of this fish by its own best, and hold reversals back as it needs."""
-        self._reward_per_newton = self.settings.reward_scale / thrust_scale(fish, self.settings)
+        self.reward_per_newton = self.settings.reward_scale / thrust_scale(fish, self.settings)
         shortest = fish.limits.dwell if self.settings.dwell else 0.0
         self._dwell = Dwell(shortest, self.link.tick, self.link.amplitude)
 
@@ -197,7 +200,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             raise ResetNeeded("no episode has begun: call reset before step")
         lost = self.swim(_share(action) * self.link.amplitude)
         self._steps += 1
-        reward = self._reward_per_newton * (self.latest.fx - self._cost)
+        reward = self.reward_per_newton * (self.latest.fx - self._cost)
         reward -= self._held_cost * self._dwell.held
         info = self._info(lost)
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
@@ -315,7 +318,13 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
     def _info(self, lost: int) -> dict[str, Any]:
         blind = int(self.eye is not None and self.stack is None)
-        return {"thrust": self.latest.fx, "lost": lost, "blind": blind, "paused": self._paused}
+        return {
+            "thrust": self.latest.fx,
+            "lateral_force": self.latest.fy,
+            "lost": lost,
+            "blind": blind,
+            "paused": self._paused,
+        }
 
 
 def _check_agreement(link: Link, config: Config) -> None:

@@ -1,4 +1,4 @@
-"""Evaluations without exploration: how does a policy swim, in simulation or on the robot?"""
+"""Evaluations without exploration, of a simulated fish; those in a tank are made of `swims`."""
 
 import itertools
 from collections.abc import Callable
@@ -13,10 +13,7 @@ from fishd.camera.frames import Stack
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start
 from fishd.controllers.dwell import DwellLimit
-from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
-from fishd.lab.measurement import Sample, evaluate, plan
-from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import (
     Camera,
     FunctionController,
@@ -43,11 +40,18 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     """How a policy swam without exploration; a row of evaluations.csv."""
 
     steps: int = 0
-    """Control steps that it had learned from."""
+    """Control steps that the training had learned from."""
+    policy: int = 0
+    """Control steps that the policy had learned from which swam: in a tank, it may be older."""
     tank_time: float = 0.0
     """Time in the tank until then [s]."""
+    swam: float | None = None
+    """How long this policy has swum in the tank in all its evaluations [s]; None in simulation."""
     thrust: float
-    """Mean thrust: the true one of a simulated fish, the measured one of a robot [N]."""
+    """Mean thrust: the true one of a simulated fish, the mean of all swims in a tank [N].
+
+    In a tank it is 0 where the policy stalled.
+    """
     error: float | None = None
     """Half of the 95 % interval of a measured thrust [N]; a true one needs none."""
     efficiency: float
@@ -61,7 +65,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     worst: float | None = None
     """Lowest efficiency on this and on other fish, where others were tried."""
     best: bool = False
-    """It swims, and no evaluation before was better."""
+    """It swims, and is the best so far."""
 
     @property
     def merit(self) -> float:
@@ -113,7 +117,7 @@ def in_simulation(
         efficiency=float(found.efficiency),
         frequency=float(found.frequency),
         fullness=float(found.fullness),
-        stalled=_is_stalled(found.frequency, found.fullness, config.tick),
+        stalled=is_stalled(found.frequency, found.fullness, config.tick),
     )
 
 
@@ -159,44 +163,6 @@ def _in_range(
     return 0.0 if report.fallback else report.efficiency
 
 
-def on_link(
-    env: SwimEnv, decide: Decide, settings: EvaluationSettings, stop: Callable[[], bool]
-) -> Evaluation | None:
-    """Evaluate on the fish that learns, by its measured thrust.
-
-    None where `stop` says so, and where too many observations were lost to tell.
-
-    The fish swims and rests in turn, as in `fishd.lab.measurement`. It must not be in a pause.
-    Raises `LinkLost`.
-    """
-    tick, amplitude = env.link.tick, env.link.amplitude
-    samples: list[Sample] = []
-    for swims, seconds in plan(settings.on_robot, {}):
-        for _ in range(round(seconds / tick)):
-            if stop():
-                return None
-            angle = max(-amplitude, min(amplitude, decide(env.latest, env.stack))) if swims else 0.0
-            seen = env.latest
-            samples.append(
-                Sample(round(seen.time / tick), seen.fx, seen.fin_velocity, angle, swims)
-            )
-            env.swim(angle)
-    shares = np.array([each.phi_c for each in samples if each.swims]) / amplitude
-    frequency, fullness = beat_frequency(shares, tick), float(np.mean(np.abs(shares)))
-    try:
-        found = evaluate(samples, tick)
-    except ParameterError:
-        return None
-    return Evaluation(
-        thrust=found.thrust,
-        error=found.error,
-        efficiency=found.thrust / env.best_thrust,
-        frequency=frequency,
-        fullness=fullness,
-        stalled=_is_stalled(frequency, fullness, tick),
-    )
-
-
 def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:
     """Tail beats per second, from a command's changes of side; 0 for less than a beat [Hz].
 
@@ -208,7 +174,8 @@ def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:
     return reversals / (2.0 * len(shares) * tick) if reversals > 1 else 0.0
 
 
-def _is_stalled(frequency: float, fullness: float, tick: float) -> bool:
+def is_stalled(frequency: float, fullness: float, tick: float) -> bool:
+    """Does a policy that beats so often [Hz] and so fully not swim? tick: period of the loop [s]"""
     return frequency == 0.0 or fullness < STALLED or 2.0 * frequency * tick > CHATTER
 
 

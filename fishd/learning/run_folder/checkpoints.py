@@ -63,6 +63,10 @@ class State(Struct, frozen=True):
     """Updates so far."""
     latest: Evaluation | None
     best: Evaluation | None
+    imitated: bool = False
+    """Has it learned by imitation what it was to, itself or in the run that it began with?"""
+    swims: int = 0
+    """How often the best was measured in a tank."""
 
 
 class Constant(Struct, frozen=True):
@@ -111,8 +115,8 @@ def newest(folder: Path) -> Path:
     found = all_in(folder)
     if not found:
         raise CheckpointError(
-            f"{folder}: there is no checkpoint in it: the training ended before the first one; "
-            "remove it, and train again"
+            f"{folder}: there is no checkpoint in it: the training ended before the first one, or "
+            "there was none; name another folder, or train into a new one"
         )
     return found[-1]
 
@@ -175,6 +179,12 @@ def load_parameters(model: PPO, checkpoint: Path, *, optimiser: bool = True) -> 
         model.set_parameters(parameters, exact_match=True, device="cpu")
     if not optimiser:
         model.policy.optimizer.load_state_dict(fresh)
+
+
+def read_parameters(checkpoint: Path) -> dict[str, Any]:
+    """Those of networks and optimiser; raises `CheckpointError`."""
+    with _readable(checkpoint / MODEL) as parameters:
+        return parameters
 
 
 def load_policy(checkpoint: Path) -> tuple[ActorCriticPolicy, Perception]:

@@ -122,17 +122,18 @@ def make_card(
     evaluation: the latest
     """
     libraries = {name: version(name) for name in _LIBRARIES}
+    imitation = ["imitation"] if settings.imitation.rounds else []
+    algorithms = [*imitation, "PPO"] if settings.steps else imitation
     return Card(
         observation=features,
         history=settings.environment.history,
-        relative=settings.environment.relative,
         pictures=settings.camera.stack if settings.see != "force" else None,
         tick=config.tick,
         amplitude=config.amplitude_limit,
         provenance=Provenance(
             created=datetime.now(UTC).isoformat(timespec="seconds"),
             fishd=__version__,
-            algorithm="PPO",
+            algorithm=" and ".join(algorithms),
             on=on,
             steps=steps,
             seed=settings.seed,

@@ -57,18 +57,20 @@ class Table(tables.Table):
     def keep_until(self, steps: int) -> None:
         """Drop the rows of later steps, which a resumed run is going to do again.
 
+        Columns that an older fishd did not write are empty.
         Raises `CheckpointError` where the file is not such a table.
         """
         try:
             head, *rows = tables.read(self.path)
             at = head.index("steps")
             complete = [row for row in rows if len(row) == len(head)]  # the last may be cut off
-            kept = [row for row in complete if int(row[at]) <= steps]
+            kept = [dict(zip(head, row, strict=True)) for row in complete if int(row[at]) <= steps]
         except (ValueError, FileProblem):
             raise CheckpointError(
                 f"{self.path}: not a table of a training; move it away, and a new one is begun"
             ) from None
-        write_atomically(self.path, tables.lines([head, *kept]))
+        rewritten = [[row.get(column, "") for column in self.columns] for row in kept]
+        write_atomically(self.path, tables.lines([self.columns, *rewritten]))
 
 
 class ProgressWriter(KVWriter):

@@ -44,6 +44,7 @@ class RolloutCallback(BaseCallback):
         self._thrusts.append(info["thrust"])
         self._actions.append(float(self.locals["clipped_actions"][0, 0]))
         self._paused += info["paused"]
+        buffer.forces[buffer.pos] = info["thrust"], info["lateral_force"]
         buffer.void[buffer.pos] = info["lost"] + info["blind"] > 0  # where this step is stored
         self._display.step(self._env.tank_time)
         self.stopped = self._stop()

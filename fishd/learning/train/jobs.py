@@ -8,9 +8,10 @@ from msgspec import Struct
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
+from fishd.core.errors import ConfigError
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.simulated_link import Camera
-from fishd.learning.settings import TrainingSettings
+from fishd.learning.settings import Randomisation, TrainingSettings
 
 On = Literal["simulation", "robot"]
 Ended = Literal["finished", "interrupted", "lost", "diverged", "failed"]
@@ -46,6 +47,25 @@ class Job(Struct, frozen=True, kw_only=True):
         if self.settings.see == "force":
             return None
         return Camera(self.camera, self.settings.camera.stack)
+
+    def check(self) -> None:
+        """Refuse an imitation on a robot; raises `ConfigError`."""
+        if self.on == "robot" and self.settings.imitation.rounds and not self.is_begun:
+            raise ConfigError(
+                "imitation.rounds: the best beat of a robot's fish is not known: learn from "
+                "simulated ones, and go on here with --from; or set it to 0"
+            )
+
+    @property
+    def is_begun(self) -> bool:
+        """Does it begin with networks that have learned something?"""
+        return self.resume or self.parent is not None
+
+    @property
+    def cleans_rewards(self) -> bool:
+        """Is a sensor's drift and turn to be found? That takes more than an episode of one fish."""
+        one_fish = self.on == "robot" or self.settings.randomisation == Randomisation()
+        return self.settings.ppo.clean_rewards and one_fish
 
     def last_step(self, done: int = 0) -> int:
         """The step with which it ends: PPO learns from whole rollouts; done: steps before."""

@@ -19,6 +19,9 @@ class Display:
     def begin(self, steps: int, target: int, text: str) -> None:
         """It begins, or goes on, after so many steps; text: what and where, one line."""
 
+    def imitated(self, number: int, rounds: int, right: float) -> None:
+        """A round of imitation is done; right: share of right sides, weighted."""
+
     def step(self, tank_time: float) -> None:
         """One more control step is done; tank_time: [s]."""
 
@@ -39,10 +42,17 @@ class LineDisplay(Display):
         """Print where the run is."""
         click.echo(text)
 
+    def imitated(self, number: int, rounds: int, right: float) -> None:
+        """Print one line."""
+        click.echo(imitation(number, rounds, right))
+
     def evaluated(self, evaluation: "Evaluation") -> None:
-        """Print one line; it is called the best only where the figure shown is higher, too."""
+        """Print one line.
+
+        In simulation it is called the best only where the figure shown is higher, too.
+        """
         merit = round(evaluation.merit, 3)
-        better = evaluation.best and merit > self._best
+        better = evaluation.best and (evaluation.error is not None or merit > self._best)
         self._best = merit if better else self._best
         click.echo(described(evaluation) + (", the best so far" if better else ""))
 
@@ -79,6 +89,10 @@ class BarDisplay(Display):
         )
         self._progress.start()
 
+    def imitated(self, number: int, rounds: int, right: float) -> None:
+        """Show it in place of how it swims."""
+        self._progress.update(self._task, figures=imitation(number, rounds, right))
+
     def step(self, tank_time: float) -> None:
         """Advance by one."""
         self._progress.update(self._task, advance=1, tank=minutes(tank_time))
@@ -111,9 +125,16 @@ def on_terminal() -> Iterator[Display]:
         bar.stop()
 
 
+def imitation(number: int, rounds: int, right: float) -> str:
+    """`imitation 3 of 8: 92.1% right`."""
+    return f"imitation {number} of {rounds}: {right:.1%} right"
+
+
 def described(evaluation: "Evaluation") -> str:
     """An evaluation in one line."""
     when = f"{evaluation.steps:7d} steps, {minutes(evaluation.tank_time):>8} in the tank"
+    if evaluation.swam is not None and evaluation.policy != evaluation.steps:
+        when += f", policy of {evaluation.policy} steps"
     others = f", worst of other fish {evaluation.worst:.1%}" if evaluation.worst is not None else ""
     return f"{when}: {summary(evaluation)}{others}"
 
@@ -122,12 +143,14 @@ def summary(evaluation: "Evaluation") -> str:
     """Its figures, or that the policy does not swim."""
     if evaluation.stalled:
         return "stalled: it does not swim"
-    return figures(evaluation.thrust, evaluation.efficiency, evaluation.frequency)
+    error = evaluation.error
+    return figures(evaluation.thrust, evaluation.efficiency, evaluation.frequency, error)
 
 
-def figures(thrust: float, efficiency: float, frequency: float) -> str:
-    """`25.1 mN  97.8%  1.67 Hz`."""
-    return f"{thrust * 1e3:.1f} mN  {efficiency:.1%}  {frequency:.2f} Hz"
+def figures(thrust: float, efficiency: float, frequency: float, error: float | None = None) -> str:
+    """`25.1 mN  97.8%  1.67 Hz`, or `25.1 ± 0.3 mN  97.8%  1.67 Hz`."""
+    known = "" if error is None else f" ± {error * 1e3:.1f}"
+    return f"{thrust * 1e3:.1f}{known} mN  {efficiency:.1%}  {frequency:.2f} Hz"
 
 
 def minutes(seconds: float) -> str:

@@ -1,6 +1,8 @@
 """What a training leaves in its run folder: tables, TensorBoard logs, checkpoints."""
 
-from contextlib import ExitStack
+import copy
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +20,7 @@ from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError, State
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, ProgressWriter, Table
+from fishd.learning.train.candidates import Candidate
 from fishd.learning.train.jobs import Job
 
 
@@ -37,8 +40,14 @@ class RunRecorder:
         """Updates."""
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
+        self.imitated = False
+        """Has it learned by imitation what it was to?"""
         self.checkpoint: Path | None = None
         """The newest `step` checkpoint, or that which the run was resumed from."""
+        self.winner: Candidate | None = None
+        """The policy of `best`, where it was found in a tank: it may be older than the model."""
+        self._kept: Evaluation | None = None
+        """That of the best policy, as its checkpoint tells it."""
         self._note = ""
         with ExitStack() as lock:
             if job.resume:
@@ -70,26 +79,32 @@ class RunRecorder:
     def add(self, evaluation: Evaluation) -> Evaluation:
         """Write one row of evaluations.csv; returns the evaluation with `best` set."""
         is_best = self.best is None or evaluation.merit >= self.best.merit
-        evaluation = replace(evaluation, best=is_best and not evaluation.stalled)
+        return self.add_measured(replace(evaluation, best=is_best and not evaluation.stalled))
+
+    def add_measured(self, evaluation: Evaluation) -> Evaluation:
+        """The same where it is known already whether the policy is the best so far."""
         self._evaluations.add(msgspec.structs.asdict(evaluation))
-        self.latest = evaluation
+        if evaluation.policy == self.steps:
+            self.latest = evaluation
         if evaluation.best:
             self.best = evaluation
         return evaluation
 
-    def save(self, *, due: bool = True) -> None:
-        """Write a checkpoint where the policy is the best so far.
+    def save(self, *, due: bool = True, anew: bool = False) -> None:
+        """Write a checkpoint where another policy is the best so far.
 
         due: write one in any case, if the newest is not of this step
+        anew: or even if it is, since the policy has changed without a step
 
         To be called after the rows of the tables are written: a resume drops rows that are newer
         than the checkpoint, but could not add missing ones.
         """
-        name = f"{self.steps:06d}"
-        is_best = self.best is not None and self.best.steps == self.steps
-        if is_best and not (self._job.folder / f"best-{name}").exists():
-            self._save("best")
-        if due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}"):
+        name, best, kept = f"{self.steps:06d}", self.best, self._kept
+        if best and best != kept and (due or kept is None or best.policy != kept.policy):
+            with _wearing(self._model, self.winner.parameters) if self.winner else nullcontext():
+                self._save("best")
+            self._kept = best
+        if anew or (due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}")):
             self.checkpoint = self._save("step")
 
     def close(self) -> None:
@@ -106,24 +121,24 @@ class RunRecorder:
             raise ConfigError(f"{folder} is being trained in, by process {taken.pid}") from None
 
     def _save(self, kind: Literal["step", "best"]) -> Path:
+        one = self.winner if kind == "best" else None
         state = State(
             on=self._job.on,
-            steps=self.steps,
-            updates=self._model._n_updates,
+            steps=one.steps if one else self.steps,
+            updates=one.updates if one else self._model._n_updates,
             tank_time=self._env.tank_time,
-            rollouts=self.rollouts,
+            rollouts=one.rollouts if one else self.rollouts,
             latest=self.latest,
             best=self.best,
+            imitated=self.imitated,
+            swims=self.winner.swims if self.winner else 0,
         )
-        return checkpoints.save(
-            self._job.folder, kind, self._model, self._card(), state, self._env.eye
-        )
+        card = self._card(state.steps, self.best if kind == "best" else self.latest)
+        return checkpoints.save(self._job.folder, kind, self._model, card, state, self._env.eye)
 
-    def _card(self) -> Card:
+    def _card(self, steps: int = 0, evaluation: Evaluation | None = None) -> Card:
         job, seen = self._job, self._env.features
-        return make_card(
-            job.config, job.settings, seen, job.on, self.steps, self.latest, self._note
-        )
+        return make_card(job.config, job.settings, seen, job.on, steps, evaluation, self._note)
 
     def _begin_with(self, parent: Path) -> None:
         """Take over the networks of another run; raises `CheckpointError`."""
@@ -131,6 +146,7 @@ class RunRecorder:
         checkpoints.load_parameters(self._model, parent, optimiser=False)
         name = f"{parent.resolve().parent.name}/{parent.name}"
         self._note = f"began with {name}, {past.steps} steps in {past.on}"
+        self.imitated = True
 
     def _checked_card(self, checkpoint: Path) -> Card:
         """The card of a checkpoint, whose inputs, actions and networks are those of this training.
@@ -146,7 +162,7 @@ class RunRecorder:
                     f"{checkpoint}: its {key} is {theirs.get(key)}, that of this training is "
                     f"{here}; eye and networks must be alike"
                 )
-        for what in ("observation", "history", "relative", "tick", "amplitude"):
+        for what in ("observation", "history", "tick", "amplitude"):
             if getattr(card, what) != getattr(own, what):
                 raise CheckpointError(
                     f"{checkpoint}: its {what}, with scales, differs from that of this training; "
@@ -169,7 +185,7 @@ class RunRecorder:
                 f"fish, begin a new run: --on {job.on} --from {job.folder}"
             )
         card = self._checked_card(self.checkpoint)
-        if state.steps >= job.settings.steps:
+        if state.steps >= job.settings.steps and (state.steps or state.imitated):
             raise ConfigError(
                 f"{job.folder} is finished, with {state.steps} steps; to train it for longer, give "
                 f"a larger total, such as --steps {state.steps + job.settings.steps}"
@@ -179,16 +195,51 @@ class RunRecorder:
         self._note = card.provenance.note
         self.steps = model.num_timesteps = state.steps
         self.rollouts, model._n_updates = state.rollouts, state.updates
-        self.latest, self.best = state.latest, state.best
+        self.latest, self.imitated = state.latest, state.imitated
+        self._take_best(state)
         self._env.tank_time = state.tank_time
         checkpoints.sweep(job.folder)
         runs.write_settings(job.folder, job.settings)
+
+    def _take_best(self, state: State) -> None:
+        """The best so far; that of a tank goes on swimming, with the swims that it had.
+
+        Where the run was killed, its checkpoint is newer than the one that is resumed.
+        """
+        path = checkpoints.best(self._job.folder) if state.on == "robot" else None
+        past = checkpoints.read_state(path) if path else state
+        best = self._kept = self.best = past.best
+        if path and best:
+            self.winner = Candidate(
+                steps=past.steps,
+                updates=past.updates,
+                rollouts=past.rollouts,
+                parameters=checkpoints.read_parameters(path),
+                swims=past.swims,
+                thrust=best.thrust if past.swims else 0.0,
+                swam=best.swam or 0.0,
+                frequency=best.frequency,
+                fullness=best.fullness,
+            )
+        elif state.on == "robot":  # it was moved away
+            self._kept = self.best = None
 
     def _open_table(self, name: str, columns: tuple[str, ...]) -> Table:
         table = Table(self._job.folder / name, columns)
         if self._job.resume:
             table.keep_until(self.steps)
         return table
+
+
+@contextmanager
+def _wearing(model: PPO, parameters: dict[str, Any]) -> Iterator[None]:
+    """While this lasts, a model has other networks, and another state of its optimiser."""
+    own: Any = copy.deepcopy(model.get_parameters())
+    model.set_parameters(parameters, device="cpu")
+    try:
+        yield
+    finally:
+        model.set_parameters(own, device="cpu")
 
 
 def _architecture(settings: dict[str, Any]) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """The training loop, in simulation or on a robot.
 
+imitate    where the settings say so, from simulated fish whose best beat is known; then, in turn:
 rollout    n_steps of exploration; the fish then waits at neutral
 update     PPO learns from them
-evaluate   without exploration: a simulated fish of its own, or the robot itself
+evaluate   without exploration: on a simulated fish of its own, or in the tank
 record     a row in the tables, a checkpoint where one is due, another where it is the best so far
 """
 
@@ -20,18 +21,28 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.core.errors import FishdError
 from fishd.learning.env import evaluation
-from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.environment import SwimEnv, thrust_scale
+from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.eyes import making as eyes
-from fishd.learning.ppo import DeterministicPolicy, is_finite, learning_rate, make_learner
+from fishd.learning.imitation import Imitation
+from fishd.learning.ppo import (
+    DeterministicPolicy,
+    Rollout,
+    is_finite,
+    learning_rate,
+    make_learner,
+)
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
+from fishd.learning.thrust_signal import ThrustSignal
 from fishd.learning.train.callbacks import RolloutCallback
 from fishd.learning.train.jobs import Ended, Job, Outcome
 from fishd.learning.train.progress import Display, minutes
 from fishd.learning.train.recorder import RunRecorder
+from fishd.learning.train.tank import TankEvaluations
 
 _NEVER = 10**9
 """Updates after which stable-baselines3 logs by itself."""
@@ -42,11 +53,13 @@ def train(
 ) -> Outcome:
     """Train; whatever ends it, the fish is at neutral afterwards.
 
-    stop: called after each step; True ends the training there, and drops the current rollout
+    stop: called at first and after each step; True ends the training there, and drops the
+        current rollout
 
     Raises `ConfigError`, `CheckpointError` and `FishError` before anything has moved, and
     `CheckpointError` where the run folder can no longer be written.
     """
+    job.check()
     torch.set_num_threads(1)
     link: Link
     if job.on == "robot":
@@ -77,8 +90,13 @@ class Training:
         self._env = SwimEnv(link, job.config, job.settings.seen, self._eye)
         self._vec_env = DummyVecEnv([lambda: self._env])
         self._model = make_learner(job.settings, self._vec_env, self._eye)
+        if job.cleans_rewards:
+            _clean(cast(Rollout, self._model.rollout_buffer), self._env)
         self._callback = RolloutCallback(self._env, display, stop)
         self._recorder = RunRecorder(job, self._env, self._model)
+        self._tank = TankEvaluations(self._model, self._env, self._recorder.winner, stop)
+        if job.parent and not job.resume:
+            self._tank.add(0, 0)  # learning may make it worse
         self._paused = False
 
     def run(self) -> Outcome:
@@ -92,8 +110,13 @@ class Training:
         ended: Ended = "finished"
         message = ""
         try:
-            self._reset()
-            if self._eye and not self._eye.is_fitted:
+            if self._stop():  # while torch was loading: the fish stays at rest
+                ended = "interrupted"
+            elif job.settings.imitation.rounds and not recorder.imitated:
+                ended = self._imitate()
+            if ended == "finished":
+                self._reset()
+            if ended == "finished" and self._eye and not self._eye.is_fitted:
                 ended, message = self._babble()
             while recorder.steps < job.settings.steps and ended == "finished":
                 ended, message = self._update()
@@ -127,6 +150,9 @@ class Training:
         if self._eye:
             also = " and forces" if job.settings.see == "both" else ""
             text += f", from pictures{also} with the eye {job.settings.camera.eye}"
+        if job.settings.imitation.rounds and not recorder.imitated:
+            fish = job.settings.imitation.rounds * job.settings.imitation.fish
+            text += f", after an imitation of the best beats of {fish} fish"
         if job.resume:
             tank = minutes(self._env.tank_time)
             text += f", resumed from {recorder.checkpoint}, {tank} in the tank"
@@ -159,6 +185,21 @@ class Training:
         self._recorder.steps = self._model.num_timesteps = ticks
         return "finished", ""
 
+    def _imitate(self) -> Ended:
+        """Learn from the best waves of other fish first; what is stopped is done anew."""
+        rounds = self._job.settings.imitation.rounds
+        imitation = Imitation(self._job.config, self._job.settings, self._model.policy)
+        for number in range(1, rounds + 1):
+            right = imitation.round(self._stop)
+            if right is None:
+                return "interrupted"
+            self._display.imitated(number, rounds, right)
+        self._recorder.imitated = True
+        if self._job.settings.evaluation.every:
+            self._evaluate()
+        self._recorder.save(anew=True)
+        return "finished"
+
     def _update(self) -> tuple[Ended, str]:
         """One rollout, its update and evaluation; how it ended, and why."""
         model, settings, recorder = self._model, self._job.settings, self._recorder
@@ -187,32 +228,44 @@ class Training:
         recorder.steps = model.num_timesteps
         recorder.rollouts += 1
         every, last = settings.evaluation.every, recorder.steps >= settings.steps
-        if every and (last or recorder.rollouts % every == 0):
-            self._evaluate()
-        recorder.log()
+        try:
+            if every and (last or recorder.rollouts % every == 0):
+                self._evaluate()
+        finally:
+            recorder.log()
         every = settings.checkpoint_every
         recorder.save(due=last or before // every < recorder.steps // every)
         return ("interrupted" if self._stop() and not last else "finished"), ""
 
     def _evaluate(self) -> None:
-        """Evaluate the policy without exploration."""
+        """Evaluate the policy without exploration, in a tank others as well."""
+        if self._job.on == "simulation":
+            self._display.evaluated(self._recorder.add(self._in_simulation()))
+            return
+        recorder, tank = self._recorder, self._tank
+        try:
+            tank.add(recorder.steps, recorder.rollouts)
+            tank.swim(self._job.settings.evaluation.on_robot)
+        finally:
+            for found in tank.results(recorder.steps):
+                self._display.evaluated(recorder.add_measured(found))
+            recorder.winner = tank.best
+
+    def _in_simulation(self) -> Evaluation:
         job, env = self._job, self._env
         policy = DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
-        if job.on == "simulation":
-            camera = job.simulated_camera
-            found = evaluation.in_simulation(job.config, policy, job.settings.evaluation, camera)
-            if job.settings.evaluation.others:
-                others = evaluation.worst_of_others(job.config, policy, job.settings, camera)
-                found = replace(found, worst=min(others, found.efficiency))
-        else:
-            env.resume()
-            on_robot = evaluation.on_link(env, policy, job.settings.evaluation, self._stop)
-            env.pause()
-            if on_robot is None:
-                return
-            found = on_robot
-        found = replace(found, steps=self._recorder.steps, tank_time=env.tank_time)
-        self._display.evaluated(self._recorder.add(found))
+        camera, steps = job.simulated_camera, self._recorder.steps
+        found = evaluation.in_simulation(job.config, policy, job.settings.evaluation, camera)
+        if job.settings.evaluation.others:
+            others = evaluation.worst_of_others(job.config, policy, job.settings, camera)
+            found = replace(found, worst=min(others, found.efficiency))
+        return replace(found, steps=steps, policy=steps, tank_time=env.tank_time)
+
+
+def _clean(rollout: Rollout, env: SwimEnv) -> None:
+    """Let it take off of the measured forces what is not the fish's."""
+    rollout.signal = ThrustSignal(thrust_scale(env.config, env.settings))
+    rollout.reward_per_newton = env.reward_per_newton
 
 
 def _advice(job: Job) -> str:

@@ -151,7 +151,7 @@ class Ina226Chip(InaChip):
         return 0x7FFF
 
 
-CHIPS = {"ina219": Ina219Chip, "ina226": Ina226Chip}
+CHIPS: dict[str, type[Ina219Chip] | type[Ina226Chip]] = {"ina219": Ina219Chip, "ina226": Ina226Chip}
 """By the name of the driver of each."""
 
 _TIMES_226 = (140e-6, 204e-6, 332e-6, 588e-6, 1.1e-3, 2.116e-3, 4.156e-3, 8.244e-3)

@@ -20,17 +20,17 @@ from fishd.core.signals import Observation
 FREE = Limits(LIMITS.amplitude, LIMITS.tick, dwell=0.0)
 
 
-def remembering(ticks: int, *features: tuple[FeatureName, float], relative: bool = False) -> Card:
-    return replace(card(*features), history=ticks, relative=relative)
+def remembering(ticks: int, *features: tuple[FeatureName, float]) -> Card:
+    return replace(card(*features), history=ticks)
 
 
 def seen(tick: int, angle: float = 0.0, fy: float = 0.0) -> Observation:
     return replace(observe(angle), time=100.0 + 0.05 * tick, fy=fy)
 
 
-def history(ticks: int, relative: bool = False) -> History:
+def history(ticks: int) -> History:
     features = (Feature("fy", 0.1), Feature("instruction_angle", 0.42))
-    return History(features, Window(ticks, 0.05 * ticks, relative))
+    return History(features, Window(ticks, 0.05 * ticks))
 
 
 def test_a_network_sees_the_latest_ticks_newest_first(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_in_the_loop_it_swims_as_its_network_answers_to_the_ticks(tmp_path: Path
 
 def test_a_policy_outside_of_the_loop_answers_alike(tmp_path: Path) -> None:
     features: tuple[tuple[FeatureName, float], ...] = (("fy", 0.02), ("instruction_angle", 0.42))
-    content = to_onnx(random_layers(8, 16, 1), "tanh", remembering(4, *features, relative=True))
+    content = to_onnx(random_layers(8, 16, 1), "tanh", remembering(4, *features))
     path = write(tmp_path, content)
     controller, pilot = registry.create("ppo", {"policy": str(path)}, FREE), Pilot(str(path), FREE)
     random = np.random.default_rng(0)
@@ -99,23 +99,6 @@ def test_a_tick_that_comes_again_is_the_same_one_and_after_a_gap_the_history_beg
     assert latest.row[1::2].tolist() == pytest.approx([-1.0] * 3)
     latest.push(seen(6, 0.21))  # another fish
     assert latest.row[1::2].tolist() == pytest.approx([0.5] * 3)
-
-
-def test_relative_forces_are_those_of_any_strength_and_angles_stay_as_they_are() -> None:
-    weak, strong = history(4, relative=True), history(4, relative=True)
-    for tick, force in enumerate((0.01, 0.03, -0.02, 0.05)):
-        weak.push(seen(tick, 0.21, force))
-        strong.push(seen(tick, 0.21, 20.0 * force))
-    assert weak.row.tolist() == pytest.approx(strong.row.tolist(), rel=1e-6)
-    assert np.sqrt(np.mean(weak.row[::2] ** 2)) == pytest.approx(1.0)
-    assert weak.row[1::2].tolist() == pytest.approx([0.5] * 4)
-
-
-def test_relative_noise_of_a_fish_at_rest_stays_small() -> None:
-    resting = history(4, relative=True)
-    for tick in range(8):
-        resting.push(seen(tick, 0.0, 1e-4 * (-1.0) ** tick))
-    assert np.abs(resting.row).max() == pytest.approx(0.05)
 
 
 def test_a_network_of_another_size_than_its_card_says_is_refused() -> None:

@@ -86,6 +86,7 @@ BOMBS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", BOMBS.values(), ids=BOMBS)
 def test_millions_of_short_messages_are_refused_before_protobuf_sees_them(content: bytes) -> None:
     with pytest.raises(PolicyError, match="256 kB of it are not raw weights"):

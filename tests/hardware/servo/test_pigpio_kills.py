@@ -125,6 +125,7 @@ def die_at(
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deed", DEEDS)
 def test_a_kill_between_any_two_commands_leaves_no_pulses(
     deed: Callable[[Bench], None], mortal: Callable[[int | None], None]

@@ -108,6 +108,7 @@ def test_a_trace_of_quadratic_drag_hardly_changes_the_best_square_wave() -> None
     assert best.fin_amplitude == pytest.approx(without.fin_amplitude, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_no_frequency_beats_the_best_square_wave_with_quadratic_drag() -> None:
     p = PlantParameters(quadratic_drag=2.0, backlash=0.05)
     best = best_square_wave(p, 0.42)
@@ -168,6 +169,7 @@ def swing_thrust(p: PlantParameters, amplitude: float, threshold: float) -> floa
     return sum(impulse for _, impulse in settled) / sum(duration for duration, _ in settled)
 
 
+@pytest.mark.slow
 def test_swinging_control_has_the_reference_efficiency_at_every_threshold(
     reference: Callable[[str], list[dict[str, str]]],
 ) -> None:

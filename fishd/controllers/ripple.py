@@ -1,0 +1,53 @@
+"""The ripple of F_x: how much of it comes twice, four and six times a beat."""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+SPIKE = 6.0
+"""A force is a spike if it is so many times further from what is usual than half of the others."""
+
+
+def ripples(halves: list[list[tuple[float, float]]]) -> list[float]:
+    """Mean squares of the ripple in each two half beats that follow one another [N²].
+
+    halves: F_x and F_y of each tick, from reversal to reversal [N]; two of them or more
+    """
+    cleaned = _without_spikes(_without_lateral_force(halves))
+    return [_square(np.concatenate(beat)) for beat in pairwise(cleaned)]
+
+
+def _without_lateral_force(halves: list[list[tuple[float, float]]]) -> list[NDArray[np.float64]]:
+    """F_x without what a turned sensor mixes in of F_y: the slope of the one on the other [N]."""
+    fx, fy = np.array([forces for half in halves for forces in half]).T
+    level = fy - fy.mean()
+    spread = level @ level
+    if spread:
+        fx = fx - fy * (level @ fx) / spread
+    return np.split(fx, np.cumsum([len(half) for half in halves])[:-1])
+
+
+def _without_spikes(halves: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """With what is usual so long after a reversal, where a force is far from that [N]."""
+    lengths = np.array([len(half) for half in halves])
+    table = np.full((len(halves), lengths.max()), np.nan)  # a row for each half beat
+    there = np.arange(lengths.max()) < lengths[:, None]
+    table[there] = np.concatenate(halves)
+    # Medians of columns that differ in length; `sort` puts what is not there last.
+    inner = (there.sum(axis=0) - 1) / 2
+    ordered, columns = np.sort(table, axis=0), np.arange(lengths.max())
+    low, high = np.floor(inner).astype(int), np.ceil(inner).astype(int)
+    usual = 0.5 * (ordered[low, columns] + ordered[high, columns])
+    distance = np.abs(table - usual)
+    limit = SPIKE * np.median(distance[there])
+    cleaned = np.where(distance > limit, usual, table)
+    return [row[:length] for row, length in zip(cleaned, lengths, strict=True)]
+
+
+def _square(beat: NDArray[np.float64]) -> float:
+    """Mean square of what comes twice a beat, four times and six times [N²]."""
+    twice = np.abs(np.fft.rfft(beat)[2:7:2] / len(beat)) ** 2
+    if len(beat) in (4, 8, 12):
+        twice[-1] *= 0.5  # of the highest frequency there is one term only
+    return 2.0 * float(twice.sum())

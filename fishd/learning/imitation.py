@@ -1,0 +1,156 @@
+"""Learning from the best square wave of each fish, before PPO begins or in its place.
+
+Of a simulated fish it is known how many ticks its best half beat has. So the learner swims many
+fish, each tick is labelled with the side that would be right there, and the network is fitted to
+the labels of all rounds so far (DAgger: Ross, Gordon and Bagnell 2011). It is not told which fish
+swims: what it can see of that is in its history. Many fish look nearly alike and want different
+beats, so it matters which are common: some are drawn from a random share of the randomisation, and
+so fish like the configured one are.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from msgspec.structs import replace
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch.nn.functional import softplus
+
+from fishd.config import Config
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.simulated_link import SimulatedLink, drawn
+from fishd.learning.ppo import DeterministicPolicy
+from fishd.learning.settings import ImitationSettings, Randomisation, TrainingSettings
+from fishd.virtual.plant.optimum import square_wave
+
+LONGEST_HALF = 1.2
+"""Half beats up to this long are compared [s]."""
+AT_RANDOM = 3
+"""At most one in so many ticks of a fish is swum by a wave of any frequency, at its beginning."""
+NEARER = 0.3
+"""So many of the fish are from a part of the randomisation, the others from anywhere in it."""
+LEAST_WEIGHT = 0.02
+"""What a tick counts in which both sides are as good, in shares of the best thrust."""
+
+
+class Labelled(NamedTuple):
+    """Ticks, and what is right in each."""
+
+    seen: NDArray[np.float32]
+    """What the network is given, shape (ticks, inputs)."""
+    sides: NDArray[np.float32]
+    """1 or -1, shape (ticks,)."""
+    weights: NDArray[np.float32]
+    """What it would cost to choose the other side, shape (ticks,)."""
+
+
+def narrowed(spread: Randomisation, share: float) -> Randomisation:
+    """A randomisation of which each range is so much narrower; share: 0 to 1."""
+    names = [name for name in Randomisation.__struct_fields__ if name != "fish"]
+    return replace(spread, **{name: share * getattr(spread, name) for name in names})
+
+
+def half_beats(config: Config) -> NDArray[np.float64]:
+    """Thrust of square waves by the ticks of half a beat, over the best of them; of 0 ticks, 0."""
+    plant, tick = config.plant, config.tick
+    ticks = range(1, math.ceil(LONGEST_HALF / tick) + 1)
+    thrusts = [square_wave(plant, config.amplitude_limit, 0.5 / (n * tick)).thrust for n in ticks]
+    return np.array([0.0, *thrusts]) / max(thrusts)
+
+
+class Imitation:
+    """Fits a policy to what is best for many simulated fish."""
+
+    def __init__(
+        self, config: Config, settings: TrainingSettings, policy: ActorCriticPolicy
+    ) -> None:
+        """policy: learns in place
+
+        Raises `ConfigError` as `SwimEnv` does.
+        """
+        self._config = config
+        self._settings: ImitationSettings = settings.imitation
+        self._environment = replace(settings.seen, own_fish=False)
+        self._spread = settings.randomisation
+        self._policy = policy
+        self._draw = np.random.default_rng([settings.seed, 1])
+        self._rounds: list[Labelled] = []
+
+    def round(self, stop: Callable[[], bool] = lambda: False) -> float | None:
+        """Swim with other fish, and learn from them and from all before.
+
+        stop: called after each fish; True ends it
+
+        The share of right sides, weighted by what they matter; None where it was stopped.
+        """
+        fish = []
+        for _ in range(self._settings.fish):
+            if stop():
+                return None
+            fish.append(self._swum())
+        self._rounds.append(_joined(fish))
+        return self._fit(_joined(self._rounds))
+
+    def _swum(self) -> Labelled:
+        """One fish: at first with random half beats, then as the learner wants, if it has begun."""
+        config, draw, ticks = self._config, self._draw, self._settings.ticks
+        spread = narrowed(self._spread, min(1.0, float(draw.uniform()) / NEARER))
+        fish = drawn(config, spread, int(draw.integers(2**31)))
+        env = SwimEnv(SimulatedLink(fish), config, self._environment)
+        seen, _ = env.reset(seed=int(draw.integers(2**31)))
+        learner = DeterministicPolicy(self._policy, env.perception, env.link.amplitude)
+        efficiency = half_beats(fish)
+        at_random = int(draw.integers(ticks // AT_RANDOM + 1)) if self._rounds else ticks
+        longest = 2 * int(efficiency.argmax())
+        half = int(draw.integers(2, longest + 2))
+        rows, sides, weights = [], [], []
+        for tick in range(ticks):
+            side = math.copysign(1.0, env.latest.side_time)
+            elapsed = round(abs(env.latest.side_time) / config.tick)
+            right, weight = advice(efficiency, elapsed)
+            rows.append(seen)
+            sides.append(right * side)
+            weights.append(weight)
+            share = learner(env.latest) / config.amplitude_limit
+            if tick < at_random:
+                share = -side if elapsed >= half else side
+                half = half if elapsed < half else int(draw.integers(2, longest + 2))
+            seen = env.step(np.full(1, share, np.float32))[0]
+        return Labelled(np.array(rows), *np.array((sides, weights), np.float32))
+
+    def _fit(self, given: Labelled) -> float:
+        settings, policy = self._settings, self._policy
+        seen, sides, weights = (torch.from_numpy(each) for each in given)
+        weights = weights / weights.mean()
+        optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
+        batches = math.ceil(len(seen) / settings.batch_size)
+        rate = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs * batches)
+        for _ in range(settings.epochs):
+            for batch in torch.from_numpy(self._draw.permutation(len(seen))).chunk(batches):
+                actions = policy.get_distribution(seen[batch]).mode()[:, 0]
+                loss = (weights[batch] * softplus(-sides[batch] * actions)).mean()
+                optimiser.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                optimiser.step()
+                rate.step()
+        with torch.no_grad():
+            right = sides * policy.get_distribution(seen).mode()[:, 0] > 0.0
+        return float((weights * right).mean())
+
+
+def advice(efficiency: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
+    """1 to stay or -1 to reverse, and what it would cost to do the other.
+
+    efficiency: as of `half_beats`
+    elapsed: ticks since the last reversal
+    """
+    now = min(elapsed, len(efficiency) - 2)
+    cost = abs(float(efficiency[now] - efficiency[now + 1])) + LEAST_WEIGHT
+    return (-1.0 if now >= efficiency.argmax() else 1.0), cost
+
+
+def _joined(parts: list[Labelled]) -> Labelled:
+    return Labelled(*(np.concatenate(each) for each in zip(*parts, strict=True)))

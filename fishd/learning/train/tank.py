@@ -1,0 +1,101 @@
+"""Evaluations in the tank: short swims of the newest policy and of those that may still be best."""
+
+import copy
+from collections.abc import Callable
+
+from stable_baselines3 import PPO
+
+from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.env.swims import Stopped, Swims
+from fishd.learning.ppo import DeterministicPolicy
+from fishd.learning.train.candidates import Candidate, Candidates
+
+
+class TankEvaluations:
+    """Finds out which policy of a training swims best, a few swims at a time."""
+
+    def __init__(
+        self, model: PPO, env: SwimEnv, former: Candidate | None, stop: Callable[[], bool]
+    ) -> None:
+        """
+        former: the best of a training that is resumed
+        stop: called before each tick; True ends an evaluation there
+        """
+        self._model, self._env, self._stop = model, env, stop
+        self._candidates = Candidates(env.best_thrust)
+        if former:
+            self._candidates.add(former)
+        self.best = former
+        """Of the policies that swim, as was known after the latest evaluation."""
+        self._swum: list[Candidate] = []
+
+    def add(self, steps: int, rollouts: int) -> None:
+        """The model as it is now may be the best; steps, rollouts: that it has learned from"""
+        self._candidates.add(
+            Candidate(
+                steps=steps,
+                updates=self._model._n_updates,
+                rollouts=rollouts,
+                parameters=copy.deepcopy(self._model.get_parameters()),
+            )
+        )
+
+    def swim(self, seconds: float) -> None:
+        """Let candidates swim until it is clear which is the best, the newest one first.
+
+        seconds: how long this may take; one swim is made in any case
+
+        The fish is in a pause before and afterwards. Raises `LinkLost`; what was measured until
+        then is kept.
+        """
+        policy, self._swum = self._model.policy, []
+        own = copy.deepcopy(policy.state_dict())
+        self._env.resume()
+        swims = Swims(self._env, self._stop)
+        try:
+            while (one := self._candidates.next()) and (not self._swum or swims.fits(seconds)):
+                policy.load_state_dict(one.parameters["policy"])
+                found = swims.swim(self._policy())
+                self._swum.append(one)
+                self._candidates.count(one, found)
+        except Stopped:
+            pass
+        finally:
+            policy.load_state_dict(own)
+        self._env.pause()
+
+    def results(self, steps: int) -> list[Evaluation]:
+        """What is known now of each policy that swam in the latest evaluation.
+
+        Of the best, too, where that is another than before.
+        steps: that the training has learned from
+        """
+        best = self._candidates.best
+        told = {one.steps: one for one in self._swum if one.stalled or one.swims}
+        if best and best is not self.best:
+            told[best.steps] = best
+        rows = [self._row(one, steps, one is best) for one in told.values()]
+        self.best = best or self.best
+        self._candidates.weed()
+        return rows
+
+    def _policy(self) -> DeterministicPolicy:
+        env = self._env
+        return DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
+
+    def _row(self, one: Candidate, steps: int, best: bool) -> Evaluation:
+        thrust = 0.0 if one.stalled else one.thrust
+        return Evaluation(
+            steps=steps,
+            policy=one.steps,
+            tank_time=self._env.tank_time,
+            swam=one.swam,
+            thrust=thrust,
+            error=None if one.stalled else self._candidates.error(one),
+            efficiency=thrust / self._env.best_thrust,
+            frequency=one.frequency,
+            fullness=one.fullness,
+            stalled=one.stalled,
+            best=best,
+        )

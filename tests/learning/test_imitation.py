@@ -1,0 +1,127 @@
+"""Learning from the best square waves of many fish, before PPO or in its place."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from rigs.swimming import brief_job, rows
+
+from fishd.config import load
+from fishd.controllers.policy.file import read
+from fishd.core.errors import ConfigError
+from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.export import export
+from fishd.learning.imitation import advice, half_beats
+from fishd.learning.run_folder import checkpoints
+from fishd.learning.settings import (
+    EnvironmentSettings,
+    ImitationSettings,
+    Randomisation,
+    TrainingSettings,
+    check,
+)
+from fishd.learning.train.progress import LineDisplay
+from fishd.learning.train.training import train
+from fishd.virtual.plant.optimum import best_square_wave
+
+SEEING = EnvironmentSettings(
+    observation=("fy", "instruction_angle", "fin_velocity", "side_time"), history=4
+)
+SHORT = ImitationSettings(rounds=2, fish=20, ticks=60, batch_size=128)
+CHANGES = {
+    "steps": 0,
+    "environment": SEEING,
+    "randomisation": Randomisation(omega0=0.3),
+    "imitation": SHORT,
+}
+
+
+def test_half_beats_are_compared_by_their_thrust() -> None:
+    config = load(None, ["tick=0.02"])
+    efficiency = half_beats(config)
+    best = best_square_wave(config.plant, config.amplitude_limit)
+    assert efficiency[0] == 0.0
+    assert efficiency.max() == 1.0
+    assert efficiency.argmax() == round(0.5 / best.frequency / 0.02)
+
+
+def test_it_is_right_to_stay_until_the_best_half_beat_is_over() -> None:
+    efficiency = np.array([0.0, 0.5, 1.0, 0.9, 0.3])
+    sides, costs = zip(*(advice(efficiency, elapsed) for elapsed in range(6)), strict=True)
+    assert sides == (1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
+    assert costs == pytest.approx((0.52, 0.52, 0.12, 0.62, 0.62, 0.62))
+
+
+def test_a_policy_that_only_imitated_swims_and_says_how_it_learned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outcome = train(brief_job(tmp_path / "run", **CHANGES), LineDisplay())
+    assert outcome.ended == "finished"
+    assert outcome.steps == 0
+    assert outcome.best_evaluation
+    assert outcome.best_evaluation.efficiency > 0.9
+    assert "imitation 2 of 2: 9" in capsys.readouterr().out
+    assert outcome.best
+    past = read(export(outcome.best, tmp_path / "policy.onnx").path).card.provenance
+    assert past.algorithm == "imitation"
+    assert past.settings["imitation"]["fish"] == 20
+
+
+def test_ppo_goes_on_with_what_was_imitated(tmp_path: Path) -> None:
+    job = brief_job(tmp_path / "run", **{**CHANGES, "steps": 64})
+    train(job)
+    first, *_ = rows(tmp_path / "run" / "evaluations.csv")
+    assert (first["steps"], first["stalled"]) == ("0", "0")
+    assert checkpoints.read_card(tmp_path / "run" / "step-000064").provenance.algorithm == (
+        "imitation and PPO"
+    )
+
+
+def test_a_training_that_was_stopped_meanwhile_imitates_anew(tmp_path: Path) -> None:
+    job = brief_job(tmp_path / "run", **CHANGES)
+    asked = iter([False] * 30 + [True] * 99)
+    assert train(job, stop=lambda: next(asked)).ended == "interrupted"
+    assert not checkpoints.read_state(tmp_path / "run" / "step-000000").imitated
+    resumed = train(replace(job, resume=True))
+    assert resumed.best_evaluation
+    assert not resumed.best_evaluation.stalled
+    with pytest.raises(ConfigError, match="is finished, with 0 steps"):
+        train(replace(job, resume=True))
+
+
+def test_who_begins_with_another_run_does_not_imitate_again(tmp_path: Path) -> None:
+    parent = train(brief_job(tmp_path / "first", **CHANGES)).best
+    found: list[Evaluation] = []
+    display = LineDisplay()
+    display.evaluated = found.append  # type: ignore[method-assign]
+    outcome = train(
+        brief_job(tmp_path / "second", **{**CHANGES, "steps": 64}, parent=parent), display
+    )
+    assert [one.steps for one in found] == [64]
+    assert outcome.checkpoint
+    assert checkpoints.read_state(outcome.checkpoint).imitated
+
+
+def test_the_best_beat_of_a_robot_is_not_known(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"imitation\.rounds: the best beat of a robot's fish"):
+        train(brief_job(tmp_path / "run", **CHANGES, on="robot"))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps: 0 is not valid without imitation.rounds"),
+        (
+            {"see": "both", "imitation": SHORT},
+            "imitation.rounds: 2 is not valid with see: both; imitation is for policies that see "
+            "forces only",
+        ),
+    ],
+)
+def test_what_cannot_be_is_one_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        check(TrainingSettings(**changes))

@@ -1,0 +1,205 @@
+"""How long a training on a robot takes in the tank, its evaluations included, for `learning tank`.
+
+The fish is a simulated one, in virtual time, where the link to a fishd would be.
+"""
+
+import math
+import statistics
+import tempfile
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import joblib
+import torch
+from msgspec.structs import replace
+
+from bench.trainings import CONFIG, rig, settings_of
+from common.report import progress, spread, table
+from fishd.camera.frames import Stack
+from fishd.config import Config, load
+from fishd.controllers.dwell import DwellLimit
+from fishd.core.errors import ParameterError
+from fishd.core.signals import Observation
+from fishd.lab.measurement import Sample, evaluate, plan
+from fishd.learning.env.evaluation import Evaluation, beat_frequency, is_stalled, judge
+from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.ppo import DeterministicPolicy
+from fishd.learning.run_folder.tables import read_evaluations
+from fishd.learning.train.jobs import Job
+from fishd.learning.train.progress import Display
+from fishd.learning.train.training import Training
+
+SEEDS = range(240, 250)
+"""No setting was chosen with these."""
+STEPS = 2048
+ENOUGH = 0.97
+AFTER = (60.0, 120.0, 180.0, 300.0)
+"""Tank times that are compared [s]."""
+BEFORE = 30.0
+"""How long an evaluation of one policy took, before policies were compared [s]."""
+
+
+class Run(NamedTuple):
+    """One training."""
+
+    bests: list[tuple[float, float]]
+    """Tank time [s], and true efficiency of the policy that was called the best from then on."""
+    highest: float
+    """True efficiency of the best candidate of all."""
+    tank_time: float
+    """[s]"""
+
+    def at(self, seconds: float) -> float:
+        """Efficiency of what was called the best at that tank time; 0 before the first."""
+        return next((share for time, share in reversed(self.bests) if time <= seconds), 0.0)
+
+    @property
+    def reached(self) -> float:
+        """When what was called the best had `ENOUGH` for the first time [s]."""
+        return next((time for time, share in self.bests if share >= ENOUGH), math.inf)
+
+
+class Comparing(Training):
+    """A training as it is, in which the true efficiency of each candidate is noted."""
+
+    truth: dict[int, float]
+
+    def _policy(self) -> DeterministicPolicy:
+        env = self._env
+        return DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
+
+    def _evaluate(self) -> None:
+        self.truth[self._recorder.steps] = true_efficiency(self._job.config, self._policy())
+        super()._evaluate()
+
+
+class OneByOne(Comparing):
+    """The rule before: each policy is measured once, for `BEFORE`, and the highest is the best."""
+
+    def _evaluate(self) -> None:
+        env, decide, steps = self._env, self._policy(), self._recorder.steps
+        self.truth[steps] = true_efficiency(self._job.config, decide)
+        env.resume()
+        tick, samples = env.link.tick, []
+        for swims, seconds in plan(BEFORE, {}):
+            for _ in range(round(seconds / tick)):
+                seen = env.latest
+                angle = decide(seen) if swims else 0.0
+                seq = round(seen.time / tick)
+                samples.append(Sample(seq, seen.fx, seen.fin_velocity, angle, swims))
+                env.swim(angle)
+        env.pause()
+        shares = torch.tensor([each.phi_c for each in samples if each.swims]).numpy()
+        shares /= env.link.amplitude
+        frequency, fullness = beat_frequency(shares, tick), float(abs(shares).mean())
+        try:
+            found = evaluate(samples, tick)
+        except ParameterError:
+            return
+        row = Evaluation(
+            steps=steps,
+            policy=steps,
+            tank_time=env.tank_time,
+            thrust=found.thrust,
+            error=found.error,
+            efficiency=found.thrust / env.best_thrust,
+            frequency=frequency,
+            fullness=fullness,
+            stalled=is_stalled(frequency, fullness, tick),
+        )
+        self._recorder.add(row)
+
+
+def true_efficiency(config: Config, decide: DeterministicPolicy) -> float:
+    """Without noise and drift, as `ppo` swims; 0 where another controller took over."""
+    quiet = replace(config.simulation, noise=0.0, drift=0.0)
+    limits = config.limits
+    limit = DwellLimit(limits.dwell, limits, config.amplitude_limit)
+
+    def limited(seen: Observation, stack: Stack | None) -> float:
+        return limit.apply(decide(seen, stack), seen.dt)
+
+    report = judge(replace(config, simulation=quiet), limited, 30.0, 10.0)
+    return 0.0 if report.fallback else report.efficiency
+
+
+def trained(config: Config, seed: int, kind: type[Comparing]) -> Run:
+    """Train once; in a process of its own."""
+    torch.set_num_threads(1)
+    config = replace(config, simulation=replace(config.simulation, seed=seed))
+    settings = replace(settings_of(None, STEPS), seed=seed)
+    with tempfile.TemporaryDirectory() as temporary:
+        job = Job(config=config, settings=settings, folder=Path(temporary) / "run", on="robot")
+        training = kind(job, SimulatedLink(config), Display(), lambda: False)
+        training.truth = {}
+        outcome = training.run()
+        rows = [row for row in read_evaluations(job.folder) if row.best]
+    bests = [(row.tank_time, training.truth[row.policy]) for row in rows]
+    return Run(bests, max(training.truth.values()), outcome.tank_time)
+
+
+def tank(options: Namespace) -> str:
+    """Tank time until what a training calls its best is good, and how good it is."""
+    rigs = {
+        "Φ = 0.42 rad": rig(),
+        "`config/simulated.yaml`": load(CONFIG / "simulated.yaml"),
+        "Φ = 0.2 rad": rig(0.2),
+    }
+    rules = {"the bandit": Comparing, f"each once, for {BEFORE:g} s": OneByOne}
+    seeds = SEEDS[: options.seeds]
+    found = _all(rigs, rules, seeds, options.jobs)
+    lines = []
+    for (fish, rule), runs in found.items():
+        short = [run.highest - run.at(math.inf) for run in runs]
+        lines.append(
+            [
+                fish,
+                rule,
+                _seconds([run.reached for run in runs]),
+                *(spread([run.at(seconds) for run in runs]) for seconds in AFTER),
+                spread([run.at(math.inf) for run in runs]),
+                spread(short),
+                f"{statistics.median(run.tank_time for run in runs):.0f}",
+            ]
+        )
+    heads = " | ".join(
+        (
+            "fish | the best is chosen by | tank time to 97 % (s)",
+            *(f"after {seconds / 60:g} min" for seconds in AFTER),
+            f"after {STEPS} steps | below the best candidate | which took, in the tank (s)",
+        )
+    )
+    return (
+        "True efficiency in % of the policy that the training calls its best, median [lowest – "
+        f"highest] of {len(seeds)} seeds:\n\n{table(heads, lines)}"
+    )
+
+
+def _all(
+    rigs: Mapping[str, Config],
+    rules: Mapping[str, type[Comparing]],
+    seeds: Sequence[int],
+    jobs: int,
+) -> dict[tuple[str, str], list[Run]]:
+    rows = [(fish, rule) for fish in rigs for rule in rules]
+    tasks = [(row, seed) for row in rows for seed in seeds]
+    found: dict[tuple[str, str], list[Run]] = {row: [] for row in rows}
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator")
+        work = parallel(
+            joblib.delayed(trained)(rigs[fish], seed, rules[rule]) for (fish, rule), seed in tasks
+        )
+        for (row, seed), run in zip(tasks, work, strict=True):
+            found[row].append(run)
+            progress(*row, f"seed {seed}", f"{run.reached:.0f} s", f"{run.at(math.inf):.1%}")
+    return found
+
+
+def _seconds(values: Sequence[float]) -> str:
+    """As `spread`, where some may never have come so far."""
+    if math.isinf(max(values)):
+        middle, low = statistics.median(values), min(values)
+        return f"{middle:.0f} [{low:.0f} – never]".replace("inf", "never")
+    return spread(values, 1.0, 0)
