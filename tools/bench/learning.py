@@ -37,7 +37,7 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 DOCUMENT = "learning.md"
 FIGURE = DOCS / "learning-curves.png"
-MILESTONES = (1000, 2000, 3000, 5000, 8000, 20_000)
+MILESTONES = (500, 1000, 2000, 5000, 8000, 20_000)
 """Control steps."""
 ENOUGH, AT_END = 0.97, 0.99
 SECONDS, SETTLE = 60.0, 10.0
