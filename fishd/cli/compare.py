@@ -152,13 +152,16 @@ def _in_simulation(
 ) -> _Outcome:
     from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
-    from fishd.lab.compare.contestants import parse, refusal
+    from fishd.lab.compare.contestants import is_missing, parse, refusal
 
     config, seen = load(file, overrides), cameras.simulated(camera)
     check_tethered(config.robot, "compare")
     chosen = [parse(text) for text in texts] or _all(config)
     _check_seen(camera, chosen)
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
+    for one, why in left_out:
+        if is_missing(one):  # a misspelt path, and no policy for another fish
+            raise why
     able = [one for one in chosen if one not in (out for out, _ in left_out)]
     swum = able or chosen
     with showing(len(swum) * runs * seconds, "s swum") as bar:

@@ -271,7 +271,8 @@ def _interval(kind: inspect.Type) -> str:
     if isinstance(kind, inspect.LiteralType):
         return " | ".join(str(value) for value in kind.values)
     if isinstance(kind, inspect.VarTupleType):
-        return _interval(kind.item_type)
+        whole = "whole numbers in " if isinstance(kind.item_type, inspect.IntType) else ""
+        return whole + _interval(kind.item_type)
     if not isinstance(kind, inspect.FloatType | inspect.IntType):
         return ""
     low = f"({kind.gt:g}" if kind.gt is not None else f"[{kind.ge:g}" if kind.ge is not None else ""
@@ -310,7 +311,8 @@ def _explain(
     return Problem(
         path,
         f"{shown(value)} is not valid: {wanted(_describe(field))} is needed"
-        + _degrees(value, field),
+        + _degrees(value, field)
+        + _entries(value, field),
     )
 
 
@@ -340,6 +342,18 @@ def _degrees(value: Any, field: inspect.Field) -> str:
     above = angle >= kind.ge if kind.ge is not None else kind.gt is None or angle > kind.gt
     below = angle <= kind.le if kind.le is not None else kind.lt is None or angle < kind.lt
     return f" (degrees? that is {angle:.3g} rad)" if above and below else ""
+
+
+def _entries(value: Any, field: inspect.Field) -> str:
+    """What to write instead of an entry that is in no list, or which entry is wrong."""
+    kind, _, _ = _unwrapped(field.type)
+    if not isinstance(kind, inspect.VarTupleType):
+        return ""
+    if isinstance(value, str | int | float):
+        return f": write [{text.quoted(str(value))}]"
+    words = kind.item_type.values if isinstance(kind.item_type, inspect.LiteralType) else ()
+    wrong = [shown(entry) for entry in value or () if words and entry not in words]
+    return f"; {wrong[0]} is none of them" if wrong else ""
 
 
 def _field_at(target: type[Struct], path: tuple[str, ...]) -> inspect.Field:

@@ -322,6 +322,12 @@ def _check(settings: TrainingSettings) -> None:
             f"{settings.imitation.rounds} is not valid with see: {settings.see}; imitation is for "
             "policies that see forces only: 0 is needed",
         )
+    if evaluation.others and settings.randomisation == Randomisation():
+        raise Problem(
+            ("evaluation", "others"),
+            f"{evaluation.others} is not valid without a randomisation: they would all be the "
+            "configured fish; 0 is needed",
+        )
     if ppo.n_steps % ppo.batch_size:
         raise Problem(
             ("ppo", "batch_size"),

@@ -42,6 +42,12 @@ def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
     assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
 
 
+def test_a_misspelt_path_of_a_policy_is_told_before_anything_swims() -> None:
+    done = run("swing", "runs/frist.onnx", "--seconds", "15", "--settle", "5")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "fishctl: ppo: policy: runs/frist.onnx: no such file\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message", "status"),
     [

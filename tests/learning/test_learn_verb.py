@@ -99,7 +99,7 @@ def test_mistakes_are_one_line(tmp_path: Path, settings: str) -> None:
     assert "is finished, with 128 steps; to train it for longer, give a larger total" in line
     status, line = complaint("ppo", "--resume", folder, "--seed", "2")
     assert status == 2
-    assert "--seed cannot be given here" in line
+    assert "--seed cannot be given with --resume" in line
     status, line = complaint("ppo", "--resume", str(tmp_path))
     assert status == 78
     assert "it holds no settings.yaml" not in line  # there is one, but nothing else of a run
@@ -269,8 +269,11 @@ def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
         press,
         *("learn", *on, *ENDLESS, "--settings", hasty, "--folder", str(folder)),
     )
-    why = "fishctl: fishd is in mode estop: the tail hit the glass; "
-    go_on = f"to go on: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
+    why = (
+        "fishctl: fishd is in mode estop: the tail hit the glass; when that is mended, leave it "
+        "with 'fishctl clear-fault'"
+    )
+    go_on = f"; to go on: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
     assert (found.returncode, found.stderr) == (1, why + go_on)
     assert checkpoints.read_state(checkpoints.newest(folder)).steps >= 16
     found = learn(*on, "--folder", str(tmp_path / "other"))

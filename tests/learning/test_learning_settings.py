@@ -47,7 +47,10 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         ("ppo:\n  nsteps: 64\n", "did you mean 'n_steps'"),
         ("randomization:\n  xi: 0.1\n", "learning.yaml:1: randomization"),
         ("environment:\n  observation: [alpha]\n", "learning.yaml:2: environment.observation"),
-        ("environment:\n  observation: [fy, alpha]\n", "instruction_angle"),
+        (
+            "environment:\n  observation: [fy, alpha]\n",
+            " | previous_angle | side_time is needed; 'alpha' is none of them",
+        ),
         (
             "environment:\n  observation: [fy, fy]\n",
             "learning.yaml:2: environment.observation: ['fy', 'fy'] is not valid: each may be in "
@@ -59,6 +62,15 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
             "it",
         ),
         ("ppo:\n  hidden: []\n", "learning.yaml:2: ppo.hidden: [] is not valid: "),
+        (
+            "ppo:\n  hidden: 64\n",
+            "ppo.hidden: 64 is not valid: a list of whole numbers in [1, 1024] is needed: write "
+            "[64]",
+        ),
+        (
+            "evaluation:\n  others: 3\n",
+            "evaluation.others: 3 is not valid without a randomisation",
+        ),
         (
             "evaluation:\n  on_robot: 5.0\n",
             "learning.yaml:2: evaluation.on_robot: 5.0 is not valid: a number in [8, 3600] s is "

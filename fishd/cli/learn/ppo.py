@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 IMPLAUSIBLE = 1.03
 """Efficiencies surely above this are an error of measurement: the best square wave is optimal."""
+AS_IT_BEGAN = "with --resume, which goes on as the run began"
 
 
 @click.command()
@@ -121,16 +122,18 @@ def ppo(
     own |= {"--see": see, "--seed": seed}
     new = {"--folder": folder, "--from": parent}
     if resume:
-        _refuse("goes on as the run began", {**own, **new, "--seeds": seeds})
+        _refuse(AS_IT_BEGAN, {**own, **new, "--seeds": seeds})
     if seeds is None:
-        _refuse("is for several trainings, of --seeds", {"--jobs": jobs, "--cluster": cluster})
+        _refuse("without --seeds", {"--jobs": jobs, "--cluster": cluster})
     elif on == "robot":
         raise click.UsageError("--seeds is for simulated fish: there is only one robot")
     job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
-        _refuse("swims in this process, and no fishd has to reach it", {"--agent": agent})
+        _refuse(
+            "here: this swims in this process, and no fishd has to reach it", {"--agent": agent}
+        )
         if resume:
-            _refuse("goes on as the run began", {"--camera": camera})
+            _refuse(AS_IT_BEGAN, {"--camera": camera})
     given = {"steps": steps, "seed": seed, "see": see}
     changed = {name: value for name, value in given.items() if value is not None}
     job = _with_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
@@ -142,7 +145,7 @@ def ppo(
 def _refuse(why: str, options: dict[str, Any]) -> None:
     given = [name for name, value in options.items() if value not in (None, ())]
     if given:
-        raise click.UsageError(f"{given[0]} cannot be given here: this {why}")
+        raise click.UsageError(f"{given[0]} cannot be given {why}")
 
 
 def _job(
@@ -200,7 +203,7 @@ def _with_camera(job: "Job", camera: str | None) -> "Job":
 
     check(job.settings)
     if job.settings.see == "force":
-        _refuse("sees forces only; give --see camera, too", {"--camera": camera})
+        _refuse("here: this sees forces only; give --see camera, too", {"--camera": camera})
         return job
     if job.on == "robot":
         return replace(job, camera_endpoint=camera)

@@ -286,8 +286,9 @@ class Remote(Controller[RemoteParameters]):
     @property
     def _wrong(self) -> str:
         """What the agent sent instead of actions in time."""
-        foreign = f", {self._foreign} named another session" if self._foreign else ""
-        return f"{self._late} answers came too late{foreign}"
+        late = f"{self._late} answers came too late" if self._late else ""
+        foreign = f"{self._foreign} named another session" if self._foreign else ""
+        return ", ".join(filter(None, (late, foreign))) or "it has sent nothing since"
 
 
 def _silence(what: str) -> ControllerFault:

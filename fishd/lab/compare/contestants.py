@@ -43,7 +43,8 @@ def parse(text: str) -> Contestant:
         if not (names_file(text, library.SUFFIX) or text in library.names()):
             if run := library.of_run(Path(text)):
                 raise ParameterError(f"{text} {run}")
-            hint = nearest(name, [*registry.names(), *library.names()])
+            able = [known for known in registry.names() if known != "remote"]
+            hint = nearest(name, [*able, *library.names()])
             raise ParameterError(
                 f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"
             )
@@ -67,6 +68,14 @@ def absolute(contestant: Contestant) -> Contestant:
         return contestant
     found = {**contestant.parameters, "policy": str(Path(policy).expanduser().absolute())}
     return contestant._replace(parameters=found)
+
+
+def is_missing(contestant: Contestant) -> bool:
+    """Is it the path of a policy file that does not exist on this machine?"""
+    policy = contestant.parameters.get("policy")
+    if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
+        return False
+    return not Path(policy).expanduser().exists()
 
 
 def best_on_grid(config: Config) -> SteadyState:

@@ -14,7 +14,7 @@ from fishd.client.agent import Agent
 from fishd.config import Config
 from fishd.controllers.remote.messages import Observed
 from fishd.core.errors import FishError, NoDaemon, PolicyError, Refused
-from fishd.core.signals import Observation, Status
+from fishd.core.signals import Observation, Reason, Status
 from fishd.learning.env.link import LinkLost, StepResult
 
 PATIENCE = 10.0
@@ -77,11 +77,7 @@ class FishdLink:
         try:
             status = self._fish.status()
             if status.reason:
-                raise Refused(
-                    status.mode,
-                    f"fishd is in mode {status.mode}: {status.reason.message}; "
-                    "when that is mended, leave it with 'fishctl clear-fault'",
-                )
+                raise Refused(status.mode, _fault(status.mode, status.reason))
             if stack:
                 self._sight = LiveSight(camera, self._fish, stack)
                 self._sight.await_frames()
@@ -262,7 +258,7 @@ class FishdLink:
                 f"fishd was restarted: it is process {status.pid} now, and was {self._known.pid}"
             )
         if status.reason:
-            return LinkLost(f"fishd is in mode {status.mode}: {status.reason.message}")
+            return LinkLost(_fault(status.mode, status.reason))
         if self._is_ours(status):
             return LinkLost(
                 f"fishd at {self._fish.endpoint} has sent no observation to {self._agent.address} "
@@ -273,6 +269,13 @@ class FishdLink:
         if status.mode == "running":
             return LinkLost(f"another controller has taken command: {status.controller}")
         return LinkLost("fishd was told to stop")
+
+
+def _fault(mode: str, reason: Reason) -> str:
+    return (
+        f"fishd is in mode {mode}: {reason.message}; when that is mended, leave it with 'fishctl "
+        "clear-fault'"
+    )
 
 
 def _waits_for_an_agent(status: Status) -> bool:

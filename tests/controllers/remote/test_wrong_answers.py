@@ -88,10 +88,9 @@ def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: Scr
     with agent.answering(lambda seen: agent.action(0.3, session="0123")):
         assert {tick.phi_c for tick in rig.run(5)} == {0.0}
     assert rig.reason == "remote-silent"
-    said = re.search(r"5 ticks in a row \((\d) answers came too late, (\d) named", reason(rig))
+    said = re.search(r"row \((?:1 answers came too late, )?(\d) named another", reason(rig))
     assert said
-    assert int(said[1]) <= 1
-    assert int(said[2]) >= 4
+    assert int(said[1]) >= 4
 
 
 def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: ScriptedAgent) -> None:
