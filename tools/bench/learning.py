@@ -3,13 +3,15 @@
 Trainings are those of `fishctl learn ppo`, in a temporary folder. Efficiency is thrust over that of
 the best square wave of the same fish and amplitude.
 
-    efficiency   learning curves: several settings, ten seeds each; draws docs/learning-curves.png
+    efficiency   learning curves: several fish and settings; draws docs/learning-curves.png
+    choices      what each of the default settings is worth
     transfer     policies for one fish on sixteen others
     tank         tank time of trainings on a robot, evaluations included
     harsh        the policy that is shipped, and swing, on rigs that delay, play and react
     speed        environment and inference, on one core
 """
 
+import math
 import statistics
 import time
 from argparse import Namespace
@@ -22,7 +24,7 @@ from msgspec.structs import replace
 from bench.learning_curves import learning_curves
 from bench.policy import policy_file
 from bench.tank_time import tank
-from bench.trainings import Row, Trained, rig, settings_of, several
+from bench.trainings import CONFIG, UNTOUCHED, Row, Trained, rig, settings_of, several
 from common.report import DOCS, Options, Report, progress, spread, table
 from fishd.config import Config, load
 from fishd.controllers import registry
@@ -30,50 +32,50 @@ from fishd.lab.compare.contestants import best_on_grid, parse
 from fishd.lab.compare.survey import survey
 from fishd.lab.other_fish import CHANGES, harsh_fish
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import TrainingSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
 DOCUMENT = "learning.md"
 FIGURE = DOCS / "learning-curves.png"
-MILESTONES = (500, 1000, 2000, 5000, 8000, 20_000)
+MILESTONES = (500, 1000, 2000, 4000, 8000, 20_000)
 """Control steps."""
-ENOUGH, AT_END = 0.97, 0.99
+PAPER_STEPS, CHOICE_STEPS = 20_000, 3000
+CHOOSING = range(300, 310)
+"""Seeds that settings were compared with."""
+SIMULATED = "`config/simulated.yaml`"
+NEARLY, ENOUGH = 0.95, 0.97
+REACHED = f" | {NEARLY:.0%} | seeds | {ENOUGH:.0%} | seeds"
 SECONDS, SETTLE = 60.0, 10.0
 STALLED = 0.5
 """A policy of less efficiency than this counts as stalled."""
 
 
-def at(points: list[Evaluation], steps: int) -> int:
-    """The policy that has learned from that many steps, or the newest from fewer."""
-    return sum(point.steps <= steps for point in points) - 1
-
-
 def efficiency(options: Namespace) -> str:
-    """Learning curves of the settings that matter, and their figure."""
-    plain = settings_of(None, MILESTONES[-1])
+    """Learning curves of the default settings on several fish, and of two others; the figure."""
+    plain, paper = settings_of(None), settings_of("learning-paper.yaml", PAPER_STEPS)
     blind = replace(plain, ppo=replace(plain.ppo, symmetric=False))
     rows = {
         "Φ = 0.42 rad": Row(rig(), plain),
-        "Φ = 0.42 rad, without the mirror": Row(rig(), blind),
-        "Φ = 0.42 rad, as in the paper": Row(
-            rig(),
-            settings_of("learning-paper.yaml", MILESTONES[-1]),
-        ),
         "Φ = 0.2 rad": Row(rig(0.2), plain),
         "Φ = 0.8 rad": Row(rig(0.8), plain),
+        SIMULATED: Row(load(CONFIG / "simulated.yaml"), plain),
+        "`config/harsh.yaml`": Row(load(CONFIG / "harsh.yaml"), plain),
+        "Φ = 0.42 rad, without the mirror": Row(rig(), blind),
+        "Φ = 0.42 rad, as in the paper": Row(rig(), paper),
     }
-    found = several(rows, range(options.seeds), options.jobs)
+    found = several(rows, UNTOUCHED[: options.seeds], options.jobs)
     picture = {
         row: [([p.steps for p in one.points], [p.efficiency for p in one.points]) for one in runs]
         for row, runs in found.items()
+        if row != SIMULATED
     }
     if options.write:
         learning_curves(FIGURE, picture, ENOUGH)
     heads = " | ".join(["", *(f"{steps} steps" for steps in MILESTONES)])
-    learned, best, shape = [], [], []
+    reached, learned, best, shape = [], [], [], []
     for row, runs in found.items():
+        reached.append([row, *to_reach(runs, NEARLY), *to_reach(runs, ENOUGH)])
         learned.append([row, *curve_of(runs, lambda one, k: one.points[k].efficiency)])
         best.append([row, *curve_of(runs, lambda one, k: one.best[k])])
         config = rows[row].config
@@ -97,20 +99,71 @@ def efficiency(options: Namespace) -> str:
     )
     return "\n\n".join(
         (
-            f"Efficiency in %, median [lowest – highest] of {options.seeds} seeds, of the policy "
-            "as it stands after so many control steps:",
-            table(heads, learned),
-            "And of the best that a seed has had until then, which is what is exported:",
+            f"Steps until the best policy so far has that efficiency, median [lowest – highest] of "
+            f"{options.seeds} seeds:",
+            table(REACHED, reached),
+            "Efficiency in % of the best policy that a seed has had until then, which is what is "
+            "exported:",
             table(heads, best),
+            "And of the policy as it stands after so many control steps:",
+            table(heads, learned),
             "The commands that were learned:",
             table(shape_heads, shape),
         )
     )
 
 
+def choices(options: Namespace) -> str:
+    """What each of the default settings is worth, on two fish where it matters."""
+    plain = settings_of(None, CHOICE_STEPS)
+    ppo, seen = plain.ppo, plain.environment
+    others = tuple(name for name in seen.observation if name != "side_time")
+    variants = {
+        "default settings": plain,
+        "128 steps between updates": replace(
+            plain,
+            ppo=replace(ppo, n_steps=2 * ppo.n_steps),
+            evaluation=replace(plain.evaluation, every=plain.evaluation.every // 2),
+        ),
+        "ten passes over them": replace(plain, ppo=replace(ppo, n_epochs=10)),
+        "exploration of 2 Φ at first": replace(plain, ppo=replace(ppo, log_std_init=math.log(2))),
+        "`side_time` not seen": replace(plain, environment=replace(seen, observation=others)),
+        "F_x as it is (`clean_rewards: false`)": replace(
+            plain, ppo=replace(ppo, clean_rewards=False)
+        ),
+        "no shortest dwell": replace(plain, environment=replace(seen, dwell=False)),
+    }
+    fish = {"Φ = 0.2 rad": rig(0.2), "`harsh.yaml`": load(CONFIG / "harsh.yaml")}
+    rows = {
+        f"{one}, {name}": Row(config, chosen)
+        for name, chosen in variants.items()
+        for one, config in fish.items()
+    }
+    found = several(rows, CHOOSING[: options.seeds], options.jobs)
+    table_rows = [
+        [name, *(cell for one in fish for cell in to_reach(found[f"{one}, {name}"], NEARLY))]
+        for name in variants
+    ]
+    heads = " | ".join(["", *(f"{one}: steps to {NEARLY:.0%} | seeds" for one in fish)])
+    return table(heads, table_rows)
+
+
+def to_reach(runs: list[Trained], share: float) -> list[str]:
+    """The cells of a row: steps to that efficiency, and how many seeds reached it."""
+    steps = [one.steps_to(share) for one in runs]
+    reached = sum(map(math.isfinite, steps))
+    return [spread(steps, 1.0, 0).replace("inf", "never"), f"{reached} of {len(runs)}"]
+
+
 def curve_of(runs: list[Trained], figure: Callable[[Trained, int], float]) -> list[str]:
-    """The cells of a row: one for each milestone."""
-    return [spread([figure(one, at(one.points, steps)) for one in runs]) for steps in MILESTONES]
+    """The cells of a row: one for each milestone until the training's end."""
+    cells = []
+    for steps in MILESTONES:
+        known = [sum(point.steps <= steps for point in one.points) for one in runs]
+        over = steps > max(one.points[-1].steps for one in runs)
+        shares = [figure(one, count - 1) for one, count in zip(runs, known, strict=True) if count]
+        cells.append("" if over or not shares else spread(shares))
+    return cells
 
 
 def transfer(options: Namespace) -> str:
@@ -120,7 +173,7 @@ def transfer(options: Namespace) -> str:
         "`learning-transfer.yaml`, best": Row(rig(), several_fish),
         "default settings, best": Row(rig(), settings_of(None, 8000)),
     }
-    found = several(rows, range(options.seeds), options.jobs, others=True)
+    found = several(rows, UNTOUCHED[: options.seeds], options.jobs, others=True)
     lines = []
     for row, runs in found.items():
         for label, off in (
@@ -210,6 +263,7 @@ def inference(config: Config) -> str:
 
 PARTS = {
     "efficiency": efficiency,
+    "choices": choices,
     "transfer": transfer,
     "tank": tank,
     "harsh": harsh,

@@ -24,6 +24,8 @@ from fishd.learning.train.jobs import Job
 from fishd.learning.train.training import train
 
 CONFIG = DOCS.parent / "config"
+UNTOUCHED = range(240, 250)
+"""Seeds that no setting was chosen with."""
 OFF = 0.15
 """By this share each of four parameters of a fish is off, up or down."""
 
