@@ -46,7 +46,7 @@ CHOOSING = range(300, 310)
 """Seeds that settings were compared with."""
 SIMULATED = "`config/simulated.yaml`"
 NEARLY, ENOUGH = 0.95, 0.97
-REACHED = f" | {NEARLY:.0%} | seeds | {ENOUGH:.0%} | seeds"
+REACHED = f" | {100 * NEARLY:.0f} % | seeds | {100 * ENOUGH:.0f} % | seeds"
 SECONDS, SETTLE = 60.0, 10.0
 STALLED = 0.5
 """A policy of less efficiency than this counts as stalled."""
@@ -154,7 +154,7 @@ def choices(options: Namespace) -> str:
         for name in variants
     ]
     heads = " | ".join(
-        ["", *(f"{one}: steps to {share:.0%} | seeds" for one, (_, share) in fish.items())]
+        ["", *(f"{one}: steps to {100 * share:.0f} % | seeds" for one, (_, share) in fish.items())]
     )
     return table(heads, table_rows)
 
