@@ -4,7 +4,7 @@ import itertools
 import math
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +28,8 @@ UNTOUCHED = range(240, 250)
 """Seeds that no setting was chosen with."""
 OFF = 0.15
 """By this share each of four parameters of a fish is off, up or down."""
+SECONDS, SETTLE = 60.0, 10.0
+"""How long policies and controllers are judged on other fish, and not judged at first [s]."""
 
 
 class Row(NamedTuple):
@@ -47,8 +49,6 @@ class Trained(NamedTuple):
     """Efficiency of the best policy until each of them."""
     others: list[float]
     """Efficiencies of its best policy on fish that are off, if those were asked for."""
-    others_last: list[float]
-    """The same of its last policy."""
     cost: float
     """Seconds of the processor for 1000 steps, evaluations included."""
 
@@ -91,16 +91,22 @@ def trained(row: Row, seed: int, others: bool) -> Trained:
         points = read_evaluations(job.folder)
         so_far = best_so_far(points)
         if not others:
-            return Trained(points, so_far, [], [], cost)
+            return Trained(points, so_far, [], cost)
         assert outcome.best
-        assert outcome.checkpoint
-        best, last = (swum(path, row.config) for path in (outcome.best, outcome.checkpoint))
-        return Trained(points, so_far, best, last, cost)
+        return Trained(points, so_far, swum(outcome.best, row.config), cost)
 
 
 def swum(checkpoint: Path, config: Config) -> list[float]:
     """Efficiency of a policy on each fish that is off, over that fish's own best square wave."""
     found = []
+    for off in fish_that_are_off(config):
+        decide = DeterministicPolicy(*load_policy(checkpoint), config.amplitude_limit)
+        found.append(judge(off, decide, SECONDS, SETTLE).efficiency)
+    return found
+
+
+def fish_that_are_off(config: Config) -> Iterator[Config]:
+    """Sixteen: each of four parameters is off, up or down."""
     for signs in itertools.product((-1.0, 1.0), repeat=4):
         plant = config.plant
         values = (plant.omega0, plant.xi, plant.servo_speed, plant.coupling)
@@ -108,10 +114,7 @@ def swum(checkpoint: Path, config: Config) -> list[float]:
             value * (1.0 + OFF * sign) for value, sign in zip(values, signs, strict=True)
         )
         off = replace(plant, omega0=omega0, xi=xi, servo_speed=speed, coupling=coupling)
-        decide = DeterministicPolicy(*load_policy(checkpoint), config.amplitude_limit)
-        fish = replace(config, plant=off, simulation=replace(config.simulation, seed=1000))
-        found.append(judge(fish, decide, 60.0, 10.0).efficiency)
-    return found
+        yield replace(config, plant=off, simulation=replace(config.simulation, seed=1000))
 
 
 def several(
