@@ -87,7 +87,8 @@ def trained(row: Row, seed: int, others: bool) -> Trained:
         )
         begun = time.process_time()
         outcome = train(job)
-        cost = 1000.0 * (time.process_time() - begun) / outcome.steps
+        spent = time.process_time() - begun
+        cost = 1000.0 * spent / outcome.steps if outcome.steps else math.nan
         points = read_evaluations(job.folder)
         so_far = best_so_far(points)
         if not others:
