@@ -81,7 +81,9 @@ def efficiency(options: Namespace) -> str:
     }
     found = several(rows, UNTOUCHED[: options.seeds], options.jobs)
     picture = {
-        row: [([p.steps for p in one.points], [p.efficiency for p in one.points]) for one in runs]
+        row.replace("`", ""): [
+            ([p.steps for p in one.points], [p.efficiency for p in one.points]) for one in runs
+        ]
         for row, runs in found.items()
         if row != SIMULATED
     }
