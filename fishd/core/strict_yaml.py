@@ -40,6 +40,7 @@ _DEEPEST = 20
 _MOST = 2000
 """Values and keys in one document; an alias counts as all that it stands for."""
 _LONGEST_NUMBER = 100
+_LONGEST_INTEGER = 1e12
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
@@ -178,7 +179,9 @@ def _surprise(text: str, tag: str) -> str | None:
 
 
 def _dotted(text: str) -> str:
-    """The number with a dot and a signed exponent, as YAML 1.1 wants it."""
+    """As YAML 1.1 wants a number: whole ones in digits, else with a dot and a signed exponent."""
+    if float(text).is_integer() and abs(float(text)) < _LONGEST_INTEGER:
+        return f"{float(text):.0f}"
     mantissa, _, exponent = text.lower().partition("e")
     mantissa = mantissa if "." in mantissa else mantissa + ".0"
     return f"{mantissa}e{exponent if exponent[0] in '+-' else '+' + exponent}"

@@ -96,7 +96,7 @@ realtime:
 
 simulation:
   seed: 1e2
-=> fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 1.0e+2
+=> fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 100
 
 plant: 3
 => fish.yaml:1: plant: 3 is not valid: a section (a mapping of keys to values)

@@ -203,6 +203,16 @@ def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -
         checkpoints.find(tmp_path / name)
 
 
+def test_a_file_that_ppo_would_not_take_for_a_policy_is_not_written(
+    tmp_path: Path, trained: Outcome
+) -> None:
+    words = ["learn", "export", str(trained.best), "--to", str(tmp_path / "mine.pt")]
+    refused = CliRunner().invoke(fishctl, words)
+    assert isinstance(refused.exception, PolicyError)
+    assert str(refused.exception).endswith("the name of a policy file must end in .onnx")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_command_overwrites_a_file_only_when_it_is_forced_to(
     tmp_path: Path, trained: Outcome
 ) -> None:

@@ -108,6 +108,11 @@ def test_who_begins_with_another_run_does_not_imitate_again(tmp_path: Path) -> N
 def test_the_best_beat_of_a_robot_is_not_known(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"imitation\.rounds: the best beat of a robot's fish"):
         train(brief_job(tmp_path / "run", **CHANGES, on="robot"))
+    nothing = brief_job(
+        tmp_path / "run", **{**CHANGES, "steps": 0}, on="robot", parent=tmp_path / "step-64"
+    )
+    with pytest.raises(ConfigError, match="steps: 0 is not valid on a robot"):
+        train(nothing)
     assert not (tmp_path / "run").exists()
 
 

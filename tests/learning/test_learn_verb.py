@@ -103,6 +103,10 @@ def test_mistakes_are_one_line(tmp_path: Path, settings: str) -> None:
     status, line = complaint("ppo", "--resume", str(tmp_path))
     assert status == 78
     assert "it holds no settings.yaml" not in line  # there is one, but nothing else of a run
+    (tmp_path / "several" / "seed-0").mkdir(parents=True)
+    status, line = complaint("ppo", "--resume", str(tmp_path / "several"))
+    assert status == 1
+    assert "holds several trainings, seed-0 to seed-0; name one of them" in line
     for name, what in (("a.onnx", "a policy file has no value network"), ("b", "no such")):
         (tmp_path / "a.onnx").touch()
         status, line = complaint("ppo", "--from", str(tmp_path / name))

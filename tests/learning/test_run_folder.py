@@ -202,8 +202,8 @@ def test_a_resume_with_another_fish_or_other_networks_is_refused(run: Path) -> N
     relu = replace(settings, ppo=replace(settings.ppo, activation="relu"))
     blind = replace(settings, environment=replace(settings.environment, force_scale=2.0))
     for config, changed, message in (
-        (wider, settings, "its observation, with scales, differs"),
-        (job.config, blind, "its observation, with scales, differs"),
+        (wider, settings, "its observation, or a scale of it, differs"),
+        (job.config, blind, "its observation, or a scale of it, differs"),
         (job.config, relu, "its ppo.activation is tanh, that of this training is relu"),
     ):
         with pytest.raises(CheckpointError, match=message):

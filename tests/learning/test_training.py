@@ -337,7 +337,7 @@ def test_networks_with_other_scales_or_sizes_are_refused(
     tmp_path: Path, brief: tuple[Job, Outcome]
 ) -> None:
     job = brief_job(tmp_path / "second", parent=brief[1].checkpoint)
-    with pytest.raises(CheckpointError, match="its observation, with scales, differs"):
+    with pytest.raises(CheckpointError, match="its observation, or a scale of it, differs"):
         train(replace(job, config=replace(job.config, amplitude_limit=0.3)))
     narrow = replace(job.settings, ppo=replace(job.settings.ppo, hidden=(8,)))
     with pytest.raises(

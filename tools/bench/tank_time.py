@@ -166,7 +166,7 @@ def tank(options: Namespace) -> str:
         (
             "fish | the best is chosen by | tank time to 97 % (s)",
             *(f"after {seconds / 60:g} min" for seconds in AFTER),
-            f"after {STEPS} steps | below the best candidate | which took, in the tank (s)",
+            f"after {STEPS} steps | below the best candidate | whole tank time (s)",
         )
     )
     return (

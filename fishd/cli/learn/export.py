@@ -22,13 +22,16 @@ from fishd.core.errors import PolicyError
 @click.option("--note", default="", help="A remark for people, kept in the file.")
 def export(run: Path, target: Path | None, newest: bool, force: bool, note: str) -> None:
     """Write the policy of RUN, a run folder or one of its checkpoints, to one .onnx file."""
+    from fishd.controllers.policy.library import SUFFIX
     from fishd.learning.export import export as write
     from fishd.learning.run_folder import checkpoints
     from fishd.learning.train.progress import summary
 
+    if target and target.suffix != SUFFIX:
+        raise PolicyError(f"{target}: the name of a policy file must end in {SUFFIX}")
     checkpoint = checkpoints.find(run, latest=newest)
     whole = run if checkpoint != run else run.resolve().parent
-    target = target or Path(f"{whole.resolve().name}.onnx")
+    target = target or Path(f"{whole.resolve().name}{SUFFIX}")
     if target.is_file() and not force:
         raise PolicyError(f"{target}: exists already; --force overwrites it, --to names another")
     found = write(checkpoint, target, force=force, note=note)

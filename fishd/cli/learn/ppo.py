@@ -168,6 +168,7 @@ def _job(
     from fishd.learning.train.jobs import Job
 
     if resume:
+        checkpoints.refuse_several(resume)
         config, settings = runs.read(resume)
         on = on or checkpoints.read_state(checkpoints.newest(resume)).on
     running = config_of(endpoint) if on == "robot" else {}

@@ -44,7 +44,8 @@ def parse(text: str) -> Contestant:
             if run := library.of_run(Path(text)):
                 raise ParameterError(f"{text} {run}")
             able = [known for known in registry.names() if known != "remote"]
-            hint = nearest(name, [*able, *library.names()])
+            files = [f"{text}{library.SUFFIX}"] if Path(f"{text}{library.SUFFIX}").is_file() else []
+            hint = nearest(name, files or [*able, *library.names()])
             raise ParameterError(
                 f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"
             )
@@ -71,11 +72,11 @@ def absolute(contestant: Contestant) -> Contestant:
 
 
 def is_missing(contestant: Contestant) -> bool:
-    """Is it the path of a policy file that does not exist on this machine?"""
+    """Is it a path at which this machine has no file, such as a misspelt one or a run folder?"""
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return False
-    return not Path(policy).expanduser().exists()
+    return not Path(policy).expanduser().is_file()
 
 
 def best_on_grid(config: Config) -> SteadyState:

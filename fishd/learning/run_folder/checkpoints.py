@@ -139,12 +139,18 @@ def find(path: Path, *, latest: bool = False) -> Path:
     if not path.is_dir():
         what = "not a folder" if path.exists() else "no such folder"
         raise CheckpointError(f"{path}: {what}; the run folder of a training is needed")
-    seeds = sorted(path.glob("seed-*"), key=lambda one: (len(one.name), one.name))
+    refuse_several(path)
+    return (None if latest else best(path)) or newest(path)
+
+
+def refuse_several(folder: Path) -> None:
+    """Raises `CheckpointError` where each seed has a run folder of its own in this one."""
+    seeds = sorted(folder.glob("seed-*"), key=lambda one: (len(one.name), one.name))
     if seeds:
         raise CheckpointError(
-            f"{path} holds several trainings, {seeds[0].name} to {seeds[-1].name}; name one of them"
+            f"{folder} holds several trainings, {seeds[0].name} to {seeds[-1].name}; name one of "
+            "them"
         )
-    return (None if latest else best(path)) or newest(path)
 
 
 def sweep(folder: Path) -> None:

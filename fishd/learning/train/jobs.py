@@ -49,7 +49,12 @@ class Job(Struct, frozen=True, kw_only=True):
         return Camera(self.camera, self.settings.camera.stack)
 
     def check(self) -> None:
-        """Refuse an imitation on a robot; raises `ConfigError`."""
+        """Refuse what a robot has nothing to learn from; raises `ConfigError`."""
+        if self.on == "robot" and self.is_begun and not self.settings.steps:
+            raise ConfigError(
+                "steps: 0 is not valid on a robot, which does not imitate: it would learn nothing; "
+                "give --steps"
+            )
         if self.on == "robot" and self.settings.imitation.rounds and not self.is_begun:
             raise ConfigError(
                 "imitation.rounds: the best beat of a robot's fish is not known: learn from "

@@ -163,9 +163,15 @@ class RunRecorder:
                     f"{here}; eye and networks must be alike"
                 )
         for what in ("observation", "history", "tick", "amplitude"):
-            if getattr(card, what) != getattr(own, what):
+            here, there = getattr(own, what), getattr(card, what)
+            if there != here:
+                how = (
+                    "observation, or a scale of it, differs from that of this training"
+                    if what == "observation"
+                    else f"{what} is {there}, that of this training is {here}"
+                )
                 raise CheckpointError(
-                    f"{checkpoint}: its {what}, with scales, differs from that of this training; "
+                    f"{checkpoint}: its {how}; "
                     "use the configuration and the environment settings that it was trained with"
                 )
         return card
