@@ -98,7 +98,7 @@ class Daemon:
             calibration_requests = CalibrationRequests(
                 self._loop, self._clock, config, assembly.state_folder(config)
             )
-            fifo = not self._virtual and realtime.enter(
+            self.is_realtime = not self._virtual and realtime.enter(
                 config.realtime.priority, config.realtime.lock_memory
             )
             self._operations = Operations(
@@ -108,7 +108,7 @@ class Daemon:
                 config,
                 controllers,
                 self._gateways.telemetry.address,
-                fifo,
+                self.is_realtime,
                 self._gateways.counters,
             )
             self._server = ControlServer(self._operations.perform, config.tick)
@@ -247,6 +247,8 @@ async def swim(
     shutdown.when_asked(partial(events.call_soon_threadsafe, stopping.set))
     with Daemon(config, print_status, file) as daemon:
         shutdown.release = daemon.release_at_once
+        if daemon.is_realtime:
+            shutdown.outrank(config.realtime.priority)
         await asyncio.sleep(0)  # lets an earlier signal set `stopping`
         if not stopping.is_set():
             await daemon.run(stopping)

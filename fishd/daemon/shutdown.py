@@ -47,7 +47,18 @@ class Shutdown:
         for number in SIGNALS:
             if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, _ignore)
-        threading.Thread(target=self._watch, name="shutdown", daemon=True).start()
+        self._thread = threading.Thread(target=self._watch, name="shutdown", daemon=True)
+        self._thread.start()
+
+    def outrank(self, priority: int) -> None:
+        """Let its thread preempt a loop of this SCHED_FIFO priority, where that is permitted.
+
+        A loop that computes for ever would keep its processor to itself.
+        """
+        assert self._thread.native_id
+        with suppress(OSError):
+            above = os.sched_param(min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO)))
+            os.sched_setscheduler(self._thread.native_id, os.SCHED_FIFO, above)
 
     def when_asked(self, tell: Callable[[], object]) -> None:
         """Call `tell` from the waiting thread at the first signal; at once if there was one."""
