@@ -345,14 +345,21 @@ def _degrees(value: Any, field: inspect.Field) -> str:
 
 
 def _entries(value: Any, field: inspect.Field) -> str:
-    """What to write instead of an entry that is in no list, or which entry is wrong."""
+    """Brackets around an entry that stands alone, or which word of a list is wrong."""
     kind, _, _ = _unwrapped(field.type)
     if not isinstance(kind, inspect.VarTupleType):
         return ""
-    if isinstance(value, str | int | float):
-        return f": write [{text.quoted(str(value))}]"
-    words = kind.item_type.values if isinstance(kind.item_type, inspect.LiteralType) else ()
-    wrong = [shown(entry) for entry in value or () if words and entry not in words]
+    item = kind.item_type
+    words = item.values if isinstance(item, inspect.LiteralType) else ()
+    if not isinstance(value, list):
+        fits = value in words or (
+            isinstance(item, inspect.IntType)
+            and type(value) is int
+            and (item.ge is None or value >= item.ge)
+            and (item.le is None or value <= item.le)
+        )
+        return f": write [{value}]" if fits else ""
+    wrong = [shown(entry) for entry in value if words and entry not in words]
     return f"; {wrong[0]} is none of them" if wrong else ""
 
 
