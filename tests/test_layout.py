@@ -9,7 +9,7 @@ from rigs.documents import ROOT, text_of
 from rooms import arrows, purpose, rooms
 
 ROOMS = rooms()
-MOST_ROOMS, MOST_ARROWS = 17, 91
+MOST_ROOMS, MOST_ARROWS = 15, 70
 
 
 def test_fishd_has_few_rooms() -> None:

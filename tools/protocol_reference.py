@@ -16,7 +16,7 @@ from fishd.camera import messages
 from fishd.control.faults import FAULTS
 from fishd.core import protocol, signals
 from fishd.core.schema import fields_of
-from fishd.swimmer.track import COLUMNS
+from fishd.virtual.swimmer.track import COLUMNS
 
 TYPES = {
     inspect.FloatType: "float",

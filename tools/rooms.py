@@ -14,7 +14,7 @@ FISHD = Path(__file__).resolve().parents[1] / "fishd"
 
 
 def rooms(folder: Path = FISHD) -> dict[str, Path]:
-    """Where each room is, by its name as in README: `core/`, `assembly.py`."""
+    """Where each room is, by its name as in README: `core/`, `__main__.py`."""
     packages = {f"{path.parent.name}/": path.parent for path in folder.glob("*/__init__.py")}
     modules = {path.name: path for path in folder.glob("*.py") if path.stem != "__init__"}
     return dict(sorted({**packages, **modules}.items()))

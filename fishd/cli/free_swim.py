@@ -15,7 +15,7 @@ from fishd.core.interruption import on_signal
 if TYPE_CHECKING:
     from fishd.config import Config
     from fishd.simulation.free_swim import SwimReport, Swum
-    from fishd.swimmer.robot import Swimmer
+    from fishd.virtual.swimmer.robot import Swimmer
 
 
 def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
@@ -27,8 +27,8 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     try:
         from fishd.simulation.free_swim import Keeping
         from fishd.simulation.free_swim import swim as run
-        from fishd.swimmer import checkpoint, track
-        from fishd.swimmer.midlines import Midlines
+        from fishd.virtual.swimmer import checkpoint, track
+        from fishd.virtual.swimmer.midlines import Midlines
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         raise MissingPackage(

@@ -50,7 +50,7 @@ def _end_pulses(config: Config) -> bool:
     """True where there were any; even if the calibration cannot be read: neutral may then be off
     by the trim.
     """
-    from fishd.assembly import end_pulses
+    from fishd.config.assembly import end_pulses
 
     try:
         return end_pulses(config)

@@ -1,4 +1,4 @@
-"""The configuration: YAML in, one frozen `Config` out, or one line that says what is wrong."""
+"""The configuration: YAML in, one frozen `Config` out, and from it the robot and its loop."""
 
 from fishd.config.configuration import (
     FILE_VARIABLE,

@@ -28,11 +28,11 @@ from fishd.hardware.settings import (
     PowerMeterSettings,
     ServoSettings,
 )
-from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.dwell import shortest_dwell
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
 """What the service runs with, as installed by 'make install-pi'."""

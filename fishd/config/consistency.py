@@ -16,9 +16,9 @@ from fishd.core.unix_sockets import check_length
 from fishd.hardware.driver import Claim
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import PanelSettings, ServoSettings
-from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 MOST_STEPS = 200
 """Of a swimmer in a tick: between two ticks fishd answers nobody."""
@@ -170,7 +170,7 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
 
 def check_swimmer(swimmer: SwimmerSettings, tick: float) -> None:
     """It can be computed; tick: period of the loop [s]."""
-    from fishd.swimmer import feasibility  # of which no other robot has any need
+    from fishd.virtual.swimmer import feasibility  # of which no other robot has any need
 
     feasibility.check(swimmer)
     step = swimmer.numerics.step

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import click
 
-from fishd import __version__, assembly
-from fishd.config import Config, load
+from fishd import __version__
+from fishd.config import Config, assembly, load
 from fishd.control.loop import SETTLING
 from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload

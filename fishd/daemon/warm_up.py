@@ -8,12 +8,11 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from fishd.assembly import build_loop
 from fishd.config import Config, Start
+from fishd.config.assembly import build_loop, simulated_fish
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.gateway.link import pair
-from fishd.virtual.fish import SimulatedFish
 
 SHORTEST_TICK = 0.01
 """Faster loops keep their caches warm by themselves [s]."""
@@ -32,7 +31,7 @@ def mock_ticks(config: Config) -> Callable[[], None] | None:
         theirs.recv(len(message))
 
     clock = VirtualClock()
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    fish = simulated_fish(config)
     loop = build_loop(replace(config, start=Start()), fish.robot(), clock, Telemetry(publish))
     slots = virtual_slots(clock, config.tick)
 

@@ -16,13 +16,13 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Reason
 from fishd.simulation.report import count_ticks
 from fishd.simulation.virtual_run import EncodingPublisher, VirtualRun
-from fishd.swimmer import checkpoint
-from fishd.swimmer.checkpoint import Checkpoint, CheckpointError
-from fishd.swimmer.fish import Diverged
-from fishd.swimmer.gait import Gait, gait
-from fishd.swimmer.grid import Array
-from fishd.swimmer.robot import Swimmer
-from fishd.swimmer.track import Track
+from fishd.virtual.swimmer import checkpoint
+from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
+from fishd.virtual.swimmer.fish import Diverged
+from fishd.virtual.swimmer.gait import Gait, gait
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.robot import Swimmer
+from fishd.virtual.swimmer.track import Track
 
 
 class SwimReport(Gait, frozen=True, kw_only=True):

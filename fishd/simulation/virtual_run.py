@@ -1,26 +1,21 @@
 """fishd's loop on a simulated fish in virtual time, and where its ticks go."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import msgspec
 from msgspec.structs import replace
 
 from fishd import __version__
-from fishd.assembly import build_loop, open_in_virtual_time, open_swimmer
 from fishd.config import Config
+from fishd.config.assembly import build_loop, open_fish_in_virtual_time
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Event, Tick
-from fishd.hardware.base import Robot
-from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.plant.base import TrueWindow
-
-if TYPE_CHECKING:
-    from fishd.swimmer.robot import Swimmer
 
 LONGEST = 1e8
 """Runs are shorter than this [s]: three years."""
@@ -63,13 +58,14 @@ class VirtualRun:
 
         Raises `MissingPackage`.
         """
-        self.swimmer: Swimmer | None
-        """The fish itself, where it swims freely."""
         self.config = config
         clock = VirtualClock()
         with ExitStack() as stack:
-            robot, self._take_window, self.swimmer = _fish(config, stack)
-            self.loop = build_loop(config, robot, clock, publisher)
+            fish = open_fish_in_virtual_time(config, stack)
+            self.swimmer = fish.swimmer
+            """The fish itself, where it swims freely."""
+            self._take_window = fish.take_window
+            self.loop = build_loop(config, fish.robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()
         self._slots = virtual_slots(clock, config.tick)
@@ -109,20 +105,6 @@ class VirtualRun:
         """One tick; what truly happened between its read and the one before."""
         self.loop.tick(next(self._slots))
         return self._take_window()
-
-
-def _fish(
-    config: Config, stack: ExitStack
-) -> tuple[Robot, Callable[[], TrueWindow], "Swimmer | None"]:
-    """What swims, and how to ask what it truly did since the last time; and one that is free."""
-    if config.robot == "swimmer":
-        swimmer = open_swimmer(config)
-        return swimmer.robot(), swimmer.take_window, swimmer
-    if config.robot == "virtual-pi":
-        robot, pi = open_in_virtual_time(config, stack)
-        return robot, pi.tank.take_window, None
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
-    return fish.robot(), fish.take_window, None
 
 
 def check_length(what: str, seconds: float) -> None:

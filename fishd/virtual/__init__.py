@@ -1,1 +1,1 @@
-"""What stands in for the world: the simulated fish, and a virtual Raspberry Pi."""
+"""What stands in for the world: simulated fish, on a rod or free, and a virtual Raspberry Pi."""

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import asdict
 from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
-from fishd.assembly import state_folder
+from fishd.config.assembly import state_folder
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import Refused
 from fishd.core.protocol import LEASE

@@ -11,8 +11,8 @@ from fishd.core.errors import FishdError
 from fishd.lab.swimmer import midline_figure, view, wake_figure
 from fishd.lab.swimmer.envelope import envelope
 from fishd.lab.swimmer.film import MOST, Film
-from fishd.swimmer.fish import Fish
-from fishd.swimmer.settings import Numerics, SwimmerSettings
+from fishd.virtual.swimmer.fish import Fish
+from fishd.virtual.swimmer.settings import Numerics, SwimmerSettings
 
 COARSE = SwimmerSettings(numerics=Numerics(cell=2e-3, step=2e-3))
 

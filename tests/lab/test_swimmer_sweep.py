@@ -90,7 +90,7 @@ def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
 def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fishd.swimmer.fish.UNSTABLE", 1e-6)
+    monkeypatch.setattr("fishd.virtual.swimmer.fish.UNSTABLE", 1e-6)
     found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
     assert found
     assert found.speed is None

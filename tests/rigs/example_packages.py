@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fishd.assembly import assemble
+from fishd.config.assembly import assemble
 from fishd.core.clock import VirtualClock
 from fishd.hardware.base import Robot
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS

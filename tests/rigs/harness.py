@@ -4,14 +4,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
-from fishd.assembly import build_loop
 from fishd.config import Config, load
+from fishd.config.assembly import build_loop, simulated_fish
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
 from fishd.core.clock import Slot, VirtualClock
 from fishd.core.signals import Event, Measurement, Observation, Tick
 from fishd.hardware.base import Robot
-from fishd.virtual.fish import SimulatedFish
 
 
 class Recorder:
@@ -53,7 +52,7 @@ class Rig:
         self.index = 0
 
     def open_robot(self, stack: ExitStack) -> Robot:
-        self.fish = SimulatedFish(self.config.plant, self.config.simulation, self.config.tick)
+        self.fish = simulated_fish(self.config)
         return self.fish.robot()
 
     @property

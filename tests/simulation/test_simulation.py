@@ -14,10 +14,10 @@ from rigs.processes import fishctl, one_line
 
 from fishd import simulation
 from fishd.config import load
+from fishd.config.assembly import simulated_fish
 from fishd.controllers import registry
 from fishd.core.errors import ConfigError, ParameterError
 from fishd.simulation import Beats, EncodingPublisher, Report, judge, simulate
-from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import Imperfections
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.optimum import square_wave
@@ -50,7 +50,7 @@ def test_the_same_seed_gives_the_same_result_to_the_last_bit() -> None:
 @pytest.mark.parametrize("start", [0.0, 12_345.67])
 def test_the_same_seed_drifts_in_the_same_way_whenever_it_starts(start: float) -> None:
     config = load(None, ["simulation.drift=0.02", "simulation.noise=0", "simulation.seed=3"])
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    fish = simulated_fish(config)
     found = [fish.read(start + 0.05 * n).fx for n in range(1, 200)]
     drift = Imperfections(config.simulation, config.tick)
     wanted = [drift.apply(0.0, 0.0, 0.05 * n, 0.05)[0] for n in range(1, 200)]

@@ -5,8 +5,8 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from fishd.assembly import build_loop, open_in_virtual_time
 from fishd.config import load
+from fishd.config.assembly import build_loop, open_in_virtual_time, simulated_fish
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Measurement
 from fishd.simulation.virtual_run import KeepingPublisher
@@ -81,7 +81,7 @@ def test_a_spike_leaves_the_noise_as_it_was_and_decays_in_the_fin_velocity() -> 
     runs = []
     for config in (calm, struck):
         clock, publisher = VirtualClock(), KeepingPublisher()
-        fish = SimulatedFish(config.plant, config.simulation, config.tick)
+        fish = simulated_fish(config)
         loop = build_loop(config, fish.robot(), clock, publisher)
         for slot, _ in zip(virtual_slots(clock, config.tick), range(1200), strict=False):
             loop.tick(slot)

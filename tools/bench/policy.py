@@ -20,15 +20,14 @@ from common.daemon import Fishd
 from common.machine import machine_in_short
 from common.report import Options, Report, quantile, table
 from fishd import __version__
-from fishd.assembly import build_loop
 from fishd.config import Config, load
+from fishd.config.assembly import build_loop, simulated_fish
 from fishd.control.loop import ControlLoop
 from fishd.controllers import registry
 from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.controllers.policy.network import to_onnx
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Percentiles, Tick
-from fishd.virtual.fish import SimulatedFish
 
 DOCUMENT = "policies.md"
 GOAL = 50.0
@@ -84,7 +83,7 @@ class Swimmer:
 
     def __init__(self, config: Config, name: str, parameters: dict[str, Any]) -> None:
         clock = VirtualClock()
-        fish = SimulatedFish(config.plant, config.simulation, config.tick)
+        fish = simulated_fish(config)
         self._loop: ControlLoop = build_loop(config, fish.robot(), clock, Deaf())
         controller = registry.create(name, parameters, config.limits)
         self.times: list[int] = []

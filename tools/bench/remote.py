@@ -20,15 +20,14 @@ from msgspec import Struct
 
 from common.machine import PRIORITY, fifo_permitted, machine_in_short, priorities, scheduling
 from common.report import Options, Report, progress, table
-from fishd.assembly import build_loop
 from fishd.config import Config, load
+from fishd.config.assembly import build_loop, simulated_fish
 from fishd.controllers.remote.controller import Remote, RemoteParameters
 from fishd.core.clock import SystemClock, Ticker
 from fishd.core.signals import Observation
 from fishd.daemon import realtime
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.warm_up import mock_ticks
-from fishd.virtual.fish import SimulatedFish
 
 DOCUMENT = "remote.md"
 GOAL = 2e-3
@@ -101,7 +100,7 @@ def agent_process(address: str, priority: int) -> Iterator[str]:
 async def swim(controller: TimedRemote, config: Config, trips: int) -> None:
     """Tick as the daemon does until there are so many round trips."""
     realtime.enter(PRIORITY if fifo_permitted() else 0, lock_memory=False)
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    fish = simulated_fish(config)
     loop = build_loop(config, fish.robot(), SystemClock(), Telemetry(lambda message: None))
     loop.set_controller("remote", controller)
     ticker = Ticker(config.tick, mock_ticks(config))

@@ -8,9 +8,9 @@ import numpy as np
 
 from bench.swimmer_flag import crossings
 from common.report import progress, table
-from fishd.swimmer.flow import Flow
-from fishd.swimmer.grid import Grid, edges
-from fishd.swimmer.immersed import Immersed
+from fishd.virtual.swimmer.flow import Flow
+from fishd.virtual.swimmer.grid import Grid, edges
+from fishd.virtual.swimmer.immersed import Immersed
 
 CYLINDER = {
     "Williamson 1989, experiment": ("0.164", ""),

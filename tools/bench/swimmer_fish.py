@@ -14,8 +14,8 @@ import numpy as np
 
 from bench.swimmer_elements import ElementStep, element_step
 from common.report import progress, table
-from fishd.swimmer.fish import Fish
-from fishd.swimmer.settings import Numerics, SwimmerSettings
+from fishd.virtual.swimmer.fish import Fish
+from fishd.virtual.swimmer.settings import Numerics, SwimmerSettings
 
 BEAT = 3.0
 """Of the square wave [Hz]."""

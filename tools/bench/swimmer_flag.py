@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from common.report import progress, table
-from fishd.swimmer.beam import Beam, Profile
-from fishd.swimmer.flow import Flow
-from fishd.swimmer.grid import Array, Grid, edges
-from fishd.swimmer.immersed import Immersed
+from fishd.virtual.swimmer.beam import Beam, Profile
+from fishd.virtual.swimmer.flow import Flow
+from fishd.virtual.swimmer.grid import Array, Grid, edges
+from fishd.virtual.swimmer.immersed import Immersed
 
 RHO = 1000.0
 RADIUS, CENTRE, HEIGHT, LENGTH, TIP, THICKNESS = 0.05, 0.2, 0.41, 2.5, 0.6, 0.02

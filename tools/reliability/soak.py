@@ -25,15 +25,14 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from common.report import BrokenPromise, Options, Report, progress
-from fishd.assembly import build_loop, open_in_virtual_time
 from fishd.config import Config, load
+from fishd.config.assembly import build_loop, open_in_virtual_time, simulated_fish
 from fishd.control.loop import ControlLoop
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.errors import SensorError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.pi.ads1115 import Ads1115Chip
 from fishd.virtual.pi.faults import FAULTS, INSTANTANEOUS, Faults
 from fishd.virtual.pi.i2c import I2cBus
@@ -57,7 +56,7 @@ def soak_simulated(ticks: int, seed: int) -> str:
     dice = random.Random(seed)
     config = load(None, [f"simulation.seed={seed}"])
     clock = VirtualClock()
-    fish = SimulatedFish(config.plant, config.simulation, config.tick)
+    fish = simulated_fish(config)
     saboteur = Saboteur(fish.robot(), dice)
     publisher = Counting(lambda: dice.random() < 1e-4)
     loop = build_loop(config, saboteur.robot(), clock, publisher)

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from fishd import assembly
 from fishd.client import Fish
-from fishd.config import Config
+from fishd.config import Config, assembly
 from fishd.config.drivers import CHOICES
 from fishd.core.addresses import find_control, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted

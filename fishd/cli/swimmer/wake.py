@@ -10,7 +10,7 @@ from fishd.cli.swimmer.options import picture_options
 from fishd.lab.swimmer import view, wake_figure
 from fishd.lab.swimmer.files import fish_of
 from fishd.recording.folder import check_new
-from fishd.swimmer import checkpoint
+from fishd.virtual.swimmer import checkpoint
 
 
 @click.command()

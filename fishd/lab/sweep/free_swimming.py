@@ -13,8 +13,8 @@ from fishd.lab.sweep.measuring import Lengths
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.sweep.settling import is_steady, judged_from
 from fishd.simulation import VirtualRun
-from fishd.swimmer.gait import gait
-from fishd.swimmer.track import Track
+from fishd.virtual.swimmer.gait import gait
+from fishd.virtual.swimmer.track import Track
 
 LONGEST = 24.0
 """A fish whose speed still changes is judged all the same after so long [s]."""

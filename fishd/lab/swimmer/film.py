@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fishd.core.errors import FishdError, MissingPackage
 from fishd.lab.swimmer.view import SIGNED, UNITS, Quantity, View, around, rounded, scale, view
 from fishd.lab.swimmer.wake_figure import COLOURS
-from fishd.swimmer.fish import Fish
-from fishd.swimmer.settings import SwimmerSettings
+from fishd.virtual.swimmer.fish import Fish
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 if TYPE_CHECKING:
     from PIL import Image

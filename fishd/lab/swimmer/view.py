@@ -6,9 +6,9 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.swimmer.feasibility import estimate
-from fishd.swimmer.fish import Fish
-from fishd.swimmer.settings import SwimmerSettings
+from fishd.virtual.swimmer.feasibility import estimate
+from fishd.virtual.swimmer.fish import Fish
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 Array = NDArray[np.float64]
 Places = NDArray[np.floating]

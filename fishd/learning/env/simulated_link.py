@@ -7,18 +7,17 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.assembly import build_loop
 from fishd.camera.frames import Stack, StackSettings
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start, check_tethered
+from fishd.config.assembly import build_loop, simulated_fish
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Tick, Truth
 from fishd.learning.env.link import LinkLost, StepResult
 from fishd.learning.settings import Randomisation
-from fishd.virtual.fish import SimulatedFish
 
 _VARIED = ("omega0", "xi", "servo_speed", "coupling")
 _VARIED_TOO = ("servo_lag", "thrust_coefficient", "lateral_drag")
@@ -181,7 +180,7 @@ class SimulatedLink:
 
     def _begin(self) -> None:
         config, clock = self.config, VirtualClock()
-        fish = SimulatedFish(config.plant, config.simulation, config.tick)
+        fish = simulated_fish(config)
         self._loop = build_loop(config, fish.robot(), clock, NullPublisher())
         self._loop.set_controller("agent", FunctionController(config, lambda _: self._angle))
         self._slots = virtual_slots(clock, config.tick)

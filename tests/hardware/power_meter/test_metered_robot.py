@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fishd.assembly import parts_of
 from fishd.config import load
+from fishd.config.assembly import parts_of
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, SensorError
 from fishd.hardware.driver import PowerMeterDriver, PowerMeterSettings, PowerSample

@@ -11,10 +11,10 @@ exchanged between two solvers, and light bodies are no harder than heavy ones.
 import numpy as np
 
 from fishd.core.errors import FishdError
-from fishd.swimmer.beam import Beam
-from fishd.swimmer.covers import Covered, circle, gather, impose, paint, slip
-from fishd.swimmer.flow import Flow
-from fishd.swimmer.grid import Array
+from fishd.virtual.swimmer.beam import Beam
+from fishd.virtual.swimmer.covers import Covered, circle, gather, impose, paint, slip
+from fishd.virtual.swimmer.flow import Flow
+from fishd.virtual.swimmer.grid import Array
 
 IMPLICIT = 0.55
 """Share of the new shape in the elastic forces of a step; 0.5 would let the shortest waves of the

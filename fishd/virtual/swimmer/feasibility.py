@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fishd.core.schema import Problem
-from fishd.swimmer.body import build_beam, curvature, half_thickness
-from fishd.swimmer.settings import (
+from fishd.virtual.swimmer.body import build_beam, curvature, half_thickness
+from fishd.virtual.swimmer.settings import (
     LARGEST_COURANT,
     LEAST_CELLS_LONG,
     LEAST_CELLS_THICK,

@@ -8,9 +8,9 @@ from msgspec import Struct
 from scipy.special import stdtrit
 from scipy.stats import kendalltau
 
-from fishd.swimmer.body import build_beam
-from fishd.swimmer.grid import Array
-from fishd.swimmer.settings import SwimmerSettings
+from fishd.virtual.swimmer.body import build_beam
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 MOST_GROUPS = 8
 """Beats are taken together in so many groups at most."""
@@ -59,7 +59,7 @@ class Gait(Struct, frozen=True, kw_only=True):
 
 
 def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
-    """Judge a track; columns as of `fishd.swimmer.track`, at least two rows.
+    """Judge a track; columns as of `fishd.virtual.swimmer.track`, at least two rows.
 
     A beat begins with the first tick in which φ_c is positive again. The Froude efficiency is in
     the manner of Borazjani and Sotiropoulos (2008), "Numerical investigation of the hydrodynamics

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from fishd.swimmer.beam import Beam
-from fishd.swimmer.grid import Array
-from fishd.swimmer.settings import Body, SwimmerSettings
+from fishd.virtual.swimmer.beam import Beam
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.settings import Body, SwimmerSettings
 
 
 def half_thickness(body: Body, X: Array) -> Array:

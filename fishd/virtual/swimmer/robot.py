@@ -13,12 +13,12 @@ import numpy as np
 from fishd.core.errors import FishLost
 from fishd.core.signals import Course, Measurement, Truth
 from fishd.hardware.base import Robot
-from fishd.swimmer.fish import Diverged, Fish, Motion, Work
-from fishd.swimmer.grid import Array
-from fishd.swimmer.settings import SwimmerSettings
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.drive_train import relax
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.swimmer.fish import Diverged, Fish, Motion, Work
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 
 class Window(NamedTuple):

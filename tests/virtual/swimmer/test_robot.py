@@ -9,10 +9,10 @@ from rigs.coarse_swimmer import coarse, swimmer
 
 from fishd.core.errors import ConfigError, FishLost
 from fishd.simulation import KeepingPublisher, VirtualRun, simulate
-from fishd.swimmer.fish import Diverged
-from fishd.swimmer.robot import Swimmer
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
+from fishd.virtual.swimmer.fish import Diverged
+from fishd.virtual.swimmer.robot import Swimmer
 
 PHI = 0.42
 TICK = 0.01

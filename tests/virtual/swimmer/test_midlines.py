@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rigs.coarse_swimmer import swimmer
 
-from fishd.swimmer.midlines import PLACES, Midlines
+from fishd.virtual.swimmer.midlines import PLACES, Midlines
 
 
 def test_midlines_are_where_the_body_was_in_the_laboratory() -> None:

@@ -16,9 +16,9 @@ from msgspec import Struct
 
 from fishd.core import files
 from fishd.core.errors import FishdError
-from fishd.swimmer.grid import Array
-from fishd.swimmer.robot import Swimmer
-from fishd.swimmer.track import COLUMNS, Track
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.robot import Swimmer
+from fishd.virtual.swimmer.track import COLUMNS, Track
 
 FORMAT = 2
 LONGEST = 2**30

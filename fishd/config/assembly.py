@@ -36,12 +36,13 @@ from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
 from fishd.virtual.fish import SimulatedFish
+from fishd.virtual.plant.base import TrueWindow
 
 if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
     from fishd.hardware.panel import RpiGpioPanel
     from fishd.hardware.power_meter.sampled_power import SampledPower
-    from fishd.swimmer.robot import Swimmer
     from fishd.virtual.pi.virtual_pi import VirtualPi
+    from fishd.virtual.swimmer.robot import Swimmer
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
     if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
             release_recipe.remove(str(file))  # of what the file said before
-        return SimulatedFish(config.plant, config.simulation, config.tick).robot()
+        return simulated_fish(config).robot()
     if config.robot == "swimmer":
         swimmer = open_swimmer(config)
         swimmer.compile()
@@ -73,10 +74,15 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
     return assemble(config, clock, stack, threaded=True, file=file)
 
 
+def simulated_fish(config: Config) -> SimulatedFish:
+    """A fish on its rod, without any hardware; nothing has to be closed."""
+    return SimulatedFish(config.plant, config.simulation, config.tick)
+
+
 def open_swimmer(config: Config) -> "Swimmer":
     """A fish that swims freely; raises `MissingPackage`."""
     try:
-        from fishd.swimmer.robot import Swimmer
+        from fishd.virtual.swimmer.robot import Swimmer
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         raise MissingPackage(
@@ -131,6 +137,28 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
         servo_driver=partial(Pigpio, standstill=pi.pigpiod.stands_still),
     )
     return InVirtualTime(robot, pi)
+
+
+class FishInVirtualTime(NamedTuple):
+    """What swims in virtual time, whichever robot the configuration names."""
+
+    robot: Robot
+    take_window: Callable[[], TrueWindow]
+    """What the fish truly did since the last time that this was asked."""
+    swimmer: "Swimmer | None" = None
+    """The fish itself, where it swims freely."""
+
+
+def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtualTime:
+    """A simulated fish, free or on its rod, or one behind a virtual Pi; raises `MissingPackage`."""
+    if config.robot == "swimmer":
+        swimmer = open_swimmer(config)
+        return FishInVirtualTime(swimmer.robot(), swimmer.take_window, swimmer)
+    if config.robot == "virtual-pi":
+        robot, pi = open_in_virtual_time(config, stack)
+        return FishInVirtualTime(robot, pi.tank.take_window)
+    fish = simulated_fish(config)
+    return FishInVirtualTime(fish.robot(), fish.take_window)
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.grid import Array, Grid, edges
-from fishd.swimmer.poisson import Poisson
+from fishd.virtual.swimmer.grid import Array, Grid, edges
+from fishd.virtual.swimmer.poisson import Poisson
 
 
 def laplacian(grid: Grid, phi: Array) -> Array:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.gait import gait, mass
-from fishd.swimmer.grid import Array
-from fishd.swimmer.settings import SwimmerSettings
-from fishd.swimmer.track import COLUMNS
+from fishd.virtual.swimmer.gait import gait, mass
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.settings import SwimmerSettings
+from fishd.virtual.swimmer.track import COLUMNS
 
 TICK, PERIOD = 0.01, 0.4
 SETTINGS = SwimmerSettings()

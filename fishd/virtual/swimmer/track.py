@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from fishd.core.errors import ParameterError
 from fishd.core.files import write_atomically
-from fishd.swimmer.fish import Work
-from fishd.swimmer.grid import Array
-from fishd.swimmer.robot import Swimmer
+from fishd.virtual.swimmer.fish import Work
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.robot import Swimmer
 
 COLUMNS = {
     "time": ("s", "of the fish, at the end of the tick"),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.covers import Covered, circle, paint
-from fishd.swimmer.grid import Array
+from fishd.virtual.swimmer.covers import Covered, circle, paint
+from fishd.virtual.swimmer.grid import Array
 
 H = 1e-3
 PX, PY = np.arange(-0.02, 0.05, H), np.arange(-0.03, 0.03, H)

@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 from numba import njit
 
-from fishd.swimmer.grid import Array, Grid
-from fishd.swimmer.poisson import Poisson
+from fishd.virtual.swimmer.grid import Array, Grid
+from fishd.virtual.swimmer.poisson import Poisson
 
 PAD = 2
 """Layers of ghost values around the velocities, as wide as the stencil of the fluxes."""

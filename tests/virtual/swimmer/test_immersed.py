@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.beam import Beam
-from fishd.swimmer.flow import Flow
-from fishd.swimmer.grid import Array, Grid, edges
-from fishd.swimmer.immersed import Immersed, LeftTheGrid
+from fishd.virtual.swimmer.beam import Beam
+from fishd.virtual.swimmer.flow import Flow
+from fishd.virtual.swimmer.grid import Array, Grid, edges
+from fishd.virtual.swimmer.immersed import Immersed, LeftTheGrid
 
 CELL, LENGTH, HALF = 2e-3, 0.06, 6e-3
 EI = 2e-3

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fishd.core.errors import FishdError
-from fishd.swimmer.body import build_beam, curvature
-from fishd.swimmer.flow import Flow
-from fishd.swimmer.grid import Array, Grid, edges
-from fishd.swimmer.immersed import Immersed, LeftTheGrid
-from fishd.swimmer.settings import SwimmerSettings
+from fishd.virtual.swimmer.body import build_beam, curvature
+from fishd.virtual.swimmer.flow import Flow
+from fishd.virtual.swimmer.grid import Array, Grid, edges
+from fishd.virtual.swimmer.immersed import Immersed, LeftTheGrid
+from fishd.virtual.swimmer.settings import SwimmerSettings
 
 FRONT = 0.4
 """The front body: this share of the length, which hardly bends; heading and tail refer to it."""

@@ -10,7 +10,7 @@ from numba import njit
 from scipy.linalg import eigh_tridiagonal
 from threadpoolctl import threadpool_limits
 
-from fishd.swimmer.grid import Array, Grid
+from fishd.virtual.swimmer.grid import Array, Grid
 
 
 class Poisson:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.beam import Beam, Profile
-from fishd.swimmer.grid import Array
+from fishd.virtual.swimmer.beam import Beam, Profile
+from fishd.virtual.swimmer.grid import Array
 
 LENGTH, HALF, EI, DENSITY = 0.2, 1e-3, 3e-3, 1000.0
 

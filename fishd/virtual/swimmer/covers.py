@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fishd.swimmer.grid import Array
+from fishd.virtual.swimmer.grid import Array
 
 
 class Covered(NamedTuple):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rigs.coarse_swimmer import coarse
 
-from fishd.swimmer.fish import Fish, Work
+from fishd.virtual.swimmer.fish import Fish, Work
 
 
 def swim(fish: Fish, seconds: float, frequency: float) -> None:

@@ -19,8 +19,8 @@ from rigs.coarse_swimmer import OPTIONS, coarse
 from rigs.processes import FISHCTL, fishctl, one_line, sets
 
 from fishd.simulation.free_swim import swim
-from fishd.swimmer import checkpoint
-from fishd.swimmer.track import COLUMNS
+from fishd.virtual.swimmer import checkpoint
+from fishd.virtual.swimmer.track import COLUMNS
 
 
 def simulated(*words: str | Path) -> "subprocess.CompletedProcess[str]":

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.swimmer.grid import Array
-from fishd.swimmer.robot import Swimmer
+from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.robot import Swimmer
 
 PLACES = 81
 """Along the body, evenly from head to tail."""

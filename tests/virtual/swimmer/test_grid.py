@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.grid import Grid, edges
+from fishd.virtual.swimmer.grid import Grid, edges
 
 
 def test_it_reaches_from_end_to_end() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fishd.swimmer.grid import Array
+from fishd.virtual.swimmer.grid import Array
 
 Profile = Callable[[Array], Array]
 """A quantity along the body, of the distance X from the head [m]."""

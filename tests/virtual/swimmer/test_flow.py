@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fishd.swimmer.flow import Flow
-from fishd.swimmer.grid import Array, Grid, edges
+from fishd.virtual.swimmer.flow import Flow
+from fishd.virtual.swimmer.grid import Array, Grid, edges
 
 NU = 1e-3
 
