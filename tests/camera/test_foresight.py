@@ -61,7 +61,9 @@ def test_the_next_tick_is_known_to_the_last_bit(
     believed = Tail(0.0, 0.0, 0.0)
     for number in range(40):
         tick = swim.tick(released=number in (20, 21))
-        if number > 5:  # what was under way to the servo at first has arrived
+        # What was under way to the servo at first has arrived, and the tail has been taken along to
+        # both sides: where it had been within its play, nobody knows.
+        if number > 12:
             assert believed == (tick.time, tick.alpha, tick.alpha_rate)
         ((_, believed),) = ahead.follow(tick)
     assert ahead.end == believed.time

@@ -197,6 +197,7 @@ def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(
     env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address)
     try:
         env.reset()
+        env.unwrapped.pause()  # else fishd soon gives up an agent that does not answer
         with Fish(daemon.endpoint) as fish:
             assert fish.status().parameters["agent"] == address
     finally:
