@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 from uuid import uuid4
@@ -13,7 +14,6 @@ import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from fishd.core.errors import FishdError
-from fishd.core.interruption import handled
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -98,9 +98,15 @@ class Workers:
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             count = max(1, min(self._jobs or joblib.cpu_count(), len(tasks)))
             parallel = joblib.Parallel(n_jobs=count, batch_size=1, return_as="generator_unordered")
-            # Its processes inherit that they ignore Ctrl-C and hang-up: they are told to stop.
-            with handled((signal.SIGINT, signal.SIGHUP), signal.SIG_IGN):
+            # Its processes inherit that Ctrl-C and hang-up are blocked: they are told to stop. One
+            # that comes meanwhile is heard here a little later. What else is started with the
+            # first of them would unblock Ctrl-C (in Python 3.11), and so is started before.
+            resource_tracker.ensure_running()
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+            try:
                 results = parallel(calls)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             yield from results
 
 

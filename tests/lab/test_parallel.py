@@ -1,0 +1,45 @@
+"""Computations on several processes, and who hears a Ctrl-C meanwhile."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import joblib
+import pytest
+
+from fishd.core.interruption import on_signal
+from fishd.lab.parallel import workers
+
+
+def blocked(_: int) -> set[int]:
+    return set(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+def test_its_processes_leave_ctrl_c_and_hang_up_to_the_one_that_has_begun_them(
+    tmp_path: Path,
+) -> None:
+    with workers(tmp_path / "stop", jobs=2) as crew:
+        for _, found in crew.run(blocked, range(3)):
+            assert found == {signal.SIGINT, signal.SIGHUP}
+    assert not blocked(0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_while_its_processes_are_being_started_is_heard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    heard: list[int] = []
+    start = joblib.Parallel.__call__
+
+    def interrupted(parallel: joblib.Parallel, calls: Any) -> Any:
+        os.kill(os.getpid(), number)
+        return start(parallel, calls)
+
+    monkeypatch.setattr(joblib.Parallel, "__call__", interrupted)
+    with (
+        on_signal(lambda: heard.append(number)),
+        workers(tmp_path / "stop", jobs=2) as crew,
+    ):
+        assert sorted(crew.run(abs, [-1, -2])) == [(0, 1), (1, 2)]
+    assert heard == [number]
