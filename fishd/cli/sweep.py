@@ -173,7 +173,7 @@ def _in_simulation(
 ) -> "tuple[bool, SweepFolder]":
     from fishd.lab.sweep import grid, running
     from fishd.lab.sweep.folder import Begun
-    from fishd.lab.sweep.measuring import Lengths
+    from fishd.lab.sweep.grid import Lengths
 
     fish: dict[tuple[tuple[str, Any], ...], Config] = {}
     pairs = []

@@ -20,8 +20,8 @@ from fishd.lab.begun import owned
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
 from fishd.lab.sweep.folder import Begun, SweepFolder
-from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths, swim
+from fishd.lab.sweep.grid import Lengths, Point
+from fishd.lab.sweep.measuring import swim
 from fishd.lab.sweep.results import Result, quantity_of
 from fishd.lab.sweep.running import on_robot
 from fishd.recording import open_run

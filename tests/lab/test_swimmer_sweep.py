@@ -16,8 +16,7 @@ from fishd.lab.sweep import figure, free_swimming
 from fishd.lab.sweep.curves import best, curves, plain
 from fishd.lab.sweep.folder import Begun, SweepFolder
 from fishd.lab.sweep.free_swimming import swim_freely
-from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths
+from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.sweep.settling import is_steady, judged_from
 

@@ -8,8 +8,7 @@ from msgspec.structs import replace
 from fishd.config import Config, Start
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
-from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths
+from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.sweep.settling import is_steady, judged_from
 from fishd.simulation import VirtualRun

@@ -1,4 +1,7 @@
-"""The points of a sweep: every combination of controllers, parameter values and configured keys."""
+"""The points of a sweep: every combination of controllers, parameter values and configured keys.
+
+And for how long a simulated fish swims at each.
+"""
 
 import itertools
 import math
@@ -8,6 +11,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from fishd.config import Config
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError
@@ -43,6 +47,24 @@ class Point(Struct, frozen=True):
             if name not in without
         )
         return " ".join((self.controller, *words))
+
+
+class Lengths(Struct, frozen=True):
+    """How long a simulated fish swims at each point."""
+
+    settle: float = 10.0
+    """Not judged [s]; a free swimmer takes longer where it has to."""
+    periods: int = 20
+    """Tail beats that are judged; of a free swimmer, at least."""
+
+    @classmethod
+    def of(cls, config: Config, settle: float | None, periods: int | None) -> "Lengths":
+        """As given, or as is usual with such a fish."""
+        usual = cls(4.0, 10) if config.robot == "swimmer" else cls()
+        return cls(
+            usual.settle if settle is None else settle,
+            usual.periods if periods is None else periods,
+        )
 
 
 def spread(text: str) -> list[str]:

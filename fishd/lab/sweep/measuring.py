@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.config import Config, Start
@@ -18,7 +17,7 @@ from fishd.lab.measurement import measure
 from fishd.lab.objective import per_watt
 from fishd.lab.parallel import Stop
 from fishd.lab.rig import Rig, is_of_one
-from fishd.lab.sweep.grid import Point
+from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import Found, Result
 from fishd.recording.writer import RunWriter
 from fishd.simulation import Beats, VirtualRun
@@ -26,24 +25,6 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 SLOWEST = 0.4
 """A controller without a frequency is given the time of so slow a tail beat [Hz]."""
-
-
-class Lengths(Struct, frozen=True):
-    """How long a simulated fish swims at each point."""
-
-    settle: float = 10.0
-    """Not judged [s]; a free swimmer takes longer where it has to."""
-    periods: int = 20
-    """Tail beats that are judged; of a free swimmer, at least."""
-
-    @classmethod
-    def of(cls, config: Config, settle: float | None, periods: int | None) -> "Lengths":
-        """As given, or as is usual with such a fish."""
-        usual = cls(4.0, 10) if config.robot == "swimmer" else cls()
-        return cls(
-            usual.settle if settle is None else settle,
-            usual.periods if periods is None else periods,
-        )
 
 
 class Task(NamedTuple):

@@ -8,8 +8,8 @@ from fishd.lab.parallel import workers
 from fishd.lab.rig import Rig
 from fishd.lab.rig_recording import recorded
 from fishd.lab.sweep.folder import SweepFolder
-from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths, Task, on_rig, simulated
+from fishd.lab.sweep.grid import Lengths, Point
+from fishd.lab.sweep.measuring import Task, on_rig, simulated
 from fishd.lab.sweep.results import Found
 
 STOP = "stop"
