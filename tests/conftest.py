@@ -5,6 +5,7 @@ import os
 import re
 import signal
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +66,19 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     fast, realtime = config.option.fast, config.option.realtime
     if not (fast or realtime) or not collection_path.match("test_*.py"):
         return None
-    text = collection_path.read_text(encoding="utf-8")
     if realtime:
-        return "mark.realtime" not in text or None
-    return "end_to_end" in collection_path.parts or bool(SLOW.search(text)) or None
+        return "mark.realtime" not in collection_path.read_text(encoding="utf-8") or None
+    return is_slow(collection_path) or None
+
+
+@cache
+def is_slow(module: Path) -> bool:
+    return "end_to_end" in module.parts or bool(SLOW.search(module.read_text(encoding="utf-8")))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The slow modules first: the many short tests then share the end evenly among the workers."""
+    items.sort(key=lambda item: not is_slow(item.path))
 
 
 def pytest_collection_finish() -> None:
