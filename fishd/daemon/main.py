@@ -143,6 +143,7 @@ class Daemon:
         realtime.quiet_garbage_collector()
         if self._slow:
             self._slow.stopping = stopping
+            self._slow.meanwhile = self._between_ticks
         clock = self._clock
         lockstep = (
             Lockstep(self._loop, clock, self._config.tick, self._slow)
@@ -184,6 +185,8 @@ class Daemon:
         """Housekeeping, one job at a time, to fit between two ticks of 2 ms."""
         self._server.ticked()
         now = time.monotonic()
+        if self._virtual:  # a tick may be waited for, until an agent answers or in slow motion
+            self._notifier.ticked(now)
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + STATUS_PERIOD / 2
             next(self._housekeeping)()

@@ -8,6 +8,7 @@ machine that is too slow the motion is only slower.
 import asyncio
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Self
 
@@ -27,6 +28,8 @@ class SlowMotion:
         self._period, self._factor = period, factor
         self.stopping = asyncio.Event()
         """Ends the wait for a tick."""
+        self.meanwhile: Callable[[], object] = lambda: None
+        """Called once a period of real time while a tick is waited for."""
         self._due = time.monotonic()
         self._latest: deque[float] = deque(maxlen=SPAN)
 
@@ -38,9 +41,13 @@ class SlowMotion:
 
     async def __anext__(self) -> None:
         """Wait until the next tick may begin, or fishd is to end."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(max(BREATH, self._due - time.monotonic())):
-                await self.stopping.wait()
+        begin = max(self._due, time.monotonic() + BREATH)
+        while (left := begin - time.monotonic()) > 0.0 and not self.stopping.is_set():
+            with suppress(TimeoutError):
+                async with asyncio.timeout(min(left, self._period)):
+                    await self.stopping.wait()
+            if left > self._period:
+                self.meanwhile()
         # A delay of up to a period is made up for; a longer one is forgotten, without a rush.
         self._begin(max(self._due, time.monotonic() - self._period))
 

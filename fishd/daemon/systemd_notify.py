@@ -25,6 +25,8 @@ class SystemdNotifier:
     def ticked(self, now: float) -> None:
         """Feed the watchdog, and be ready with the first tick; to be called from the tick only.
 
+        In virtual time also where a tick is waited for: nothing moves meanwhile.
+
         now: start of the tick [s, monotonic]
         """
         if now < self._next_feed or not self._address:

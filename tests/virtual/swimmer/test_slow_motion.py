@@ -1,6 +1,7 @@
 """A swimmer in a running fishd: its time is slower than that of people, and nothing is late."""
 
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -95,9 +96,26 @@ def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> No
     assert agent.lost == 0
 
 
-def test_it_ends_soon_however_slow_its_motion_is(tmp_path: Path) -> None:
-    slow = ("--set", "swimmer.slow_motion=1000")
+def test_it_answers_and_ends_soon_however_slow_its_motion_is(tmp_path: Path) -> None:
+    slow = ("--set", "swimmer.slow_motion=1000")  # 10 s from tick to tick
     with running(tmp_path, *OPTIONS, *slow) as daemon:
+        seen = {daemon.status(timeout=5.0).seq for _ in range(20)}
+        assert len(seen) <= 2
         status, _, errors = daemon.end(signal.SIGTERM)
     assert status == 0, errors
     assert "hangs" not in errors
+
+
+def test_systemd_hears_of_it_however_slow_its_motion_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, slow = str(tmp_path / "notify"), ("--set", "swimmer.slow_motion=1000")
+    monkeypatch.setenv("NOTIFY_SOCKET", path)
+    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(path)
+        with running(tmp_path, *OPTIONS, *slow):
+            systemd.settimeout(5.0)
+            feeds = 0
+            while feeds < 4:
+                feeds += b"WATCHDOG=1" in systemd.recv(1000)
