@@ -83,6 +83,8 @@ class Attempt(Generic[T]):
         self._done = done
         self._late = late
         self._interrupt = interrupt
+        self._begun = False
+        """Is the thread in code that `GivenUp` may end? Not in that of `threading` at its start."""
         self._result: list[T] = []
         self._error: Exception | None = None
         self._settling = threading.Lock()
@@ -118,7 +120,7 @@ class Attempt(Generic[T]):
 
     def _raise_in_thread(self, error: Any) -> None:
         """Raise there, as soon as it is in Python; None takes back what was not raised yet."""
-        if not self._interrupt:
+        if not (self._interrupt and self._begun):
             return
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), error)
 
@@ -134,7 +136,11 @@ class Attempt(Generic[T]):
                 contained(self._late, self._result[0])
 
     def _attempt(self) -> bool:
-        """Call the function; True unless it was given up meanwhile."""
+        """Call the function; True unless it was given up before or meanwhile."""
+        with self._settling:
+            if self._given_up and self._interrupt:
+                return False
+            self._begun = True
         try:
             self._result.append(contained(self._function))
         except Exception as error:

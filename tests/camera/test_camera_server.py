@@ -71,7 +71,7 @@ def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(
     monkeypatch.setattr(server, "AGAIN", 3.0)
     with serving(tmp_path, FailsOnce()) as client:
         problem = "a camera cannot be used: ZeroDivisionError: in a library"
-        assert client.status().problem == problem
+        wait_until(lambda: client.status().problem == problem)
         (frame, *_) = client.poll(PATIENCE)
         assert np.all(frame.pixels == 7)
         wait_until(lambda: client.status().state == "streaming")

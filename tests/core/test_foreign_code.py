@@ -97,3 +97,24 @@ def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thro
         # One that was ended before it returned has no result at all.
         assert attempt.wait(0.0) == done
         assert len(late) <= (0 if done else 1)
+
+
+def test_one_that_is_given_up_before_its_thread_has_begun_ends_without_a_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begin, calls, uncaught = threading.Event(), [], []
+
+    class SlowToBegin(threading.Thread):
+        def run(self) -> None:
+            begin.wait(PATIENCE)
+            super().run()
+
+    monkeypatch.setattr(threading, "Thread", SlowToBegin)
+    monkeypatch.setattr(threading, "excepthook", uncaught.append)
+    attempt = Attempt(lambda: calls.append(1))
+    assert attempt.give_up()
+    begin.set()
+    deadline = time.monotonic() + PATIENCE
+    while attempt.alive and time.monotonic() < deadline:
+        time.sleep(0.001)
+    assert (calls, uncaught) == ([], [])
