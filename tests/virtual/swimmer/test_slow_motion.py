@@ -3,6 +3,7 @@
 import signal
 import socket
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -99,8 +100,8 @@ def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> No
 def test_it_answers_and_ends_soon_however_slow_its_motion_is(tmp_path: Path) -> None:
     slow = ("--set", "swimmer.slow_motion=1000")  # 10 s from tick to tick
     with running(tmp_path, *OPTIONS, *slow) as daemon:
-        seen = {daemon.status(timeout=5.0).seq for _ in range(20)}
-        assert len(seen) <= 2
+        answered = Counter(daemon.status(timeout=5.0).seq for _ in range(20))
+        assert max(answered.values()) > 6  # as many as a real tick of 10 ms permits
         status, _, errors = daemon.end(signal.SIGTERM)
     assert status == 0, errors
     assert "hangs" not in errors
