@@ -9,7 +9,7 @@ from fishd.core.errors import RecordingError
 from fishd.recording.folder import new_path, paths
 from fishd.recording.part_file import PART, is_being_written
 from fishd.recording.recorder import RESERVE
-from fishd.recording.recover import recover
+from fishd.recording.recover import RECOVERING, recover
 from fishd.recording.writer import RunWriter
 
 PREFIX = "blackbox-"
@@ -33,6 +33,10 @@ class BlackBox:
 
     def open(self) -> RunWriter:
         """Begin a file; those that were cut off, by a power cut say, are finished first."""
+        for copy in self._folder.glob(f"{PREFIX}*{RECOVERING}"):
+            if not is_being_written(copy):  # left by a kill
+                with suppress(OSError):
+                    copy.unlink()
         self._make_room(0)
         for path in self._own():
             if path.name.endswith(PART) and not is_being_written(path):

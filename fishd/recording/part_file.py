@@ -3,7 +3,8 @@
 import errno
 import fcntl
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from fishd.core.errors import RecordingError
@@ -83,19 +84,7 @@ class PartFile:
     def finish(self) -> None:
         """Give the file its final name; raises OSError, and leaves the part where it is then."""
         self.sync()
-        try:
-            self.final.hardlink_to(self.path)  # unlike a rename, never onto another file
-        except OSError as error:
-            if error.errno == errno.EEXIST or self.final.exists():
-                raise
-            self.path.rename(self.final)  # a file system without links, such as that of USB sticks
-        else:
-            self.path.unlink()
-        folder = os.open(self.final.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        give_name(self.path, self.final)
 
     def remove(self) -> None:
         """Take the part away."""
@@ -108,8 +97,37 @@ class PartFile:
             self._fd = -1
 
 
+def give_name(part: Path, final: Path) -> None:
+    """Rename what is whole, never onto another file; raises OSError, and leaves it as it was then.
+
+    A kill in the midst of it may leave both names, of the same file.
+    """
+    try:
+        final.hardlink_to(part)  # unlike a rename, never onto another file
+    except OSError as error:
+        if error.errno == errno.EEXIST or final.exists():
+            raise
+        part.rename(final)  # a file system without links, such as that of USB sticks
+    else:
+        part.unlink()
+    folder = os.open(final.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+@contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Lock a recording as one that is being written, where its file system can; raises OSError."""
+    with path.open("rb") as file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def is_being_written(path: Path) -> bool:
-    """Does some process still write this part?"""
+    """Does some process still write this part, or recover it?"""
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -8,12 +8,21 @@ from mcap.writer import CompressionType, Writer
 from fishd.core.errors import RecordingError
 from fishd.recording import images
 from fishd.recording.mcap_file import records
-from fishd.recording.part_file import PART, SUFFIX, PartFile, is_being_written
+from fishd.recording.part_file import (
+    PART,
+    SUFFIX,
+    PartFile,
+    give_name,
+    held,
+    is_being_written,
+)
 from fishd.recording.reader import TOPICS, Run, open_run
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import to_metadata
 from fishd.recording.writer import CHUNK
 
+RECOVERING = ".recovering"
+"""Is added to the name of the copy until it is whole."""
 UNFINISHED = "recovered: the recording was not finished"
 DAMAGED = "recovered: the recording was damaged, ticks that could not be read: {}"
 
@@ -22,27 +31,50 @@ def recover(path: Path) -> Run:
     """Write what can be read of a recording into a finished one, and open that.
 
     `RUN.mcap.part` becomes `RUN.mcap`; what has another name stays, beside `NAME-recovered.mcap`.
+    A kill costs nothing: the next call finishes what this one began.
     Raises `RecordingError` where there is nothing to recover, or no room to do so.
     """
-    is_part = path.name.endswith(SUFFIX + PART)
-    if is_part and is_being_written(path):
-        raise RecordingError(f"{path} is being recorded now; end that first")
+    if is_being_written(path):
+        raise RecordingError(f"{path} is being recorded now, or recovered; end that first")
     run = open_run(path)
-    if run.finished and not run.is_damaged:
+    is_part = path.name.endswith(SUFFIX + PART)
+    if not is_part and run.finished and not run.is_damaged:
         raise RecordingError(f"{path} is finished and whole: there is nothing to recover")
     final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
-    file = PartFile(final, final.with_name(final.name + ".recovering"))
+    try:
+        with held(path):
+            final.with_name(final.name + RECOVERING).unlink(missing_ok=True)  # left by a kill
+            if not (is_part and _is_done(run, final)):
+                _write(run, final)
+            if is_part:
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{final} cannot be written: {error.strerror or error}") from None
+    return open_run(final)
+
+
+def _is_done(part: Run, final: Path) -> bool:
+    """Has the part its final name already, or a copy that has, when a kill came before the end?"""
+    if part.finished and not part.is_damaged and not final.exists():
+        give_name(part.path, final)
+    if not final.exists():
+        return False
+    run = open_run(final)
+    return run.finished and not run.is_damaged and run.about == part.about
+
+
+def _write(run: Run, final: Path) -> None:
+    if final.exists():
+        raise RecordingError(f"{final} is there already; move it away first")
+    file = PartFile(final, final.with_name(final.name + RECOVERING))
     try:
         _copy(run, file)
         file.finish()
-    except OSError as error:
+    except BaseException:
         file.remove()
-        raise RecordingError(f"{final} cannot be written: {error.strerror or error}") from None
+        raise
     finally:
         file.close()
-    if is_part:
-        path.unlink(missing_ok=True)
-    return open_run(final)
 
 
 def _copy(run: Run, file: PartFile) -> None:

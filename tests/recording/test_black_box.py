@@ -48,9 +48,13 @@ def test_a_file_that_a_power_cut_left_is_finished_at_the_next_start(tmp_path: Pa
     writer.flush()
     writer._give_up()  # as a kill does
     (tmp_path / "blackbox-0.mcap.part").touch()  # nothing was written yet
+    copies = [Path(f"{path}.recovering") for path in (writer.path, tmp_path / "blackbox-1.mcap")]
+    for copy in copies:  # a second power cut, while the first one was seen to
+        copy.write_bytes(writer.part.read_bytes())
     with BlackBox(tmp_path, KEEP, RunWriter).open() as now:
         assert open_run(writer.path).ticks == ticks
         assert now.path != writer.path
+    assert not any(copy.exists() for copy in copies)
 
 
 def test_an_almost_full_disk_costs_the_oldest_file_first(

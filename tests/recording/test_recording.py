@@ -3,8 +3,11 @@
 import errno
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -97,8 +100,74 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
 def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
     with RunWriter(tmp_path / "run") as writer:
         assert glance(writer.part).writing
-        with pytest.raises(RecordingError, match="is being recorded now; end that first"):
+        with pytest.raises(RecordingError, match="is being recorded now, or recovered; end that first"):
             recover(writer.part)
+
+
+def recover_until(call: int, path: Path) -> bool:
+    """Recover in another process, which is killed before this system call; did it end before?"""
+    if not (child := os.fork()):
+        calls = count()
+
+        def dying(act: Callable[..., Any]) -> Callable[..., Any]:
+            def acting(*args: Any, **options: Any) -> Any:
+                if next(calls) == call:
+                    os._exit(9)
+                return act(*args, **options)
+
+            return acting
+
+        for name in ("open", "write", "fdatasync", "link", "unlink", "fsync"):
+            setattr(os, name, dying(getattr(os, name)))
+        with suppress(BaseException):
+            recover(path)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@pytest.mark.parametrize("damaged", [False, True], ids=["cut off", "damaged"])
+def test_whenever_a_recovery_is_killed_the_next_one_finishes_it(
+    tmp_path: Path, damaged: bool
+) -> None:
+    whole = recorded(swum(), tmp_path / "whole", flush_every=10)
+    content = bytearray(whole.read_bytes())
+    for call in count():
+        folder = tmp_path / f"{call}"
+        folder.mkdir()
+        if damaged:
+            content[int(0.4 * len(content))] ^= 0x55 if call == 0 else 0
+            source, final = folder / "run.mcap", folder / "run-recovered.mcap"
+            source.write_bytes(content)
+        else:
+            source, final = folder / "run.mcap.part", folder / "run.mcap"
+            source.write_bytes(content[: len(content) // 2])
+        ticks = open_run(source).ticks
+        ended = recover_until(call, source)
+        with suppress(RecordingError):  # there is nothing left to do
+            recover(source)
+        assert set(folder.iterdir()) == ({source, final} if damaged else {final})
+        assert (open_run(final).ticks, open_run(final).is_damaged) == (ticks, False)
+        if ended:
+            break
+    assert call > 5
+
+
+def test_a_recording_that_was_killed_while_it_got_its_name_gets_it_from_a_recovery(
+    tmp_path: Path,
+) -> None:
+    whole = recorded(swum(), tmp_path / "run")
+    content, part = whole.read_bytes(), whole.with_name("run.mcap.part")
+    part.hardlink_to(whole)
+    assert recover(part).path == whole
+    assert not part.exists()
+    whole.rename(part)
+    assert recover(part).path == whole
+    assert not part.exists()
+    assert whole.read_bytes() == content
+    part.write_bytes(content[: len(content) // 2])
+    whole.write_bytes(recorded(swum(), tmp_path / "other").read_bytes())
+    with pytest.raises(RecordingError, match=r"run\.mcap is there already; move it away first"):
+        recover(part)
 
 
 @pytest.mark.slow
