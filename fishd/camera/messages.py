@@ -4,7 +4,7 @@ Each message of the PUB socket is a topic and one JSON object; behind that of a 
 comes the picture. Requests are those of fishd's control protocol (`fishd.core.protocol`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from fishd.camera.frames import Pixels
+from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
 from fishd.core.schema import note, unit
 
@@ -199,10 +200,10 @@ def until(until: Until) -> list[bytes]:
 
 
 _decoders: dict[bytes, Any] = {
-    FRAME: msgspec.json.Decoder(FrameHeader),
-    VIEW: msgspec.json.Decoder(ViewHeader),
-    STATE: msgspec.json.Decoder(CameraState),
-    UNTIL: msgspec.json.Decoder(Until),
+    FRAME: decoder(FrameHeader),
+    VIEW: decoder(ViewHeader),
+    STATE: decoder(CameraState),
+    UNTIL: decoder(Until),
 }
 
 
@@ -210,7 +211,7 @@ class _OnlyVersion(Struct):
     v: int
 
 
-_decode_version = msgspec.json.Decoder(_OnlyVersion).decode
+_decode_version: Callable[[bytes], _OnlyVersion] = decoder(_OnlyVersion)
 
 
 def decode(parts: Sequence[bytes]) -> Message:
@@ -228,8 +229,8 @@ def decode(parts: Sequence[bytes]) -> Message:
                 f"a message of topic {name} in version {version}; version {VERSION} is needed: "
                 "let camera and client be of the same fishd"
             )
-        header: FrameHeader | ViewHeader | CameraState | Until = _decoders[topic].decode(parts[1])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        header: FrameHeader | ViewHeader | CameraState | Until = _decoders[topic](parts[1])
+    except msgspec.DecodeError as error:
         raise BadMessage(f"a message of topic {name} that cannot be read: {error}") from None
     if isinstance(header, FrameHeader):
         age = header.available - header.time

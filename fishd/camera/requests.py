@@ -4,7 +4,7 @@ import itertools
 import os
 import time
 from contextlib import suppress
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import msgspec
 import zmq
@@ -13,6 +13,7 @@ from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
 from fishd.client.connection import milliseconds_until
 from fishd.core import addresses, protocol, text
+from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
 
 ENDPOINT_VARIABLE = "FISHD_CAMERA"
@@ -67,14 +68,14 @@ class CameraRequests:
         if self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
             self._socket.send(protocol.encode(request))
             while self._socket.poll(milliseconds_until(deadline)):
-                with suppress(msgspec.DecodeError, UnicodeDecodeError):
+                with suppress(msgspec.DecodeError):
                     reply = protocol.decode_reply(self._socket.recv_multipart()[-1])
                     if reply.id != identity:
                         continue
                     if reply.error:
                         raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
                     if reply.result:
-                        return msgspec.json.decode(reply.result, type=kind)
+                        return cast(T, decoder(kind)(reply.result))
         if self._publishes():
             raise CameraLost(
                 f"at {self.endpoint} a camera publishes its frames; requests go to another address "

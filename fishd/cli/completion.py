@@ -6,7 +6,6 @@
 from collections.abc import Iterable
 
 import click
-import msgspec
 from click.shell_completion import CompletionItem, get_completion_class
 
 from fishd.client import Fish
@@ -61,7 +60,7 @@ def complete_pair(
     try:
         with Fish(endpoint_of(ctx), timeout=_PATIENCE) as fish:
             fields = active_parameters(fish)
-    except (FishError, msgspec.DecodeError):
+    except FishError:
         return []
     given: tuple[str, ...] = ctx.params.get(param.name or "") or ()
     if len(given) % 2 == 0:

@@ -3,7 +3,6 @@
 import sys
 
 import click
-import msgspec
 
 from fishd import __version__
 from fishd.cli.verbs import Verb, Verbs
@@ -88,8 +87,6 @@ def main() -> None:
         complain("fishctl", f"{error} [{error.code}]", 1)
     except FishdError as error:
         complain("fishctl", str(error), 1)
-    except msgspec.DecodeError as error:
-        complain("fishctl", f"what answers at this endpoint is no fishd: {error}", 1)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except BrokenPipeError:  # the reader, `head` say, has seen enough

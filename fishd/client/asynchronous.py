@@ -2,11 +2,10 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import closing
 from typing import Any, Self, TypeVar
 
-import msgspec
 import zmq.asyncio
 
 from fishd.client.connection import (
@@ -18,6 +17,7 @@ from fishd.client.connection import (
     subscriber,
 )
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.core.decoding import decoder
 from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
@@ -148,7 +148,7 @@ class AsyncFish(Connection):
             raise self.silent() from None
         while await self._socket.poll(milliseconds_until(deadline)):
             frames = await self._socket.recv_multipart()
-            result = self.result(frames[-1], identity, kind)
+            result = self.result(frames, identity, kind)
             if result is not None:
                 return result
         raise self.silent(patience)
@@ -156,8 +156,8 @@ class AsyncFish(Connection):
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
         address = self.telemetry_address or (await self.status()).telemetry
         patience = -1 if kind is Event else int(self.timeout * 1e3)
-        decoder = msgspec.json.Decoder(kind)
+        decode: Callable[[bytes], T] = decoder(kind)
         with closing(subscriber(self._context, address, topic)) as socket:
             while await socket.poll(patience) or await socket.poll(SECOND_LOOK):
-                yield decoder.decode((await socket.recv_multipart())[1])
+                yield self.read(decode, await socket.recv_multipart())
         raise self.telemetry_silent()

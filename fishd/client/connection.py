@@ -4,15 +4,16 @@ import itertools
 import math
 import os
 import time
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar, cast
 
 import msgspec
 import zmq
 
 from fishd.core import protocol, text
 from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, socket_path
-from fishd.core.errors import NoDaemon, ParameterError, Refused, Untrusted
+from fishd.core.decoding import decoder
+from fishd.core.errors import FishError, NoDaemon, ParameterError, Refused, Untrusted
 from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
 
 T = TypeVar("T")
@@ -92,16 +93,23 @@ class Connection:
             raise ParameterError(f"{op}: the request is longer than {protocol.MAX_MESSAGE} bytes")
         return identity, payload
 
-    @staticmethod
-    def result(payload: bytes, identity: int, kind: type[T]) -> T | None:
+    def result(self, frames: Sequence[bytes], identity: int, kind: type[T]) -> T | None:
         """The result in a reply; None when it answers an earlier request that timed out."""
-        reply = protocol.decode_reply(payload)
+        reply: protocol.Reply = self.read(protocol.decode_reply, frames)
         if reply.id != identity:
             return None
         if reply.error:
             raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
-        assert reply.result
-        return msgspec.json.decode(reply.result, type=kind)
+        return cast(T, self.read(decoder(kind), (reply.result or b"",)))
+
+    def read(self, decode: Callable[[bytes], T], frames: Sequence[bytes]) -> T:
+        """What the last frame of a message says; raises `FishError` where that is nothing known."""
+        try:
+            return decode(frames[-1])
+        except msgspec.DecodeError as error:
+            raise FishError(
+                f"what answers at {self.endpoint} is no fishd of this version: {text.line(str(error))}"
+            ) from None
 
     def telemetry_silent(self) -> NoDaemon:
         """What to raise when no telemetry comes in time."""

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from typing import Any, Self, TypeVar
 
-import msgspec
 import zmq
 
 from fishd.client.connection import (
@@ -17,6 +16,7 @@ from fishd.client.connection import (
     subscriber,
 )
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.core.decoding import decoder
 from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
@@ -178,7 +178,7 @@ class Fish(Connection):
             raise self.silent(patience)
         self._socket.send(request)
         while self._socket.poll(milliseconds_until(deadline)):
-            result = self.result(self._socket.recv_multipart()[-1], identity, kind)
+            result = self.result(self._socket.recv_multipart(), identity, kind)
             if result is not None:
                 return result
         raise self.silent(patience)
@@ -187,14 +187,15 @@ class Fish(Connection):
         """Messages of these topics; forever: however long they take."""
         address = self.telemetry_address or self.status().telemetry
         patience = -1 if forever else int(self.timeout * 1e3)
-        decoders = {topic: msgspec.json.Decoder(kind) for topic, kind in kinds.items()}
+        decoders = {topic: decoder(kind) for topic, kind in kinds.items()}
         socket = subscriber(self._context, address, *kinds)
 
         def messages() -> Iterator[T]:
             with closing(socket):
                 while socket.poll(patience) or socket.poll(SECOND_LOOK):
-                    topic, payload = socket.recv_multipart()
-                    yield decoders[topic].decode(payload)
+                    frames = socket.recv_multipart()
+                    if decode := decoders.get(frames[0]):
+                        yield self.read(decode, frames)
             raise self.telemetry_silent()
 
         return messages()

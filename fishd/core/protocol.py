@@ -4,6 +4,7 @@ docs/protocol.md is its reference for clients in other languages; its tables are
 is declared here (`make docs`).
 """
 
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
@@ -11,6 +12,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from fishd.core import text
 from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.decoding import decoder
 from fishd.core.errors import Refused
 from fishd.core.schema import PRINTABLE, note, unit
 from fishd.core.signals import MODES, Reason
@@ -254,16 +256,16 @@ OPERATIONS = {
 """All operations, by name."""
 
 encode = msgspec.json.Encoder().encode
-decode_reply = msgspec.json.Decoder(Reply).decode
-_decode_request = msgspec.json.Decoder(Request).decode
-_decode_id = msgspec.json.Decoder(OnlyId).decode
+decode_reply: Callable[[bytes], Reply] = decoder(Reply)
+_decode_request: Callable[[bytes], Request] = decoder(Request)
+_decode_id: Callable[[bytes], OnlyId] = decoder(OnlyId)
 
 
 def decode_request(payload: bytes) -> Request:
     """The request in `payload`; raises `Refused` with code `bad-request` or `version`."""
     try:
         request = _decode_request(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except msgspec.DecodeError as error:
         raise Refused("bad-request", f"not a request: {error}") from None
     if request.v != VERSION:
         raise Refused(
@@ -276,7 +278,7 @@ def request_id(payload: bytes) -> RequestId:
     """The id of a request that may be broken otherwise; None where it cannot be told."""
     try:
         return _decode_id(payload).id
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    except msgspec.DecodeError:
         return None
 
 

@@ -4,6 +4,7 @@ The schema is foxglove.CompressedImage, as JSON; beside its fields stand those o
 viewers pass over. PNG loses nothing, so that what was recorded can be learned from.
 """
 
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
@@ -11,6 +12,7 @@ import numpy as np
 from msgspec import UNSET, Struct, structs
 from numpy.typing import NDArray
 
+from fishd.core.decoding import decoder
 from fishd.core.errors import MissingPackage, RecordingError
 from fishd.core.schema import fields_of, note, unit
 
@@ -104,10 +106,10 @@ def encoded(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
     return msgspec.json.encode(message)
 
 
-decode_head = msgspec.json.Decoder(FrameHead).decode
+decode_head: Callable[[bytes], FrameHead] = decoder(FrameHead)
 """A message without its picture; raises `msgspec.DecodeError`."""
 
-_decode = msgspec.json.Decoder(ImageMessage).decode
+_decode: Callable[[bytes], ImageMessage] = decoder(ImageMessage)
 
 
 def decoded(payload: bytes) -> RecordedFrame:

@@ -11,6 +11,7 @@ import yaml
 from mcap.records import Attachment, Channel, Footer, Message, Metadata
 
 from fishd.config import Config, adopt
+from fishd.core.decoding import decoder
 from fishd.core.errors import ConfigError, RecordingError
 from fishd.core.frames import frame
 from fishd.core.protocol import Calibrations
@@ -226,10 +227,10 @@ class Run:
         if name == CONFIG:
             self.configs[int(self.daemons[-1]["number"])] = yaml.safe_load(data)
         elif name == CALIBRATIONS:
-            self.calibrations.append(msgspec.json.decode(data, type=Calibrations))
+            self.calibrations.append(decoder(Calibrations)(data))
 
     def _decoded(self, topic: str, kind: type[T]) -> list[T]:
-        decode = msgspec.json.Decoder(kind).decode
+        decode = decoder(kind)
         try:
             return [decode(payload) for found, payload in self.entries if found == topic]
         except msgspec.DecodeError as error:

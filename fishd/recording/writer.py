@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from fishd.config import Config, to_yaml
+from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
@@ -243,7 +244,7 @@ class RunWriter:
 
 
 _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {
-    "tick": msgspec.json.Decoder(TickHead).decode,
-    "event": msgspec.json.Decoder(Event).decode,
-    "status": msgspec.json.Decoder(Status).decode,
+    "tick": decoder(TickHead),
+    "event": decoder(Event),
+    "status": decoder(Status),
 }

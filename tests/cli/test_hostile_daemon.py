@@ -1,6 +1,7 @@
 """A daemon that would talk to the terminal: fishctl prints nothing of it but printable text."""
 
 import json
+import re
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import zmq
 from msgspec import inspect
 from rigs.processes import PATIENCE, fishctl
 
+from fishd.client import Fish, FishError
 from fishd.core import protocol
 from fishd.core.protocol import Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Status, Tick
@@ -58,6 +60,8 @@ class Hostile:
         self._telemetry = f"ipc://{folder}/telemetry"
         self._over = threading.Event()
         self.refuses = False
+        self.rubbish = b""
+        """What is answered and published instead."""
         self._thread = threading.Thread(target=self._serve)
         self._ready = threading.Event()
         self._thread.start()
@@ -79,10 +83,11 @@ class Hostile:
             seq = 0
             while not self._over.is_set():
                 seq += 1
-                telemetry.send_multipart((b"tick", msgspec.json.encode(evil(Tick, seq=seq))))
+                tick = self.rubbish or msgspec.json.encode(evil(Tick, seq=seq))
+                telemetry.send_multipart((b"tick", tick))
                 if control.poll(20):
                     *envelope, payload = control.recv_multipart()
-                    control.send_multipart([*envelope, self._answer(payload)])
+                    control.send_multipart([*envelope, self.rubbish or self._answer(payload)])
 
     def _answer(self, payload: bytes) -> bytes:
         request = protocol.decode_request(payload)
@@ -151,6 +156,26 @@ def test_no_refusal_says_anything_to_the_terminal(hostile: Hostile, verb: tuple[
     check(done.stderr)
     assert done.stderr.count("\n") == 1
     assert "forged" in done.stderr or "evil" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "rubbish", [b"no JSON", b'{"v":1,"id":"\xff"}', b'{"a":' + 60_000 * b"["], ids=len
+)
+def test_rubbish_is_one_line_that_says_where_it_comes_from(
+    hostile: Hostile, rubbish: bytes
+) -> None:
+    with Fish(hostile.endpoint) as fish:
+        telemetry = fish.status().telemetry
+    hostile.rubbish = rubbish
+    where = f"what answers at {hostile.endpoint} is no fishd of this version: "
+    with Fish(hostile.endpoint, telemetry=telemetry) as fish:
+        with pytest.raises(FishError, match=f"^{re.escape(where)}[^\n]+$"):
+            fish.status()
+        with pytest.raises(FishError, match=f"^{re.escape(where)}[^\n]+$"):
+            next(fish.ticks())
+    done = asked(hostile, "status")
+    assert done.stderr.startswith(f"fishctl: {where}")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
 
 
 @pytest.mark.parametrize("verb", ["status", "controllers", "policies", "stop"])

@@ -100,7 +100,9 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
 def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
     with RunWriter(tmp_path / "run") as writer:
         assert glance(writer.part).writing
-        with pytest.raises(RecordingError, match="is being recorded now, or recovered; end that first"):
+        with pytest.raises(
+            RecordingError, match="is being recorded now, or recovered; end that first"
+        ):
             recover(writer.part)
 
 

@@ -22,6 +22,7 @@ from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
 from fishd.client.connection import subscriber
 from fishd.core.addresses import find_control
+from fishd.core.decoding import decoder
 from fishd.core.errors import FishError
 from fishd.core.schema import Problem, convert
 from fishd.core.signals import Status
@@ -110,7 +111,7 @@ class SimulatedSource:
         """size: height and width of a picture [px]"""
         self._settings = settings
         self._size = size
-        self._decode = msgspec.json.Decoder(TickTruth).decode
+        self._decode: Callable[[bytes], TickTruth] = decoder(TickTruth)
         where = settings.fishd or find_control()
         self.device = f"a simulated camera above the fish at {where}"
 
@@ -161,7 +162,7 @@ class SimulatedSource:
     def _decoded(self, payload: bytes) -> TickTruth | None:
         try:
             return self._decode(payload)
-        except (msgspec.DecodeError, UnicodeDecodeError):
+        except msgspec.DecodeError:
             return None
 
 

@@ -11,8 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
 from fishd.client import Fish
 from fishd.config import Config, assembly
 from fishd.config.drivers import CHOICES
@@ -68,8 +66,8 @@ def ask(endpoint: str | None) -> Running | Unreachable | None:
         why = str(error)
     except NoDaemon:
         why = f"no answer from {endpoint} within {PATIENCE:g} s, but a fishd may be there"
-    except (FishError, msgspec.MsgspecError) as error:
-        why = f"what answers at {endpoint} is no fishd of this version: {error}"
+    except FishError as error:
+        why = str(error)
     return Unreachable(why, False)
 
 

@@ -108,7 +108,7 @@ class Remote(Controller[RemoteParameters]):
         self.silent = 0
         self._waited = 0.0
         """For the first action [s]."""
-        self._problem: ControllerFault | None = None
+        self._problem: Exception | None = None
 
     @classmethod
     def check(cls, parameters: Any, limits: Limits) -> None:
@@ -154,7 +154,7 @@ class Remote(Controller[RemoteParameters]):
             if observation is not self._observation:
                 self._begin(observation)
             self._exchange()
-        except ControllerFault as problem:
+        except Exception as problem:  # a fault of the tick, which lockstep waits for
             self._problem = problem
         return self._settled or self._problem is not None
 

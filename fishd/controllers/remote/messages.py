@@ -4,11 +4,13 @@ fishd connects to the agent. Each observation is numbered within its session, an
 the observation that it answers: one that comes too late is dropped.
 """
 
+from collections.abc import Callable
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta, Struct
 
+from fishd.core.decoding import decoder
 from fishd.core.signals import Observation
 
 VERSION = 1
@@ -69,5 +71,5 @@ FromFish = Observed | Ended
 FromAgent = Action | Pause
 
 encode = msgspec.json.Encoder().encode
-decode_from_fish = msgspec.json.Decoder(FromFish).decode
-decode_from_agent = msgspec.json.Decoder(FromAgent).decode
+decode_from_fish: Callable[[bytes], FromFish] = decoder(FromFish)
+decode_from_agent: Callable[[bytes], FromAgent] = decoder(FromAgent)

@@ -2,6 +2,7 @@
 
 import re
 import select
+from collections.abc import Callable
 from contextlib import ExitStack
 
 import msgspec
@@ -9,6 +10,7 @@ import zmq
 
 from fishd.controllers.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
 from fishd.core.addresses import FORM
+from fishd.core.decoding import decoder
 from fishd.core.errors import ControllerFault, ParameterError
 
 _QUEUE = 100
@@ -33,6 +35,9 @@ class _Versioned(msgspec.Struct):
     """Any message, as far as every version will have it."""
 
     v: int = VERSION
+
+
+_decode_version: Callable[[bytes], _Versioned] = decoder(_Versioned)
 
 
 class Wire:
@@ -78,7 +83,7 @@ class Wire:
         if len(frames) != 1:
             raise self._bad(f"a message of {len(frames)} frames; one frame of JSON is needed")
         try:
-            message: FromAgent = decode_from_agent(frames[0])
+            message = decode_from_agent(frames[0])
         except msgspec.DecodeError as error:  # of the syntax, or of what is in it
             raise self._bad(_why(frames[0], error)) from None
         if message.v != VERSION:
@@ -104,7 +109,7 @@ class Wire:
 
 def _why(payload: bytes, error: msgspec.DecodeError) -> str:
     try:
-        version = msgspec.json.decode(payload, type=_Versioned).v
+        version = _decode_version(payload).v
     except msgspec.DecodeError:
         version = VERSION
     if version != VERSION:

@@ -174,6 +174,7 @@ def test_what_is_no_message_of_a_fishd_is_left_aside(tmp_path: Path) -> None:
     with Agent(f"ipc://{tmp_path}/agent", timeout=0.3) as agent:
         stranger = context.socket(zmq.DEALER)
         stranger.connect(agent.address)
+        stranger.send(b'{"kind":"ended","session":"\xff"}')
         stranger.send(b"hello")
         with pytest.raises(NoDaemon, match="but what is none: JSON is malformed"):
             agent.observe()

@@ -17,6 +17,8 @@ def spoiled(**changes: Any) -> dict[str, Any]:
     ("rubbish", "complaint"),
     [
         (b"\xff\x00", "which is neither an action nor a pause"),
+        (b'{"kind":"action","session":"\xff","seq":1,"phi_c":0.1}', "can't decode byte 0xff"),
+        (b'{"a":' + 60_000 * b"[", "maximum recursion depth exceeded"),
         (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
         (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
         (spoiled(phi_c="0.1"), "Expected `float`, got `str` - at `$.phi_c`"),
