@@ -55,7 +55,7 @@ class AsyncFish(Connection):
 
     async def policies(self) -> list[PolicyInfo]:
         """The named policies that the daemon finds, with what their files say about themselves."""
-        return await self._call(list[PolicyInfo], "policies")
+        return await self._call(list[PolicyInfo], "policies", patience=LOADING)
 
     async def config(self) -> dict[str, Any]:
         """The configuration that the daemon was started with, defaults included."""
@@ -98,11 +98,13 @@ class AsyncFish(Connection):
     async def tare(self, seconds: float = 2.0) -> Calibrations:
         """Measure for a while and call that zero force; refused unless all is still."""
         sample = await self.sample_force(seconds)
-        return await self._call(Calibrations, "tare", sample=sample.number)
+        return await self._call(Calibrations, "tare", patience=LOADING, sample=sample.number)
 
     async def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
         """Apply another calibration of the force sensor, and save it."""
-        return await self._call(Calibrations, "calibrate-force", calibration=calibration)
+        return await self._call(
+            Calibrations, "calibrate-force", patience=LOADING, calibration=calibration
+        )
 
     async def calibrate_thrust(self, factor: float, error: float) -> State:
         """As `Fish.calibrate_thrust`."""
@@ -113,7 +115,12 @@ class AsyncFish(Connection):
     ) -> Calibrations:
         """Apply another calibration of the servo, and save it or not."""
         return await self._call(
-            Calibrations, "calibrate-servo", calibration=calibration, save=save, lease=lease
+            Calibrations,
+            "calibrate-servo",
+            patience=LOADING if save else 0.0,
+            calibration=calibration,
+            save=save,
+            lease=lease,
         )
 
     async def renew_lease(self, lease: str) -> Calibrations:

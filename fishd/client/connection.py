@@ -107,8 +107,9 @@ class Connection:
         try:
             return decode(frames[-1])
         except msgspec.DecodeError as error:
+            why = text.line(str(error))
             raise FishError(
-                f"what answers at {self.endpoint} is no fishd of this version: {text.line(str(error))}"
+                f"what answers at {self.endpoint} is no fishd of this version: {why}"
             ) from None
 
     def telemetry_silent(self) -> NoDaemon:

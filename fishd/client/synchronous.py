@@ -66,7 +66,7 @@ class Fish(Connection):
 
     def policies(self) -> list[PolicyInfo]:
         """The named policies that the daemon finds, with what their files say about themselves."""
-        return self._call(list[PolicyInfo], "policies")
+        return self._call(list[PolicyInfo], "policies", patience=LOADING)
 
     def config(self) -> dict[str, Any]:
         """The configuration that the daemon was started with, defaults included."""
@@ -106,7 +106,7 @@ class Fish(Connection):
         return self._call(Calibrations, "calibrations")
 
     def sample_force(self, seconds: float = 2.0) -> ForceSample:
-        """Measure for a while; refused while the fish swims, and for a simulated fish."""
+        """Measure for a while; refused while a controller other than `hold` is active."""
         return self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
 
     def tare(self, seconds: float = 2.0) -> Calibrations:
@@ -115,11 +115,13 @@ class Fish(Connection):
         Nothing changes where that is given up while it measures.
         """
         sample = self.sample_force(seconds)
-        return self._call(Calibrations, "tare", sample=sample.number)
+        return self._call(Calibrations, "tare", patience=LOADING, sample=sample.number)
 
     def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
         """Apply another calibration of the force sensor, and save it."""
-        return self._call(Calibrations, "calibrate-force", calibration=calibration)
+        return self._call(
+            Calibrations, "calibrate-force", patience=LOADING, calibration=calibration
+        )
 
     def calibrate_servo(
         self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
@@ -130,7 +132,12 @@ class Fish(Connection):
         seconds unless it is renewed. Name it in further changes, and to save.
         """
         return self._call(
-            Calibrations, "calibrate-servo", calibration=calibration, save=save, lease=lease
+            Calibrations,
+            "calibrate-servo",
+            patience=LOADING if save else 0.0,
+            calibration=calibration,
+            save=save,
+            lease=lease,
         )
 
     def renew_lease(self, lease: str) -> Calibrations:

@@ -7,7 +7,7 @@ from typing import Any
 
 
 class FishdError(Exception):
-    """Any of them, but for `Escaped`."""
+    """Base of all exceptions here except `Escaped`."""
 
 
 class ConfigError(FishdError, ValueError):

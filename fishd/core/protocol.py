@@ -27,7 +27,7 @@ FRESH = 10.0
 """How long after it was taken a force sample is good for a tare [s]."""
 
 LOADING = 10.0
-"""How long a controller may take to load, and a file to be written [s]."""
+"""How long a controller may take to load, and files to be read or written [s]."""
 
 BEGINNINGS = {"set-controller", "clear-fault", "calibrate-servo"}
 """Operations after which a fish at rest moves, or its servo gets pulses."""

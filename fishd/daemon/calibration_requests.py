@@ -4,6 +4,7 @@ import asyncio
 import datetime
 import math
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -214,7 +215,12 @@ class CalibrationRequests:
             self._servo.check(calibration, wanted.lease, keep=wanted.save)
             if wanted.save:
                 calibration, path = await self._save(calibration)
-                self._servo.check(calibration, wanted.lease, keep=True)
+                try:
+                    self._servo.check(calibration, wanted.lease, keep=True)
+                except Refused:  # the lease has ended meanwhile, or the fish swims
+                    with suppress(OSError):
+                        path.unlink()  # not to be used from the next start on
+                    raise
                 self._servo.keep(calibration)
                 self._servo_file = str(path)
                 self._announce("servo", path)

@@ -92,6 +92,7 @@ class Daemon:
                 config, robot, self._clock, self._telemetry, self._ticked
             )
             stack.callback(self._loop.close)
+            stack.callback(self._release)
             stack.callback(self._come_to_rest)
             if robot.panel:
                 robot.panel.on_press = self._on_press
@@ -203,9 +204,14 @@ class Daemon:
     def _come_to_rest(self) -> None:
         """Where fishd failed and could not fade: neutral, and time to get there."""
         if self._loop.servo.on and self._loop.applied != 0.0:
-            with suppress(ServoError):  # closing it comes next, and says what could not be done
+            with suppress(ServoError):  # closing it comes later, and says what could not be done
                 self._loop.robot.servo.write(0.0)
                 self._clock.sleep(REST)
+
+    def _release(self) -> None:
+        """Before a controller is closed, which may never return."""
+        with suppress(ServoError):  # closing it comes later, and says what could not be done
+            self._loop.robot.servo.release()
 
     def release_at_once(self) -> None:
         """Let go of the servo from another thread, while this one hangs.

@@ -62,7 +62,10 @@ class Operations:
         self._monotonic = time.monotonic if isinstance(clock, SlowClock) else clock.monotonic
         self._started = self._monotonic()
         self._boot = boot_id()
-        self._decisions = 0
+        self._arrivals = 0
+        """How many requests have come that choose the controller."""
+        self._carried_out = 0
+        """The newest of them that was carried out."""
         self._calls = BackgroundCalls(protocol.LOADING)
         self._controllers = controllers
         self._at_start = set(registry.names())
@@ -172,9 +175,9 @@ class Operations:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
         self._calibrations.check_startable(wanted.name)
         self._calls.check_busy()
-        decision = self._decide()
+        arrival = self._arrive()
         controller = await self._load(wanted)
-        if decision != self._decisions:
+        if arrival < self._carried_out:  # one that loads slowly must not undo a newer one
             self._dispose(controller)
             raise Refused(
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
@@ -185,6 +188,7 @@ class Operations:
         except Exception as error:  # a fault since, a calibration, or parameters that it has lost
             self._dispose(controller)
             raise _refusal(wanted.name, "cannot start", error) from error
+        self._carried_out = arrival
         return self._state()
 
     async def _load(self, wanted: protocol.SetController) -> Controller[Any]:
@@ -228,17 +232,17 @@ class Operations:
         return registry.merged(loop.active.controller, loop.active.name, values)
 
     async def _stop(self, _: protocol.NoArguments) -> State:
-        self._decide()
+        self._carried_out = self._arrive()
         self._loop.stop()
         return self._state()
 
     async def _estop(self, wanted: protocol.Estop) -> State:
-        self._decide()
+        self._carried_out = self._arrive()
         self._loop.estop(wanted.message)
         return self._state()
 
     async def _clear_fault(self, _: protocol.NoArguments) -> State:
-        self._decide()
+        self._carried_out = self._arrive()
         self._loop.clear_fault()
         return self._state()
 
@@ -254,10 +258,10 @@ class Operations:
         """Close a controller that was never active, which may take its time."""
         self._calls.dispose(partial(_close, controller))
 
-    def _decide(self) -> int:
-        """Count a choice of the controller; one that loads slowly must not undo a newer one."""
-        self._decisions += 1
-        return self._decisions
+    def _arrive(self) -> int:
+        """The number of a request that chooses the controller."""
+        self._arrivals += 1
+        return self._arrivals
 
     def _state(self) -> State:
         loop = self._loop

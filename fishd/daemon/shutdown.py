@@ -77,10 +77,12 @@ class Shutdown:
 
     def _end_at_once(self, name: str) -> NoReturn:
         """Waits for no lock: the thread that hangs may hold any, that of logging too."""
-        release = self.release
-        if release:
-            _within(_RELEASE, release)
-        what = "the servo is released and" if release else "it has not begun to drive the servo;"
+        if not self.release:
+            what = "it has not begun to drive the servo;"
+        elif _within(_RELEASE, self.release):
+            what = "the servo is released and"
+        else:
+            what = "the servo may keep its pulses ('fishctl release' releases it) and"
         place = _place(sys._current_frames().get(self._main))
         line = (
             f"{name} came {PATIENCE:g} s ago, and fishd hangs {place}: {what} the process is ended"
@@ -98,15 +100,19 @@ def leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _within(seconds: float, function: Callable[[], object]) -> None:
-    thread = threading.Thread(target=_quietly, args=(function,), daemon=True)
+def _within(seconds: float, function: Callable[[], object]) -> bool:
+    """Call it, and wait for so long [s] at most: has it returned, and raised nothing?"""
+    returned = threading.Event()
+
+    def call() -> None:
+        with suppress(Exception):
+            function()
+            returned.set()
+
+    thread = threading.Thread(target=call, daemon=True)
     thread.start()
     thread.join(seconds)
-
-
-def _quietly(function: Callable[[], object]) -> None:
-    with suppress(Exception):
-        function()
+    return returned.is_set()
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:

@@ -153,8 +153,8 @@ class TrialCalibration:
         if lease is None or lease.identity != identity or lease.ending:
             raise Refused(
                 "no-lease",
-                f"this lease has ended: it was not renewed for {LEASE:g} s, or fishd was "
-                "restarted; the calibration of before is used again",
+                f"this lease has ended: it was given back, or not renewed for {LEASE:g} s, or "
+                "fishd was restarted; the calibration of before is used again",
             )
         return lease
 

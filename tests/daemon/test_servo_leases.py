@@ -1,6 +1,7 @@
 """A servo calibration that is not saved is a lease: who has it, and how fishd takes it back."""
 
 import asyncio
+import threading
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import asdict
 from rigs.lockstep_rig import LockstepRig, lockstep_rig
+from rigs.processes import PATIENCE
 
 from fishd.config.assembly import state_folder
 from fishd.core.calibration import ServoCalibration
@@ -15,8 +17,12 @@ from fishd.core.errors import Refused
 from fishd.core.protocol import LEASE
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.requests import Operations
+from fishd.hardware.calibration_files import CalibrationFolder
 
 WIDE = ServoCalibration(trim=30.0, lowest=-3.0, highest=3.0)
+
+
+NARROW = ServoCalibration(trim=30.0)
 
 
 class Client:
@@ -72,6 +78,39 @@ def tell(rig: LockstepRig, story: Story) -> None:
         await story(Client(rig))
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize("ended", ["end-lease", "set-controller"])
+def test_a_calibration_whose_lease_ends_while_it_is_saved_is_not_used_at_the_next_start(
+    rig: LockstepRig, monkeypatch: pytest.MonkeyPatch, ended: str
+) -> None:
+    saving, going_on = threading.Event(), threading.Event()
+
+    def save(*args: Any) -> Any:
+        saving.set()
+        assert going_on.wait(PATIENCE)
+        return saved(*args)
+
+    saved = CalibrationFolder.save
+    monkeypatch.setattr(CalibrationFolder, "save", save)
+
+    async def story(client: Client) -> None:
+        lease = None
+        if ended == "end-lease":
+            lease = (await client.calibrate(NARROW)).lease
+        task = asyncio.create_task(client.calibrate(NARROW, save=True, lease=lease))
+        await asyncio.to_thread(saving.wait, PATIENCE)
+        if lease:
+            await client.ask("end-lease", lease=lease)
+        else:
+            rig.start("swing")
+        going_on.set()
+        with pytest.raises(Refused, match=r"this lease has ended|is the active controller"):
+            await task
+        assert not list(state_folder(rig.config).glob("servo-*"))
+        assert (await client.ask("calibrations")).servo_file is None
+
+    tell(rig, story)
 
 
 def taken_back(rig: LockstepRig) -> list[str]:

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import re
 import signal
 import subprocess
 import sys
@@ -13,18 +14,21 @@ from rigs.harness import Wrapped, fragile_rig
 from rigs.processes import PATIENCE, Daemon
 
 from fishd.config import Config
+from fishd.config.configuration import ControlSettings, TelemetrySettings
+from fishd.controllers.hold import Hold, HoldParameters
 from fishd.daemon.main import Daemon as Inside
 from fishd.hardware.base import Robot
 
 PROGRAM = """
-import sys, threading, time
+import logging, sys, threading, time
 from fishd.daemon.shutdown import Shutdown, leave
 
 shutdown = Shutdown()
 asked = threading.Event()
 shutdown.when_asked(asked.set)
 shutdown.release = lambda: (print("released", flush=True), {release})
-shutdown.last_words = lambda: print("last words", flush=True)
+logging.basicConfig(format="%(message)s", stream=sys.stdout)
+shutdown.last_words = sys.stdout.flush
 print("up", flush=True)
 {hang}
 asked.wait()
@@ -65,11 +69,16 @@ def test_an_orderly_shutdown_needs_no_last_resort(number: int) -> None:
     ids=["loop", "sleep", "block", "handler taken"],
 )
 def test_a_process_that_hangs_lets_go_of_the_servo_and_ends(hang: str) -> None:
-    assert end(hang) == (1, "released\nlast words\n")
+    status, output = end(hang)
+    assert (status, output.partition("\n")[0]) == (1, "released")
+    assert re.search(r"fishd hangs in .+: the servo is released and the process is ended", output)
 
 
-def test_a_servo_that_hangs_as_well_keeps_nobody() -> None:
-    assert end("time.sleep(60)", "time.sleep(60)") == (1, "released\nlast words\n")
+@pytest.mark.parametrize("release", ["time.sleep(60)", "1 / 0"])
+def test_a_servo_that_is_not_released_keeps_nobody_and_is_named(release: str) -> None:
+    status, output = end("time.sleep(60)", release)
+    assert (status, output.partition("\n")[0]) == (1, "released")
+    assert "the servo may keep its pulses ('fishctl release' releases it)" in output
 
 
 def test_a_thread_that_a_controller_left_behind_keeps_nobody() -> None:
@@ -102,3 +111,27 @@ def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdo
 
     asyncio.run(release())
     assert robot.log == ([None] if countdown == 0.2 else [0.0, None])
+
+
+def test_where_fishd_fails_the_servo_is_released_before_a_controller_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    class Closing(Hold):
+        def close(self) -> None:
+            done.append("closed")  # and it might never return
+
+    async def fail() -> None:
+        control = ControlSettings(address=f"ipc://{tmp_path}/control")
+        telemetry = TelemetrySettings(address=f"ipc://{tmp_path}/telemetry")
+        config = Config(lockstep=True, control=control, telemetry=telemetry)
+        with Inside(config, print_status=False) as daemon:
+            loop = daemon._loop
+            monkeypatch.setattr(loop.robot.servo, "release", lambda: done.append("released"))
+            loop.set_controller("hold", Closing(HoldParameters(), loop.limits))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(fail())
+    assert done == ["released", "closed"]

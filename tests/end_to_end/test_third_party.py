@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -162,6 +163,21 @@ def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
         after = ticks.until(controller="slow")
     assert after["missed"] == before["missed"]
     assert after["seq"] - before["seq"] > 15
+
+
+def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
+    daemon: Daemon,
+) -> None:
+    with (
+        ThreadPoolExecutor() as threads,
+        Fish(daemon.endpoint) as one,
+        Fish(daemon.endpoint) as other,
+    ):
+        loading = threads.submit(one.set_controller, "slow")
+        while not loading.done():
+            with pytest.raises(Refused, match="swnig"):
+                other.set_controller("swnig")
+        assert loading.result().controller == "slow"
 
 
 @pytest.mark.parametrize("newer", ["stop", "estop"])
