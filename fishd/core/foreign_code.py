@@ -103,10 +103,14 @@ class Attempt(Generic[T]):
         return self._settled.wait(seconds)
 
     def result(self) -> T:
-        """What the function returned; raises what it raised. Only once it is `done`."""
-        if self._error:
-            raise self._error
-        return self._result[0]
+        """What the function returned; raises what it raised, once. Only when it is `done`."""
+        error, self._error = self._error, None
+        try:
+            if error:
+                raise error
+            return self._result[0]
+        finally:
+            del error  # its traceback leads here: a cycle would keep what the function had read
 
     def give_up(self) -> bool:
         """End a loop in Python, and leave alone what cannot be ended; False if it is done."""
@@ -147,6 +151,7 @@ class Attempt(Generic[T]):
             self._error = error
         with self._settling:
             if self._given_up:
+                self._error = None  # nobody asks for it
                 self._raise_in_thread(None)
             else:
                 self._settled.set()

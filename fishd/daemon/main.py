@@ -17,6 +17,7 @@ import click
 from fishd import __version__
 from fishd.config import Config, assembly, load
 from fishd.control.loop import SETTLING
+from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
 from fishd.controllers.remote import wire
@@ -67,7 +68,7 @@ class Daemon:
         self._clock = SlowClock() if self._slow else _clock(config)
         self._virtual = isinstance(self._clock, VirtualClock)
         self._events = asyncio.get_running_loop()
-        self._housekeeping = itertools.cycle((self._report, realtime.collect_garbage))
+        self._housekeeping = itertools.cycle((self._report, self._collect_garbage))
         self._next_housekeeping = 0.0
         self._stack = ExitStack()
 
@@ -191,6 +192,9 @@ class Daemon:
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + STATUS_PERIOD / 2
             next(self._housekeeping)()
+
+    def _collect_garbage(self) -> None:
+        realtime.collect_garbage(thorough=self._loop.supervisor.mode is not Mode.RUNNING)
 
     def _ticked(self, now: float) -> None:
         """now: start of the tick, on the loop's clock [s]"""

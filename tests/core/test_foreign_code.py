@@ -1,9 +1,12 @@
 """Code that is not fishd's: it may raise anything and never return, and is no trouble."""
 
+import gc
 import signal
 import sys
 import threading
 import time
+import weakref
+from contextlib import suppress
 
 import pytest
 from fishd_zoo import RAISED
@@ -42,6 +45,29 @@ def test_an_attempt_gives_what_is_returned_or_raises_what_is_raised() -> None:
     with pytest.raises(Escaped, match="SystemExit: 3"):
         bad.result()
     assert not good.give_up()
+
+
+def test_what_a_failed_call_had_read_is_freed_without_a_garbage_collection() -> None:
+    class Content:
+        pass
+
+    content = [Content()]
+    alive = weakref.ref(content[0])
+
+    def fail() -> None:
+        read = content.pop()
+        raise ValueError(f"{read} is no good")
+
+    gc.disable()
+    try:
+        attempt = Attempt(fail)
+        assert attempt.wait(PATIENCE)
+        with suppress(ValueError):
+            attempt.result()
+        del attempt
+        wait_until(lambda: alive() is None)
+    finally:
+        gc.enable()
 
 
 def test_a_loop_in_python_ends_when_it_is_given_up() -> None:
