@@ -228,6 +228,19 @@ def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing
     assert whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
 
 
+@pytest.mark.parametrize(("word", "shown"), [("auto", "auto"), (None, "default")])
+def test_a_value_that_is_no_number_is_a_line_of_its_own_beside_the_curve(
+    tmp_path: Path, word: str | None, shown: str
+) -> None:
+    begun = Begun("robot", msgspec.to_builtins(load()), {"seconds": 21.0})
+    folder = SweepFolder(tmp_path, begun, ["controller", "parameters.C"])
+    found = [Point("swing", {"C": value}) for value in (word, 0.3, 0.6)]
+    for point in found:
+        folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
+    shapes = [(curve.label, curve.over, curve.x) for curve in curves(folder, found)]
+    assert shapes == [(f"swing C={shown}", "", []), ("swing", "C", [0.3, 0.6])]
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -321,6 +334,15 @@ def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> Non
     done = swept(tmp_path / "run", "square", "--frequency", "1.7", *vary)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\nsquare: best measured at plant.servo_speed 12, " in done.stdout
+    assert (tmp_path / "run" / "thrust.png").stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("_no_worker_stays")
+def test_a_word_among_the_numbers_is_swept_with_them(tmp_path: Path) -> None:
+    done = swept(tmp_path / "run", "swing", "--amplitude", "default,0.2,0.4")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\nswing amplitude=default: 25.7" in done.stdout
+    assert "\nswing: best measured at amplitude 0.4 rad, " in done.stdout
     assert (tmp_path / "run" / "thrust.png").stat().st_size > 10_000
 
 

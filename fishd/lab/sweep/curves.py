@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from fishd.lab.sweep.folder import SweepFolder
-from fishd.lab.sweep.grid import PARAMETER, Point, axis
+from fishd.lab.sweep.grid import PARAMETER, Point, axis, is_number
 from fishd.lab.sweep.peak import Peak, peak
 from fishd.lab.sweep.results import Found, Quantity
 
@@ -70,7 +70,8 @@ class Best(Struct, frozen=True):
 def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
     """The curves of the points that were measured.
 
-    Each runs along the quantity that has the most values among the points of its controller.
+    Each runs along the quantity that has the most values among the points of its controller. A
+    point that has no number there, such as `auto`, is one of its own.
     """
     groups: dict[tuple[str, str], list[Point]] = {}
     axes = {
@@ -79,8 +80,10 @@ def curves(folder: SweepFolder, found: Sequence[Point]) -> list[Curve]:
     }
     for point in found:
         if folder.key(point) in folder.results:
+            columns = point.columns()
             over = axes[point.controller]
-            rest = {name: value for name, value in point.columns().items() if name != over}
+            over = over if is_number(columns.get(over)) else ""
+            rest = {name: value for name, value in columns.items() if name != over}
             groups.setdefault((over, json.dumps(rest)), []).append(point)
     return [_curve(folder, group, over, found) for (over, _), group in groups.items()]
 

@@ -177,11 +177,18 @@ def axis(found: Sequence[Point]) -> str:
     values: dict[str, set[Any]] = {}
     for point in found:
         for name, value in point.columns().items():
-            if isinstance(value, int | float) and not isinstance(value, bool):
+            if is_number(value):
                 values.setdefault(name, set()).add(value)
     counts = {name: len(each) for name, each in values.items() if len(each) > 1}
     return max(counts, key=lambda name: counts[name]) if counts else ""
 
 
+def is_number(value: Any) -> bool:
+    """Can results be drawn over it?"""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _short(value: Any) -> str:
+    if value is None:
+        return "default"
     return f"{value:g}" if isinstance(value, float) else str(value)
