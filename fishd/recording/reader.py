@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -161,9 +162,11 @@ class Run:
     def frames(self) -> Iterator[RecordedFrame]:
         """The frames of a camera, in the order in which they came, read as they are asked for.
 
+        Those of `frame_heads`: what is being recorded may have more by now.
+
         Raises `RecordingError`, and `MissingPackage` without OpenCV (extra: camera).
         """
-        for payload in self._images():
+        for payload in islice(self._images(), len(self.frame_heads)):
             try:
                 yield images.decoded(payload)
             except RecordingError as error:

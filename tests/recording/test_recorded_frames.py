@@ -177,6 +177,21 @@ def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
         export(open_run(path), tmp_path, form)  # type: ignore[arg-type]
 
 
+def test_frames_that_are_recorded_meanwhile_are_no_part_of_an_export(
+    tmp_path: Path, frames: list[Frame]
+) -> None:
+    with RunWriter(tmp_path / "run") as writer:
+        writer.describe(Rig().config)
+        writer.frame(head(frames[0], 1), frames[0].pixels)
+        writer.flush()
+        run = open_run(writer.part)
+        writer.frame(head(frames[1], 2), frames[1].pixels)
+        writer.flush()
+        assert len(list(run.frames())) == len(run.frame_heads) == 1
+        export(run, tmp_path, "csv")
+    assert np.load(tmp_path / "run-frames.npy").shape == (1, 84, 84)
+
+
 def test_frames_of_several_sizes_are_no_array(tmp_path: Path, frames: list[Frame]) -> None:
     with RunWriter(tmp_path / "run") as writer:
         writer.describe(Rig().config)
