@@ -124,7 +124,8 @@ def adapt(
                 echo(f"fishctl: stopped; {kept}; to go on: {again(path)}", err=True)
                 return INTERRUPTED
             except FishdError as error:
-                raise type(error)(f"{error}; {_kept(run)}{again(path)}") from None
+                error.args = (f"{error}; {_kept(run)}{again(path)}",)
+                raise
         if as_json:
             print_json(msgspec.to_builtins(state))
         else:

@@ -6,12 +6,13 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 import pytest
+from rigs.processes import fishctl, one_line
 from rigs.virtual_daemon import VirtualDaemon
 
 from fishd.cli.adapt import command_of
 from fishd.client import Fish
 from fishd.config import Config, load
-from fishd.core.errors import ConfigError, FishdError
+from fishd.core.errors import ConfigError, FishdError, Refused
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
 from fishd.lab.rig import LiveRig, VirtualRig
 from fishd.learning.adapt import adaptation, report, steps
@@ -205,6 +206,27 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> Non
     ):
         Adaptation(rig, config, run, 150.0, 640, 0, Quiet()).run()
     assert folder(run.path).state.excitation == "excitation.mcap"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "status"),
+    [
+        (Refused("leased", "a lease is held"), " [leased]", 1),
+        (ConfigError("run: of another"), "", 78),
+    ],
+)
+def test_an_error_ends_it_in_one_line_that_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: FishdError, code: str, status: int
+) -> None:
+    def run(_: Adaptation) -> State:
+        raise error
+
+    said = str(error)
+    monkeypatch.setattr(Adaptation, "run", run)
+    done = fishctl("adapt", "--folder", str(tmp_path / "run"))
+    again = f"fishctl adapt --folder {tmp_path / 'run'}"
+    assert one_line(done) == f"fishctl: {said}; to begin again: {again}{code}\n"
+    assert done.returncode == status
 
 
 def test_the_last_line_says_what_to_type() -> None:
