@@ -114,7 +114,8 @@ class Workers:
 def workers(stop: Path, jobs: int | None = None, cluster: str | None = None) -> Iterator[Workers]:
     """Workers while this lasts.
 
-    stop: a file that tells them to stop, on this machine; it is removed at the end
+    stop: a file that tells them to stop, on this machine; it is removed at the end, and at the
+        beginning, as one that was killed leaves it
     jobs: processes at a time; None is one per core
     cluster: address of a Dask scheduler whose workers compute instead
 
@@ -122,6 +123,7 @@ def workers(stop: Path, jobs: int | None = None, cluster: str | None = None) -> 
     """
     with _scheduler(cluster) as event:
         asks = Stop(event.name, True) if event else Stop(str(stop), False)
+        stop.unlink(missing_ok=True)
         try:
             yield Workers(asks, jobs, cluster, event)
         finally:

@@ -25,6 +25,17 @@ def test_its_processes_leave_ctrl_c_and_hang_up_to_the_one_that_has_begun_them(
     assert not blocked(0)
 
 
+def test_what_one_that_was_killed_told_its_processes_does_not_stop_the_next(tmp_path: Path) -> None:
+    stop = tmp_path / "stop"
+    stop.touch()
+    with workers(stop) as crew:
+        is_asked = crew.stop.asked()
+        assert not is_asked()
+        crew.ask_to_stop()
+        assert is_asked()
+    assert not stop.exists()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_while_its_processes_are_being_started_is_heard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int

@@ -183,8 +183,9 @@ def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 1025, 64))
 
 
-def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path) -> None:
-    kept = tmp_path / "run" / "seed-0" / "policy"
+@pytest.mark.parametrize("name", ["seed-0/policy", "stop"])
+def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path, name: str) -> None:
+    kept = tmp_path / "run" / name
     kept.parent.mkdir(parents=True)
     kept.write_text("of last week")
     done = fishctl(*command(tmp_path, "--seeds", "2"))

@@ -63,10 +63,18 @@ def make_folder(folder: Path, otherwise: str = "") -> None:
 
     Raises `ConfigError`.
     """
+    check_free(folder, otherwise)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def check_free(folder: Path, otherwise: str = "") -> None:
+    """Raises `ConfigError` where there is one already that is not empty."""
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ConfigError(f"{folder} exists already; give another --folder{otherwise}")
-        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
 

@@ -50,7 +50,7 @@ def train_seeds(
     SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
     the folder is in use, and `FishdError` where there is no scheduler.
     """
-    from fishd.learning.run_folder.runs import make_folder
+    from fishd.learning.run_folder.runs import check_free, make_folder
     from fishd.learning.run_folder.tables import write_summary
 
     folder = job.folder.absolute()
@@ -61,6 +61,7 @@ def train_seeds(
         outcomes[index] = outcome
         ended(waiting[index].settings.seed, outcome)
 
+    check_free(folder)  # before workers remove the file that stops them
     with workers(folder / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
         make_folder(folder)
         tasks = [_Task(each, crew.stop) for each in waiting]
