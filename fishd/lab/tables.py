@@ -27,9 +27,12 @@ class Table:
             file.write(lines([values]))
 
 
-def read(path: Path) -> list[list[str]]:
-    """All rows, the head first; raises `FileProblem`."""
-    text = files.read_text(path, files.TABLE, "a table")
+def read(path: Path, longest: int = files.TABLE) -> list[list[str]]:
+    """All rows, the head first; raises `FileProblem`.
+
+    longest: more is not read [bytes]
+    """
+    text = files.read_text(path, longest, "a table")
     try:
         return list(csv.reader(io.StringIO(text)))
     except csv.Error as error:

@@ -20,10 +20,11 @@ from fishd.lab.begun import owned
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
 from fishd.lab.sweep.folder import Begun, SweepFolder
-from fishd.lab.sweep.grid import Lengths, Point
+from fishd.lab.sweep.grid import MOST, Lengths, Point
 from fishd.lab.sweep.measuring import swim
 from fishd.lab.sweep.results import Result, quantity_of
 from fishd.lab.sweep.running import on_robot
+from fishd.lab.tables import lines
 from fishd.recording import open_run
 from fishd.recording.rerun import rerun
 
@@ -196,6 +197,29 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     table.write_bytes(table.read_bytes()[:-30])
     assert len(opened(tmp_path).results) == 2
     assert table.read_text().count("\n") == 3
+
+
+@pytest.mark.slow
+def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Path) -> None:
+    opened(tmp_path)
+    table = tmp_path / "points.csv"
+    third = 1.0 / 3.0
+    result = Result(third, third, third, third, third, third, third, third, third)
+    values = msgspec.structs.astuple(result)
+    rows = [("square", third + k, *values, f"ticks/{k}-square.mcap") for k in range(MOST)]
+    with table.open("a", encoding="utf-8") as file:
+        file.write(lines(rows))
+    folder = opened(tmp_path)
+    assert len(folder.results) == MOST
+    folder.sort([Point("square", {"frequency": third + k}) for k in range(MOST)])
+
+
+def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+    opened(tmp_path)
+    (tmp_path / "points.csv").unlink()
+    (tmp_path / "points.csv").mkdir()
+    with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
+        opened(tmp_path)
 
 
 @pytest.mark.parametrize(

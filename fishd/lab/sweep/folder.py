@@ -18,6 +18,8 @@ from fishd.lab.sweep.results import Found, Quantity, quantity_of
 BEGUN, POINTS, RECORDINGS = "sweep.json", "points.csv", "ticks"
 RECORDING = "recording"
 """The column that names the recording of a point."""
+_LONGEST = 256 * 2**20
+"""Longest table of points [bytes]: 2.6 kB for each of the most that a grid has."""
 
 On = Literal["simulation", "robot"]
 
@@ -93,10 +95,7 @@ class SweepFolder:
 
     def sort(self, found: Sequence[Point]) -> None:
         """Put the rows in the order of these points; others stay at the end."""
-        try:
-            head, *rows = tables.read(self.path / POINTS)
-        except FileProblem as problem:
-            raise ConfigError(f"{self.path / POINTS}: {problem}") from None
+        head, *rows = self._rows()
         order = {self.key(point): index for index, point in enumerate(found)}
         width = len(self._columns)
         rows.sort(key=lambda row: order.get(tuple(row[:width]), len(order)))
@@ -111,28 +110,33 @@ class SweepFolder:
         if not path.exists():
             return
         quantity = self.begun.quantity
+        names = quantity.measured
         try:
-            before, *rows = tables.read(path)
+            before, *rows = self._rows()
             if tuple(before) != head:
-                raise ConfigError(
-                    f"{path}: {_other(before, quantity.measured)}; give another --folder"
-                )
+                raise ConfigError(f"{path}: {_other(before, names)}; give another --folder")
             complete = [row for row in rows if len(row) == len(head)]
             for row in complete:
                 measured = dict(zip(head, row, strict=True))
-                given = {name: measured[name] for name in quantity.measured if measured[name]}
+                given = {name: measured[name] for name in names if measured[name]}
                 self.results[tuple(row[: len(self._columns)])] = msgspec.convert(
                     given, quantity.result, strict=False
                 )
         except ConfigError:
             raise
-        except (ValueError, FileProblem):
+        except ValueError:
             raise ConfigError(
                 f"{path}: not the table of a sweep; move it away, and its points are measured again"
             ) from None
         text = tables.lines([head, *complete])
         if text != path.read_text(encoding="utf-8"):
             write_atomically(path, text)
+
+    def _rows(self) -> list[list[str]]:
+        try:
+            return tables.read(self.path / POINTS, _LONGEST)
+        except FileProblem as problem:
+            raise ConfigError(f"{self.path / POINTS}: {problem}") from None
 
     def _unwritable(self, error: OSError) -> ConfigError:
         where = error.filename or self.path
