@@ -28,15 +28,17 @@ class Table:
 
 
 def read(path: Path, longest: int = files.TABLE) -> list[list[str]]:
-    """All rows, the head first; raises `FileProblem`.
+    """All rows, the head first; a last one that a kill has cut off is left out.
 
     longest: more is not read [bytes]
+    Raises `FileProblem`.
     """
     text = files.read_text(path, longest, "a table")
     try:
-        return list(csv.reader(io.StringIO(text)))
+        rows = list(csv.reader(io.StringIO(text)))
     except csv.Error as error:
         raise FileProblem(f"not a CSV file: {error}") from None
+    return rows if text.endswith("\n") else rows[:-1]
 
 
 def lines(rows: Iterable[Sequence[Any]]) -> str:

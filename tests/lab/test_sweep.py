@@ -199,6 +199,17 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     assert table.read_text().count("\n") == 3
 
 
+def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) -> None:
+    folder = opened(tmp_path)
+    for point in SQUARES:
+        folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
+    table = tmp_path / "points.csv"
+    whole = table.read_bytes()
+    table.write_bytes(whole[:-1])
+    assert len(opened(tmp_path).results) == 2
+    assert table.read_bytes() == b"".join(whole.splitlines(keepends=True)[:-1])
+
+
 @pytest.mark.slow
 def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Path) -> None:
     opened(tmp_path)

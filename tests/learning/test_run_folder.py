@@ -157,6 +157,18 @@ def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> No
         assert [row["steps"] for row in rows(job.folder / name)] == ["64", "128", "192", "256"]
 
 
+def test_a_row_that_a_kill_cut_off_is_none_even_where_only_a_digit_is_missing(run: Path) -> None:
+    table = Table(run / "table.csv", ("steps", "std"))
+    for steps in (64, 128):
+        table.add({"steps": steps, "std": 0.75})
+    table.path.write_bytes(table.path.read_bytes()[:-2])
+    table.keep_until(128)
+    assert table.path.read_text() == "steps,std\n64,0.75\n"
+    with (run / "evaluations.csv").open("a", encoding="utf-8") as file:
+        file.write("128,0.")
+    assert [one.steps for one in read_evaluations(run)] == [64]
+
+
 def test_a_run_of_an_older_fishd_goes_on_with_the_columns_of_this_one(run: Path) -> None:
     table = run / "evaluations.csv"
     new = ("policy", "swam")

@@ -96,9 +96,8 @@ def _read(path: Path, head: tuple[str, ...]) -> list[Trial]:
         before, *rows = tables.read(path)
         if tuple(before) != head:
             raise ValueError
-        if rows and not path.read_bytes().endswith(b"\n"):
-            write_atomically(path, tables.lines([head, *rows[:-1]]))
-            rows = rows[:-1]
+        if not path.read_bytes().endswith(b"\n"):
+            write_atomically(path, tables.lines([head, *rows]))
         found = [dict(zip(head, map(float, row), strict=True)) for row in rows]
     except (ValueError, FileProblem):
         raise ConfigError(f"{path}: not the table of this search; give another --folder") from None

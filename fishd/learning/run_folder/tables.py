@@ -63,7 +63,7 @@ class Table(tables.Table):
         try:
             head, *rows = tables.read(self.path)
             at = head.index("steps")
-            complete = [row for row in rows if len(row) == len(head)]  # the last may be cut off
+            complete = [row for row in rows if len(row) == len(head)]
             kept = [dict(zip(head, row, strict=True)) for row in complete if int(row[at]) <= steps]
         except (ValueError, FileProblem):
             raise CheckpointError(
