@@ -33,7 +33,7 @@ SECONDS, SETTLE = 60.0, 10.0
 class _Outcome(NamedTuple):
     standings: "list[Standing]"
     traces: "list[Trace]"
-    left_out: "list[tuple[Contestant, FishdError]]"
+    left_out: "list[tuple[Contestant, FishdError, int]]"  # why, and after how many runs
     amplitude: float  # rad
     unit: str = "N"
     ended: str = ""  # why before everyone had swum, if so
@@ -133,7 +133,7 @@ def compare(
     else:
         lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
         outcome = _in_simulation(contestants, file, overrides, *lengths, runs, camera)
-    status = _report(outcome, as_json)
+    status = _report(outcome, runs, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
 
@@ -166,7 +166,7 @@ def _in_simulation(
     swum = able or chosen
     with showing(len(swum) * runs * seconds, "s swum") as bar:
         found = comparison.compare(config, swum, seconds, settle, runs, bar.at, seen)
-    return _Outcome(*found, left_out, config.amplitude_limit)
+    return _Outcome(*found, [(*each, 0) for each in left_out], config.amplitude_limit)
 
 
 def _on_robot(
@@ -230,8 +230,11 @@ def _all(config: Config) -> "list[Contestant]":
     return default_contestants(config)
 
 
-def _report(outcome: _Outcome, as_json: bool) -> int:
-    """Print it; gives the exit status."""
+def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
+    """Print it; gives the exit status.
+
+    runs: that each should have swum
+    """
     standings = outcome.standings
     if as_json:
         print_json(standings)
@@ -241,8 +244,9 @@ def _report(outcome: _Outcome, as_json: bool) -> int:
         Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings, outcome.unit))
         if said := _of_simulated(standings):
             echo(said)
-    for one, why in outcome.left_out:
-        echo(f"fishctl: {one.label}: left out: {why}", err=True)
+    for one, why, swum in outcome.left_out:
+        when = f" after {swum} of {runs} runs, which stand in the table" if swum else ""
+        echo(f"fishctl: {one.label}: left out{when}: {why}", err=True)
     for standing in standings:
         for took_over in standing.fallbacks:
             echo(f"fishctl: {standing.contestant}: another took over: {took_over}", err=True)

@@ -3,11 +3,18 @@
 import json
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rigs.policy_files import write
 from rigs.processes import fishctl
+
+from fishd.config import Config
+from fishd.lab.measurement import Measured, measure
+from fishd.lab.rig import Replaced, VirtualRig
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -40,6 +47,28 @@ def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
     assert "0.42 rad" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
+
+
+def test_of_one_that_gives_up_later_it_is_said_that_its_runs_before_stand_in_the_table(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fish = SimpleNamespace(status=lambda: SimpleNamespace(force_unit="N"))
+    swum: list[str] = []
+
+    def tiring(rig: VirtualRig, controller: str, *given: Any) -> Measured:
+        swum.append(controller)
+        if swum == ["swing", "sine", "swing"]:
+            raise Replaced("swing gave up")
+        return measure(rig, controller, *given)
+
+    monkeypatch.setattr("fishd.cli.compare.Fish", lambda _: nullcontext(fish))
+    monkeypatch.setattr("fishd.lab.compare.piloted_rig.PilotedRig", lambda *_: VirtualRig(Config()))
+    monkeypatch.setattr("fishd.lab.compare.live.measure", tiring)
+    done = run("swing", "sine", "--on", "robot", "--for", "25", "--runs", "2")
+    assert done.stderr == (
+        "fishctl: swing: left out after 1 of 2 runs, which stand in the table: swing gave up\n"
+    )
+    assert (done.returncode, done.stdout.count("swing")) == (1, 1)
 
 
 def test_a_misspelt_path_of_a_policy_is_told_before_anything_swims() -> None:

@@ -84,7 +84,7 @@ def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: 
         live = LiveComparison(rig, ["swing:C=7", shaking, "swing"])
         live.swim(25.0, runs=2)
     assert [standing.contestant for standing in live.standings()] == ["swing"]
-    (one, refusal), (other, gave_up) = live.left_out
+    (one, refusal, _), (other, gave_up, _) = live.left_out
     assert (one.label, other.label) == ("swing:C=7", shaking)
     assert "number in [0, 1]" in str(refusal)
     assert "ppo gave up" in str(gave_up)

@@ -21,8 +21,8 @@ class LiveComparison:
     def __init__(self, rig: Rig, contestants: Iterable[Contestant | str]) -> None:
         """contestants: texts are parsed: see `parse`, which raises `ParameterError`"""
         self.contestants = [parse(one) if isinstance(one, str) else one for one in contestants]
-        self.left_out: list[tuple[Contestant, FishdError]] = []
-        """Who could not be measured, and why."""
+        self.left_out: list[tuple[Contestant, FishdError, int]] = []
+        """Who could not be measured, or no further, why, and after how many runs."""
         self._rig = rig
         self._measured: list[list[Measured]] = [[] for _ in self.contestants]
 
@@ -35,7 +35,8 @@ class LiveComparison:
         """Let each swim and rest in turn, for so long in each run.
 
         With several runs everyone swims once, then everyone again, so that what changes slowly
-        meets all of them. Who cannot swim is left out, and the others go on.
+        meets all of them. Who cannot swim is left out, and the others go on; what it swam before
+        counts.
 
         progress: called with the time that has passed, or need not pass any more [s]
         Raises `ParameterError` for a time that is too short, `Disturbed` and `NoDaemon`.
@@ -60,7 +61,7 @@ class LiveComparison:
             except FishdError as error:
                 if not is_of_one(error):
                     raise
-                self.left_out.append((contestant, error))
+                self.left_out.append((contestant, error, len(self._measured[index])))
                 out.add(index)
                 continue
             self._measured[index].append(found)
