@@ -22,6 +22,7 @@ from fishd.core.errors import RecordingError
 from fishd.core.foreign_code import contained
 from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
+from fishd.recording.summary import Tally
 
 ESTIMATES = ("fy_rate", "fin_velocity", "frequency")
 """What the estimator adds to a measurement, and ticks tell; their thrust is that of the filter."""
@@ -91,11 +92,13 @@ def rerun(
         )
     again = _Rerun(run, name, dict(parameters or {}), tuple(overrides))
     upcoming: list[Event | Status | Tick] = list(run.messages())
+    tally = Tally()
     for index, message in enumerate(upcoming):
+        tally.add(message)
         if isinstance(message, Event):
             again.event(message)
         elif isinstance(message, Tick):
-            again.tick(message, upcoming[index:])
+            again.tick(message, tally.restarts, upcoming[index:])
     return Rerun(again.stretches, again.estimates)
 
 
@@ -134,13 +137,13 @@ class _Rerun:
             if self._last is not None:
                 self._estimator.rest()
 
-    def tick(self, tick: Tick, upcoming: list[Event | Status | Tick]) -> None:
-        """Choose again in one tick."""
+    def tick(self, tick: Tick, number: int, upcoming: list[Event | Status | Tick]) -> None:
+        """Choose again in one tick; number: of its fishd, as the recorder has counted."""
         last = self._last
-        if last is None or tick.seq <= last.seq:
-            self._begin_fishd(tick)
+        if number != self._number:
+            self._begin_fishd(tick, number)
             last = None
-        elif tick.seq > last.seq + 1:
+        elif last is not None and tick.seq > last.seq + 1:
             self.estimates.from_start = False
             self._swims = None
             last = None
@@ -156,8 +159,8 @@ class _Rerun:
             self._compare(tick, seen, applied, upcoming)
         self._last, self._before = tick, applied
 
-    def _begin_fishd(self, tick: Tick) -> None:
-        self._number += 1
+    def _begin_fishd(self, tick: Tick, number: int) -> None:
+        self._number = number
         self._swims = None
         self._before = 0.0
         recorded = self._run.config_of(self._number)

@@ -10,6 +10,7 @@ from rigs.recordings import recorded, write
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, RecordingError
+from fishd.core.signals import Percentiles, Status, Tick, Timing
 from fishd.recording import RunWriter, open_run
 from fishd.recording.rerun import Rerun, rerun
 
@@ -114,6 +115,39 @@ def test_ticks_that_are_missing_begin_a_stretch_of_unknown_past(tmp_path: Path) 
     result = rerun(open_run(write(tmp_path / "run", ticks[:40] + ticks[43:])))
     assert [stretch.from_start for stretch in result.stretches] == [True, False]
     assert result.stretches[0].equal == 40
+
+
+def status(tick: Tick, pid: int) -> Status:
+    """What a fishd of this process says of itself just after a tick."""
+    never = Percentiles(0.0, 0.0, 0.0, 0)
+    return Status(
+        tick.t, "", pid, tick.time, tick.mode, None, tick.controller, {}, tick.servo_on, 0.0, 0.0,
+        0.05, 0.42, -0.42, 0.42, tick.seq, 0, 0, Timing(never, never, {}), "simulated", (), {},
+        realtime=False, telemetry="",
+    )  # fmt: skip
+
+
+def test_another_fishd_whose_first_ticks_were_lost_is_judged_with_its_own_configuration(
+    tmp_path: Path,
+) -> None:
+    first, second = Rig(), Rig("slew_limit=4")
+    first.run(10)
+    second.start("swing")
+    second.run_for(20)
+    with RunWriter(tmp_path / "run") as writer:
+        for pid, rig, heard in ((1, first, 0), (2, second, 30)):
+            ticks = rig.recorder.ticks[heard:]
+            for tick in ticks[:8]:
+                writer.tick(tick)
+            writer.status(status(ticks[7], pid))
+            writer.describe(rig.config)
+            for tick in ticks[8:]:
+                writer.tick(tick)
+    run = open_run(writer.path)
+    assert (run.summary.restarts, [gap.lost for gap in run.gaps]) == (1, [20])
+    before, stretch = rerun(run).stretches
+    assert (before.ticks, stretch.seq, stretch.from_start) == (7, 40, False)
+    assert (stretch.equal, stretch.ticks) == (361, 361)
 
 
 def test_another_controller_sees_what_the_recorded_one_saw(tmp_path: Path) -> None:
