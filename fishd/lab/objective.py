@@ -8,8 +8,9 @@ def per_watt(
 ) -> tuple[float, float] | tuple[None, None]:
     """The ratio of two means and half of its 95 % interval [N/W], to the first order of the errors.
 
-    error, watts_error: half of the 95 % interval of each; None where the power is not known, or
-    the servo takes none
+    Both are None where the power is not known, or the servo takes none.
+
+    error, watts_error: half of the 95 % interval of each
     """
     if not watts or watts_error is None:
         return None, None

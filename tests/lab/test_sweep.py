@@ -4,6 +4,7 @@ import csv
 import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
+from errno import ENOSPC
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -223,6 +224,18 @@ def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Pa
     folder = opened(tmp_path)
     assert len(folder.results) == MOST
     folder.sort([Point("square", {"frequency": third + k}) for k in range(MOST)])
+
+
+def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(ENOSPC, "No space left on device", "points.csv")
+
+    folder = opened(tmp_path)
+    monkeypatch.setattr("fishd.lab.tables.Table.add", full)
+    with pytest.raises(ConfigError, match="No space left on device; what was measured before is k"):
+        folder.keep(SQUARES[0], Result(), b"a recording")
 
 
 def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:

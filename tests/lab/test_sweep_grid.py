@@ -38,8 +38,10 @@ def test_a_grid_has_every_combination_and_each_controller_only_its_own_parameter
     assert len(found) == 6
     assert found[-1] == Point("swing", {"C": 0.6, "amplitude": 0.3}, {"plant.xi": "1.2"})
     assert axis(found) == "parameters.frequency"
-    with pytest.raises(ParameterError, match="no parameter 'phase'"):
+    with pytest.raises(ParameterError, match=r"^square has no parameter 'phase'$"):
         points(["square"], {"phase": [0.1]}, takes)
+    with pytest.raises(ParameterError, match=r"^none of square, swing has a parameter 'phase'$"):
+        points(["square", "swing"], {"phase": [0.1]}, takes)
 
 
 def test_the_best_of_a_noisy_curve_is_within_its_interval_as_often_as_it_says() -> None:

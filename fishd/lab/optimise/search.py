@@ -80,8 +80,8 @@ class Proposal(NamedTuple):
 
     parameters: dict[str, float]
     low: dict[str, float]
-    """Of each parameter, the 95 % interval of where the maximum lies: it would there in as many of
-    the curves that go with what was measured."""
+    """Of each parameter, the 95 % interval of where the maximum lies: it lies between these in 95 %
+    of the curves that agree with what was measured."""
     high: dict[str, float]
     value: float
     """Of the objective; [N] where that is the thrust."""

@@ -140,7 +140,9 @@ class SweepFolder:
 
     def _unwritable(self, error: OSError) -> ConfigError:
         where = error.filename or self.path
-        return ConfigError(f"{where}: cannot be written: {error.strerror}; nothing is lost")
+        return ConfigError(
+            f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
+        )
 
 
 def _other(head: Sequence[str], measured: tuple[str, ...]) -> str:

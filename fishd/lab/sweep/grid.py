@@ -126,7 +126,9 @@ def points(
     keys = keys or {}
     for name in parameters:
         if not any(name in takes[each] for each in controllers):
-            raise ParameterError(f"no parameter '{name}' has {', '.join(controllers)}")
+            if len(controllers) == 1:
+                raise ParameterError(f"{controllers[0]} has no parameter '{name}'")
+            raise ParameterError(f"none of {', '.join(controllers)} has a parameter '{name}'")
     found = []
     for changed in _combinations(keys):
         for controller in dict.fromkeys(controllers):

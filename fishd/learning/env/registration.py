@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def register() -> None:
-    """Register both with Gymnasium, where it is installed: comparing controllers needs it not."""
+    """Register both with Gymnasium if it is installed: comparing controllers works without it."""
     try:
         import gymnasium
     except ModuleNotFoundError:
