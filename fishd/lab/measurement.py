@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET, Struct
@@ -23,6 +23,8 @@ LONGEST = 3600.0
 """The longest measurement [s]."""
 MOST_BLOCKS = 200
 """Beats and pieces of a rest are taken together until there are no more blocks than this."""
+FEW_STEPS = 3
+"""From fewer beat to beat nobody knows how beats differ."""
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
 
@@ -72,6 +74,20 @@ class Measured(NamedTuple):
     """Electrical power of the servo while it swims [W]; None where it is not known."""
     watts_error: float | None = None
     """Half of its 95 % interval, by how beats differ [W]."""
+    steps: Sequence["Step"] = ()
+    """How each beat differed from the one before it."""
+
+
+class Step(NamedTuple):
+    """How two neighbouring beats of a swim, or pieces of a rest, differ.
+
+    Squares of the differences; their means are the variances of the mean of a second.
+    """
+
+    force: float
+    """[N² s]"""
+    watts: float
+    """[W² s]"""
 
 
 def measure(
@@ -205,6 +221,7 @@ def evaluate(
     tick: float,
     settles: float = SWIM_SETTLES,
     stills: float = REST_SETTLES,
+    alike: Sequence[Step] = (),
 ) -> Measured:
     """The thrust of a fish that swam and rested in turn; names no controller, and has no ticks.
 
@@ -212,6 +229,7 @@ def evaluate(
 
     tick: period of the loop [s]
     settles, stills: when a swim is steady, and a rest is still [s]
+    alike: how beats of other swims on this rig differed; counts where there are few beats here
     Raises `ParameterError` where there is too little to tell it from a drift.
     """
     first = samples[0].seq
@@ -230,7 +248,10 @@ def evaluate(
     swims = np.array([block.swims for block in found])
     lasts = np.array([block.lasts for block in found])
     apart = [block for blocks in kept for block in blocks]
-    spread = np.where(swims, _spread(apart, True), _spread(apart, False))
+    steps, still = list(_steps(apart, True)), list(_steps(apart, False))
+    known = steps if len(steps) >= FEW_STEPS else [*steps, *alike]
+    beats, rests = _spread(known if len(known) >= FEW_STEPS else [*known, *still]), _spread(still)
+    spread = np.where(swims, beats.force, rests.force)
     blocks = Blocks(time, force, spread / lasts, swims)
     result = fit(blocks)
     lasting = sum(block.lasts for block in swimming)
@@ -247,7 +268,8 @@ def evaluate(
         ticks=[],
         unit="N",
         remark=_remark(kept),
-        **_watts(swimming, _spread(apart, True, "watts")),
+        steps=steps,
+        **_watts(swimming, beats.watts),
     )
 
 
@@ -381,14 +403,18 @@ def _reversals(phase: Sequence[Sample]) -> list[int]:
     return found
 
 
-def _spread(found: Sequence[Block], swims: bool, of: Literal["force", "watts"] = "force") -> float:
-    """Variance of the force or the power of a second, from block to block [N² s or W² s].
+def _steps(found: Sequence[Block], swims: bool) -> Iterator[Step]:
+    """Between neighbours, so that hardly any drift is in them."""
+    for one, other in pairwise(found):
+        if one.swims == other.swims == swims and other.time - one.time < 2.0 * one.lasts:
+            share = 1.0 / (1.0 / one.lasts + 1.0 / other.lasts)
+            yield Step(
+                (other.force - one.force) ** 2 * share, (other.watts - one.watts) ** 2 * share
+            )
 
-    By neighbours, so that hardly any drift is in it.
-    """
-    steps = [
-        (getattr(other, of) - getattr(one, of)) ** 2 / (1.0 / one.lasts + 1.0 / other.lasts)
-        for one, other in pairwise(found)
-        if one.swims == other.swims == swims and other.time - one.time < 2.0 * one.lasts
-    ]
-    return max(float(sum(steps)) / max(1, len(steps)), 1e-12)
+
+def _spread(steps: Sequence[Step]) -> Step:
+    """Their means; next to nothing where there are none."""
+    count = max(1, len(steps))
+    force, watts = (sum(each) / count for each in zip(*steps, strict=True)) if steps else (0.0, 0.0)
+    return Step(max(force, 1e-12), max(watts, 1e-12))

@@ -144,6 +144,8 @@ class Tally:
 
     def status(self, status: Status) -> None:
         """Add a status, which also shows another fishd whose ticks have higher numbers."""
+        if self._last and status.seq < self._last.seq:  # its next tick will show it
+            return
         if self._pid not in (0, status.pid) and self._known == self._restarts:
             self._restarts += 1
         self._pid, self._known = status.pid, self._restarts

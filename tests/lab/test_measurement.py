@@ -7,7 +7,15 @@ from msgspec.structs import replace
 from fishd.config import Config, load
 from fishd.core.errors import ParameterError
 from fishd.lab import drift
-from fishd.lab.measurement import MOST_BLOCKS, Measured, measure, plan
+from fishd.lab.measurement import (
+    MOST_BLOCKS,
+    Measured,
+    Sample,
+    Step,
+    evaluate,
+    measure,
+    plan,
+)
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.simulation import simulate
 
@@ -78,6 +86,40 @@ def test_a_fault_in_the_middle_ends_the_measurement_and_says_which() -> None:
         rig._run.loop.estop("somebody fell in")
         with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(somebody"):
             rig.rest(1.0)
+
+
+def candidate(generator: np.random.Generator, half_beat: int) -> list[Sample]:
+    """A swim of 2 s between rests, whose beats differ five times as much as pieces of a rest.
+
+    half_beat: [ticks]
+    """
+    rests, swims = generator.normal(0.0, 1e-3, (2, 55)), generator.normal(0.0, 5e-3, 40)
+    fx = [*rests[0], *(swims + 0.02), *rests[1]]
+    power = [0.1] * 55
+    watts = [*power, *generator.normal(0.5, 0.05, 40), *power]
+    samples = []
+    for seq in range(150):
+        swim = seq - 55
+        is_swimming = 0 <= swim < 40
+        angle = 0.0 if not is_swimming else 0.4 if swim // half_beat % 2 else -0.4
+        samples.append(Sample(seq, fx[seq], angle, angle, is_swimming, watts[seq]))
+    return samples
+
+
+def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_power_are() -> None:
+    generator = np.random.default_rng(3)
+    alike: list[Step] = []
+    thrust_missed = power_missed = 0
+    for _ in range(60):
+        alike += evaluate(candidate(generator, 4), 0.05, 0.75, alike=alike).steps
+        found = evaluate(candidate(generator, 6), 0.05, 0.75, alike=alike)
+        assert not found.steps  # of one beat
+        assert found.watts is not None
+        assert found.watts_error is not None
+        thrust_missed += abs(found.thrust - 0.02) > found.error
+        power_missed += abs(found.watts - 0.5) > found.watts_error
+    assert thrust_missed <= 9  # of 60, where three are meant
+    assert power_missed <= 9
 
 
 def test_swimming_alone_cannot_be_told_from_a_drift() -> None:

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 from rigs.harness import Rig
-from rigs.recordings import recorded, swum, write
+from rigs.recordings import recorded, status, swum, write
 
 from fishd.core.errors import RecordingError
 from fishd.recording import Gap, RunWriter, open_run, read
@@ -74,6 +74,19 @@ def test_ticks_that_are_missing_are_counted(tmp_path: Path) -> None:
     for summary in (open_run(path).summary, glance(path).summary):
         assert (summary.gaps, summary.lost, summary.restarts) == (2, 5, 1)
     assert open_run(path).gaps == [Gap(ticks[9].t, 11, 3), Gap(ticks[-1].t, 1, 2)]
+
+
+@pytest.mark.parametrize("seq", [3, 30], ids=["lower", "higher"])
+def test_another_fishd_of_which_a_status_is_heard_first_is_one(seq: int) -> None:
+    ticks, tally = swum().recorder.ticks, Tally()
+    tally.status(status(ticks[0], pid=1))
+    for tick in ticks[:20]:
+        tally.tick(tick)
+    tally.status(status(ticks[seq - 1], pid=2))
+    for tick in ticks[seq:]:
+        tally.tick(tick)
+        tally.status(status(tick, pid=2))
+    assert tally.restarts == 1
 
 
 def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> None:

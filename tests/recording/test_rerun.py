@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 from rigs.harness import Rig, fragile_rig
-from rigs.recordings import recorded, write
+from rigs.recordings import recorded, status, write
 
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, RecordingError
-from fishd.core.signals import Percentiles, Status, Tick, Timing
 from fishd.recording import RunWriter, open_run
 from fishd.recording.rerun import Rerun, rerun
 
@@ -115,16 +114,6 @@ def test_ticks_that_are_missing_begin_a_stretch_of_unknown_past(tmp_path: Path) 
     result = rerun(open_run(write(tmp_path / "run", ticks[:40] + ticks[43:])))
     assert [stretch.from_start for stretch in result.stretches] == [True, False]
     assert result.stretches[0].equal == 40
-
-
-def status(tick: Tick, pid: int) -> Status:
-    """What a fishd of this process says of itself just after a tick."""
-    never = Percentiles(0.0, 0.0, 0.0, 0)
-    return Status(
-        tick.t, "", pid, tick.time, tick.mode, None, tick.controller, {}, tick.servo_on, 0.0, 0.0,
-        0.05, 0.42, -0.42, 0.42, tick.seq, 0, 0, Timing(never, never, {}), "simulated", (), {},
-        realtime=False, telemetry="",
-    )  # fmt: skip
 
 
 def test_another_fishd_whose_first_ticks_were_lost_is_judged_with_its_own_configuration(

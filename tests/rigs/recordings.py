@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fishd.core.signals import Tick
+from fishd.core.signals import Percentiles, Status, Tick, Timing
 from fishd.recording import RunWriter
 from rigs.harness import Rig
 
@@ -37,3 +37,13 @@ def write(path: Path, ticks: Sequence[Tick]) -> Path:
         for tick in ticks:
             writer.tick(tick)
     return writer.path
+
+
+def status(tick: Tick, pid: int) -> Status:
+    """What a fishd of this process says of itself just after a tick."""
+    never = Percentiles(0.0, 0.0, 0.0, 0)
+    return Status(
+        tick.t, "", pid, tick.time, tick.mode, None, tick.controller, {}, tick.servo_on, 0.0, 0.0,
+        0.05, 0.42, -0.42, 0.42, tick.seq, 0, 0, Timing(never, never, {}), "simulated", (), {},
+        realtime=False, telemetry="",
+    )  # fmt: skip

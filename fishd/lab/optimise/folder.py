@@ -99,7 +99,9 @@ def _read(path: Path, head: tuple[str, ...]) -> list[Trial]:
         if not path.read_bytes().endswith(b"\n"):
             write_atomically(path, tables.lines([head, *rows]))
         found = [dict(zip(head, map(float, row), strict=True)) for row in rows]
-    except (ValueError, FileProblem):
+    except FileProblem as problem:
+        raise ConfigError(f"{path}: {problem}") from None
+    except ValueError:
         raise ConfigError(f"{path}: not the table of this search; give another --folder") from None
     names = head[: -len(_COLUMNS)]
     return [

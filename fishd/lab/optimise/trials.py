@@ -8,7 +8,7 @@ from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
-from fishd.lab.measurement import REST, evaluate, samples_of
+from fishd.lab.measurement import REST, Step, evaluate, samples_of
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.rig import Rig, refuse_lost
@@ -69,6 +69,7 @@ def trials(
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
     rest: list[Tick] = []
+    alike: list[Step] = []
     swum, passed = (before.swum, before.passed) if before else (0, 0.0)
     passed += REST
     while True:
@@ -83,7 +84,8 @@ def trials(
         after = rig.rest(REST)
         ticks = [*rest, *swim, *after]
         refuse_lost(ticks, (REST, length, REST), rig.tick)
-        found = evaluate(samples_of(ticks), rig.tick, settles)
+        found = evaluate(samples_of(ticks), rig.tick, settles, alike=alike)
+        alike += found.steps
         swum += len(swim)
         passed += length + REST
         power, power_error = (
