@@ -47,7 +47,7 @@ FAULTS = {
         "change what the message says, and start fishd again: this fish is gone",
     ),
     "estimate-error": Fault(
-        "the estimator raised an exception",
+        "the estimator raised an exception, or gave what is no finite number",
         "report it, with the log: it is an error in fishd",
     ),
     "controller-error": Fault(

@@ -234,7 +234,10 @@ class ControlLoop:
 
     def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
         try:
-            return self._estimator.update(measurement, self.applied, slot.deadline, dt)
+            seen = self._estimator.update(measurement, self.applied, slot.deadline, dt)
+            if not math.isfinite(seen.fy_rate + seen.fin_velocity + seen.thrust):
+                raise ArithmeticError(f"it gave a fin velocity of {seen.fin_velocity}")
+            return seen
         except Exception as error:
             self._fail("estimate-error", "the estimator failed", error)
             fx, fy, angle = measurement.fx, measurement.fy, self.applied

@@ -1,5 +1,6 @@
 """The fault table, row by row: what broke, what the servo got, and recovery."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -191,6 +192,27 @@ def test_an_exception_in_any_phase_ends_in_neutral_and_the_loop_goes_on(
     rig.run_for(1.0)
     assert_neutral_then_off(rig, broke, limit=1.5)
     assert_recovers_by_clear_fault_only(rig)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_estimate_that_is_no_number_is_a_fault_and_nothing_keeps_it(
+    rig: LockstepRig, monkeypatch: pytest.MonkeyPatch, value: float
+) -> None:
+    rig.loop.stop()
+    rig.run_for(3.0)  # the zero of the force is found
+    rig.start("swing")
+    rig.run_for(5.0)
+    broke = rig.now
+    with monkeypatch.context() as broken:
+        broken.setattr(LateralForceEstimator, "fin_velocity", lambda *_: value)
+        rig.run(1)
+    assert_one_fault(rig, "estimate-error")
+    assert math.isfinite(rig.recorder.ticks[-1].fin_velocity)
+    assert_neutral_then_off(rig, broke, limit=0.05 + FADE)
+    assert_recovers_by_clear_fault_only(rig)
+    thrust, error = rig.loop.known_thrust
+    assert error is not None
+    assert math.isfinite(thrust + error)
 
 
 def test_a_servo_whose_driver_fails_rests(

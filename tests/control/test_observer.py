@@ -46,6 +46,17 @@ def test_skipped_slots_and_a_sensor_that_fails_once_cost_little() -> None:
     assert error(rig, 10) < 0.02
 
 
+@pytest.mark.parametrize("seconds", [1.2, 95.0, 600.0])
+def test_after_a_fishd_that_stood_still_it_finds_the_fin_anew(seconds: float) -> None:
+    rig = Rig(OBSERVER, *REAL)
+    rig.start("square", frequency=1.7)
+    rig.run_for(10)
+    rig.run(1, missed=round(seconds / rig.config.tick))
+    rig.run_for(1)
+    assert rig.mode == "running"
+    assert error(rig, 10) < 0.02
+
+
 @pytest.mark.parametrize(("kind", "least", "most"), [("observer", 0.97, 1.0),
                                                      ("lateral_force", 0.6, 0.9)])  # fmt: skip
 def test_swing_on_it_does_not_mind_a_slow_servo(kind: str, least: float, most: float) -> None:
