@@ -98,6 +98,11 @@ class ControlLoop:
             return self.thrust.thrust, self.thrust.error
         return (self.observation.thrust if self.observation else 0.0), None
 
+    @property
+    def settled(self) -> bool:
+        """Has the servo been at neutral for so long that its pulses may end?"""
+        return self.neutral_for >= SETTLING - 1e-9
+
     def tick(self, slot: Slot) -> None:
         """One turn of the loop."""
         self.act(self.observe(slot))
@@ -129,10 +134,11 @@ class ControlLoop:
 
     def act(self, turn: Turn) -> None:
         """Second half of a tick: let the controller choose, drive the servo, publish."""
-        self.applied = self._update(turn.observation)
-        self.neutral_for = 0.0 if self.applied else self.neutral_for + turn.observation.dt
+        before, self.applied = self.applied, self._update(turn.observation)
+        moved = before or self.applied
+        self.neutral_for = 0.0 if moved else self.neutral_for + turn.observation.dt
         updated = self._now()
-        self._write(neutral=self.neutral_for > SETTLING)
+        self._write(neutral=self.settled)
         written = self._now()
         self._publish(turn, written)
         marks = (*turn.marks, updated, written, self._now())

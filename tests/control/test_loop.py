@@ -72,6 +72,32 @@ def test_stopping_fades_to_neutral_within_the_fade_time() -> None:
     assert rig.recorder.ticks[-1].servo_on
 
 
+@pytest.mark.parametrize("tick", [0.002, 0.03, 0.05, 0.08, 0.2])
+@pytest.mark.parametrize("fade_time", [0.1, 0.4])
+@pytest.mark.parametrize("missed", [0, 7])
+def test_in_fault_the_servo_gets_neutral_for_a_tenth_of_a_second_before_it_is_released(
+    tick: float, fade_time: float, missed: int
+) -> None:
+    rig, robot = fragile_rig(f"tick={tick}", f"fade_time={fade_time}")
+    rig.start("hold", angle=0.42)
+    rig.run(3)
+    rig.loop.supervisor.fail("controller-error", "a test")
+    while robot.log[-1]:
+        rig.run(1, missed=missed)  # as on a machine that is overloaded
+    since = rig.now
+    while robot.log[-1] is not None:
+        rig.run(1)
+    assert 0.1 - 1e-9 <= rig.now - since < 0.1 + tick - 1e-9
+
+
+def test_a_tail_that_has_been_at_neutral_is_released_at_once_in_fault() -> None:
+    rig, robot = fragile_rig()
+    rig.run(4)
+    rig.loop.supervisor.fail("controller-error", "a test")
+    rig.run(1)
+    assert robot.log[-1] is None
+
+
 def test_an_emergency_stop_ends_the_pulses_before_the_next_tick() -> None:
     rig, robot = fragile_rig()
     rig.start("square")
