@@ -23,6 +23,7 @@ from fishd.control.statistics import Statistics
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits
 from fishd.core import text
+from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
 from fishd.core.errors import ControllerFault, FishLost, SensorError
 from fishd.core.foreign_code import contained
@@ -89,7 +90,7 @@ class ControlLoop:
         self._notify = notify
         self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
         self._index = -1
-        self._awaited: tuple[int, str, Controller[Any]] | None = None
+        self._awaited: tuple[int, str, Controller[Any], ServoCalibration | None] | None = None
 
     @property
     def known_thrust(self) -> tuple[float, float | None]:
@@ -117,12 +118,7 @@ class ControlLoop:
         self.statistics.missed += slot.missed
         dt = (slot.index - self._index) * self.limits.tick
         self._index = slot.index
-        if self._awaited and self.seq > self._awaited[0]:
-            (_, name, controller), self._awaited = self._awaited, None
-            try:
-                self.set_controller(name, controller)
-            except Exception as error:
-                self._fail("controller-error", f"controller {name} cannot begin", error)
+        self._begin_awaited()
         self._attend_panel(slot)
         measurement = self._read(slot)
         power = self.power.read(slot.deadline)
@@ -164,8 +160,12 @@ class ControlLoop:
         self.supervisor.start()
 
     def set_controller_after(self, seconds: float, name: str, controller: Controller[Any]) -> None:
-        """Make it the active one after so long at rest; whatever else is asked for comes first."""
-        self._awaited = (math.ceil(seconds / self.limits.tick - 1e-9), name, controller)
+        """Make it the active one after so long at rest; whatever else is asked for comes first.
+
+        So does another calibration of the servo: somebody tries it out, and the tail must wait.
+        """
+        rest = math.ceil(seconds / self.limits.tick - 1e-9)
+        self._awaited = (rest, name, controller, self._servo_calibration)
 
     def stop(self) -> None:
         """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
@@ -185,9 +185,28 @@ class ControlLoop:
         self._await_nobody()
         self.active.rest()
 
+    @property
+    def _servo_calibration(self) -> ServoCalibration | None:
+        return self.robot.calibrated.servo.calibration if self.robot.calibrated else None
+
+    def _begin_awaited(self) -> None:
+        if self._awaited is None:
+            return
+        rest, name, controller, calibration = self._awaited
+        if self._servo_calibration is not calibration:
+            self._await_nobody()
+            message = f"{name} does not begin by itself any more: the servo has another calibration"
+            self.reporter.event("calibration", message, "warning")
+        elif self.seq > rest:
+            self._awaited = None
+            try:
+                self.set_controller(name, controller)
+            except Exception as error:
+                self._fail("controller-error", f"controller {name} cannot begin", error)
+
     def _await_nobody(self) -> None:
         if self._awaited:
-            _, name, controller = self._awaited
+            _, name, controller, _ = self._awaited
             self._awaited = None
             self.active.dispose(controller, f"{name}, which was to begin,")
 

@@ -257,6 +257,12 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "a trial of a calibration ended, and the one before it is used again",
         "empty",
     ),
+    (
+        "calibration",
+        "warning",
+        "the controller of `start` does not begin after its rest: the servo was calibrated",
+        "empty",
+    ),
     ("calibration", "warning", "when the tail set off, F_y was seen to be reversed", "empty"),
     (
         "gateway",

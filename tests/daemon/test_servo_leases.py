@@ -12,6 +12,7 @@ from rigs.lockstep_rig import LockstepRig, lockstep_rig
 from rigs.processes import PATIENCE
 
 from fishd.config.assembly import state_folder
+from fishd.controllers import registry
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import Refused
 from fishd.core.protocol import LEASE
@@ -212,6 +213,27 @@ def test_a_controller_that_was_loading_when_a_lease_began_does_not_take_over(
 
     tell(rig, story)
     assert rig.mode == "idle"
+
+
+@pytest.mark.parametrize("given_back", [False, True])
+def test_a_controller_that_was_to_begin_after_a_rest_does_not_begin_in_a_lease_or_after_it(
+    rig: LockstepRig, given_back: bool
+) -> None:
+    async def story(client: Client) -> None:
+        square = registry.create("square", {}, rig.config.limits)
+        rig.loop.set_controller_after(3.0, "square", square)
+        rig.run_for(1.0)
+        lease = (await client.calibrate(WIDE)).lease
+        rig.run_for(0.1)
+        if given_back:
+            await client.ask("end-lease", lease=lease)
+            await client.until_over()
+        assert {tick.mode for tick in rig.run_for(4.0)} == {"idle"}
+
+    tell(rig, story)
+    assert [event.message for event in rig.recorder.events if event.level == "warning"] == [
+        "square does not begin by itself any more: the servo has another calibration"
+    ]
 
 
 def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: LockstepRig) -> None:
