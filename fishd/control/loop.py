@@ -327,6 +327,7 @@ class ControlLoop:
         before = self.active.name
         try:
             self.active.succeed(error, code, successor)
+            self.supervisor.start()
         except Exception as problem:
             what = f"{successor[0]}, who was to follow {before}, failed"
             self._fail("controller-error", what, problem)

@@ -8,7 +8,7 @@ import pytest
 from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
 
 from fishd.core.clock import VirtualClock
-from fishd.core.errors import Refused, SensorError, ServoError
+from fishd.core.errors import ControllerFault, Refused, SensorError, ServoError
 from fishd.core.signals import Extremes, Measurement, Observation, Tick, Truth
 from fishd.hardware.base import Robot
 
@@ -224,6 +224,45 @@ def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
     robot.release_error = None
     assert not rig.run(1)[-1].servo_on
     assert robot.log[-1] is None
+
+
+class Slow(Scripted):
+    """Takes longer than half a period."""
+
+    def __init__(self, rig: Rig, then: Exception | None = None) -> None:
+        """then: raised in its third update"""
+        self._updates = 0
+
+        def doze(_: Observation) -> float:
+            self._updates += 1
+            if then and self._updates == 3:
+                raise then
+            rig.clock.now += 0.03
+            return 0.0
+
+        super().__init__(doze)
+
+
+@pytest.mark.parametrize("between", ["stop", "nothing"])
+def test_a_controller_is_not_blamed_for_the_slow_updates_of_the_one_before(between: str) -> None:
+    rig = Rig()
+    for _ in range(3):
+        rig.start(Slow(rig))
+        rig.run(2)
+        if between == "stop":
+            rig.loop.stop()
+            rig.run(20)
+    assert rig.reason is None
+
+
+def test_nor_is_one_that_takes_over_from_one_that_gave_up() -> None:
+    rig = Rig()
+    successor = ("slow", Slow(rig))
+    rig.start(Slow(rig, then=ControllerFault("chatter", "a test", successor=successor)))
+    rig.run(4)
+    assert (rig.reason, rig.loop.active.name) == (None, "slow")
+    rig.run(1)
+    assert rig.reason == "controller-slow"
 
 
 def test_parameters_change_while_running_and_are_announced() -> None:
