@@ -213,9 +213,9 @@ class ControlLoop:
     def _mode_changed(self, before: Mode) -> None:
         """All that a change of mode leads to, whatever caused it."""
         mode = self.supervisor.mode
-        self._await_nobody()
         if mode is Mode.ESTOP:
             self._write(neutral=False)  # first of all
+        self._await_nobody()
         if mode is not Mode.RUNNING:
             self.active.rest()
             self._estimator.rest()

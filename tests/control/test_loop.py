@@ -265,6 +265,28 @@ def test_nor_is_one_that_takes_over_from_one_that_gave_up() -> None:
     assert rig.reason == "controller-slow"
 
 
+class Waiting(Scripted):
+    """Notes what the servo had got when it was closed."""
+
+    def __init__(self, robot: Wrapped) -> None:
+        super().__init__(lambda _: 0.4)
+        self._robot = robot
+        self.closed_after: list[float | None] = []
+
+    def close(self) -> None:
+        self.closed_after.append(self._robot.log[-1])
+
+
+def test_an_emergency_stop_releases_the_servo_before_it_closes_a_controller() -> None:
+    rig, robot = fragile_rig()
+    active, awaited = Waiting(robot), Waiting(robot)
+    rig.start(active)
+    rig.loop.set_controller_after(10.0, "waiting", awaited)
+    rig.run(2)
+    rig.loop.estop("test")
+    assert (active.closed_after, awaited.closed_after) == ([None], [None])
+
+
 def test_parameters_change_while_running_and_are_announced() -> None:
     rig = Rig()
     rig.start("swing", C=0.6)
