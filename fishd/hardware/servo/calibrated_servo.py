@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from typing import Any
 
+from fishd.core import text
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock
+from fishd.core.errors import ServoError
 from fishd.core.foreign_code import contained
 from fishd.hardware.driver import ServoDriver
 from fishd.hardware.servo import pulses
@@ -64,8 +66,18 @@ class CalibratedServo:
 
     def release(self) -> None:
         """Stop the pulses; may be called twice. Raises `ServoError`."""
-        contained(self.driver.off)
+        _ended(self.driver.off)
 
     def close(self) -> None:
         """Release the servo and let go of it; may be called twice. Raises `ServoError`."""
-        contained(self.driver.close)
+        _ended(self.driver.close)
+
+
+def _ended(end: Callable[[], None]) -> None:
+    """Call what ends the pulses; whatever it raises, they may still be on: a `ServoError`."""
+    try:
+        contained(end)
+    except ServoError:
+        raise
+    except Exception as error:
+        raise ServoError(text.named(error)) from error

@@ -32,15 +32,43 @@ def servo(calibration: ServoCalibration | None = None, centre: float = 1500.0) -
     return CalibratedServo(Recorder, settings, given, VirtualClock(), threaded=False, tick=0.05)
 
 
-@pytest.mark.parametrize("method", ["write", "off", "close"])
-def test_a_driver_that_wants_to_end_the_process_is_an_error_like_any_other(method: str) -> None:
-    def leave(*_: float) -> None:
-        raise SystemExit(3)
+def raising(error: BaseException) -> Any:
+    """A servo whose driver raises that, whatever it is asked to do."""
+
+    def fail(*_: float) -> None:
+        raise error
 
     made = servo()
-    setattr(made.driver, method, leave)
+    made.driver.write = made.driver.off = made.driver.close = fail
+    return made
+
+
+def test_a_driver_that_wants_to_end_the_process_is_an_error_like_any_other() -> None:
     with pytest.raises(Escaped, match="SystemExit: 3"):
-        {"write": lambda: made.write(0.1), "off": made.release, "close": made.close}[method]()
+        raising(SystemExit(3)).write(0.1)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ServoError("the board is gone"), "the board is gone"),
+        (OSError("device reports readiness"), "OSError: device reports readiness"),
+        (SystemExit(3), "SystemExit: 3"),
+    ],
+)
+@pytest.mark.parametrize("method", ["release", "close"])
+def test_whatever_keeps_a_driver_from_ending_its_pulses_is_a_servo_error(
+    method: str, error: BaseException, told: str
+) -> None:
+    with pytest.raises(ServoError) as caught:
+        getattr(raising(error), method)()
+    assert str(caught.value) == told
+
+
+@pytest.mark.parametrize("method", ["release", "close"])
+def test_a_true_ctrl_c_passes(method: str) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        getattr(raising(KeyboardInterrupt()), method)()
 
 
 def test_trim_direction_and_scale_come_from_the_calibration() -> None:
