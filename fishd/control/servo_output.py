@@ -33,8 +33,9 @@ class ServoOutput:
         if silence <= self._countdown:
             return ""
         return (
-            f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral and "
-            "ends its pulses by itself: the machine is overloaded or was suspended"
+            f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral by "
+            "itself, its pulses end within half a second: the machine is overloaded or was "
+            "suspended"
         )
 
     def command(self, mode: Mode, angle: float, neutral: bool) -> None:

@@ -89,7 +89,7 @@ class Robot:
     Raises `SensorError` where it is not known.
     """
     countdown: float = math.inf
-    """How long the servo goes on without a write before it ends its pulses by itself [s]."""
+    """As `ServoDriver.countdown` [s]."""
 
     @property
     def force_unit(self) -> str:

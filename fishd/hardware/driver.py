@@ -226,9 +226,9 @@ class ServoDriver(Driver[V]):
     degraded: tuple[str, ...] = ()
     """Why its pulses are not as good as they could be, a line each."""
     countdown: float = math.inf
-    """How long the servo goes on without a write; then it goes to neutral and ends its pulses [s].
+    """How long the servo goes on without a write [s]; infinite where only this process stops it.
 
-    Infinite where nothing but this process ends them.
+    Then it goes to neutral, and half a second later its pulses end.
     """
 
     def __init__(

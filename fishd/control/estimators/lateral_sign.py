@@ -66,7 +66,7 @@ class LateralSign:
     def update(self, seen: Observation) -> bool:
         """Take in a tick; True where that shows the other sign than was known before."""
         if self._push is None and seen.instruction_angle == 0.0:
-            self._lie(seen)
+            self._at_rest(seen)
             return False
         if self._push is None:
             if self._rested < LEAST_REST:
@@ -86,7 +86,7 @@ class LateralSign:
         self.reversed = verdict
         return True
 
-    def _lie(self, seen: Observation) -> None:
+    def _at_rest(self, seen: Observation) -> None:
         self._still += seen.dt
         if self._still <= SETTLES:
             return
