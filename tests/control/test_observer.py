@@ -57,6 +57,16 @@ def test_after_a_fishd_that_stood_still_it_finds_the_fin_anew(seconds: float) ->
     assert error(rig, 10) < 0.02
 
 
+def test_a_fin_that_water_stops_quickly_is_no_harder_to_follow() -> None:
+    rig = Rig(OBSERVER, *REAL, "tick=0.2", "plant.omega0=50", "plant.xi=14")
+    rig.start("square", frequency=0.5)
+    rig.run_for(10)
+    rig.run(1, missed=10)
+    rig.run_for(1)
+    assert rig.mode == "running"
+    assert error(rig, 10) < 0.1
+
+
 @pytest.mark.parametrize(("kind", "least", "most"), [("observer", 0.97, 1.0),
                                                      ("lateral_force", 0.6, 0.9)])  # fmt: skip
 def test_swing_on_it_does_not_mind_a_slow_servo(kind: str, least: float, most: float) -> None:

@@ -121,25 +121,29 @@ class Observer(Estimator):
 def _motion(plant: PlantParameters, time: float) -> tuple[Array, Array]:
     """(2, 2), how the fin coasts; (2, 2), what white noise of its acceleration adds, for density 1.
 
-    By the matrix exponential of Van Loan, "Computing integrals involving the matrix exponential".
+    By the matrix exponential of Van Loan, "Computing integrals involving the matrix exponential",
+    for a part of the time: of all of it, what grows as the fin comes to rest would overflow. Then
+    the time is doubled.
     """
     fin = np.array([[0.0, 1.0], [-(plant.omega0**2), -plant.xi * plant.omega0]])
     block = np.zeros((4, 4))
     block[:2, :2], block[2:, 2:] = -fin, fin.T
     block[1, 3] = 1.0
-    moved = _exponential(block * time)
+    size = float(np.abs(block).sum(axis=1).max()) * time
+    doublings = math.ceil(math.log2(max(size, 0.5))) + 1
+    moved = _exponential(block * (time / 2.0**doublings))
     motion = moved[2:, 2:].T
-    return motion, motion @ moved[:2, 2:]
+    spread = motion @ moved[:2, 2:]
+    for _ in range(doublings):
+        spread = spread + motion @ spread @ motion.T
+        motion = motion @ motion
+    return motion, spread
 
 
 def _exponential(matrix: Array) -> Array:
-    """Scaling and squaring of the series: nothing of scipy is on the robot."""
-    squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 0.5))) + 1)
-    scaled = matrix / 2.0**squarings
+    """By the series: nothing of scipy is on the robot."""
     total = term = np.eye(len(matrix))
     for power in range(1, _TERMS):
-        term = term @ scaled / power
+        term = term @ matrix / power
         total = total + term
-    for _ in range(squarings):
-        total = total @ total
     return total
