@@ -176,7 +176,7 @@ class Daemon:
             self._loop.stop()
             deadline = self._clock.monotonic() + FADE_LIMIT + SETTLING
             async for slot in ticker:
-                if self._loop.neutral_for > SETTLING or slot.now > deadline:
+                if self._loop.settled or slot.now > deadline:
                     break
                 self._loop.tick(slot)
                 self._server.ticked()
@@ -208,7 +208,7 @@ class Daemon:
     def _come_to_rest(self) -> None:
         """Where fishd failed and could not fade: neutral, and time to get there."""
         if self._loop.servo.on and self._loop.applied != 0.0:
-            with suppress(ServoError):  # closing it comes later, and says what could not be done
+            with suppress(Exception):  # closing it comes later, and says what could not be done
                 self._loop.robot.servo.write(0.0)
                 self._clock.sleep(REST)
 
