@@ -92,7 +92,7 @@ class AsyncFish(Connection):
         return await self._call(Calibrations, "calibrations")
 
     async def sample_force(self, seconds: float = 2.0) -> ForceSample:
-        """Measure for a while; refused while the fish swims, and for a simulated fish."""
+        """Measure for a while; refused while a controller other than `hold` is active."""
         return await self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
 
     async def tare(self, seconds: float = 2.0) -> Calibrations:

@@ -52,6 +52,7 @@ class Lockstep:
     async def tick(self, slot: Slot, poll: Callable[[], None]) -> None:
         """One turn of the loop, which waits for the agent as long as `remote` is active.
 
+        An agent that sends what is no answer ends the wait, with a fault.
         poll: called again and again meanwhile; may select another controller
         """
         turn = self._loop.observe(slot)
