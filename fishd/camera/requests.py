@@ -76,7 +76,7 @@ class CameraRequests:
                         raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
                     if reply.result:
                         return cast(T, decoder(kind)(reply.result))
-        if self._publishes():
+        if timeout is None and self._publishes():  # within a tick there is no time for it
             raise CameraLost(
                 f"at {self.endpoint} a camera publishes its frames; requests go to another address "
                 f"of it: its publish.requests, {PublishSettings().requests} by default"
@@ -118,6 +118,7 @@ def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
     if complaint := addresses.why_not_connected(address):
         raise CameraLost(f"'{address}' is no address of a camera: {complaint}")
     try:
+        socket.set(zmq.IPV6, addresses.is_ipv6(address))
         socket.connect(address)
     except zmq.ZMQError as error:
         raise CameraLost(

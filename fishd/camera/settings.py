@@ -1,6 +1,7 @@
 """The settings of `fishd-camera`, from a YAML file: what it opens, shows and publishes."""
 
 import os
+import re
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
@@ -27,6 +28,7 @@ _Delay = Annotated[
     ),
 ]
 _SCHEMES = ("rtsp", "rtsps", "http", "https", "rtp", "udp", "tcp")
+_VALUE = re.compile("=[^&/;]*")
 _Text = Annotated[str, Meta(min_length=1, max_length=500, pattern=PRINTABLE)]
 
 
@@ -192,10 +194,12 @@ def without_password(settings: CameraSettings) -> CameraSettings:
 
 
 def public(url: str) -> str:
-    """The path of a file, or a URL without user and password."""
+    """The path of a file, or a URL without what may be a secret: user, password, and any value."""
     scheme, network, rest = url.partition("://")
+    if not network:
+        return url
     place, slash, path = rest.partition("/")
-    return f"{scheme}://{place.rpartition('@')[2]}{slash}{path}" if network else url
+    return f"{scheme}://{place.rpartition('@')[2]}{slash}{_VALUE.sub('=…', path)}"
 
 
 def to_yaml(settings: CameraSettings) -> str:

@@ -20,8 +20,6 @@ GREETING = 2000
 """How long a connection may take until it speaks ZeroMQ [ms]."""
 _AT_ONCE = 20
 """Requests or subscriptions that are taken before frames are looked at."""
-_TOPICS = 20
-"""Subscriptions that are remembered."""
 _RIVAL = "another fishd-camera"
 _IN_USE = "it is in use, by another fishd-camera perhaps; end that, or choose another address"
 _ADVICE = "end it, or give this one another publish.frames and publish.requests"
@@ -34,6 +32,7 @@ class Publisher:
         """Raises `StartupError`."""
         self.socket, self.address = _listening(zmq.XPUB, address, "publish.frames", stack)
         self._topics: set[bytes] = set()
+        """Those by which somebody gets views: `view`, or how that begins."""
 
     def send(self, parts: list[bytes]) -> None:
         """Publish a message."""
@@ -42,7 +41,7 @@ class Publisher:
     @property
     def views_wanted(self) -> bool:
         """Has anybody subscribed to pictures for people?"""
-        return any(VIEW.startswith(topic) for topic in self._topics)
+        return bool(self._topics)
 
     def take_subscriptions(self) -> bool:
         """Note what is wanted; true where somebody has just subscribed to the state."""
@@ -50,7 +49,7 @@ class Publisher:
         for (message,) in _waiting(self.socket, 1):
             topic = message[1:]
             if message[:1] == b"\x01":
-                if len(self._topics) < _TOPICS:
+                if VIEW.startswith(topic):
                     self._topics.add(topic)
                 state = state or STATE.startswith(topic)
             else:

@@ -23,7 +23,7 @@ from fishd.controllers.remote.messages import (
     decode_from_fish,
     encode,
 )
-from fishd.core.addresses import claimed, parse
+from fishd.core.addresses import claimed, is_ipv6, parse
 from fishd.core.errors import FishError, NoDaemon, ParameterError, StartupError
 
 PATIENCE = 10.0
@@ -187,6 +187,7 @@ def _bound(address: str, stack: ExitStack) -> "zmq.Socket[bytes]":
         socket = context.socket(zmq.ROUTER)
         socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
         socket.set(zmq.LINGER, 100)
+        socket.set(zmq.IPV6, is_ipv6(address))
         socket.bind(address)
         return socket
     except StartupError as error:

@@ -11,7 +11,7 @@ import msgspec
 import zmq
 
 from fishd.core import protocol, text
-from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, socket_path
+from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, is_ipv6, socket_path
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, NoDaemon, ParameterError, Refused, Untrusted
 from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
@@ -140,6 +140,7 @@ def subscriber(context: "zmq.Context[S]", address: str, *topics: bytes) -> S:
 
 def _connect(socket: "zmq.Socket[Any]", address: str) -> None:
     try:
+        socket.set(zmq.IPV6, is_ipv6(address))
         socket.connect(address)
     except zmq.ZMQError as error:
         socket.close()

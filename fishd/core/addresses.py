@@ -74,6 +74,11 @@ def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
+def is_ipv6(text: str) -> bool:
+    """Must a socket be told to speak IPv6? One that does looks names up as IPv6, too."""
+    return "[" in text
+
+
 def is_local(text: str) -> bool:
     """Is it certain that only this machine can reach an address?"""
     address = parse(text)

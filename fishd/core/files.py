@@ -100,6 +100,15 @@ def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> 
             part.unlink(missing_ok=True)
 
 
+def sync_folder(folder: Path) -> None:
+    """Wait until a power cut no longer takes the names in it away again; raises OSError."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def check_writable(path: Path) -> None:
     """Find out before long work whether a file can be written at its end.
 

@@ -5,7 +5,6 @@ None is ever overwritten; the newest one of a kind is used.
 
 import datetime
 import math
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -71,11 +70,7 @@ class CalibrationFolder:
         path = self.folder / f"{stem}.yaml"
         text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
         files.write_atomically(path, text, new=True)
-        folder = os.open(self.folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # else a power cut takes the name away again
-        finally:
-            os.close(folder)
+        files.sync_folder(self.folder)
         return dated, path
 
     def ignored(self) -> list[str]:

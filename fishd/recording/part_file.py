@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from fishd.core import files
 from fishd.core.errors import RecordingError
 
 PART = ".part"
@@ -110,11 +111,7 @@ def give_name(part: Path, final: Path) -> None:
         part.rename(final)  # a file system without links, such as that of USB sticks
     else:
         part.unlink()
-    folder = os.open(final.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    files.sync_folder(final.parent)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import msgspec
 import zmq
 
 from fishd.client import Fish
-from fishd.core import text
+from fishd.core import addresses, text
 from fishd.core.errors import FishError, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
@@ -269,6 +269,7 @@ class Telemetry:
         if address != self._address:
             if self._address:
                 self._socket.disconnect(self._address)
+            self._socket.set(zmq.IPV6, addresses.is_ipv6(address))
             self._socket.connect(address)
             self._address = address
 

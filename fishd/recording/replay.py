@@ -182,6 +182,7 @@ def _bound(socket: "zmq.Socket[bytes]", address: str, option: str) -> str:
     try:
         if path:
             path.unlink(missing_ok=True)
+        socket.set(zmq.IPV6, addresses.is_ipv6(address))
         socket.bind(address)
     except (zmq.ZMQError, OSError) as error:
         why = zmq.strerror(error.errno or 0)

@@ -10,7 +10,7 @@ from rigs.camera_process import COMMAND
 from rigs.documents import ROOT
 from rigs.processes import call, one_line
 
-from fishd.camera.settings import CameraSettings, SimulatedSettings, load, to_yaml
+from fishd.camera.settings import CameraSettings, SimulatedSettings, load, public, to_yaml
 from fishd.camera.simulated.settings import WEB
 from fishd.core.errors import ConfigError
 
@@ -83,3 +83,19 @@ def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: s
     said = one_line(call(*COMMAND, "--set", "source=v4l2", env=env))
     assert module in said
     assert said.endswith("install the extra: pip install 'fishd[camera]'\n")
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("/videos/fish.mp4", "/videos/fish.mp4"),
+        ("rtsp://me:secret@10.0.0.5:554/fish", "rtsp://10.0.0.5:554/fish"),
+        ("http://10.0.0.5/video.cgi?user=me&pwd=secret", "http://10.0.0.5/video.cgi?user=…&pwd=…"),
+        (
+            "rtsp://10.0.0.5/user=me&password=secret&channel=1/0.sdp",
+            "rtsp://10.0.0.5/user=…&password=…&channel=…/0.sdp",
+        ),
+    ],
+)
+def test_nobody_is_told_a_password_wherever_a_camera_wants_it(url: str, shown: str) -> None:
+    assert public(url) == shown

@@ -19,7 +19,7 @@ from rigs.processes import Daemon, Subscriber, call, running, sets
 
 from fishd.camera.client import CameraClient, CameraLost
 from fishd.camera.messages import STATE
-from fishd.camera.requests import reachable
+from fishd.camera.requests import CameraRequests, reachable
 from fishd.cli.doctor import service
 from fishd.cli.doctor.base import Context
 from fishd.config import Config
@@ -111,6 +111,34 @@ def test_a_flood_of_garbage_is_survived_while_frames_go_on(camera: CameraProcess
         finally:
             context.destroy(linger=0)
     assert camera.status().seq > before
+
+
+def test_whatever_else_a_neighbour_subscribes_to_views_come(camera: CameraProcess) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    neighbour = context.socket(zmq.SUB)
+    try:
+        for number in range(50):
+            neighbour.subscribe(f"topic {number}")
+        neighbour.connect(camera.frames)
+        time.sleep(0.3)  # the neighbour is heard first
+        with camera.client(views=True) as client:
+            assert next(client.views()).jpeg
+    finally:
+        context.destroy(linger=0)
+
+
+def test_within_a_tick_there_is_no_time_to_find_out_why_no_answer_comes(
+    camera: CameraProcess,
+) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        requests = CameraRequests(camera.frames, context, timeout=0.3)
+        with pytest.raises(CameraLost, match=r"no answer within 0\.05 s"):
+            requests.status(0.05)
+        with pytest.raises(CameraLost, match=r"at .+ a camera publishes its frames"):
+            requests.status()
+    finally:
+        context.destroy(linger=0)
 
 
 def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess) -> None:

@@ -5,8 +5,10 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
@@ -125,6 +127,55 @@ def test_an_archive_that_would_fill_the_memory_is_refused(run: Path) -> None:
 def test_a_checkpoint_with_a_strange_number_is_not_the_newest(run: Path) -> None:
     (run / "step-²").mkdir()
     assert checkpoints.newest(run).name == STEP
+
+
+def save_best(run: Path, state: checkpoints.State) -> None:
+    """Save the networks of the run once more, as those that swam best."""
+    content = (run / STEP / "model.zip").read_bytes()
+    model: Any = SimpleNamespace(save=lambda archive: archive.write(content))
+    checkpoints.save(run, "best", model, checkpoints.read_card(run / STEP), state)
+
+
+def save_until(call: int, run: Path, steps: int) -> bool:
+    """Save a best checkpoint in a process that is killed before this call; did it end before?"""
+    state = replace(checkpoints.read_state(run / STEP), steps=steps, tank_time=9.0)
+    if not (child := os.fork()):
+        calls = count()
+
+        def dying(act: Callable[..., Any]) -> Callable[..., Any]:
+            def acting(*args: Any, **options: Any) -> Any:
+                if next(calls) == call:
+                    os._exit(9)
+                return act(*args, **options)
+
+            return acting
+
+        for name in ("rename", "replace", "unlink", "rmdir", "fsync"):
+            setattr(os, name, dying(getattr(os, name)))
+        with suppress(BaseException):
+            save_best(run, state)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@pytest.mark.parametrize("steps", [32, 64], ids=["of the same name", "of another name"])
+def test_whenever_a_save_is_killed_the_best_is_the_new_one_or_the_old_one(
+    finished: Path, tmp_path: Path, steps: int
+) -> None:
+    for call in count():
+        run = Path(shutil.copytree(finished, tmp_path / f"{call}"))
+        save_best(run, replace(checkpoints.read_state(run / STEP), tank_time=1.0))
+        ended = save_until(call, run, steps)
+        checkpoints.sweep(run)
+        best = checkpoints.best(run)
+        assert best
+        state = checkpoints.read_state(best)
+        assert (state.steps, state.tank_time) in ((64, 1.0), (steps, 9.0))
+        assert checkpoints.load_policy(best)
+        assert not list(run.glob(".*"))
+        if ended:
+            assert state.tank_time == 9.0
+            break
 
 
 def test_a_table_of_another_kind_is_one_line(run: Path) -> None:

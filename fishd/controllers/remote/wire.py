@@ -9,7 +9,7 @@ import msgspec
 import zmq
 
 from fishd.controllers.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
-from fishd.core.addresses import FORM
+from fishd.core.addresses import FORM, is_ipv6
 from fishd.core.decoding import decoder
 from fishd.core.errors import ControllerFault, ParameterError
 
@@ -53,6 +53,7 @@ class Wire:
         self._socket.set(zmq.RCVHWM, _QUEUE)
         self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
         try:
+            self._socket.set(zmq.IPV6, is_ipv6(address))
             self._socket.connect(address)
         except zmq.ZMQError as error:
             self._socket.close(linger=0)

@@ -87,15 +87,22 @@ def save(
     part.mkdir()
     archive = io.BytesIO()  # given a path, it leaves a file open where the disk is full
     model.save(archive)
-    (part / MODEL).write_bytes(archive.getvalue())
-    (part / CARD).write_text(msgspec.json.format(encode(card), indent=2) + "\n", encoding="utf-8")
-    (part / STATE).write_bytes(msgspec.json.encode(state))
+    files.write_atomically(part / MODEL, archive.getvalue())
+    files.write_atomically(part / CARD, msgspec.json.format(encode(card), indent=2) + "\n")
+    files.write_atomically(part / STATE, msgspec.json.encode(state))
     if eye and eye.is_fitted:
         constants = {name: Constant(a.shape, a.tobytes()) for name, a in eye.constants.items()}
-        (part / EYE).write_bytes(msgspec.msgpack.encode(constants))
+        files.write_atomically(part / EYE, msgspec.msgpack.encode(constants))
+    files.sync_folder(part)
     if final.exists():  # a run that was stopped before it learned any more
-        _discard(final)
-    part.rename(final)
+        replaced = folder / f".{name}.replaced"
+        final.rename(replaced)
+        part.rename(final)
+        files.sync_folder(folder)
+        _discard(replaced)
+    else:
+        part.rename(final)
+        files.sync_folder(folder)
     if kind == "best":
         for other in folder.glob("best-*"):
             if other != final:
@@ -124,7 +131,7 @@ def newest(folder: Path) -> Path:
 def best(folder: Path) -> Path | None:
     """The checkpoint that swam best; None where no policy of the run has swum."""
     found = [path for path in all_in(folder) if path.name.startswith("best")]
-    return found[-1] if found else None
+    return max(found, key=_written, default=None)  # a kill may have left the one before
 
 
 def find(path: Path, *, latest: bool = False) -> Path:
@@ -154,7 +161,13 @@ def refuse_several(folder: Path) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what a killed writer left half-written, or half-removed."""
+    """Remove what a killed writer left half-written, or half-removed; nothing whole is lost."""
+    for replaced in folder.glob(".*.replaced"):
+        final = folder / replaced.name.removeprefix(".").removesuffix(".replaced")
+        if final.exists():
+            shutil.rmtree(replaced)
+        else:
+            replaced.rename(final)
     for left in (*folder.glob(".*.part"), *folder.glob(".*.old")):
         if left.is_dir():
             shutil.rmtree(left)
@@ -258,10 +271,17 @@ def _brief(error: BaseException) -> str:
 
 def _discard(checkpoint: Path) -> None:
     """Remove a checkpoint; killed in between, it leaves none that looks complete."""
-    old = checkpoint.with_name(f".{checkpoint.name}.old")
+    old = checkpoint.with_name(f".{checkpoint.name.removeprefix('.')}.old")
     shutil.rmtree(old, ignore_errors=True)
     checkpoint.rename(old)
     shutil.rmtree(old)
+
+
+def _written(checkpoint: Path) -> float:
+    try:
+        return (checkpoint / STATE).stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def _text(path: Path) -> str:

@@ -183,6 +183,7 @@ class RunRecorder:
     def _resume(self) -> None:
         """Go on from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
         job, model = self._job, self._model
+        checkpoints.sweep(job.folder)
         self.checkpoint = checkpoints.newest(job.folder)
         state = checkpoints.read_state(self.checkpoint)
         if state.on != job.on:
@@ -204,7 +205,6 @@ class RunRecorder:
         self.latest, self.imitated = state.latest, state.imitated
         self._take_best(state)
         self._env.tank_time = state.tank_time
-        checkpoints.sweep(job.folder)
         runs.write_settings(job.folder, job.settings)
 
     def _take_best(self, state: State) -> None:
