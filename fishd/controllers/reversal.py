@@ -6,7 +6,8 @@ from fishd.controllers.base import Limits
 from fishd.core.signals import Observation
 
 REFRACTORY = 0.05
-"""Share of the longest half period in which noise, at small ticks, cannot cause a reversal."""
+"""Share of the longest half period in which noise, at small ticks, cannot cause a reversal; of one
+beyond 1 s it is that of 1 s: noise lasts no longer because somebody is ready to wait longer."""
 FIRST_PUSH = 0.2
 """Who begins from neutral does not reverse sooner: until the servo acts, all speed is noise [s]."""
 SLOPE_OVER = 0.05
@@ -54,7 +55,7 @@ class Reversal:
         self._top_speed = max(self._top_speed, speed)
         # Half a tick early is nearer to the longest half period than half a tick late.
         nearly = self.since_reversal + 0.5 * self._tick
-        settled = self.since_reversal > REFRACTORY * longest
+        settled = self.since_reversal > REFRACTORY * min(longest, 1.0)
         if self._first:
             settled = settled and nearly > FIRST_PUSH
         overdue = nearly > longest

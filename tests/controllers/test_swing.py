@@ -57,6 +57,16 @@ def test_without_any_sign_of_slowing_down_it_reverses_after_the_longest_half_per
     assert reversals(commands(controller, 35)) == [9, 19, 29]
 
 
+@pytest.mark.parametrize("tick", [0.01, 0.05])
+def test_a_longer_longest_half_period_changes_nothing_where_the_fin_tells_when(tick: float) -> None:
+    swum = []
+    for longest in (1.0, 10.0):
+        rig = Rig(f"tick={tick}")
+        rig.start("swing", longest_half_period=longest)
+        swum.append([tick.phi_c for tick in rig.run_for(15)])
+    assert swum[0] == swum[1]
+
+
 def test_it_takes_over_towards_the_side_that_is_in_force() -> None:
     assert commands(registry.create("swing", {}, LIMITS), 1, angle=-0.1) == [-0.42]
     assert commands(registry.create("swing", {}, LIMITS), 1, angle=0.1) == [0.42]
