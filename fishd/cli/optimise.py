@@ -22,6 +22,7 @@ from fishd.cli.sweep_output import again
 from fishd.client import Fish
 from fishd.config import Start, load
 from fishd.controllers import registry
+from fishd.controllers.base import Limits
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, NoDaemon, ParameterError
 from fishd.core.interruption import interrupted_once
@@ -128,6 +129,8 @@ def _optimise(
     from fishd.lab.optimise.folder import Begun, SearchFolder, draw
     from fishd.lab.optimise.least_power import LeastPower
     from fishd.lab.optimise.trials import lengths
+    from fishd.lab.sweep import grid
+    from fishd.lab.sweep.grid import Point
 
     drawing.check_installed()
     if objective and at_least:
@@ -138,10 +141,13 @@ def _optimise(
     with _fish(on, file, overrides, endpoint) as (rig, config):
         ranges = [_range(text, name, parameters, rig) for text in over]
         search = aim.search(ranges, seed)
-        if on == "simulation":
-            for end in ("low", "high"):
-                ends = {each.name: getattr(each, end) for each in ranges}
+        for end in ("low", "high"):
+            ends = {each.name: getattr(each, end) for each in ranges}
+            if on == "simulation":
                 registry.check(name, {**parameters, **ends}, load(file, overrides).limits)
+            else:
+                of_fish = Limits(rig.amplitude, rig.tick)
+                grid.check_remote([Point(name, {**parameters, **ends})], of_fish)
         if budget < (least := 2.0 * REST + lengths(parameters)[1]):
             raise ParameterError(
                 f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"

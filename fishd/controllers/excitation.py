@@ -5,6 +5,7 @@ from typing import Annotated, Any
 from msgspec import Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.controllers.waveform import check_frequency
 from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
@@ -16,7 +17,15 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
     lowest: Annotated[
         float, unit("Hz", "Frequency at which the sweep begins and ends.", gt=0, le=10)
     ] = 0.5
-    highest: Annotated[float, unit("Hz", "Frequency at which it turns back.", gt=0, le=10)] = 3.0
+    highest: Annotated[
+        float,
+        unit(
+            "Hz",
+            "Frequency at which it turns back; at two ticks a beat it does in any case.",
+            gt=0,
+            le=10,
+        ),
+    ] = 3.0
     sweep_time: Annotated[
         float, unit("s", "Time from lowest to highest and back.", ge=1, le=3600)
     ] = 20.0
@@ -50,8 +59,9 @@ class Excitation(Controller[ExcitationParameters]):
 
     @classmethod
     def check(cls, parameters: Any, limits: Limits) -> None:
-        """Refuse bounds in the wrong order, and an amplitude beyond Φ."""
+        """Refuse bounds in the wrong order or too high, and an amplitude beyond Φ."""
         super().check(parameters, limits)
+        check_frequency("lowest", parameters.lowest, limits.tick)
         if parameters.highest < parameters.lowest:
             raise ParameterError(
                 f"highest: {parameters.highest:g} Hz is below lowest, {parameters.lowest:g} Hz",
@@ -68,6 +78,7 @@ class Excitation(Controller[ExcitationParameters]):
         group, phase = int(self._phase // p.beats), self._phase % 1.0
         self._progress = (self._progress + observation.dt / p.sweep_time) % 1.0
         height = 1.0 - abs(1.0 - 2.0 * self._progress)
-        self._phase += (p.lowest + (p.highest - p.lowest) * height) * observation.dt
+        highest = min(p.highest, 0.5 / self.limits.tick)
+        self._phase += (p.lowest + (highest - p.lowest) * height) * observation.dt
         side = 1.0 if phase < 0.5 else -1.0
         return side * amplitude_of(p, self.limits) * (p.smaller if group % 2 else 1.0)

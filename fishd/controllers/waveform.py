@@ -5,14 +5,34 @@ All keep their phase when the frequency changes. Sine and triangle start from th
 
 import math
 from abc import abstractmethod
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from msgspec import Struct
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
 from fishd.controllers.quantities import quantity
+from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
+
+_ROUNDING = 1e-5
+"""Of a highest frequency that is a short number, such as 7.14286 Hz for ticks of 0.07 s."""
+
+
+def check_frequency(name: str, frequency: float, tick: float, *, highest: bool = True) -> None:
+    """Refuse a parameter with which a beat has less than two ticks: it would be that of a slower
+    wave, or none.
+
+    highest: whether just two are enough
+    Raises `ParameterError`.
+    """
+    ratio = frequency * 2.0 * tick
+    if ratio > 1.0 + _ROUNDING or (ratio > 1.0 - _ROUNDING and not highest):
+        raise ParameterError(
+            f"{name}: {frequency:g} Hz is too fast for ticks of {tick:g} s: "
+            f"{'at most' if highest else 'less than'} {0.5 / tick:g} Hz is possible",
+            (name,),
+        )
 
 
 class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -32,12 +52,22 @@ class Waveform(Controller[WaveformParameters]):
     """
 
     Parameters = WaveformParameters
+    two_ticks_are_a_beat: ClassVar[bool] = True
+    """Else it stands still where each beat has just two."""
     phase: float = quantity("1", "Phase of the waveform: 0 to 1 over one period.")
 
     def __init__(self, parameters: WaveformParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self.phase = 0.0
         self._first = True
+
+    @classmethod
+    def check(cls, parameters: WaveformParameters, limits: Limits) -> None:
+        """As for any controller; and the ticks are short enough. Raises `ParameterError`."""
+        super().check(parameters, limits)
+        check_frequency(
+            "frequency", parameters.frequency, limits.tick, highest=cls.two_ticks_are_a_beat
+        )
 
     def update(self, observation: Observation) -> float:
         """The waveform's angle at this tick [rad]."""
@@ -76,6 +106,7 @@ class Smooth(Waveform):
     An angle that the new waveform never reaches is left at the waveform's own top speed.
     """
 
+    two_ticks_are_a_beat = False  # they may both be at neutral
     TOP_SPEED: float
     """Largest slope of the shape [1 / period]."""
 

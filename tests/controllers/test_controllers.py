@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from rigs.harness import LIMITS, commands, observe
 
 from fishd.controllers import registry
@@ -103,6 +104,39 @@ def test_an_amplitude_beyond_the_robots_limit_is_refused() -> None:
         made("square", amplitude=0.5)
     with pytest.raises(ParameterError, match=r"hold: angle: -0\.5 rad is beyond"):
         made("hold", angle=-0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "tick", "frequency", "possible"),
+    [
+        ("square", 0.1, 6.0, "at most 5 Hz is"),
+        ("square", 0.07, 7.143, "at most 7.14286 Hz is"),
+        ("sine", 0.05, 10.0, "less than 10 Hz is"),
+        ("triangle", 0.1, 5.0, "less than 5 Hz is"),
+        ("sine", 0.2, 3.0, "less than 2.5 Hz is"),
+    ],
+)
+def test_a_wave_too_fast_for_the_tick_is_refused_with_the_highest_frequency(
+    name: str, tick: float, frequency: float, possible: str
+) -> None:
+    limits = replace(LIMITS, tick=tick)
+    with pytest.raises(ParameterError) as caught:
+        made(name, limits, frequency=frequency)
+    assert str(caught.value) == (
+        f"{name}: frequency: {frequency:g} Hz is too fast for ticks of {tick:g} s: {possible} "
+        "possible"
+    )
+    slower = made(name, limits, frequency=1.0)
+    with pytest.raises(ParameterError, match="too fast"):
+        registry.merged(slower, name, {"frequency": frequency})
+
+
+@pytest.mark.parametrize(("tick", "frequency"), [(0.05, 10.0), (0.07, 7.14286), (0.2, 2.5)])
+def test_a_square_wave_may_reverse_in_every_tick(tick: float, frequency: float) -> None:
+    controller = made("square", replace(LIMITS, tick=tick), frequency=frequency)
+    controller.activate(observe())
+    given_ = [controller.update(observe(dt=tick)) for _ in range(1000)]
+    assert given_ == [0.42, -0.42] * 500
 
 
 def test_a_wrong_name_gets_the_nearest_right_one() -> None:

@@ -4,7 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, wait_until
+from rigs.processes import FISHCTL, Daemon, Process, one_line, wait_until
 
 
 @pytest.mark.slow
@@ -37,4 +37,6 @@ def test_what_the_fish_cannot_do_is_not_begun(daemon: Daemon, tmp_path: Path) ->
         refused = daemon.fishctl(*words, "--over", over)
         assert refused.returncode == 1
         assert f"is not within {named}" in refused.stderr
+    words[1] = "sine"
+    assert "less than 10 Hz" in one_line(daemon.fishctl(*words, "--over", "frequency=1:10"))
     assert not folder.exists()

@@ -13,6 +13,8 @@ def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
     before = daemon.status().seq
     complaint = one_line(daemon.fishctl(*words, "--amplitude", "0.3,0.41,0.6"))
     assert "amplitude_limit" in complaint
+    words = ("sweep", "sine", *words[2:])
+    assert "less than 10 Hz" in one_line(daemon.fishctl(*words, "--frequency", "8:10:1"))
     assert daemon.status().seq < before + 60  # a point takes 600
     assert not (tmp_path / "run").exists()
 

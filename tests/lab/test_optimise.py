@@ -159,6 +159,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
         (["--over", "frequency=3:1"], "is no range"),
         (["--over", "frequency=1"], "LOW:HIGH"),
         (["--over", "frequency=1:30"], "frequency"),
+        (["--over", "frequency=1:8", "--set", "tick=0.1"], "8 Hz is too fast for ticks of 0.1 s"),
         (["--over", "frequency=1.5:1.9"], "there: 1.667; around: 1.429, 1.667, 2"),
         (["--over", "frequency", "--frequency", "2"], "is given, too"),
         (["--over", "frequency", "--budget", "5"], "too short"),
