@@ -1,11 +1,13 @@
 """What the INA219 and the INA226 of Texas Instruments have in common.
 
 Both measure the voltage over a shunt and that of the supply behind it, one after the other and all
-the time, and average by themselves. Their registers for power and current are not used: those are
-lost with the chip's supply until somebody writes them again, and know of one shunt.
+the time, and average by themselves. Their registers for power and current are not used: those know
+of one shunt. How they average is lost with the chip's supply, so that is looked at now and then.
 """
 
 import contextlib
+import errno
+import math
 from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -21,6 +23,8 @@ TOLERANCE = 1.15
 """Of the chips' own clocks, and of ours."""
 LOWEST_SUPPLY = 3.0
 """Below this [V] no servo moves."""
+TRUSTED = 1.0
+"""For so long it is believed to average as it was told, unless a transfer fails [s]."""
 
 
 Shunt = Annotated[
@@ -52,6 +56,7 @@ class Ina(PowerMeterDriver[N]):
     full_scale: ClassVar[float]
     """Largest voltage over the shunt that it tells, ± [V]."""
     _bus: Any = None
+    _trusted_until = -math.inf
 
     @property
     def least(self) -> float:
@@ -78,12 +83,25 @@ class Ina(PowerMeterDriver[N]):
         """Let it measure for `least` or longer for each value; raises OSError."""
 
     @abstractmethod
+    def is_set_up(self) -> bool:
+        """Whether the chip still measures as `set_up` told it to; raises OSError."""
+
+    @abstractmethod
     def volts(self) -> tuple[float, float]:
         """Voltage of the supply behind the shunt, and over the shunt [V]; raises OSError."""
 
     def sample(self) -> PowerSample:
-        """Two registers. Raises OSError."""
+        """Two registers. Raises OSError, until it is opened anew where the chip was reset."""
+        now = self.clock.monotonic()
+        trusted_until, self._trusted_until = self._trusted_until, -math.inf  # where this fails
+        if now >= trusted_until:
+            if not self.is_set_up():
+                raise OSError(
+                    errno.EIO, f"{self.place} lost its settings: its supply was interrupted"
+                )
+            trusted_until = now + TRUSTED
         supply, shunt = self.volts()
+        self._trusted_until = trusted_until
         current = shunt / self.settings.shunt
         clipped = ""
         if abs(shunt) >= self.full_scale:

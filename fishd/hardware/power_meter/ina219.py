@@ -46,7 +46,12 @@ class Ina219(Ina[Ina219Settings]):
         doublings = 1
         while doublings < 7 and (2**doublings + 1) * CONVERSION < self.least:
             doublings += 1
-        self._chip.shunt_adc_resolution = 0x8 | doublings  # 2, 4 … 128 samples
+        self._resolution = 0x8 | doublings  # 2, 4 … 128 samples
+        self._chip.shunt_adc_resolution = self._resolution
+
+    def is_set_up(self) -> bool:
+        """As `Ina.is_set_up`; the rest of its settings are those after a reset."""
+        return bool(self._chip.shunt_adc_resolution == self._resolution)
 
     def volts(self) -> tuple[float, float]:
         """As `Ina.volts`."""

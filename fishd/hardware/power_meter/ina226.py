@@ -18,6 +18,8 @@ CONFIG, SHUNT, SUPPLY, MANUFACTURER = 0x00, 0x01, 0x02, 0xFE
 TEXAS_INSTRUMENTS = 0x5449
 _ALWAYS = 0x4007
 """Both voltages, one after the other, without an end."""
+_WHAT_COUNTS = 0x0FFF
+"""Of the settings: the bits above have no meaning."""
 
 
 class Ina226Settings(InaSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -47,8 +49,12 @@ class Ina226(Ina[Ina226Settings]):
             for bits, lasts in enumerate(CONVERSIONS)
             if count * (lasts + CONVERSIONS[0]) >= self.least
         )
-        config = _ALWAYS | average << 9 | bits << 3
-        bus.writeto(self.settings.address, bytes([CONFIG]) + config.to_bytes(2, "big"))
+        self._config = _ALWAYS | average << 9 | bits << 3
+        bus.writeto(self.settings.address, bytes([CONFIG]) + self._config.to_bytes(2, "big"))
+
+    def is_set_up(self) -> bool:
+        """As `Ina.is_set_up`."""
+        return (self._register(CONFIG) ^ self._config) & _WHAT_COUNTS == 0
 
     def volts(self) -> tuple[float, float]:
         """As `Ina.volts`."""

@@ -23,13 +23,14 @@ FAULTS: dict[str, str] = {
     "frozen-code": "ADS1115: each input repeats its last code",
     "clipped": "ADS1115: every code is at full scale",
     "meter-unplugged": "INA219, INA226: without power or wires (error 121); back at reset",
+    "meter-brown-out": "INA219, INA226: registers reset; happens at once",
     "pigpiod-gone": "pigpiod: dead; connections closed, pulses stopped, scripts lost",
     "pigpiod-frozen": "pigpiod: stopped; answers nothing, scripts stand still, pulses go on",
     "pigpiod-restart": "pigpiod: killed and started again; happens at once",
 }
 """Every fault and what it does."""
 
-INSTANTANEOUS = frozenset({"brown-out", "pigpiod-restart"})
+INSTANTANEOUS = frozenset({"brown-out", "meter-brown-out", "pigpiod-restart"})
 """Faults that happen at once: they have listeners, but no duration."""
 
 TRANSFER_ERRORS = {

@@ -49,6 +49,12 @@ class InaChip(ABC):
         self._lock = threading.Lock()
         self.reset()
         faults.listen("meter-unplugged", self.reset)
+        faults.listen("meter-brown-out", self.reset)
+
+    @property
+    def config(self) -> int:
+        """The register that says how it converts."""
+        return self._registers[CONFIG]
 
     def reset(self) -> None:
         """Go back to the state after power-up."""

@@ -104,6 +104,40 @@ def test_a_meter_that_was_unplugged_is_set_up_anew(rig: MeterRig) -> None:
     assert meter.counters()["i2c_power_reconnects"] == 1
 
 
+@pytest.mark.parametrize(
+    ("fault", "seconds", "lasts"), [("meter-unplugged", 0.005, 0.2), ("meter-brown-out", None, 1.2)]
+)
+def test_a_short_loss_of_its_supply_costs_no_averaging_for_longer(
+    rig: MeterRig, fault: str, seconds: float | None, lasts: float
+) -> None:
+    meter = rig.meter()
+    rig.tick(meter)
+    averages = rig.meter_chip.config
+    rig.clock.sleep(4e-3)  # the next sample is due after 6.25 ms
+    rig.faults.inject(fault, seconds)
+    assert rig.meter_chip.config != averages
+    told = []
+    for _ in range(round(lasts / TICK)):
+        try:
+            power = rig.tick(meter)
+        except SensorError as error:
+            told.append(str(error))
+    assert all("lost its settings: its supply was interrupted" in line for line in told)
+    assert rig.meter_chip.config == averages
+    assert power == pytest.approx(1.5, rel=0.01)
+    assert meter.counters()["i2c_power_reconnects"] == 1
+
+
+def test_a_transfer_that_fails_while_its_supply_holds_costs_one_sample_only(rig: MeterRig) -> None:
+    meter = rig.meter()
+    rig.tick(meter)
+    rig.clock.sleep(4e-3)  # the next sample is due after 6.25 ms
+    rig.faults.inject("nack", 0.005)
+    for _ in range(10):
+        rig.tick(meter)
+    assert meter.counters() == {"i2c_power_errors": 1, "i2c_power_reconnects": 0}
+
+
 def test_a_current_beyond_the_range_is_not_believed(rig: MeterRig) -> None:
     rig.watts = lambda time: 6.0 * 40.0
     meter = rig.meter()
