@@ -121,6 +121,19 @@ def test_an_agent_learns_for_seconds_and_then_swims_on(daemon: Daemon, address: 
         assert fish.status().mode == "running"
 
 
+@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="a kernel without IPv6")
+def test_an_agent_and_telemetry_may_be_reached_over_ipv6(tmp_path: Path) -> None:
+    telemetry = sets("telemetry.address=tcp://[::1]:0")
+    with (
+        running(tmp_path, *telemetry) as daemon,
+        Agent("tcp://[::1]:*", timeout=PATIENCE) as agent,
+        Fish(daemon.endpoint) as fish,
+    ):
+        fish.set_controller("remote", agent=agent.address, first_action=PATIENCE)
+        assert agent.observe().session
+        assert next(fish.ticks()).controller == "remote"
+
+
 def test_rubbish_is_a_fault_that_says_what_came(daemon: Daemon, address: str) -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     socket = context.socket(zmq.DEALER)  # may bind just as well
