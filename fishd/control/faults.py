@@ -37,7 +37,8 @@ FAULTS = {
     "sensor-range": Fault(
         "the force is not to be believed: a sample at the end of the ADC's range, a channel that "
         "has not changed for `force_sensor.frozen_after`, or a force beyond "
-        "`force_sensor.force_limit`",
+        "`force_sensor.force_limit`; until it is a fault, the last force that was believed is used "
+        "again",
         "look for a clipped or broken wire of the force sensor, or calibrate it",
         in_a_row=3,
     ),

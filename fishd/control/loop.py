@@ -88,7 +88,8 @@ class ControlLoop:
         """As of the estimator, at the latest tick [s]."""
         self._now = clock.monotonic
         self._notify = notify
-        self._measurement = Measurement(clock.monotonic(), 0.0, 0.0, 0)
+        self._believed = Measurement(clock.monotonic(), 0.0, 0.0, 0)
+        """The latest measurement that was to be believed, as one of no samples."""
         self._index = -1
         self._awaited: tuple[int, str, Controller[Any], ServoCalibration | None] | None = None
 
@@ -123,9 +124,10 @@ class ControlLoop:
         measurement = self._read(slot)
         power = self.power.read(slot.deadline)
         read = self._now()
-        observation = self._follow_thrust(self._estimate(measurement, slot, dt))
-        self.observation = observation
-        self._watch_sign(observation)
+        suspect = bool(measurement.suspect)
+        estimated = self._estimate(self._believed if suspect else measurement, slot, dt)
+        self.observation = observation = self._follow_thrust(estimated, suspect)
+        self._watch_sign(observation, suspect)
         return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
@@ -246,11 +248,13 @@ class ControlLoop:
             if isinstance(error, FishLost):
                 self._fail("fish-lost", "there is nothing to read any more", error)
             problem = f"the force sensor cannot be read: {text.named(error)}"
-            # Once more, and nothing of it is new.
-            measurement = replace(self._measurement, samples=0, suspect="", extremes=None)
+            measurement = self._believed  # once more
         else:
             self.supervisor.check("sensor-range", measurement.suspect)
-        self._measurement = measurement
+            if not measurement.samples:  # it says again what may have been suspect
+                measurement = replace(measurement, fx=self._believed.fx, fy=self._believed.fy)
+        if not measurement.suspect:
+            self._believed = replace(measurement, samples=0, extremes=None)
         age = slot.now - measurement.time
         if problem is None and age > STALE * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
@@ -268,8 +272,11 @@ class ControlLoop:
             fx, fy, angle = measurement.fx, measurement.fy, self.applied
             return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
 
-    def _follow_thrust(self, observation: Observation) -> Observation:
-        """Add what is known of the thrust; where that fails, it begins anew."""
+    def _follow_thrust(self, observation: Observation, suspect: bool) -> Observation:
+        """Add what is known of the thrust; where that fails, it begins anew.
+
+        suspect: is the force of this tick not to be believed?
+        """
         if self.supervisor.sensor_lost:
             return observation
         try:
@@ -278,6 +285,8 @@ class ControlLoop:
                 self.thrust.forget_factor()
             running = self.supervisor.mode is Mode.RUNNING
             self.thrust.update(observation, running, self.active.wave)
+            if suspect:
+                self.thrust.interrupt()
             known = self.thrust.factor
         except ArithmeticError as error:
             self.reporter.problem("the thrust cannot be told, and is found anew", error)
@@ -287,9 +296,12 @@ class ControlLoop:
             return observation
         return replace(observation, thrust_factor=known[0], thrust_factor_error=known[1])
 
-    def _watch_sign(self, observation: Observation) -> None:
+    def _watch_sign(self, observation: Observation, suspect: bool) -> None:
         """Notice, when the tail sets off, that F_y is reversed."""
         if self.supervisor.sensor_lost or not self.limits.tethered:
+            return
+        if suspect:
+            self.lateral_sign.rest()
             return
         try:
             if self.lateral_sign.update(observation) and self.lateral_sign.reversed:

@@ -102,8 +102,8 @@ class Reporter:
                 seq=loop.seq,
                 mode=loop.supervisor.mode.value,
                 controller=loop.active.name,
-                fx=observation.fx,
-                fy=observation.fy,
+                fx=measurement.fx,
+                fy=measurement.fy,
                 fy_rate=observation.fy_rate,
                 fin_velocity=observation.fin_velocity,
                 phi_c=loop.applied,
@@ -133,6 +133,7 @@ class Reporter:
                 thrust_factor_error=UNSET if factor_error is None else factor_error,
                 power=UNSET if power is None else power,
                 leak=UNSET if loop.found_leak is None else loop.found_leak,
+                suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
             )
         )
 

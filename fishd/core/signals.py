@@ -203,6 +203,13 @@ class Tick(Struct, frozen=True, gc=False):
         float | UnsetType,
         unit("s", "The leak in use, with `estimator.leak: auto`; absent with a number."),
     ] = UNSET
+    suspect: Annotated[
+        str | UnsetType,
+        note(
+            "Why `fx` and `fy` are not to be believed; absent where they are. Estimators and "
+            "controllers then see those of the tick before."
+        ),
+    ] = UNSET
 
 
 Level = Literal["info", "warning", "error"]

@@ -113,6 +113,8 @@ class _Rerun:
         self._number = -1
         """Of the fishd whose ticks are compared."""
         self._last: Tick | None = None
+        self._believed = Measurement(0.0, 0.0, 0.0, 0)
+        """As of the loop."""
         self._before = 0.0
         """The angle before that of the last tick [rad]."""
         self._started: tuple[str, dict[str, Any]] | None = None
@@ -163,6 +165,7 @@ class _Rerun:
         self._number = number
         self._swims = None
         self._before = 0.0
+        self._believed = Measurement(0.0, 0.0, 0.0, 0)
         recorded = self._run.config_of(self._number)
         self._config: Config = adopt(self._run.configs[self._number], self._overrides)
         modelled = self._config.estimator.kind == "observer"
@@ -190,6 +193,10 @@ class _Rerun:
             tick.samples,
             fin_velocity=tick.fin_velocity,
         )
+        if tick.suspect is UNSET:
+            self._believed = replace(measurement, samples=0)
+        else:
+            measurement = self._believed
         again = self._estimator.update(measurement, applied, tick.t, dt)
         self.estimates.ticks += 1
         self.estimates.equal += all(

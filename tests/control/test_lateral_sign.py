@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 from msgspec.structs import replace
-from rigs.harness import Rig, observe
+from rigs.harness import Rig, fragile_rig, observe
 
 from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.core.signals import Measurement
@@ -84,6 +84,22 @@ def test_a_fish_that_did_not_rest_shows_nothing() -> None:
     rig = Rig()
     rig.start("swing")
     rig.run_for(5.0)
+    assert rig.loop.lateral_sign.reversed is None
+
+
+@pytest.mark.parametrize("tick", [-10, 0, 1, 4])
+def test_a_push_with_a_force_that_is_not_to_be_believed_shows_nothing(tick: int) -> None:
+    rig, robot = fragile_rig()
+    rig.run_for(REST)
+    rig.run(10 + min(tick, 0))
+    if tick >= 0:
+        rig.start("swing")
+        rig.run(tick)
+    robot.fy, robot.suspect = 5.0, "F_y is clipped"
+    rig.run(1)
+    robot.fy, robot.suspect = None, ""
+    rig.start("swing")
+    rig.run_for(1.0)
     assert rig.loop.lateral_sign.reversed is None
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import pytest
 from msgspec import UNSET
 from msgspec.structs import replace
+from rigs.harness import Rig, Wrapped, fragile_rig
 
 from fishd.config import load
 from fishd.core.signals import Tick
@@ -161,3 +162,33 @@ def test_a_factor_that_overflows_stops_no_fish() -> None:
         fish._run.loop.thrust.calibrate(1e150, 1e150)
         ticks = fish.swim("swing", {}, 10.0)
         assert {tick.mode for tick in ticks} == {"running"}
+
+
+def clip(rig: Rig, robot: Wrapped, fx: float) -> None:
+    """One tick whose force is not to be believed."""
+    robot.fx, robot.suspect = fx, "F_x is clipped"
+    rig.run(1)
+    robot.fx, robot.suspect = None, ""
+
+
+@pytest.mark.parametrize("fx", [0.1, 1.0, -5.0])
+def test_a_force_at_rest_that_is_not_to_be_believed_moves_no_zero(fx: float) -> None:
+    rig, robot = fragile_rig()
+    rig.run_for(2.75)
+    clip(rig, robot, fx)
+    rig.run_for(0.2)
+    rig.start("square", frequency=5.0 / 3.0)
+    thrust, error = known(rig.run_for(30))
+    assert abs(thrust - TRUTH) < error < 3e-3
+
+
+@pytest.mark.parametrize("fx", [1.0, -5.0])
+def test_one_in_a_beat_spoils_no_thrust(fx: float) -> None:
+    rig, robot = fragile_rig()
+    rig.run_for(3.0)
+    rig.start("square", frequency=5.0 / 3.0)
+    rig.run_for(10.0)
+    for ticks in range(40, 52):  # each tick of a beat once, the reversals among them
+        clip(rig, robot, fx)
+        thrust, error = known(rig.run(ticks))
+        assert abs(thrust - TRUTH) < error < 3e-3

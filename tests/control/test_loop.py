@@ -2,9 +2,11 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
+from msgspec import UNSET, structs
 from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
 
 from fishd.core.clock import VirtualClock
@@ -212,6 +214,45 @@ def test_one_suspect_window_and_failed_reads_are_not_three_suspect_windows() -> 
     assert rig.mode == "idle"
 
 
+def test_a_force_that_is_not_to_be_believed_is_told_but_reaches_no_estimator() -> None:
+    rig, robot = fragile_rig()
+    seen: list[Observation] = []
+    rig.start(Scripted(lambda observation: seen.append(observation) or 0.42))  # type: ignore[func-returns-value]
+    good = rig.run(10)[-1]
+    robot.fx, robot.fy, robot.suspect = 1.0, 5.0, "F_y is clipped"
+    tick = rig.run(1)[-1]
+    assert (tick.fx, tick.fy, tick.samples, tick.suspect) == (1.0, 5.0, 10, "F_y is clipped")
+    assert (seen[-1].fx, seen[-1].fy, seen[-1].fy_rate) == (good.fx, good.fy, 0.0)
+    robot.read_error = SensorError("no acknowledge")
+    tick = rig.run(1)[-1]
+    assert (tick.fx, tick.fy, tick.samples, tick.suspect) == (good.fx, good.fy, 0, UNSET)
+
+
+def test_nor_does_it_when_a_slow_sensor_says_it_again() -> None:
+    rig, robot = fragile_rig(kind=SlowSensor)
+    good = rig.run(10)[-1]
+    robot.fx, robot.fy, robot.suspect = 1.0, 5.0, "F_y is clipped"
+    rig.run(1)
+    robot.suspect, robot.samples = "", 0
+    tick = rig.run(1)[-1]
+    assert (tick.fx, tick.fy, tick.samples) == (good.fx, good.fy, 0)
+    assert tick.age_ms < 10.0
+
+
+@pytest.mark.parametrize("tick", range(12))
+def test_one_such_force_costs_swing_no_beat(tick: int) -> None:
+    rig, robot = fragile_rig()
+    rig.start("swing")
+    rig.run_for(10.0)
+    rig.run(tick)
+    robot.fy, robot.suspect = 5.0, "F_y is clipped"
+    rig.run(1)
+    robot.fy, robot.suspect = None, ""
+    angles = [tick.phi_c for tick in rig.recorder.ticks[-30:] + rig.run_for(5.0)]
+    reversals = [k for k, (a, b) in enumerate(pairwise(angles)) if a * b < 0.0]
+    assert {b - a for a, b in pairwise(reversals)} <= {5, 6, 7}
+
+
 def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
     rig, robot = fragile_rig()
     rig.start("square")
@@ -329,6 +370,15 @@ def test_a_tail_that_nobody_moves_has_no_frequency(how: str) -> None:
     assert all(tick.frequency == 0.0 for tick in rig.run_for(5))
 
 
+class SlowSensor(Wrapped):
+    """A robot whose force sensor has no sample for each tick."""
+
+    samples = 10
+
+    def read(self, now: float) -> Measurement:
+        return structs.replace(super().read(now), samples=self.samples)
+
+
 class Restless(Wrapped):
     """A robot of which nothing is ever the same in two ticks."""
 
@@ -352,8 +402,8 @@ class Restless(Wrapped):
         return Measurement(now - self.reads * 1e-6, *self.news(2), self.reads, "", extremes)
 
 
-ABSENT = {"x", "y", "speed", "heading", "leak"}
-"""Fields of a swimmer, and of an estimator that finds its leak."""
+ABSENT = {"x", "y", "speed", "heading", "leak", "suspect"}
+"""Fields of a swimmer, of an estimator that finds its leak, and of a force that nobody doubts."""
 
 
 @pytest.mark.parametrize(

@@ -164,10 +164,14 @@ def test_a_fault_and_what_follows_it_are_rerun_too(tmp_path: Path) -> None:
     rig, robot = fragile_rig()
     rig.start("swing")
     rig.run_for(3)
-    robot.suspect = "clipped"
+    robot.fy, robot.suspect = 5.0, "clipped"
+    rig.run(1)
+    robot.fy, robot.suspect = None, ""
+    rig.run_for(3)
+    robot.fy, robot.suspect = 5.0, "clipped"
     rig.run(4)
     assert rig.mode == "fault"
-    robot.suspect = ""
+    robot.fy, robot.suspect = None, ""
     rig.run_for(1)
     rig.loop.clear_fault()
     rig.start("swing", C=0.2)

@@ -148,7 +148,8 @@ class Wrapped:
         self.release_error: Exception | None = None
         self.suspect = ""
         self.fx: float | None = None
-        """What every measurement says instead of the true one [N]."""
+        self.fy: float | None = None
+        """What every measurement says instead of the true ones [N]."""
         self.delay = 0.0
         """Age that is added to every measurement [s]."""
         self.log: list[float | None] = []
@@ -168,7 +169,8 @@ class Wrapped:
             raise self.read_error
         m = self._robot.sensor.read(now)
         fx = m.fx if self.fx is None else self.fx
-        return Measurement(m.time - self.delay, fx, m.fy, m.samples, self.suspect)
+        fy = m.fy if self.fy is None else self.fy
+        return Measurement(m.time - self.delay, fx, fy, m.samples, self.suspect)
 
     def write(self, angle: float) -> None:
         if self.write_error:

@@ -51,7 +51,7 @@ class LateralSign:
         self.rest()
 
     def rest(self) -> None:
-        """The sensor's zero was changed: the fish must rest anew."""
+        """The sensor's zero was changed, or a force is in doubt: the fish must rest anew."""
         self._still = 0.0
         self._rest: deque[tuple[float, float]] = deque()  # (F_y [N], duration [s])
         self._rested = 0.0

@@ -109,6 +109,12 @@ class LiveThrust:
         self._block = None
         self._beats.clear()
 
+    def interrupt(self) -> None:
+        """The latest force is not to be believed: its beat, or piece of a rest, does not count."""
+        self._block = None
+        if self._swims:  # the fin velocity settles anew
+            self._phase = 0.0
+
     def calibrate(self, factor: float, error: float) -> None:
         """Take the factor from a measurement.
 
