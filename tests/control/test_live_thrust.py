@@ -192,3 +192,35 @@ def test_one_in_a_beat_spoils_no_thrust(fx: float) -> None:
         clip(rig, robot, fx)
         thrust, error = known(rig.run(ticks))
         assert abs(thrust - TRUTH) < error < 3e-3
+
+
+@pytest.mark.parametrize("tick", [43, 52, 57, 59])
+@pytest.mark.parametrize("fx", [0.2, 1.0, -5.0])
+def test_a_spike_that_nobody_doubts_makes_the_zero_uncertain_and_not_wrong(
+    fx: float, tick: int
+) -> None:
+    rig, robot = fragile_rig()
+    rig.run(tick)
+    robot.fx = fx
+    rig.run(1)
+    robot.fx = None
+    rig.run(60 - tick)
+    rig.start("square", frequency=5.0 / 3.0)
+    ticks = rig.run_for(30)
+    if ticks[-1].thrust_error is not UNSET:
+        thrust, error = known(ticks)
+        assert abs(thrust - TRUTH) < error
+    rig.loop.stop()
+    rig.run_for(3.0)
+    rig.start("square", frequency=5.0 / 3.0)
+    thrust, error = known(rig.run_for(30))
+    assert abs(thrust - TRUTH) < error < 3e-3
+
+
+@pytest.mark.parametrize("load", [0.05, -2.0, 300.0])
+def test_a_load_that_stays_is_the_zero_after_two_pieces_of_a_rest(load: float) -> None:
+    rig, robot = fragile_rig()
+    rig.run_for(3.0)
+    robot.fx = load
+    thrust, error = known(rig.run_for(1.7))
+    assert abs(thrust) < error < 4e-3

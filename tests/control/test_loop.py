@@ -399,7 +399,8 @@ class Restless(Wrapped):
         self.reads += 1
         self.clock.now += self.reads * 1e-6
         extremes = Extremes(*self.news(4))
-        return Measurement(now - self.reads * 1e-6, *self.news(2), self.reads, "", extremes)
+        forces = (1e-3 * force for force in self.news(2))  # a drift, so that there is a zero
+        return Measurement(now - self.reads * 1e-6, *forces, self.reads, "", extremes)
 
 
 ABSENT = {"x", "y", "speed", "heading", "leak", "suspect"}

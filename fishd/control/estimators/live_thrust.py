@@ -39,7 +39,7 @@ e-fold of the fin's speed or of the frequency (rms of 40 random simulated fish).
 INTERVAL = 1.96
 """Half of a 95 % interval, over the standard deviation."""
 BROKEN = 8.0
-"""A force at rest so many standard deviations off is no drift: the zero is found anew."""
+"""A force at rest so many standard deviations off is no drift: by so much the zero is uncertain."""
 WANDER_FADES = 0.9
 """What rests showed of a faster drift counts this much less with each further rest."""
 UNKNOWN = 1.0
@@ -235,21 +235,21 @@ class LiveThrust:
         """What is known becomes less certain with time."""
         passed = max(0.0, time - self._time) if self._time > -math.inf else 0.0
         self._time = time
-        self._zero_variance = min(UNKNOWN**2, self._zero_variance + self._wander * passed)
+        self._zero_variance += self._wander * passed
         if self._factor_variance is not None:
             self._factor_variance += (FACTOR_WALKS * self._factor) ** 2 * passed
 
     def _learn(self, force: float, power: float, variance: float) -> bool:
         """A step of the filter: force = zero + factor * power + noise of that variance.
 
-        False where the zero has jumped.
+        False where the zero has jumped, or this was a spike: what comes next will tell.
         """
         a, b, c = self._zero_variance, self._covariance, self._factor_variance or 0.0
         surprise = force - self._zero - self._factor * power
         along, across = a + b * power, b + c * power
         total = along + across * power + variance
         if power == 0.0 and surprise**2 > BROKEN**2 * total:
-            self._zero, self._zero_variance, self._covariance = force, variance, 0.0
+            self._zero_variance += surprise**2
             return False
         gap = self._time - self._rested
         if power == 0.0 and 2.0 * PIECE < gap < math.inf:  # a swim was between
