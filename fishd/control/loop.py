@@ -169,6 +169,16 @@ class ControlLoop:
         rest = math.ceil(seconds / self.limits.tick - 1e-9)
         self._awaited = (rest, name, controller, self._servo_calibration)
 
+    def forget_force(self, *, scale: bool) -> None:
+        """The force sensor has another zero: find it anew; scale: all the rest is another, too."""
+        self._estimator.forget_zero()
+        if scale:
+            self.thrust.forget()
+            self.lateral_sign.forget()
+        else:
+            self.thrust.forget_zero()
+            self.lateral_sign.rest()
+
     def stop(self) -> None:
         """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
         self._await_nobody()

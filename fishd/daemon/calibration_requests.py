@@ -201,12 +201,7 @@ class CalibrationRequests:
             self._announce("force sensor", path)
         # The newest file is used from the next start on, so it is now, whatever else began.
         sensor.recalibrate(calibration)
-        if _matrix(before) == _matrix(calibration):
-            self._loop.thrust.forget_zero()
-            self._loop.lateral_sign.rest()
-        else:
-            self._loop.thrust.forget()
-            self._loop.lateral_sign.forget()
+        self._loop.forget_force(scale=_matrix(before) != _matrix(calibration))
         return self._used()
 
     async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:

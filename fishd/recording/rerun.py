@@ -138,6 +138,12 @@ class _Rerun:
             self._swims = None
             if self._last is not None:
                 self._estimator.rest()
+        elif (
+            event.kind == "calibration"
+            and event.message.startswith("force sensor: ")
+            and self._last is not None
+        ):
+            self._estimator.forget_zero()
 
     def tick(self, tick: Tick, number: int, upcoming: list[Event | Status | Tick]) -> None:
         """Choose again in one tick; number: of its fishd, as the recorder has counted."""

@@ -48,6 +48,19 @@ def test_the_force_rate_is_the_change_over_the_time_between_ticks() -> None:
     assert observation.fy_rate == pytest.approx(0.06)
 
 
+@pytest.mark.parametrize("samples", [10, 0])
+def test_a_new_zero_of_the_sensor_is_no_motion_of_the_fin(samples: int) -> None:
+    """samples: of the first tick after it; a sensor that has none says the old force again."""
+    estimator = LateralForceEstimator(EstimatorSettings())
+    for _ in range(100):
+        estimator.update(Measurement(0.0, 0.0, 1.0, 10), 0.0, 0.0, DT)
+    estimator.forget_zero()
+    estimator.update(Measurement(0.0, 0.0, 0.0 if samples else 1.0, samples), 0.0, 0.0, DT)
+    for _ in range(20):
+        seen = estimator.update(Measurement(0.0, 0.0, 0.0, 10), 0.0, 0.0, DT)
+        assert (seen.fin_velocity, seen.fy_rate) == (0.0, 0.0)
+
+
 def test_it_remembers_the_angle_before_the_one_in_force() -> None:
     estimator = LateralForceEstimator(EstimatorSettings())
     seen = [

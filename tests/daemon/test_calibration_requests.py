@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,26 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
     assert after.force.tared
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
     assert Path(after.force_file).exists()
+
+
+@pytest.mark.parametrize("kind", ["lateral_force", "observer"])
+def test_after_a_tare_swing_beats_as_if_the_zero_had_always_been_there(
+    tmp_path: Path, kind: str
+) -> None:
+    beats = []
+    for zero in (0.0, 1.0):
+        overrides = (f"virtual_pi.zero_y={zero}", f"estimator.kind={kind}")
+        with lockstep_rig(tmp_path / f"{zero}", *FISH, *overrides) as rig:
+            rig.run_for(2.0)
+            perform(rig, subject(rig), ("tare", BRIEFLY))
+            rig.run_for(1.0)
+            rig.start("swing")
+            angles = [tick.phi_c for tick in rig.run_for(6.0)]
+        reversals = [k for k, (a, b) in enumerate(pairwise(angles)) if a * b < 0.0]
+        beats.append([b - a for a, b in pairwise([0, *reversals])])
+    still, tared = beats
+    assert len(tared) == len(still)
+    assert all(abs(a - b) <= 1 for a, b in zip(tared, still, strict=True)), beats
 
 
 def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> None:

@@ -182,6 +182,20 @@ def test_a_fault_and_what_follows_it_are_rerun_too(tmp_path: Path) -> None:
     assert result.estimates.equal == result.estimates.ticks
 
 
+def test_a_new_zero_of_the_force_sensor_is_one_for_the_rerun_too(tmp_path: Path) -> None:
+    rig, robot = fragile_rig()
+    robot.fy = 1.0
+    rig.run_for(3)
+    robot.fy = None
+    rig.loop.forget_force(scale=False)
+    rig.loop.reporter.event("calibration", "force sensor: a.yaml", file="a.yaml")
+    rig.run_for(1)
+    rig.start("swing")
+    rig.run_for(3)
+    result = rerun_of(rig, tmp_path / "run")
+    assert result.estimates.equal == result.estimates.ticks
+
+
 @pytest.mark.parametrize(
     ("source", "virtual"), [("fishd", False), ("pi", False), ("simulation", True)]
 )

@@ -90,6 +90,10 @@ class Estimator(ABC):
         """Note that nobody moves the tail any more: it does not beat."""
         self._beat.rest()
 
+    def forget_zero(self) -> None:
+        """The sensor's zero was set: the forces before tell nothing of those to come."""
+        self._fy = None
+
     def update(
         self, measurement: Measurement, instruction_angle: float, time: float, dt: float
     ) -> Observation:
@@ -101,7 +105,8 @@ class Estimator(ABC):
         """
         fy = measurement.fy
         fy_rate = (fy - self._fy) / dt if self._fy is not None else 0.0
-        self._fy = fy
+        if measurement.samples:
+            self._fy = fy
         before = instruction_angle if self._angle is None else self._angle
         self._angle = instruction_angle
         self._beat.update(instruction_angle, measurement.fx, dt)

@@ -28,10 +28,17 @@ class LateralForceEstimator(Estimator):
         """As `Estimator.found_leak`."""
         return self._search.leak if self._search else None
 
+    def forget_zero(self) -> None:
+        """As `Estimator.forget_zero`."""
+        super().forget_zero()
+        self._bias, self._fin_velocity = None, 0.0
+
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
         """As `Estimator.fin_velocity`; about K times the fin velocity [N s]."""
         fy = measurement.fy
         if self._bias is None:
+            if not measurement.samples:
+                return 0.0
             self._bias = fy
         self._bias -= math.expm1(-dt / self._settings.bias_time) * (fy - self._bias)
         if self._search:

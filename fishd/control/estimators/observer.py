@@ -65,6 +65,11 @@ class Observer(Estimator):
         self._covariance: Array = np.diag(np.square(_UNKNOWN))
         self._step = lru_cache(maxsize=32)(self._window)
 
+    def forget_zero(self) -> None:
+        """As `Estimator.forget_zero`."""
+        super().forget_zero()
+        self._offset, self._covariance = None, np.diag(np.square(_UNKNOWN))
+
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
         """As `Estimator.fin_velocity`, but after the servo's delay, when the next instruction acts.
 
@@ -75,8 +80,6 @@ class Observer(Estimator):
         force = math.cos(rotation) * measurement.fy - math.sin(rotation) * measurement.fx
         if dt > _SETTLES:  # fishd stood still: fin and water have forgotten what was before
             dt, self._offset, self._covariance = _SETTLES, None, np.diag(np.square(_UNKNOWN))
-        if self._offset is None:
-            self._offset = force
         window = fish.advance(instruction_angle, dt, 1)
         ahead.advance(instruction_angle, dt, 1)
         step = self._step(round(dt, 9))
@@ -85,6 +88,8 @@ class Observer(Estimator):
         if not measurement.samples:  # nothing new was measured
             self._covariance = grown @ step.grow.T + step.noise
             return ahead.state.alpha_rate
+        if self._offset is None:
+            self._offset = force
         gain = grown @ step.felt + step.shared
         variance = float(step.felt @ P @ step.felt) + step.variance
         correction = gain * ((force - window.lateral_force - self._offset) / variance)
