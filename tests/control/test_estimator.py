@@ -129,6 +129,18 @@ def test_a_tail_that_stops_is_noticed_after_twice_its_longest_half_beat() -> Non
     assert beats([5] * 10 + [14]).frequency == 0.0
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.4])
+def test_how_long_a_tail_stood_still_is_no_half_beat(angle: float) -> None:
+    beat = beats([5] * 10)
+    for _ in range(1200):
+        beat.update(angle, 0.02, DT)
+    seen = []
+    for k in range(25):
+        beat.update(-0.4 if k // 5 % 2 else 0.4, 0.02, DT)
+        seen.append(beat.frequency)
+    assert {round(frequency, 3) for frequency in seen} == {0.0, 2.0}
+
+
 def test_a_tail_that_is_brought_to_rest_does_not_beat_and_keeps_its_mean_force() -> None:
     beat = beats([5] * 10)
     thrust = beat.thrust

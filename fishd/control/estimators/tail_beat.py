@@ -54,6 +54,7 @@ class TailBeat:
             # Overdue by as much as the longest half beat took: the tail has stopped.
             if self.frequency and elapsed > 2.0 * self._longest:
                 self._halves.clear()
+                self._open = None
                 self.frequency = 0.0
         if not self.frequency:
             self.thrust -= math.expm1(-duration / self._REST) * (force - self.thrust)
