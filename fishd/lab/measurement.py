@@ -123,7 +123,10 @@ def measure(
 
 
 def samples_of(ticks: Iterable[Tick]) -> list[Sample]:
-    """What a measurement needs to know of these."""
+    """What a measurement needs to know of these.
+
+    One whose force is not to be believed counts as lost, and with it its beat.
+    """
     return [
         Sample(
             each.seq,
@@ -134,6 +137,7 @@ def samples_of(ticks: Iterable[Tick]) -> list[Sample]:
             math.nan if each.power is UNSET else each.power,
         )
         for each in ticks
+        if each.suspect is UNSET
     ]
 
 

@@ -15,6 +15,7 @@ from fishd.lab.measurement import (
     evaluate,
     measure,
     plan,
+    samples_of,
 )
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.simulation import simulate
@@ -86,6 +87,17 @@ def test_a_fault_in_the_middle_ends_the_measurement_and_says_which() -> None:
         rig._run.loop.estop("somebody fell in")
         with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(somebody"):
             rig.rest(1.0)
+
+
+def test_a_force_that_is_not_to_be_believed_spoils_no_measurement() -> None:
+    found = measured(RIG)
+    ticks = [
+        replace(tick, fx=tick.fx + 5.0, suspect="clipped") if tick.seq % 97 == 0 else tick
+        for tick in found.ticks
+    ]
+    again = evaluate(samples_of(ticks), RIG.tick)
+    assert again.thrust == pytest.approx(found.thrust, abs=found.error)
+    assert again.error < 3.0 * found.error
 
 
 def candidate(generator: np.random.Generator, half_beat: int) -> list[Sample]:
