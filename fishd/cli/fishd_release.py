@@ -5,7 +5,9 @@ small Pi each import counts.
 """
 
 import os
+import signal
 import sys
+from contextlib import suppress
 from typing import Any
 
 from fishd.core.errors import ServoError, StartupError
@@ -13,7 +15,12 @@ from fishd.hardware import release_recipe
 
 
 def main() -> None:
-    """Release the servo as the recipe says; without one, or with other options, as fishctl does."""
+    """Release the servo as the recipe says; without one, or with other options, as fishctl does.
+
+    Neither a lost session nor Ctrl-C ends it halfway, with pulses that go on.
+    """
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, signal.SIG_IGN)
     words = sys.argv[1:]
     found = release_recipe.read(words[1]) if len(words) == 2 and words[0] == "--config" else None
     status = _release(found) if found else 0
@@ -37,9 +44,11 @@ def _release(recipe: dict[str, Any]) -> int:
     try:
         done = release_recipe.carry_out(recipe["function"], recipe["neutral"], recipe["arguments"])
     except (ServoError, StartupError, ImportError) as error:
-        print(f"fishctl: {error}; {release_recipe.NOT_RELEASED}", file=sys.stderr)
+        with suppress(OSError):  # the terminal may be gone
+            print(f"fishctl: {error}; {release_recipe.NOT_RELEASED}", file=sys.stderr)
         return 1
-    print(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
+    with suppress(OSError):
+        print(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
     return 0
 
 

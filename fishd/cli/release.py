@@ -1,6 +1,7 @@
 """`fishctl release`: the last resort, when fishd can no longer let go of the servo itself."""
 
 import os
+import signal
 from pathlib import Path
 
 import click
@@ -9,6 +10,7 @@ from msgspec.structs import replace
 from fishd.cli.config import load_service, service_option, set_option
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config
 from fishd.core.errors import ConfigError, ServoError
+from fishd.core.interruption import SIGNALS, handled
 from fishd.hardware.release_recipe import NOT_RELEASED
 
 _NO_FOLDER = "/proc/self/no-calibrations"
@@ -24,14 +26,16 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     systemd runs this when the service has ended (ExecStopPost). A servo without pulses is not
     touched. Exit status 1 when the servo cannot be reached, and when no configuration says where a
     servo is: the defaults are those of a simulated fish. One that a file says is simulated has
-    nothing to release, and that is no error.
+    nothing to release, and that is no error. Once it has begun, neither a lost session nor Ctrl-C
+    ends it halfway.
     """
     config, found = load_service(file, overrides)
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
     if config.has_hardware:
         try:
-            done = _end_pulses(config)
+            with handled(SIGNALS, signal.SIG_IGN):
+                done = _end_pulses(config)
         except ServoError as error:
             raise ServoError(f"{error}; {NOT_RELEASED}") from None
         click.echo(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))

@@ -3,6 +3,7 @@
 import os
 import re
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from pathlib import Path
 import pigpio
 import pytest
 from rigs.operator_rig import Bench
-from rigs.processes import call, fishctl
+from rigs.processes import Process, call, fishctl, wait_until
 
 from fishd.client import Fish
 from fishd.core.calibration import ServoCalibration
@@ -183,25 +184,58 @@ def test_whatever_else_is_asked_fishctl_answers(words: tuple[str, ...]) -> None:
     assert said(quick) == slow.stderr.splitlines()
 
 
-@pytest.mark.parametrize("recipe", [True, False])
-@pytest.mark.parametrize("enabled", [1, 0])
-def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int, recipe: bool) -> None:
-    channel = tmp_path / "pwm" / "pwmchip3" / "pwm2"
+def powered(folder: Path, *, enabled: int = 1, recipe: bool = True) -> tuple[Path, Path]:
+    """A channel of the kernel's PWM with pulses, and the configuration file of its servo.
+
+    recipe: a fishd has left one for `fishd-release`
+    """
+    channel = folder / "pwm" / "pwmchip3" / "pwm2"
     channel.mkdir(parents=True)
-    device = tmp_path / "devices" / "1f00098000.pwm"
+    device = folder / "devices" / "1f00098000.pwm"
     device.mkdir(parents=True)
     (channel.parent / "device").symlink_to(device)
     for name, value in (("period", 20_000_000), ("duty_cycle", 1_800_000), ("enable", enabled)):
         (channel / name).write_text(f"{value}\n")
-    file = tmp_path / "fishd.yaml"
-    servo = f"{{driver: sysfs-pwm, root: {tmp_path / 'pwm'}}}"
-    file.write_text(f"robot: pi\nservo: {servo}\nstate_folder: {tmp_path}\n")
+    file = folder / "fishd.yaml"
+    servo = f"{{driver: sysfs-pwm, root: {folder / 'pwm'}}}"
+    file.write_text(f"robot: pi\nservo: {servo}\nstate_folder: {folder}\n")
     if recipe:
-        function, arguments = SysfsPwm.last_resort(SysfsPwmSettings(root=str(tmp_path / "pwm")))
+        function, arguments = SysfsPwm.last_resort(SysfsPwmSettings(root=str(folder / "pwm")))
         release_recipe.write(str(file), function, 1490.0, arguments)
+    return channel, file
+
+
+def duty_and_enable(channel: Path) -> tuple[int, int]:
+    """Empty where a write is under way: -1."""
+    duty, on = ((channel / name).read_text().split() for name in ("duty_cycle", "enable"))
+    return int(duty[0]) if duty else -1, int(on[0]) if on else -1
+
+
+@pytest.mark.parametrize("recipe", [True, False])
+@pytest.mark.parametrize("enabled", [1, 0])
+def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int, recipe: bool) -> None:
+    channel, file = powered(tmp_path, enabled=enabled, recipe=recipe)
     ended = release("--config", str(file))
     assert (ended.returncode, said(ended)) == (0, [])
     assert ("click" in ended.stderr) != recipe
     assert ended.stdout.startswith("pulses were on" if enabled else "there were no pulses")
-    duty, on = ((channel / name).read_text().split()[0] for name in ("duty_cycle", "enable"))
-    assert (int(duty), int(on)) == ((0, 0) if enabled else (1_800_000, 0))
+    assert duty_and_enable(channel) == ((0, 0) if enabled else (1_800_000, 0))
+
+
+@pytest.mark.parametrize("program", ["fishd-release", "fishctl release"])
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_a_lost_session_or_ctrl_c_at_neutral_does_not_leave_the_servo_powered(
+    tmp_path: Path, number: int, program: str
+) -> None:
+    channel, file = powered(tmp_path)
+    words = program.split()
+    words[0] = str(Path(sys.executable).with_name(words[0]))
+    process = Process(*words, "--config", str(file))
+    wait_until(lambda: duty_and_enable(channel)[0] not in (-1, 1_800_000) or over(process))
+    code, out, errors = process.end(number)
+    assert (code, out, errors) == (0, "pulses were on: neutral, then off\n", "")
+    assert duty_and_enable(channel) == (0, 0)
+
+
+def over(process: Process) -> bool:
+    return process.process.poll() is not None
