@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import click
@@ -12,6 +11,7 @@ from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
 from fishd.client import Fish
 from fishd.controllers import registry
+from fishd.core import files
 from fishd.core.errors import FishError, ParameterError, UnknownController
 from fishd.core.schema import Field, names_file, spelled, wanted
 from fishd.core.signals import ControllerInfo
@@ -68,7 +68,7 @@ class ParameterType(click.ParamType[Any]):
         if value in field.words:
             return value
         if field.file and names_file(value, field.file):
-            return str(Path(value).expanduser().absolute())  # fishd may run in another folder
+            return str(files.expanded(value).absolute())  # fishd may run in another folder
         try:
             return _PARSERS.get(field.kind, str)(value)
         except ValueError:

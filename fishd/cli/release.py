@@ -2,13 +2,15 @@
 
 import os
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 import click
 from msgspec.structs import replace
 
 from fishd.cli.config import load_service, service_option, set_option
-from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config
+from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
+from fishd.core import text
 from fishd.core.errors import ConfigError, ServoError
 from fishd.core.interruption import SIGNALS, handled
 from fishd.hardware.release_recipe import NOT_RELEASED
@@ -29,7 +31,7 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     nothing to release, and that is no error. Once it has begun, neither a lost session nor Ctrl-C
     ends it halfway.
     """
-    config, found = load_service(file, overrides)
+    config, found = _loaded(file, overrides)
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
     if config.has_hardware:
@@ -50,9 +52,23 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     return 0
 
 
+def _loaded(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path | None]:
+    """As `load_service`; a configuration that is wrong in its state folder alone goes without."""
+    try:
+        return load_service(file, overrides)
+    except ConfigError as error:
+        file = file or service_file()
+        try:
+            config = load(file, (*overrides, f"state_folder={_NO_FOLDER}"))
+        except ConfigError:
+            raise error from None
+        _go_on_without(error)
+        return config, file
+
+
 def _end_pulses(config: Config) -> bool:
-    """True where there were any; even if the calibration cannot be read: neutral may then be off
-    by the trim.
+    """True where there were any; whatever is wrong with the calibration or its folder: neutral may
+    then be off by the trim.
     """
     from fishd.config.assembly import end_pulses
 
@@ -60,6 +76,11 @@ def _end_pulses(config: Config) -> bool:
         return end_pulses(config)
     except ServoError:
         raise
-    except (ConfigError, OSError) as error:
-        click.echo(f"fishctl: {error}; going on without it", err=True)
+    except (OSError, ValueError) as error:  # a ConfigError is one, too
+        _go_on_without(error)
         return end_pulses(replace(config, state_folder=_NO_FOLDER))
+
+
+def _go_on_without(error: Exception) -> None:
+    with suppress(OSError):  # the terminal may be gone
+        click.echo(f"fishctl: {text.line(str(error))}; going on without it", err=True)

@@ -21,6 +21,7 @@ from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
+from fishd.core import files
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.clock import Clock, SystemClock, VirtualClock
@@ -188,9 +189,9 @@ def state_folder(config: Config) -> Path:
     """Where the calibrations of this robot are kept."""
     folder = config.state_folder or os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if folder:
-        return Path(folder).expanduser() / config.robot
+        return files.expanded(folder) / config.robot
     state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    return Path(state).expanduser() / "fishd" / config.robot
+    return files.expanded(state) / "fishd" / config.robot
 
 
 def end_pulses(config: Config) -> bool:

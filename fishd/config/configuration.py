@@ -272,6 +272,7 @@ def _check(config: Config) -> None:
     checks = config_checks
     checks.check_start(config.start.controller, config.start.parameters, config.limits)
     checks.check_addresses(config.telemetry.address, config.control.address)
+    checks.check_state_folder(config.state_folder)
     servo = config.servo
     drivers.check_drivers(config.robot, config.tick, config.driver_settings)
     checks.check_neutral(servo)

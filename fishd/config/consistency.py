@@ -4,11 +4,13 @@ Each check raises `Problem` with the key at fault and what would be right.
 """
 
 import math
+import os
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
+from fishd.core import files
 from fishd.core.addresses import FORM, is_local, why_not_served
 from fishd.core.errors import ParameterError, UnknownController
 from fishd.core.schema import Problem
@@ -57,6 +59,28 @@ def check_addresses(telemetry: str, control: str | None) -> None:
         raise Problem(("control", "address"), f"'{control}' is not valid: {complaint}")
     if control == telemetry:
         raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
+
+
+def check_state_folder(folder: str | None) -> None:
+    """It is a path, in no home that this machine does not have."""
+    if folder is None:
+        return
+    try:
+        good = b"\0" not in os.fsencode(folder)
+    except UnicodeEncodeError:
+        good = False
+    if not good:
+        raise Problem(
+            ("state_folder",),
+            f"'{folder}' is not valid: a path has no zero byte and no half of a character",
+        )
+    if str(files.expanded(folder)).startswith("~"):
+        user = folder.partition("/")[0].removeprefix("~")
+        why = f"no user here is '{user}'" if user else "this user has no home"
+        raise Problem(
+            ("state_folder",),
+            f"'{folder}' is not valid: {why}; write it out, such as /var/lib/fishd",
+        )
 
 
 def check_neutral(servo: ServoSettings) -> None:

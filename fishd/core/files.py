@@ -72,6 +72,14 @@ def _check_kind(found: os.stat_result) -> None:
         raise FileProblem(f"is {kind}; a regular file is needed")
 
 
+def expanded(path: str | os.PathLike[str]) -> Path:
+    """The path with its `~` or `~user` replaced; as it is where there is no such user or home."""
+    try:
+        return Path(path).expanduser()
+    except (RuntimeError, ValueError):  # the latter for a zero byte in the user's name
+        return Path(path)
+
+
 def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> None:
     """Write a file, or replace it; a full disk or a kill leaves the old one, never half a file.
 

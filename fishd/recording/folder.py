@@ -6,6 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from fishd.core import files
 from fishd.core.errors import RecordingError
 from fishd.core.schema import nearest
 from fishd.recording.mcap_file import metadata
@@ -81,7 +82,7 @@ def named(run: str, folder: Path | None = None) -> Path:
     """
     if Path(run).name in ("", ".."):  # "/", "." and their like
         raise RecordingError(f"'{run}' is no name of a recording")
-    path = Path(run).expanduser() if "/" in run else made(folder or runs_folder()) / run
+    path = files.expanded(run) if "/" in run else made(folder or runs_folder()) / run
     return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 
 
@@ -101,7 +102,7 @@ def find(run: str, folder: Path | None = None) -> Path:
 
     Raises `RecordingError`.
     """
-    path = Path(run).expanduser()
+    path = files.expanded(run)
     if path.is_file():
         return path
     folder = folder or runs_folder()

@@ -75,6 +75,9 @@ def test_a_misspelt_path_of_a_policy_is_told_before_anything_swims() -> None:
     done = run("swing", "runs/frist.onnx", "--seconds", "15", "--settle", "5")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "fishctl: ppo: policy: runs/frist.onnx: no such file\n"
+    done = run("~nobody-here.onnx", "--seconds", "15", "--settle", "5")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "fishctl: ppo: policy: ~nobody-here.onnx: no such file\n"
 
 
 @pytest.mark.parametrize(

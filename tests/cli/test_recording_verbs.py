@@ -95,6 +95,16 @@ def test_where_no_controller_swam_nothing_is_chosen_again(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("verb", ["export --csv", "plot", "replay", "rerun", "recover"])
+@pytest.mark.parametrize("run", ["~nobody-here", "~nobody-here/run", "~nobody\0here"])
+def test_a_home_that_nobody_has_is_one_line_of_every_verb(
+    tmp_path: Path, verb: str, run: str
+) -> None:
+    done = fishctl(*verb.split(), run, "--folder", str(tmp_path))
+    assert done.returncode == 1
+    assert "fishctl: no recording '~nobody" in one_line(done)
+
+
+@pytest.mark.parametrize("verb", ["export --csv", "plot", "replay", "rerun", "recover"])
 def test_a_file_that_is_no_recording_is_one_line_of_every_verb(tmp_path: Path, verb: str) -> None:
     (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)) * 9)
     done = fishctl(*verb.split(), "run", "--folder", str(tmp_path))

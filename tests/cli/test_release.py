@@ -121,6 +121,25 @@ def test_a_calibration_that_cannot_be_read_does_not_keep_the_servo_energised(
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 
+@pytest.mark.parametrize("folder", ["~nobody-here/fish", '"/var/\\0fish"', "3"])
+def test_a_state_folder_that_cannot_be_does_not_keep_the_servo_energised(
+    pi: Bench, other_program: pigpio.pi, folder: str
+) -> None:
+    ended = release(*pi.settings, "--set", f"state_folder={folder}")
+    assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
+    assert re.fullmatch(
+        r"fishctl: --set state_folder=[^\n]+: state_folder: [^\n]+; going on without it\n",
+        ended.stderr,
+    )
+    assert pi.pi.widths()[-3:] == [1750, 1500, 0]
+
+
+def test_a_state_folder_that_cannot_be_hides_no_other_fault() -> None:
+    ended = release("--set", "robot=pi", "--set", "state_folder=~nobody-here", "--set", "tick=soon")
+    assert (ended.returncode, ended.stdout) == (78, "")
+    assert re.fullmatch(r"fishctl: [^\n]*tick: 'soon' is not valid[^\n]*\n", ended.stderr)
+
+
 @pytest.mark.realtime
 @pytest.mark.parametrize("fault", ["pigpiod-frozen", "pigpiod-gone"])
 def test_a_pigpiod_that_does_not_answer_is_one_line_and_no_long_wait(pi: Bench, fault: str) -> None:

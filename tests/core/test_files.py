@@ -168,6 +168,12 @@ def test_a_new_file_replaces_none_and_has_the_usual_permissions(tmp_path: Path) 
     assert path.read_text() == "first"
 
 
+@pytest.mark.parametrize("path", ["~nobody-here/file", "~nobody\0here", "file/~root", ""])
+def test_a_home_that_nobody_has_leaves_a_path_as_it_is(path: str) -> None:
+    assert files.expanded(path) == Path(path)
+    assert files.expanded("~root/file").is_absolute()
+
+
 def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> None:
     files.check_writable(tmp_path / ("x" * 255))
     files.write_atomically(tmp_path / ("ö" * 127), "long")

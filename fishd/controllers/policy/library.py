@@ -8,6 +8,7 @@ import os
 import shlex
 from pathlib import Path
 
+from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.protocol import PolicyInfo
 from fishd.core.schema import names_file, nearest
@@ -22,7 +23,7 @@ def folders() -> list[Path]:
     """Where policies are looked for, in this order; some may not exist."""
     given = os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)
     return [
-        *(Path(folder).expanduser().absolute() for folder in given if folder),
+        *(files.expanded(folder).absolute() for folder in given if folder),
         _state_folder() / "policies",
         _SYSTEM,
         _shipped(),
@@ -40,7 +41,7 @@ def find(text: str) -> Path:
     Raises `PolicyError` for an unknown name; a path is not checked here.
     """
     if names_file(text, SUFFIX):
-        return Path(text).expanduser()
+        return files.expanded(text)
     known = _files()
     if text not in known:
         if run := of_run(Path(text)):
@@ -120,7 +121,7 @@ def _state_folder() -> Path:
     service = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if service:
         return Path(service)
-    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "fishd"
+    return files.expanded(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "fishd"
 
 
 def _shipped() -> Path:

@@ -11,7 +11,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import library
 from fishd.controllers.policy.controller import PpoParameters
-from fishd.core import strict_yaml
+from fishd.core import files, strict_yaml
 from fishd.core.errors import FishdError, ParameterError, PolicyError, UnknownController
 from fishd.core.schema import names_file, nearest
 from fishd.lab.compare.seeing import SeeingController, sees_pictures
@@ -67,7 +67,7 @@ def absolute(contestant: Contestant) -> Contestant:
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return contestant
-    found = {**contestant.parameters, "policy": str(Path(policy).expanduser().absolute())}
+    found = {**contestant.parameters, "policy": str(files.expanded(policy).absolute())}
     return contestant._replace(parameters=found)
 
 
@@ -76,7 +76,7 @@ def is_missing(contestant: Contestant) -> bool:
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return False
-    return not Path(policy).expanduser().is_file()
+    return not files.expanded(policy).is_file()
 
 
 def best_on_grid(config: Config) -> SteadyState:
