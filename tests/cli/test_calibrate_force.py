@@ -178,3 +178,57 @@ def test_a_plan_of_ones_own_is_gone_through_load_by_load(
     determinant = 1 - CROSSTALK**2
     assert found.xx == pytest.approx(1 / SENSITIVITY_X / determinant, rel=0.02)
     assert found.yy == pytest.approx(1 / SENSITIVITY_Y / determinant, rel=0.02)
+
+
+def test_loads_outlive_a_fishd_that_does_not_answer_or_refuses_what_they_make(
+    talk: Talk, rig: Bench, daemon: Daemon
+) -> None:
+    dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.3", "--yes")
+    measure(dialogue, rig, 0.0, 0.0)
+    measure(dialogue, rig, 0.2, 0.0, "0.2")
+    dialogue.answer("load [N]")
+    rig.pi.load(-0.2, 0.0)
+    daemon.process.send_signal(signal.SIGSTOP)
+    try:
+        dialogue.answer("Enter when it is still")
+        dialogue.expect("not measured: no answer within")
+    finally:
+        daemon.process.send_signal(signal.SIGCONT)
+    daemon.at_rest()
+    measure(dialogue, rig, -0.2, 0.0, "")
+    measure(dialogue, rig, 0.0, 0.2, "")
+    measure(dialogue, rig, 0.0, -0.2, "")
+    rig.pi.load(0.0, 0.0)
+    assert daemon.fishctl("set-controller", "swing").returncode == 0
+    dialogue.answer("Another load")
+    assert "stop it with 'fishctl stop'" in dialogue.expect("Enter to try again")
+    assert rig.files("force") == []
+    daemon.at_rest()
+    dialogue.answer(":")
+    dialogue.expect("saved in ")
+    assert dialogue.finish() == 0
+    assert len(rig.files("force")) == 1
+
+
+def test_a_full_disk_costs_no_load_and_is_told(
+    talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
+) -> None:
+    record = tmp_path / "folder" / "loads.csv"
+    record.parent.mkdir()
+    dialogue = talk(
+        daemon, "calibrate", "force", "--seconds", "0.2", "--yes", "--record", str(record)
+    )
+    measure(dialogue, rig, 0.0, 0.0)
+    dialogue.expect("load [N]")
+    record.unlink()
+    record.parent.rmdir()
+    dialogue.answer("", "0.2")
+    dialogue.expect("Enter when it is still")
+    rig.pi.load(0.2, 0.0)
+    dialogue.answer(":")
+    dialogue.answer("r to measure it again:")
+    dialogue.expect(f"warning: {record}: cannot be written: No such file or directory")
+    record.parent.mkdir()
+    measure(dialogue, rig, -0.2, 0.0, "")
+    dialogue.expect("load [N]")
+    assert len(record.read_text().splitlines()) == 4

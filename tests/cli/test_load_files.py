@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from rigs.operator_rig import Bench, fishctl_alone
-from rigs.processes import Daemon
+from rigs.processes import Daemon, one_line
 
 from fishd.client import Fish
 
@@ -44,6 +44,37 @@ def test_what_was_measured_earlier_cannot_be_recorded(tmp_path: Path) -> None:
         rf"fishctl: --record keeps what [^\n]* {measured} holds [^\n]*\n$", ended.stderr
     )
     assert not record.exists()
+
+
+def test_where_the_loads_are_to_be_recorded_is_looked_at_before_the_first_one(
+    rig: Bench, daemon: Daemon, tmp_path: Path
+) -> None:
+    record = tmp_path / "loads.csv"
+    record.write_text("precious\n")
+    asked = ("calibrate", "force", "--record")
+    ended = daemon.fishctl(*asked, str(record))
+    assert one_line(ended) == f"fishctl: {record}: is there already; --force replaces it\n"
+    assert record.read_text() == "precious\n"
+    ended = daemon.fishctl(*asked, str(tmp_path / "none" / "loads.csv"), "--force")
+    assert one_line(ended).endswith("none/loads.csv: there is no folder to put it into\n")
+
+
+def test_loads_of_a_file_that_are_refused_for_now_are_said_to_be_there_still(
+    rig: Bench, daemon: Daemon
+) -> None:
+    measured = rig.folder / "measured.csv"
+    measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
+    asked = ("calibrate", "force", "--yes", "--loads", str(measured))
+    assert daemon.fishctl("set-controller", "swing").returncode == 0
+    ended = daemon.fishctl(*asked)
+    assert ended.returncode == 1
+    assert re.fullmatch(
+        rf"fishctl: [^\n]+ 'fishctl stop'; then run this again: the loads are in {measured} "
+        r"\[running\]\n",
+        ended.stderr,
+    )
+    daemon.at_rest()
+    assert daemon.fishctl(*asked).returncode == 0
 
 
 def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(

@@ -1,19 +1,22 @@
 """`fishctl calibrate force`: measure known loads or read them, fit, and ask before saving."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import click
 
 from fishd.cli.calibrate import load_files
 from fishd.cli.calibrate.force_dialogue import Dialogue
 from fishd.cli.calibrate.load_files import NEWTONS
-from fishd.cli.options import endpoint_option
+from fishd.cli.options import FiniteRange, endpoint_option
 from fishd.cli.output import echo
-from fishd.cli.prompts import input_interrupted
+from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.calibration import ForceCalibration
+from fishd.core.errors import FishError
 from fishd.hardware.force_sensor.calibration_fit import (
     Fit,
     Load,
@@ -23,6 +26,8 @@ from fishd.hardware.force_sensor.calibration_fit import (
     missing_loads,
     worst,
 )
+
+T = TypeVar("T")
 
 _POOR_FIT = 0.02
 """A residual beyond this share of the largest load is worth a warning."""
@@ -38,7 +43,7 @@ _POOR_FIT = 0.02
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.1, 60.0),
+    type=FiniteRange(0.1, 60.0),
     default=5.0,
     show_default=True,
     help="How long to measure each load.",
@@ -55,6 +60,9 @@ _POOR_FIT = 0.02
     type=click.Path(path_type=Path),
     help="Write each measured load to this CSV file, which --loads reads.",
 )
+@click.option(
+    "--force", "replace", is_flag=True, help="Replace the file of --record if it is there already."
+)
 @click.option("--yes", is_flag=True, help="Save without asking.")
 @endpoint_option
 def force(
@@ -62,6 +70,7 @@ def force(
     seconds: float,
     plan: Path | None,
     record: Path | None,
+    replace: bool,
     yes: bool,
     endpoint: str | None,
 ) -> int:
@@ -80,6 +89,8 @@ def force(
             f"--record keeps what is measured now, but {plan} holds loads measured earlier; give "
             "one of the two"
         )
+    if record:
+        load_files.check_new(record, replace=replace)
     with Fish(endpoint) as fish, input_interrupted():
         present = fish.calibrations()  # refused where there is nothing to calibrate
         limit = present.force_limit
@@ -91,7 +102,7 @@ def force(
                 dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
                 fitted = _fitted_with_help(dialogue)
-            seen = fish.status().fy_reversed
+            seen = _answered(fish.status, plan if measured else None).fy_reversed
             if doubt := _doubtful_sign(seen, present.force, fitted.calibration):
                 echo(f"warning: {doubt}", err=True)
             good = yes or click.confirm("Use this calibration from now on, and save it?")
@@ -101,9 +112,27 @@ def force(
         if not good:
             echo("nothing was changed", err=True)
             return 1
-        saved = fish.calibrate_force(fitted.calibration)
+        saved = _answered(
+            lambda: fish.calibrate_force(fitted.calibration), plan if measured else None
+        )
     echo(text.line(f"in use, and saved in {saved.force_file}"))
     return 0
+
+
+def _answered(ask: Callable[[], T], loads: Path | None) -> T:
+    """What fishd answers; while it does not, or refuses, the operator may mend that.
+
+    loads: the file where the loads are; None where they are nowhere else, and are to be kept
+    """
+    while True:
+        try:
+            return ask()
+        except FishError as error:
+            if loads:
+                error.args = (f"{error}; then run this again: the loads are in {loads}",)
+                raise
+            echo(f"\n{error}\nThe loads are kept", err=True)
+            choose("Mend that, then Enter to try again", "")
 
 
 def _doubtful_sign(

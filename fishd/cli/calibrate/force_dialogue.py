@@ -10,11 +10,12 @@ import click
 
 from fishd.cli.calibrate import load_files
 from fishd.cli.calibrate.load_files import NEWTONS
+from fishd.cli.options import FiniteRange
 from fishd.cli.output import echo
 from fishd.cli.prompts import choose
 from fishd.client import Fish
 from fishd.core.calibration import ForceSample
-from fishd.core.errors import Refused
+from fishd.core.errors import FishError
 from fishd.hardware.force_sensor.calibration_fit import Load
 
 PLAN = (
@@ -121,8 +122,8 @@ class Dialogue:
             choose("  Enter when it is still", "")
             try:
                 sample = self._fish.sample_force(self._seconds)
-            except Refused as refusal:  # what was measured so far must not be lost
-                echo(f"  not measured: {refusal}", err=True)
+            except FishError as error:  # what was measured so far must not be lost
+                echo(f"  not measured: {error}", err=True)
                 continue
             echo(
                 f"  V_x {sample.vx:+.5f} ± {sample.vx_std:.5f} V   "
@@ -139,12 +140,15 @@ class Dialogue:
     def _write(self) -> None:
         if self._record:
             measured = [(each.load, each.sample) for each in self._measured.values()]
-            load_files.write(self._record, measured)
+            try:
+                load_files.write(self._record, measured)
+            except OSError as error:  # the next load tries again
+                echo(f"  warning: {self._record}: cannot be written: {error.strerror}", err=True)
 
     def _ask_size(self, x: int, y: int) -> Force:
         size = 0.0
         while x or y:
-            positive = click.FloatRange(min=0.0, min_open=True)
+            positive = FiniteRange(min=0.0, min_open=True)
             size = click.prompt(f"  load [{self._unit}]", type=positive, default=self._usual)
             if self._possible((size * self._newtons, 0.0)):
                 self._usual = size

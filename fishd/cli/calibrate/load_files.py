@@ -67,17 +67,25 @@ def read(path: Path, unit: str) -> list[Step]:
     return steps
 
 
-def write(path: Path, measured: Sequence[tuple[tuple[float, float], ForceSample]]) -> None:
-    """Write loads [N] and what was measured [V], as `read` takes it."""
+def check_new(path: Path, *, replace: bool) -> None:
+    """Find out before the first load whether `write` may, and can; raises `ClickException`."""
     try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["fx_N", "fy_N", "vx_V", "vy_V", "vx_std_V", "vy_std_V", "pairs"])
-            for (fx, fy), sample in measured:
-                volts = (sample.vx, sample.vy, sample.vx_std, sample.vy_std)
-                writer.writerow([*(f"{value:.9g}" for value in (fx, fy, *volts)), sample.pairs])
-    except OSError as error:
-        raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None
+        files.check_writable(path)
+    except files.FileProblem as problem:
+        raise click.ClickException(f"{path}: {problem}") from None
+    if path.exists() and not replace:
+        raise click.ClickException(f"{path}: is there already; --force replaces it")
+
+
+def write(path: Path, measured: Sequence[tuple[tuple[float, float], ForceSample]]) -> None:
+    """Write loads [N] and what was measured [V], as `read` takes it; raises OSError."""
+    table = io.StringIO()
+    writer = csv.writer(table)
+    writer.writerow(["fx_N", "fy_N", "vx_V", "vy_V", "vx_std_V", "vy_std_V", "pairs"])
+    for (fx, fy), sample in measured:
+        volts = (sample.vx, sample.vy, sample.vx_std, sample.vy_std)
+        writer.writerow([*(f"{value:.9g}" for value in (fx, fy, *volts)), sample.pairs])
+    files.write_atomically(path, table.getvalue())
 
 
 def _columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, float]]:
