@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from fishd.cli.config import set_option
 from fishd.cli.lab_progress import showing
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.sweep import ON, refuse_other
 from fishd.cli.sweep_output import again
@@ -35,7 +35,7 @@ STEPS = 6400
 @ON
 @click.option(
     "--tank-time",
-    type=click.FloatRange(min=150.0, max=3600.0),
+    type=FiniteRange(min=150.0, max=3600.0),
     default=300.0,
     show_default=True,
     help="For all that needs the fish, rests included [s]: a fifth of it excitation, a seventh the "

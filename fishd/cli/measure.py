@@ -8,7 +8,7 @@ import click
 
 from fishd.cli.config import fish_options
 from fishd.cli.lab_progress import showing
-from fishd.cli.options import ControllerGroup, endpoint_option, json_option
+from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
 from fishd.config import load
@@ -42,7 +42,7 @@ def measure_options(function: Any) -> Any:
         ),
         click.option(
             "--settle",
-            type=click.FloatRange(0.0, 600.0),
+            type=FiniteRange(0.0, 600.0),
             default=1.5,
             show_default=True,
             help="How long the fin takes to swim steadily, and to come to rest [s].",

@@ -15,7 +15,13 @@ from msgspec.structs import replace
 from fishd.cli.config import set_option
 from fishd.cli.lab_progress import showing
 from fishd.cli.optimise_output import optimum_of, say, told
-from fishd.cli.options import ControllerGroup, ParameterType, endpoint_option, json_option
+from fishd.cli.options import (
+    ControllerGroup,
+    FiniteRange,
+    ParameterType,
+    endpoint_option,
+    json_option,
+)
 from fishd.cli.output import counted, echo, print_json, warn_of_fin
 from fishd.cli.sweep import ON, refuse_other
 from fishd.cli.sweep_output import again
@@ -51,7 +57,7 @@ def optimise_options(function: Any) -> Any:
         ),
         click.option(
             "--at-least",
-            type=click.FloatRange(min=0.0, min_open=True),
+            type=FiniteRange(min=0.0, min_open=True),
             metavar="MN",
             help="A thrust [mN]: search what gives it for the least power.",
         ),
@@ -64,14 +70,14 @@ def optimise_options(function: Any) -> Any:
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the search."),
         click.option(
             "--until",
-            type=click.FloatRange(0.0, 1.0),
+            type=FiniteRange(0.0, 1.0),
             default=0.01,
             show_default=True,
             help="Stop where another trial is expected to give no more, as a share of the thrust.",
         ),
         click.option(
             "--budget",
-            type=click.FloatRange(min=0.0, min_open=True),
+            type=FiniteRange(min=0.0, min_open=True),
             default=300.0,
             show_default=True,
             help="Time in the tank at most, rest included [s].",

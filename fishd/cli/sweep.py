@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fishd.cli.config import set_option
-from fishd.cli.options import ControllerGroup, endpoint_option, json_option
+from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, json_option
 from fishd.cli.sweep_output import again, conclude, telling
 from fishd.client import Fish
 from fishd.config import Config, check_tethered, load
@@ -52,7 +52,7 @@ def sweep_options(function: Any) -> Any:
         click.option(
             "--for",
             "seconds",
-            type=click.FloatRange(min=0.0, min_open=True),
+            type=FiniteRange(min=0.0, min_open=True),
             help="On a robot: swimming and resting at each point [s]. [default: 30]",
         ),
         click.option(
@@ -63,7 +63,7 @@ def sweep_options(function: Any) -> Any:
         ),
         click.option(
             "--settle",
-            type=click.FloatRange(min=0.0),
+            type=FiniteRange(min=0.0),
             help="In simulation: time before they are judged [s]. [default: 10; of a swimmer 4, or "
             "until its speed is steady]",
         ),

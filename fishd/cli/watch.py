@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import click
 
-from fishd.cli.options import daemon_options
+from fishd.cli.options import FiniteRange, daemon_options
 from fishd.cli.output import echo, measured, print_json_line, time_of_day
 from fishd.client import AsyncFish
 from fishd.core import text
@@ -25,7 +25,7 @@ REDRAW = 0.1
 @daemon_options
 @click.option(
     "--seconds",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     help="End by itself after this time; by default Ctrl-C ends it.",
 )
 def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:

@@ -54,3 +54,31 @@ def test_a_misspelled_verb_gets_the_nearest(words: list[str], meant: str) -> Non
     done = CliRunner().invoke(fishctl, words)
     assert "Did you mean" in done.stderr
     assert f"'{meant}'" in done.stderr
+
+
+def numbers(command: click.Command, name: str = "fishctl") -> Iterator[tuple[str, click.Parameter]]:
+    """The options for a number within bounds, of all verbs."""
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for each in command.list_commands(context):
+            found = command.get_command(context, each)
+            assert found
+            yield from numbers(found, f"{name} {each}")
+    for parameter in command.params:
+        if isinstance(parameter.type, click.FloatRange):
+            yield name, parameter
+
+
+def test_no_option_takes_for_a_number_within_bounds_what_is_none() -> None:
+    found = list(numbers(fishctl))
+    assert len(found) > 20
+    for name, parameter in found:
+        with pytest.raises(click.BadParameter, match="a finite number is needed"):
+            print(name, parameter.name, parameter.type.convert("nan", parameter, None))
+
+
+@pytest.mark.parametrize("verb", ["tare", "watch --json"])
+def test_a_time_that_is_no_number_is_a_wrong_use(verb: str) -> None:
+    done = CliRunner().invoke(fishctl, [*verb.split(), "--seconds", "nan"])
+    assert done.exit_code == 2
+    assert "'nan' is not valid: a finite number is needed" in done.stderr

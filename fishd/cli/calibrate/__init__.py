@@ -2,7 +2,7 @@
 
 import click
 
-from fishd.cli.options import daemon_options
+from fishd.cli.options import FiniteRange, daemon_options
 from fishd.cli.output import echo, print_json
 from fishd.cli.verbs import Verb, Verbs
 from fishd.client import Fish
@@ -24,7 +24,7 @@ def calibrate() -> None:
 @click.command()
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.1, 60.0),
+    type=FiniteRange(0.1, 60.0),
     default=2.0,
     show_default=True,
     help="How long to measure.",

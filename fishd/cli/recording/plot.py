@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 
+from fishd.cli.options import FiniteRange
 from fishd.cli.output import echo
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.lab.run_figure import picture
@@ -14,10 +15,8 @@ from fishd.recording.folder import check_new
 
 @click.command()
 @click.argument("run")
-@click.option("--from", "begin", type=click.FloatRange(min=0), default=0.0, help="Begin here [s].")
-@click.option(
-    "--until", "end", type=click.FloatRange(min=0), default=math.inf, help="End here [s]."
-)
+@click.option("--from", "begin", type=FiniteRange(min=0), default=0.0, help="Begin here [s].")
+@click.option("--until", "end", type=FiniteRange(min=0), help="End here [s]; default: the end.")
 @click.option(
     "--to",
     "target",
@@ -32,7 +31,7 @@ from fishd.recording.folder import check_new
 def plot(
     run: str,
     begin: float,
-    end: float,
+    end: float | None,
     target: Path,
     only: str | None,
     force: bool,
@@ -44,7 +43,7 @@ def plot(
     is a page to zoom into, which needs no network.
     """
     recorded = opened(run, folder)
-    drawn = traces(recorded, begin, end)
+    drawn = traces(recorded, begin, math.inf if end is None else end)
     forms = [only] if only else ["png", "html"]
     paths = {form: target / f"{recorded.name}.{form}" for form in forms}
     check_new(paths.values(), replace=force)
