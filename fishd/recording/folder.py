@@ -89,7 +89,8 @@ def named(run: str, folder: Path | None = None) -> Path:
 def paths(folder: Path) -> list[Path]:
     """All recordings of a folder, finished or not, the oldest first."""
     try:
-        found = [path for path in folder.iterdir() if path.name.endswith((SUFFIX, SUFFIX + PART))]
+        ending = (path for path in folder.iterdir() if path.name.endswith((SUFFIX, SUFFIX + PART)))
+        found = [path for path in ending if path.is_file()]  # a pipe would never be read to its end
     except FileNotFoundError:
         return []
     except OSError as error:

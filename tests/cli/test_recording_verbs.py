@@ -23,6 +23,15 @@ def test_a_recording_has_a_length_that_ends(tmp_path: Path, length: str) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("size", ["1MB", "9" * 400 + "GB", "2000000GB", "2"])
+def test_a_black_box_has_a_size_that_a_disk_can_have(tmp_path: Path, size: str) -> None:
+    refused = fishctl("record", "--black-box", "--keep", size, "--folder", str(tmp_path))
+    assert refused.returncode == 2
+    assert one_line(refused).endswith(
+        "is not valid: 10MB to 1000000GB is needed, such as 2GB; see 'fishctl record --help'\n"
+    )
+
+
 def test_times_and_forces_that_cannot_be_are_listed_in_few_digits(tmp_path: Path) -> None:
     (tick, *_) = swum(0.2).recorder.ticks
     with RunWriter(tmp_path / "run") as writer:

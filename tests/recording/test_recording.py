@@ -17,7 +17,7 @@ from rigs.recordings import recorded, status, swum, write
 
 from fishd.core.errors import RecordingError
 from fishd.recording import Gap, RunWriter, open_run, read
-from fishd.recording.folder import find, glance, glances
+from fishd.recording.folder import find, glance, glances, paths
 from fishd.recording.recorder import Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
@@ -321,6 +321,16 @@ def test_what_is_no_recording_is_said_in_one_line(
     make(tmp_path / "run.mcap")
     with pytest.raises(RecordingError, match=complaint):
         open_run(tmp_path / "run.mcap")
+
+
+def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> None:
+    path = recorded(swum(0.2), tmp_path / "run")
+    os.mkfifo(tmp_path / "pipe.mcap")  # which opens for nobody
+    os.mkfifo(tmp_path / "pipe.mcap.part")
+    (tmp_path / "folder.mcap").mkdir()
+    (tmp_path / "link.mcap").symlink_to(path)
+    assert {found.name for found in paths(tmp_path)} == {"run.mcap", "link.mcap"}
+    assert len(list(glances(tmp_path))) == 2
 
 
 def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:

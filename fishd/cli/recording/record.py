@@ -30,6 +30,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 UNITS = {"MB": 10**6, "GB": 10**9}
 LEAST = 10**7
 """A black box is no smaller than this [bytes]."""
+MOST = 10**15
+"""Nor larger [bytes]."""
 
 
 class Size(click.ParamType[int]):
@@ -44,10 +46,13 @@ class Size(click.ParamType[int]):
         if isinstance(value, int):
             return value
         found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(MB|GB)", value.strip(), re.IGNORECASE)
-        size = round(float(found[1]) * UNITS[found[2].upper()]) if found else 0
-        if size < LEAST:
-            self.fail(f"'{value}' is not valid: 10MB or more is needed, such as 2GB", param, ctx)
-        return size
+        size = float(found[1]) * UNITS[found[2].upper()] if found else 0.0
+        if not LEAST <= size <= MOST:
+            shown = text.quoted(value)
+            self.fail(
+                f"'{shown}' is not valid: 10MB to 1000000GB is needed, such as 2GB", param, ctx
+            )
+        return round(size)
 
 
 def recording_options(function: F) -> F:
