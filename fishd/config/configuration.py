@@ -94,7 +94,13 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """How hard fishd tries to be on time; without the privilege it warns once and goes on."""
 
     priority: Annotated[
-        int, note("SCHED_FIFO priority; 0 keeps the normal scheduler.", ge=0, le=99)
+        int,
+        note(
+            "SCHED_FIFO priority; 0 keeps the normal scheduler. More than 50 needs more than the "
+            "LimitRTPRIO=51 of the service: one above the priority.",
+            ge=0,
+            le=99,
+        ),
     ] = 50
     warm_up: Annotated[
         bool,

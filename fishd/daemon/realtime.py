@@ -5,6 +5,7 @@ import ctypes
 import gc
 import logging
 import os
+import resource
 import sys
 import threading
 from pathlib import Path
@@ -44,11 +45,24 @@ def enter(priority: int, lock_memory: bool) -> bool:
             refused.append(f"no real-time scheduling ({error.strerror})")
     if refused:
         log.warning(
-            "%s: ticks will be late under load; run as the systemd service, or set "
-            "realtime.priority: 0 and realtime.lock_memory: false to accept that",
+            "%s: ticks will be late under load; %s, or set realtime.priority: 0 and "
+            "realtime.lock_memory: false to accept that",
             " and ".join(refused),
+            "run as the systemd service" if scheduled else _remedy(priority),
         )
     return scheduled
+
+
+def limit_for(priority: int) -> int:
+    """The RLIMIT_RTPRIO that it takes: a thread one above the loop ends it where it hangs."""
+    return min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO))
+
+
+def _remedy(priority: int) -> str:
+    limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if 0 < limit < priority:
+        return f"let LimitRTPRIO= of its service be {limit_for(priority)}, not {limit}"
+    return "run as the systemd service"
 
 
 def _keep_running(thread: int, priority: int) -> None:

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import NoReturn
 
 from fishd.core import text
+from fishd.daemon.realtime import limit_for
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ class Shutdown:
         """
         assert self._thread.native_id
         with suppress(OSError):
-            above = os.sched_param(min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO)))
+            above = os.sched_param(limit_for(priority))
             os.sched_setscheduler(self._thread.native_id, os.SCHED_FIFO, above)
 
     def when_asked(self, tell: Callable[[], object]) -> None:

@@ -9,6 +9,8 @@ from rigs.doctor_process import doctor, free_telemetry
 from rigs.doctor_tree import Examine, put, unprivileged
 from rigs.processes import call
 
+from fishd.cli.doctor import timing
+
 MODEL, BUS = "proc/device-tree/model", "of_node/clock-frequency"
 PI_4 = {MODEL: "Raspberry Pi 4 Model B Rev 1.5\0"}
 PI_5 = {MODEL: "Raspberry Pi 5 Model B Rev 1.0\0"}
@@ -248,3 +250,19 @@ def test_a_button_that_nothing_can_read_is_not_passed_over(
     level, message, mend = examine("gpio package", "panel.estop_gpio=17")
     assert (level, message.startswith("neither RPi.GPIO nor rpi-lgpio is")) == ("FAIL", True)
     assert "make install-pi" in mend
+
+
+@pytest.mark.parametrize(
+    ("priority", "words"),
+    [
+        (50, "as its systemd service, or allow 'rtprio 51' in"),
+        (60, "service with LimitRTPRIO=61 (sudo systemctl edit fishd), or allow 'rtprio 61' in"),
+        (99, "or allow 'rtprio 99' in"),
+    ],
+)
+def test_whoever_may_not_be_in_real_time_is_told_which_limit_suffices(
+    examine: Examine, monkeypatch: pytest.MonkeyPatch, priority: int, words: str
+) -> None:
+    monkeypatch.setattr(timing, "_TRY", "raise SystemExit(1)")
+    level, _, mend = examine("real time", f"realtime.priority={priority}")
+    assert (level, words in mend) == ("warning", True), mend

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +19,7 @@ from rigs.processes import (
     Daemon,
     Subscriber,
     addresses,
+    call,
     running,
     sets,
     wait_until,
@@ -197,6 +199,27 @@ def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None
     assert errors.count("fishd.daemon.realtime") == 1
     assert "memory is not locked" in errors
     assert "no real-time scheduling" in errors
+    assert "; run as the systemd service, or set realtime.priority: 0 and " in errors
+
+
+ABOVE = """
+import logging, os, resource
+from fishd.daemon import realtime
+
+def forbid(*_):
+    raise PermissionError(1, "Operation not permitted")
+
+os.sched_setscheduler = forbid
+resource.getrlimit = lambda _: (51, 51)
+logging.basicConfig()
+assert not realtime.enter(60, False)
+"""
+"""What a service with LimitRTPRIO=51 does; not every machine lets a test raise that limit."""
+
+
+def test_a_priority_above_what_is_permitted_is_told_with_the_limit() -> None:
+    told = call(sys.executable, "-c", ABOVE).stderr
+    assert "; let LimitRTPRIO= of its service be 61, not 51, or set realtime.priority: 0" in told
 
 
 def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:

@@ -7,12 +7,15 @@ import subprocess
 import sys
 
 from fishd.cli.doctor.base import Context
+from fishd.daemon.realtime import limit_for
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
 _TRY = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
 _LIMITS = "/etc/security/limits.d/fishd.conf"
 ENOUGH_MEMORY = 512 * 2**20
 """Limit on locked memory that is no limit to fishd [bytes]."""
+OF_SERVICE = 51
+"""LimitRTPRIO= of fishd.service as it is installed."""
 _CAP_IPC_LOCK = 14
 _ON_TIME = ("simulated", "pi", "virtual-pi")
 """Robots whose ticks can be late; a swimmer's cannot, in slow motion."""
@@ -28,7 +31,7 @@ def realtime(context: Context) -> Result:
     if context.running:
         if context.running.status.realtime:
             return ok("the running fishd has real-time scheduling")
-        return warning("the running fishd has no real-time scheduling", _permit("rtprio 50"))
+        return warning("the running fishd has no real-time scheduling", _permit_priority(priority))
     tried = subprocess.run(
         [sys.executable, "-I", "-S", "-c", _TRY, str(priority)], capture_output=True, check=False
     )
@@ -36,7 +39,7 @@ def realtime(context: Context) -> Result:
         return ok(f"SCHED_FIFO {priority} is permitted")
     return warning(
         f"user {getpass.getuser()} may not use SCHED_FIFO {priority}: ticks come late under load",
-        _permit("rtprio 50"),
+        _permit_priority(priority),
     )
 
 
@@ -96,8 +99,14 @@ def _kernel_is_synchronised() -> bool:
     return 0 <= state < _TIME_ERROR and not status & _UNSYNCHRONISED
 
 
-def _permit(limit: str) -> str:
-    return f"run fishd as its systemd service, or allow '{limit}' in {_LIMITS}"
+def _permit_priority(priority: int) -> str:
+    needed = limit_for(priority)
+    more = f" with LimitRTPRIO={needed} (sudo systemctl edit fishd)"
+    return _permit(f"rtprio {needed}", more if needed > OF_SERVICE else "")
+
+
+def _permit(limit: str, more: str = "") -> str:
+    return f"run fishd as its systemd service{more}, or allow '{limit}' in {_LIMITS}"
 
 
 CHECKS = (
