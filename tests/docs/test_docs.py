@@ -214,3 +214,15 @@ def test_each_permitted_operator_is_listed() -> None:
     assert f"versions {operators.OPSETS[0]} to {operators.OPSETS[-1]}:" in text
     assert f"more than {operators.LARGEST_NODES} operators, 10⁸ multiplications" in text
     assert operators.LARGEST_WORK == 10**8
+
+
+def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
+    layout = (ROOT / "tools/pi_layout.sh").read_text()
+    users = (ROOT / "systemd/sysusers.d/fishd.conf").read_text()
+    table = text_of(ROOT / "docs/installing.md").split("What it brings:")[1].split("\n\n")[1]
+    files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
+    wanted = {f"`{name or other}`" for name, other in files}
+    assert len(wanted) > 10
+    wanted |= {f"`/usr/local/bin/{name}`" for name in ("fishd", "fishctl", "fishd-camera")}
+    wanted |= set(re.findall(r"(?m)^m fishd (\w+)$", users))
+    assert {name for name in wanted if name not in table} == set()
