@@ -21,6 +21,7 @@ from fishd.lab.identification import (
     experiment,
     identify,
 )
+from fishd.lab.identification.passages import passages
 from fishd.lab.identification.response import Drive, response
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.plant.parameters import PlantParameters
@@ -127,6 +128,17 @@ def test_gaps_and_skipped_slots_cost_only_what_is_missing(table: pd.DataFrame) -
     assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
     assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
     assert all(channel.white for channel in found.channels)
+
+
+def test_a_force_that_is_not_to_be_believed_is_left_out(table: pd.DataFrame) -> None:
+    clipped = table.copy()
+    doubted = clipped.index % 400 == 399
+    clipped.loc[doubted, "fy"] += 50.0
+    clipped["suspect"] = np.where(doubted, "a sample is clipped", None)
+    found = passages([clipped])
+    assert len(found) == 5
+    assert sum(each.duration for each in found) == pytest.approx(90.0, abs=1.0)
+    assert max(float(abs(each.forces).max()) for each in found) < 10.0
 
 
 def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:

@@ -65,6 +65,8 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
         if len(table) < 2:
             continue
         columns = {name: table[name].to_numpy() for name in COLUMNS}
+        if "suspect" in table:  # a force that is not to be believed is none
+            columns["samples"] = np.where(table["suspect"].fillna("") == "", columns["samples"], 0)
         tick = _period(columns)
         for rows in _unbroken(columns):
             passage = _passage(columns, rows, tick, begin)
