@@ -171,10 +171,12 @@ def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
 def _evaluated(
     checkpoint: Path, card: Card, policy: ActorCriticPolicy, perception: Perception
 ) -> Evaluation:
-    """The latest evaluation on the robot, else one on the simulated fish of its training."""
+    """That of this policy on the robot, else one on the simulated fish of its training."""
     state = checkpoints.read_state(checkpoint)
-    if state.on == "robot" and state.latest and state.latest.steps == state.steps:
-        return state.latest
+    if state.on == "robot":
+        for found in (state.best, state.latest):
+            if found and found.policy == state.steps:
+                return found
     try:  # with the imperfections of its rig, where the run folder still exists
         config, _ = runs.read(checkpoint.parent)
     except FishdError:

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.config import load
 from fishd.core.signals import Observation
+from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.link import StepResult
@@ -249,7 +250,7 @@ def same(checkpoint: Path, networks: dict[str, torch.Tensor]) -> bool:
 
 
 def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
-    tmp_path: Path, beating: list[Policy]
+    tmp_path: Path, beating: list[Policy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     beating[:] = [square(6), square(5), square(6), still, square(5)]
     job = on_robot(tmp_path / "run")
@@ -275,6 +276,10 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     ]
     assert [row["swam"] for row in table] == ["3.5", "3.5", "7.0", "1.5", "7.0"]
     assert 0.0 < float(table[2]["error"]) < float(table[0]["error"])
+    monkeypatch.delattr(exporting, "in_simulation")  # its figures are those of the tank
+    exported = exporting.export(outcome.best, tmp_path / "best.onnx")
+    assert exported.evaluation == best
+    assert exported.card.provenance.efficiency == best.efficiency
 
 
 def test_a_resumed_training_goes_on_with_the_best_and_the_swims_that_it_had(
