@@ -46,6 +46,7 @@ class Dwell:
         """Begin at the present angle [rad], as if the tail had reversed just now."""
         self._angle = angle
         self._side = math.copysign(1.0, angle) if angle else 0.0
+        self._elapsed = 0.0
 
     def apply(self, angle: float, dt: float) -> float:
         """The angle to command [rad], `dt` s after the one before."""

@@ -73,6 +73,15 @@ def test_a_missed_tick_counts_as_time() -> None:
     assert limit.apply(-0.42, 0.05) == -0.42
 
 
+def test_who_is_activated_again_waits_from_then() -> None:
+    limit = DwellLimit(0.2, LIMITS, 0.42)
+    limit.activate(0.42)
+    assert limit.apply(0.42, 1.0) == 0.42
+    limit.activate(0.42)
+    assert limit.apply(-0.42, 0.15) == 0.42
+    assert limit.apply(-0.42, 0.05) == -0.42
+
+
 def test_without_a_dwell_every_command_passes() -> None:
     wanted = [0.42 * (-1) ** k for k in range(1000)]
     assert limited(wanted, dwell=0.0) == wanted

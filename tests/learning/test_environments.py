@@ -92,6 +92,39 @@ def test_after_a_pause_the_agent_sees_the_fish_as_it_is_now(tmp_path: Path) -> N
     assert info["paused"] == 0.0
 
 
+@pytest.mark.parametrize("swims", [False, True])
+def test_from_rest_a_tail_may_beat_to_either_side(tmp_path: Path, swims: bool) -> None:
+    settings = EnvironmentSettings(longest_start=0)
+    link = SimulatedLink(load(None, STILL)) if swims else Resting(brief_job(tmp_path))
+    env = SwimEnv(link, load(None, STILL), settings)
+    env.reset(seed=1)
+    for share in (1.0, 1.0, 1.0, 1.0, -1.0):
+        env.step(np.array([share], np.float32))
+    env.pause(60.0)
+    if swims:  # by itself, as in an evaluation in the tank
+        env.resume()
+        for _ in range(20):
+            env.advance(0.0)
+        env.pause(60.0)
+    env.resume()
+    env.step(np.ones(1, np.float32))
+    assert env.latest.instruction_angle == 0.42
+
+
+def test_where_no_time_has_passed_a_pause_ends_no_dwell() -> None:
+    config = load(None, STILL)
+    env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings(longest_start=0))
+    env.reset(seed=1)
+    env.step(np.ones(1, np.float32))
+    sides = ""
+    for _ in range(4):
+        env.pause(60.0)
+        env.resume()
+        env.step(-np.ones(1, np.float32))
+        sides += "+" if env.latest.instruction_angle > 0 else "-"
+    assert sides == "+++-"
+
+
 @pytest.mark.parametrize("action", [[np.nan], [np.inf], np.array([-np.inf], np.float32)])
 def test_an_action_that_is_no_number_is_refused_and_the_episode_goes_on(action: Any) -> None:
     env = gymnasium.make("fishd/Swim-v0").unwrapped

@@ -134,6 +134,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._price, self._cost = settings.power_price, 0.0  # N/W, N
         shortest = config.limits.dwell if settings.dwell else 0.0
         self._dwell = Dwell(shortest, link.tick, link.amplitude)
+        self._limited = 0.0
+        """The time of the latest observation after a tick with the shortest dwell [s]."""
         self._held_cost = settings.held_cost * settings.reward_scale
         self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
@@ -212,7 +214,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
         Gives the number of ticks lost. Raises `LinkLost`.
         """
-        return self.advance(self._dwell.apply(angle, self.link.tick))
+        lost = self.advance(self._dwell.apply(angle, self.link.tick))
+        self._limited = self.latest.time
+        return lost
 
     def advance(self, angle: float) -> int:
         """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
@@ -278,6 +282,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._longest_pause = max(took, self._longest_pause or 0.0)
         self.latest = self.link.resume()
         self._await_frames()
+        if self.latest.time > self._limited:
+            self._dwell.activate(self.latest.instruction_angle)
         waited = self.latest.time - before
         self._paused += waited
         self.tank_time += waited
