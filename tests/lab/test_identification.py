@@ -189,6 +189,14 @@ def test_several_runs_are_one_fish(table: pd.DataFrame) -> None:
     assert width(both) < 0.8 * width(one)
 
 
+def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
+    table = swum("plant.xi=0.3", seconds=68.0)
+    short, long = table.iloc[:160], table.iloc[160:]
+    found, of_long = (identify(runs, fit=("xi",)) for runs in ([short, long], long))
+    assert (found.passages, found.seconds) == (1, of_long.seconds)
+    assert found["xi"].value == pytest.approx(of_long["xi"].value)
+
+
 @pytest.mark.slow
 def test_data_that_cannot_tell_say_so() -> None:
     with VirtualRig(load(None, ["simulation.noise=0.003"])) as rig:

@@ -87,7 +87,8 @@ def identify(
     settle = _settling(values)
     if settle > _SETTLE:
         longer = [one for one in parts if one.duration > settle + SHORTEST]
-        problem = Problem(longer or parts, names, settle if longer else _SETTLE)
+        parts, settle = (longer, settle) if longer else (parts, _SETTLE)
+        problem = Problem(parts, names, settle)
         values = solve(problem, values)
     return _summary(parts, problem, values, known)
 
