@@ -258,6 +258,7 @@ class DeterministicPolicy:
         Without the frames that it needs, it holds the last one for `HOLD`, then neutral.
         """
         if stack is None and self._perception.eye:
+            self._perception.note(observation)
             self._blind += observation.dt
             return self._latest if self._blind <= HOLD else 0.0
         self._blind = 0.0

@@ -13,6 +13,7 @@ from rigs.swimming import brief_job
 from stable_baselines3 import PPO
 
 from fishd.camera.frames import StackSettings
+from fishd.camera.pilot import Pilot
 from fishd.camera.simulated.settings import DEFAULT
 from fishd.cli.main import fishctl
 from fishd.config import Config
@@ -26,9 +27,11 @@ from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.export import export, export_model
+from fishd.learning.eyes.making import babble
 from fishd.learning.look import look
-from fishd.learning.ppo import activation_of, layers_of
+from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (
+    EnvironmentSettings,
     EvaluationSettings,
     PpoSettings,
     TrainingSettings,
@@ -72,6 +75,24 @@ def test_the_file_says_what_the_trained_policy_says(settings: TrainingSettings) 
     network, perception = network_of(settings)  # raises where they differ
     assert network.frames.shape == settings.camera.stack.shape
     assert len(network.row) == len(perception.features)
+
+
+def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(
+    tmp_path: Path,
+) -> None:
+    settings = settings_of("modes", environment=EnvironmentSettings(history=3))
+    card, policy, perception = babbled(settings)
+    path, config = tmp_path / "eye.onnx", Config()
+    exporting._write(path, card, policy, perception)
+    pilot = Pilot(str(path), replace(config.limits, dwell=0.0))
+    decide = DeterministicPolicy(policy, perception, card.amplitude)
+    link = SimulatedLink(config, camera=Camera(DEFAULT, settings.camera.stack))
+    seen = link.reset()
+    blind = {12, 15, 16, 19, *range(22, 30)}
+    for tick, angle in enumerate(babble(1, 40, card.amplitude).tolist()):
+        stack = None if tick in blind else link.look()
+        assert pilot.angle(seen, stack) == pytest.approx(decide(seen, stack), abs=1e-4)
+        seen = link.step(angle).observation
 
 
 @pytest.mark.parametrize("eye", ["cnn", "nature"])

@@ -6,7 +6,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from fishd.camera.simulated.settings import DEFAULT
 from fishd.config import Config
-from fishd.controllers.policy.card import Card
+from fishd.controllers.policy.card import Card, Window
 from fishd.learning.env.environment import features
 from fishd.learning.env.perception import Perception
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
@@ -34,10 +34,12 @@ def babbled(settings: TrainingSettings) -> tuple[Card, ActorCriticPolicy, Percep
     eye.fit(np.stack(frames), np.array(angles))
     inputs = features(config, settings.seen)
     torch.manual_seed(settings.seed)
-    policy = make_policy(settings.ppo, len(inputs), eye)
+    history = settings.seen.history
+    perception = Perception(inputs, eye, Window(history, history * config.tick))
+    policy = make_policy(settings.ppo, perception.numbers, eye)
     policy.set_training_mode(False)
     with torch.no_grad():
         for parameter in policy.action_net.parameters():
             parameter.mul_(SPREAD)
     card = make_card(config, settings, inputs, "simulation", 0, None, "")
-    return card, policy, Perception(inputs, eye)
+    return card, policy, perception
