@@ -80,6 +80,22 @@ def test_a_rollout_without_a_single_valid_step_is_no_error() -> None:
     assert ThrustSignal(0.02).of(np.full(8, 0.3), np.zeros(8)).tolist() == [0.0] * 8
 
 
+def test_what_a_spike_is_does_not_follow_the_scale_of_the_reward(tmp_path: Path) -> None:
+    found = []
+    for scale in (None, 0.5):
+        environment = replace(BRIEF.environment, thrust_scale=scale)
+        job = brief_job(tmp_path / f"run-{scale}", environment=environment)
+        training = Training(job, SimulatedLink(job.config), Display(), lambda: False)
+        training._recorder.close()
+        rollout = training._model.rollout_buffer
+        assert isinstance(rollout, Rollout)
+        assert rollout.signal
+        fx = np.linspace(-0.001, 0.001, 64)
+        fx[20] = 1.0
+        found.append(rollout.signal.of(fx, np.zeros(64)).max())
+    assert found[0] == found[1] < 0.01
+
+
 def test_one_fish_is_learned_from_without_it_and_a_new_one_in_each_episode_as_it_is(
     tmp_path: Path,
 ) -> None:

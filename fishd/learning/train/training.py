@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.core.errors import FishdError
 from fishd.learning.env import evaluation
-from fishd.learning.env.environment import SwimEnv, thrust_scale
+from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
@@ -264,7 +264,7 @@ class Training:
 
 def _clean(rollout: Rollout, env: SwimEnv) -> None:
     """Let it take off of the measured forces what is not the fish's."""
-    rollout.signal = ThrustSignal(thrust_scale(env.config, env.settings))
+    rollout.signal = ThrustSignal(env.best_thrust)
     rollout.reward_per_newton = env.reward_per_newton
 
 
