@@ -176,10 +176,9 @@ def settings_of(config: Config) -> dict[str, Any]:
     """What the motion of a swimmer depends on, as in the configuration."""
     swimmer = msgspec.to_builtins(config.swimmer)
     del swimmer["slow_motion"]
-    found = {"tick": config.tick, "swimmer": swimmer}
+    found = {"tick": config.tick, "swimmer": swimmer, "amplitude_limit": config.amplitude_limit}
     if config.swimmer.muscle.servo:
         plant = config.plant
-        found["amplitude_limit"] = config.amplitude_limit
         found["plant"] = {"servo_speed": plant.servo_speed, "servo_lag": plant.servo_lag}
     return found
 

@@ -133,6 +133,7 @@ def test_another_controller_swims_on_with_a_track_of_its_own(
         ("swimmer.body.viscosity=2e-4", "swimmer.body.viscosity 0.0001, and here it is 0.0002"),
         ("tick=0.02", "tick 0.01, and here it is 0.02"),
         ("swimmer.muscle.servo=true", "swimmer.muscle.servo false, and here it is true"),
+        ("amplitude_limit=0.3", "amplitude_limit 0.42, and here it is 0.3"),
     ],
 )
 def test_a_checkpoint_of_another_fish_is_refused_with_the_key_that_differs(
