@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+SAME = 1.001
+"""Cells are of one size where none is larger than another by more than this factor."""
 
 
 class Grid:
@@ -35,7 +37,8 @@ def edges(low: float, high: float, fine: tuple[float, float], h: float, ratio: f
     """Edges of cells from `low` to `high`: of size h between `fine`, and growing outside of it.
 
     ratio: of neighbouring cells outside, at most
-    The fine part is widened to whole cells, and the ratio lowered so that whole cells fit.
+    The fine part is widened to whole cells, and the ratio lowered so that whole cells fit. Where
+    that would make them smaller than h, there is one less, and the ratio is larger.
     """
     count = max(1, math.ceil((fine[1] - fine[0]) / h - 1e-9))
     middle = 0.5 * (fine[0] + fine[1])
@@ -51,9 +54,13 @@ def _stretched(length: float, h: float, ratio: float) -> Array:
         return np.empty(0)
     if ratio <= 1.0 or length <= h:
         count = max(1, round(length / h))
+        if count > 1 and count * h > SAME * length:
+            count -= 1
         return np.linspace(length / count, length, count)
     count = math.ceil(math.log1p((ratio - 1.0) * length / (h * ratio)) / math.log(ratio))
     low, high = 1.0, ratio
+    if count * h > SAME * length:
+        count, high = count - 1, 2.0
     for _ in range(60):  # the ratio with which `count` cells are just as long
         middle = 0.5 * (low + high)
         if h * sum(middle**k for k in range(1, count + 1)) > length:

@@ -14,7 +14,7 @@ from fishd.core.errors import FishdError
 from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.covers import Covered, circle, gather, impose, paint, slip
 from fishd.virtual.swimmer.flow import Flow
-from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.grid import SAME, Array
 
 IMPLICIT = 0.55
 """Share of the new shape in the elastic forces of a step; 0.5 would let the shortest waves of the
@@ -148,7 +148,7 @@ class Immersed:
             first, last = np.searchsorted(edges, [low, high])
             ranges.append(slice(int(first) - 1, int(last)))
             sizes = np.diff(edges[ranges[-1].start : ranges[-1].stop + 1])
-            if sizes.max() > 1.001 * grid.h:
+            if sizes.max() > SAME * grid.h:
                 raise LeftTheGrid("the body left the part of the grid with small cells")
         return ranges[0], ranges[1]
 

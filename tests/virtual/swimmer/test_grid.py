@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fishd.virtual.swimmer.grid import Grid, edges
+from fishd.virtual.swimmer.grid import SAME, Grid, edges
 
 
 def test_it_reaches_from_end_to_end() -> None:
@@ -36,3 +36,13 @@ def test_a_grid_knows_its_centres_sizes_and_smallest_cell() -> None:
     assert (grid.nx, grid.ny, grid.cells, grid.h) == (2, 3, 6, 0.5)
     assert grid.xc == pytest.approx([0.5, 2.0])
     assert grid.dy == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.001, 1.01, 1.02, 1.04, 1.06, 1.1, 1.2])
+def test_no_cell_outside_is_smaller_than_those_around_the_body(ratio: float) -> None:
+    for outside in np.arange(1.0, 15.01, 0.1):
+        sizes = np.diff(edges(0.0, 2.0 + outside, (0.0, 2.0), 1.0, ratio))
+        assert sizes.sum() == pytest.approx(2.0 + outside)
+        assert sizes.min() >= 1.0 / SAME
+        if len(sizes) - 2 < int(outside + 1e-9):  # with one more they would not be smaller
+            assert (sizes[1:] / sizes[:-1]).max() <= ratio + 1e-9
