@@ -66,6 +66,15 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
         )
     unsaved = False
     if options.save and len(swum.track):
+        if resume and options.save.suffix == ".npz":
+            midlines.put_before(options.save, swum.track.rows())
+            if len(midlines) < len(swum.track):
+                start = min(midlines.start, resume.time)
+                echo(
+                    f"fishctl: {options.save}: its midlines begin at {start:.2f} s: those before "
+                    "are kept where --save names the NPZ file of the first part",
+                    err=True,
+                )
         try:
             track.save(swum.track, options.save, midlines.arrays())
         except OSError as error:

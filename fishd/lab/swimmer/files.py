@@ -10,9 +10,10 @@ import numpy as np
 from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.lab.swimmer.envelope import Array
-from fishd.virtual.swimmer.checkpoint import LONGEST, Checkpoint, CheckpointError
+from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import SwimmerSettings
+from fishd.virtual.swimmer.track import LONGEST
 
 
 def fish_of(checkpoint: Checkpoint) -> Fish:

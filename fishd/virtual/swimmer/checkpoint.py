@@ -18,11 +18,9 @@ from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.virtual.swimmer.grid import Array
 from fishd.virtual.swimmer.robot import Swimmer
-from fishd.virtual.swimmer.track import COLUMNS, Track
+from fishd.virtual.swimmer.track import COLUMNS, LONGEST, Track
 
 FORMAT = 2
-LONGEST = 2**30
-"""Of a file [bytes]."""
 _STATE = "state."
 
 

@@ -35,6 +35,8 @@ COLUMNS = {
     "lateral_power": ("W/m", "of the body on the water along y, mean"),
 }
 """Unit and meaning of each column; forces and powers per metre of depth."""
+LONGEST = 2**30
+"""Of a file of a swim that is read [bytes]."""
 SUFFIXES = (".csv", ".npz")
 
 

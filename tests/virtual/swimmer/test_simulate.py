@@ -104,6 +104,27 @@ def test_a_swim_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> Non
         assert np.array_equal(whole[name], rest[name]), name
 
 
+def test_midlines_of_the_first_part_stay_where_the_swim_goes_on_into_its_file(
+    tmp_path: Path,
+) -> None:
+    saved, other, kept = (tmp_path / name for name in ("swim.npz", "other.npz", "kept"))
+    hold = ("hold", "--angle", "0.3", "--settle", "0.1")
+    simulated(*hold, "--seconds", "0.2", "--save", saved, "--checkpoint", kept)
+    first = table(saved)
+    further = (*hold, "--seconds", "0.3", "--resume", kept)
+    assert simulated(*further, "--save", saved).stderr == ""
+    both = table(saved)
+    assert both["midline_time"] == pytest.approx(0.01 * np.arange(1, 31))
+    assert np.array_equal(both["midlines"][:20], first["midlines"])
+    assert simulated(*further, "--save", other).stderr == (
+        f"fishctl: {other}: its midlines begin at 0.20 s: those before are kept where --save "
+        "names the NPZ file of the first part\n"
+    )
+    assert np.array_equal(table(other)["midlines"], both["midlines"][20:])
+    simulated("sine", "--seconds", "0.2", "--settle", "0.1", "--resume", kept, "--save", saved)
+    assert np.array_equal(table(saved)["time"], table(saved)["midline_time"])  # a track of its own
+
+
 def test_a_swim_that_is_as_long_already_leaves_its_files_alone(
     swum: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
