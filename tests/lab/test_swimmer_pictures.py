@@ -104,7 +104,22 @@ def test_a_long_film_leaves_frames_out_and_keeps_its_pace(
     with Image.open(path) as shown:
         assert shown.n_frames == 3  # of 17
         list(pixels(shown))
-        assert shown.info["duration"] == 320  # eight of 40 ms in one
+        assert shown.info["duration"] == pytest.approx(320, rel=0.01)  # eight of 40 ms in one
+
+
+@pytest.mark.parametrize("kind", [".webp", ".gif"])
+def test_a_film_is_half_as_fast_as_the_fish_where_ticks_are_long(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"wake{kind}"
+    swimmer = Fish(COARSE)
+    with Film(path, COARSE) as film:
+        for step in range(1, 101):
+            swimmer.step(1.0)
+            if step % 25 == 0:
+                film.look(swimmer)
+    with Image.open(path) as shown:
+        assert shown.n_frames == 4
+        list(pixels(shown))
+        assert shown.info["duration"] == 100  # of 50 ms
 
 
 def test_a_film_of_another_kind_is_refused_before_anything_swims(tmp_path: Path) -> None:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 FORMATS = (".webp", ".gif")
 EVERY = 0.02
-"""Time between two frames [s]."""
-SHOWN = 0.04
-"""How long each is shown [s]: half as fast as it swims."""
+"""Time between two frames [s], or longer where it is shown the fish less often."""
+SLOWER = 2.0
+"""A film takes so many times as long as the swim."""
 MOST = 800
 """Frames; where there would be more, every other one is left out, and each is shown twice as long,
 so that a long run needs no more memory, 0.13 MB a frame."""
@@ -60,6 +60,7 @@ class Film:
         self._window = around(settings)
         self._limit = scale(settings, quantity)
         self._frames: list[Image.Image] = []
+        self._times: list[float] = []
         self._stride = 1
         self._seen = 0
         self._next = 0.0
@@ -83,9 +84,10 @@ class Film:
         self._next = max(self._next + EVERY, fish.time + 0.5 * EVERY)
         if self._seen % self._stride == 0:
             self._frames.append(self._paint(view(fish, self._quantity, self._window, COLUMNS)))
+            self._times.append(fish.time)
         self._seen += 1
         if len(self._frames) > MOST:
-            self._frames = self._frames[::2]
+            self._frames, self._times = self._frames[::2], self._times[::2]
             self._stride *= 2
 
     def _paint(self, shown: View) -> "Image.Image":
@@ -172,10 +174,12 @@ class Film:
         if not self._frames:
             return
         first, *others = self._frames
+        interval = (self._times[-1] - self._times[0]) / len(others) if others else EVERY
+        unit = 1 if self.path.suffix.lower() == ".webp" else 10  # of times in the file [ms]
         options: dict[str, Any] = {
             "save_all": True,
             "append_images": others,
-            "duration": round(1e3 * SHOWN * self._stride),
+            "duration": unit * round(1e3 * SLOWER * interval / unit),
             "loop": 0,
         }
         if self.path.suffix.lower() == ".webp":
