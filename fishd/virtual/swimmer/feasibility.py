@@ -28,6 +28,8 @@ LEAST_SEGMENT = 1.5
 """A piece of the beam is at least so many cells long: shorter ones move too little water."""
 THINNEST = 0.05
 """Thickness of the body, ends left out, over its largest."""
+AHEAD = 0.05
+"""A fish that speeds up gets ahead of the middle of the grid by up to so many of its lengths."""
 _MARGIN = 1.2
 
 
@@ -137,6 +139,18 @@ def _check_profile(body: Body) -> None:
 
 def _check_tank(settings: SwimmerSettings) -> None:
     body, water, numerics = settings.body, settings.water, settings.numerics
+    beam = build_beam(settings)
+    centre = float(beam.share @ beam.X)
+    longer = max(centre + AHEAD * body.length, body.length - centre)
+    around = float(beam.half_thickness.max()) + 2.0 * numerics.cell
+    fine = 2.0 * (longer + around) / body.length
+    if numerics.fine_length < fine:
+        raise Problem(
+            ("swimmer", "numerics", "fine_length"),
+            f"{numerics.fine_length:g} is too short for a fish whose centre of mass, "
+            f"{centre / body.length:.2g} of its length from the head, is in the middle: at least "
+            f"{math.ceil(fine * 100.0 - 1e-9) / 100.0:g}",
+        )
     for key, size, share in (
         ("length", water.length, numerics.fine_length),
         ("width", water.width, numerics.fine_width),
