@@ -70,6 +70,16 @@ def test_small_cells_that_end_before_the_fish_does_are_refused(profile: str) -> 
     load(FILE, [*body, f"swimmer.numerics.fine_length={least}"])
 
 
+@pytest.mark.parametrize("viscosity", ["1e-4", "1.2e-4", "1e-3"])
+def test_what_is_carried_along_and_viscosity_share_one_limit_of_the_step(viscosity: str) -> None:
+    water = [f"swimmer.water.viscosity={viscosity}"]
+    with pytest.raises(ConfigError, match="the tail would pass") as refusal:
+        load(FILE, water)  # with 1e-4, ν Δt/h² is 0.1: either would do alone
+    longest = str(refusal.value).rpartition("at most ")[2].removesuffix(" s")
+    tick = round(0.01 / float(longest)) * float(longest)
+    load(FILE, [*water, f"swimmer.numerics.step={longest}", f"tick={tick:.9g}"])
+
+
 def test_swing_may_go_by_the_lateral_force_instead() -> None:
     assert not load(FILE, ["estimator.kind=lateral_force"]).limits.scaled
 
