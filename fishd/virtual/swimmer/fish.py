@@ -27,7 +27,7 @@ _FASTEST = 0.05
 """No body moves by so many of its lengths in a step."""
 _CHECKED_EVERY = 20
 _STEER_TIME = 0.4
-"""Heading and place are averaged over about so long before the fish is steered [s]."""
+"""Heading and place are averaged over about so long, for how the fish is steered [s]."""
 _STEER_RATE = 2.0
 """So fast the heading is corrected [1/s]; below 1/_STEER_TIME, or a gliding fish would swing."""
 _STEER_REACH = 10.0
@@ -185,9 +185,12 @@ class Fish:
     def _steer(self) -> float:
         """A torque that turns the fish back to the middle, without any net force [N m].
 
-        It goes by heading and place as averaged over more than a beat, and by how that heading
-        changes. So within a beat it is in step with the yaw and not with its rate: it takes next to
-        no power from the swimming. `Work.steering` counts it.
+        It goes by heading h and place as averaged over `_STEER_TIME`, T, and by how that heading
+        changes: from h it makes −(s + 2)/(T s + 1) h, with s = iω. For slow turns that is −2 h,
+        within a beat nearly −h/T = −2.5 h. So it is a spring that holds the yaw, of stiffness
+        5 gain I with the inertia I, and not a damper, but for some degrees of phase: it takes next
+        to no power from the swimming, which `Work.steering` counts. It is not small: with gain 1 as
+        much as 5/ω² of the inertia, 13 % at 1 Hz and 1.4 % at 3 Hz.
         """
         gain = self.settings.steering
         if not gain:
