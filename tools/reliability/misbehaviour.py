@@ -202,16 +202,29 @@ def importing() -> Outcome:
 
 
 def ask(endpoint: str, method: str, way: str) -> None:
-    """Let a method hang; nobody waits for answers, as there are none where the loop hangs."""
+    """Let a method hang, and wait until it does; one that loads holds up nobody."""
     zoo = {"name": "zoo", "parameters": {"deed": way, "method": method}}
-    with contextlib.suppress(NoDaemon), Fish(endpoint, timeout=0.5) as fish:
+    with Fish(endpoint, timeout=PATIENCE) as fish:
         send(endpoint, fish.request("set-controller", zoo)[1])
         if method in ("retune", "close"):
             await_mode(fish, "running")
             nudge = {"parameters": {"nudge": 1}}
             retune = ("set-parameter", nudge) if method == "retune" else ("stop", {})
             send(endpoint, fish.request(*retune)[1])
-    time.sleep(0.5)
+    if method in ("check", "__init__"):
+        time.sleep(0.5)
+    else:
+        await_silence(endpoint)
+
+
+def await_silence(endpoint: str) -> None:
+    """Raises TimeoutError when fishd goes on answering."""
+    deadline = time.monotonic() + PATIENCE
+    with contextlib.suppress(NoDaemon), Fish(endpoint, timeout=0.7) as fish:
+        while time.monotonic() < deadline:
+            fish.status()
+            time.sleep(0.01)
+        raise TimeoutError("fishd does not hang")
 
 
 def send(endpoint: str, request: bytes) -> None:
