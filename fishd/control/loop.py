@@ -89,7 +89,7 @@ class ControlLoop:
         self._now = clock.monotonic
         self._notify = notify
         self._believed = Measurement(clock.monotonic(), 0.0, 0.0, 0)
-        """The latest measurement that was to be believed, as one of no samples."""
+        """The latest measurement that was to be believed."""
         self._index = -1
         self._awaited: tuple[int, str, Controller[Any], ServoCalibration | None] | None = None
 
@@ -125,7 +125,7 @@ class ControlLoop:
         power = self.power.read(slot.deadline)
         read = self._now()
         suspect = bool(measurement.suspect)
-        estimated = self._estimate(self._believed if suspect else measurement, slot, dt)
+        estimated = self._estimate(self._once_more() if suspect else measurement, slot, dt)
         self.observation = observation = self._follow_thrust(estimated, suspect)
         self._watch_sign(observation, suspect)
         return Turn(slot, measurement, observation, (started, read, self._now()), power)
@@ -258,18 +258,22 @@ class ControlLoop:
             if isinstance(error, FishLost):
                 self._fail("fish-lost", "there is nothing to read any more", error)
             problem = f"the force sensor cannot be read: {text.named(error)}"
-            measurement = self._believed  # once more
+            measurement = self._once_more()
         else:
             self.supervisor.check("sensor-range", measurement.suspect)
             if not measurement.samples:  # it says again what may have been suspect
                 measurement = replace(measurement, fx=self._believed.fx, fy=self._believed.fy)
         if not measurement.suspect:
-            self._believed = replace(measurement, samples=0, extremes=None)
+            self._believed = measurement
         age = slot.now - measurement.time
         if problem is None and age > STALE * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
         self.supervisor.check("sensor-stale", problem)
         return measurement
+
+    def _once_more(self) -> Measurement:
+        """What was to be believed last, of which nothing is new."""
+        return replace(self._believed, samples=0, extremes=None)
 
     def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
         try:

@@ -44,7 +44,9 @@ def recover(path: Path) -> Run:
     try:
         with held(path):
             final.with_name(final.name + RECOVERING).unlink(missing_ok=True)  # left by a kill
-            if not (is_part and _is_done(run, final)):
+            if is_part and run.finished and not run.is_damaged and not final.exists():
+                give_name(path, final)  # it was killed just before
+            elif not (is_part and _is_copy(final, run)):
                 _write(run, final)
             if is_part:
                 path.unlink(missing_ok=True)
@@ -53,10 +55,8 @@ def recover(path: Path) -> Run:
     return open_run(final)
 
 
-def _is_done(part: Run, final: Path) -> bool:
-    """Has the part its final name already, or a copy that has, when a kill came before the end?"""
-    if part.finished and not part.is_damaged and not final.exists():
-        give_name(part.path, final)
+def _is_copy(final: Path, part: Run) -> bool:
+    """Is there a whole recording of this run already, when a kill came before the end?"""
     if not final.exists():
         return False
     run = open_run(final)

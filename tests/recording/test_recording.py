@@ -7,12 +7,12 @@ from contextlib import suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
 from msgspec.structs import replace
 from rigs.harness import Rig
+from rigs.kills import ends_before
 from rigs.recordings import recorded, status, swum, write
 
 from fishd.core.errors import RecordingError
@@ -119,27 +119,6 @@ def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
             recover(writer.part)
 
 
-def recover_until(call: int, path: Path) -> bool:
-    """Recover in another process, which is killed before this system call; did it end before?"""
-    if not (child := os.fork()):
-        calls = count()
-
-        def dying(act: Callable[..., Any]) -> Callable[..., Any]:
-            def acting(*args: Any, **options: Any) -> Any:
-                if next(calls) == call:
-                    os._exit(9)
-                return act(*args, **options)
-
-            return acting
-
-        for name in ("open", "write", "fdatasync", "link", "unlink", "fsync"):
-            setattr(os, name, dying(getattr(os, name)))
-        with suppress(BaseException):
-            recover(path)
-        os._exit(0)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
 @pytest.mark.parametrize("damaged", [False, True], ids=["cut off", "damaged"])
 def test_whenever_a_recovery_is_killed_the_next_one_finishes_it(
     tmp_path: Path, damaged: bool
@@ -157,7 +136,7 @@ def test_whenever_a_recovery_is_killed_the_next_one_finishes_it(
             source, final = folder / "run.mcap.part", folder / "run.mcap"
             source.write_bytes(content[: len(content) // 2])
         ticks = open_run(source).ticks
-        ended = recover_until(call, source)
+        ended = ends_before(call, partial(recover, source))
         with suppress(RecordingError):  # there is nothing left to do
             recover(source)
         assert set(folder.iterdir()) == ({source, final} if damaged else {final})

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.control.estimators.base import Estimator, EstimatorSettings
+from fishd.control.estimators.lateral_sign import SETTLES
 from fishd.core.signals import Measurement
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
@@ -25,8 +26,6 @@ _TERMS = 20
 """Of the series of a matrix exponential; enough for a norm of 0.5."""
 _UNKNOWN = (0.05, 0.5, 0.1)
 """What is known at first of fin angle [rad], fin velocity [rad/s] and offset [N]."""
-_SETTLES = 1.0
-"""A fin hangs still when nothing has moved the tail for so long [s]."""
 
 
 class Step(NamedTuple):
@@ -78,8 +77,8 @@ class Observer(Estimator):
         settings, fish, ahead = self._settings, self._fish, self._ahead
         rotation = settings.sensor_rotation
         force = math.cos(rotation) * measurement.fy - math.sin(rotation) * measurement.fx
-        if dt > _SETTLES:  # fishd stood still: fin and water have forgotten what was before
-            dt, self._offset, self._covariance = _SETTLES, None, np.diag(np.square(_UNKNOWN))
+        if dt > SETTLES:  # fishd stood still: fin and water have forgotten what was before
+            dt, self._offset, self._covariance = SETTLES, None, np.diag(np.square(_UNKNOWN))
         window = fish.advance(instruction_angle, dt, 1)
         ahead.advance(instruction_angle, dt, 1)
         step = self._step(round(dt, 9))
