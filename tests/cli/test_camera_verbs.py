@@ -6,6 +6,7 @@ import pty
 import re
 import select
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -316,6 +317,17 @@ def test_the_page_shows_the_view_live_with_the_axis_in_a_true_browser(swimming: 
         assert process.finish() == (0, "", "")
     finally:
         process.end()
+
+
+def test_a_page_whose_port_is_taken_is_refused(swimming: Daemon) -> None:
+    with socket.socket() as somebody:
+        somebody.bind(("127.0.0.1", 0))
+        port = somebody.getsockname()[1]
+        line = one_line(fishctl("camera", "page", "--port", str(port)))
+    assert line == (
+        f"fishctl: cannot serve a page at 127.0.0.1:{port}: Address already in use; "
+        "name another port with --port\n"
+    )
 
 
 RED_ROW = """() => {

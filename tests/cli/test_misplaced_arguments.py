@@ -1,5 +1,6 @@
 """An argument that belongs elsewhere: the verb says where."""
 
+import socket
 from pathlib import Path
 
 import pytest
@@ -75,7 +76,10 @@ def test_a_true_camera_cannot_see_a_simulated_fish(eye: str) -> None:
 
 @pytest.mark.parametrize("verb", ["status", "view", "align", "page"])
 def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> None:
-    line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml"))
+    with socket.socket() as somebody:  # also where a page is shown already
+        somebody.bind(("127.0.0.1", 0))
+        port = ("--port", str(somebody.getsockname()[1])) if verb == "page" else ()
+        line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml", *port))
     assert line == (
         "fishctl: 'config/web.yaml' is a file, for 'fishd-camera --config' and for simulated "
         "fish; here the address at which a running fishd-camera takes requests is needed, such as "

@@ -41,6 +41,7 @@ def test_a_policy_that_shakes_the_servo_loses_command_and_everyone_is_told(
         Subscriber(daemon.telemetry, b"event") as events,
         Subscriber(daemon.telemetry, b"tick") as ticks,
     ):
+        events.connected()
         fish.set_controller("ppo", policy="flip")
         told = events.until(kind="fallback")
         assert (told["data"]["before"], told["data"]["controller"]) == ("ppo", "swing")

@@ -109,6 +109,7 @@ def test_it_swims_a_fishd_in_real_time_and_leaves_it_at_rest(daemon: Daemon, fis
     link = FishdLink(daemon.endpoint)
     with Subscriber(daemon.telemetry, b"tick") as telemetry:
         assert (link.tick, link.amplitude) == (0.1, 0.42)
+        telemetry.message()  # from here on none is missed
         before = link.reset()
         told: dict[float, float] = {}
         for n in range(20):

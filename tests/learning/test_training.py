@@ -365,6 +365,7 @@ def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
     elsewhere = f"ipc://{tmp_path}/elsewhere"
     settings = sets("lockstep=true", *NOISY)
     with running(tmp_path, *settings) as fishd, Subscriber(fishd.telemetry, b"event") as events:
+        events.connected()
         job = brief_job(tmp_path / "run", steps=128, evaluation=never())
         train(replace(job, on="robot", endpoint=fishd.endpoint, agent=elsewhere))
         taken = events.until(kind="controller")["data"]

@@ -187,6 +187,13 @@ class Subscriber:
         self.socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
         self.socket.connect(address)
 
+    def connected(self) -> Self:
+        """Wait until ticks come, from where on nothing is missed."""
+        self.socket.subscribe(b"tick")
+        self.message()
+        self.socket.unsubscribe(b"tick")
+        return self
+
     def message(self) -> dict[str, Any]:
         _, payload = self.socket.recv_multipart()
         message: dict[str, Any] = msgspec.json.decode(payload)

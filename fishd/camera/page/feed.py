@@ -62,11 +62,15 @@ class Feed:
                     self._check()
                     self._tell(News(self._facts(), None))
         finally:
-            self._client.close()
+            self.close()
 
     def stop(self) -> None:
         """End `run` soon."""
         self._stopping.set()
+
+    def close(self) -> None:
+        """Leave the camera, where `run` has not begun; it does so itself at its end."""
+        self._client.close()
 
     def _check(self) -> None:
         try:

@@ -7,6 +7,7 @@ somebody looks at here could read what the camera sees.
 
 import asyncio
 import ipaddress
+import os
 import socket
 from collections.abc import Awaitable, Callable
 from importlib import resources
@@ -78,9 +79,11 @@ class PageServer:
             self._server = await loop.create_server(self._connected, self._host, self._port)
         except OSError as error:
             await self._runner.cleanup()
+            number = error.errno or 0  # below 0 of the resolver
+            why = os.strerror(number) if number > 0 else error.strerror or error
             raise StartupError(
-                f"cannot serve a page at {self._host}:{self._port}: "
-                f"{error.strerror or error}; name another port with --port"
+                f"cannot serve a page at {self._host}:{self._port}: {why}; "
+                "name another port with --port"
             ) from None
         return self
 

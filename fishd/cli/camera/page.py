@@ -8,6 +8,7 @@ import click
 
 from fishd.cli.camera.options import camera_option
 from fishd.cli.output import echo
+from fishd.core.errors import StartupError
 from fishd.core.interruption import on_signal
 
 PORT = 9876
@@ -47,27 +48,33 @@ async def _serve(address: str | None, host: str, port: int) -> None:
 
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
     failures: list[BaseException] = []
-    async with PageServer(host, port) as server:
+    server = PageServer(host, port)
 
-        def tell(news: News) -> None:
-            with suppress(RuntimeError):  # the loop has ended meanwhile
-                loop.call_soon_threadsafe(server.show, news)
+    def tell(news: News) -> None:
+        with suppress(RuntimeError):  # the loop has ended meanwhile
+            loop.call_soon_threadsafe(server.show, news)
 
-        def follow() -> None:
-            try:
-                feed.run()
-            except BaseException as error:
-                failures.append(error)
-                with suppress(RuntimeError):
-                    loop.call_soon_threadsafe(ended.set)
+    feed = Feed(address, tell)
 
-        feed = Feed(address, tell)
-        thread = threading.Thread(target=follow, name="camera", daemon=True)
-        with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
-            thread.start()
-            echo(f"the camera is at {server.url}; Ctrl-C ends it")
-            await ended.wait()
-        feed.stop()
-        await asyncio.to_thread(thread.join, LEAVING)
+    def follow() -> None:
+        try:
+            feed.run()
+        except BaseException as error:
+            failures.append(error)
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(ended.set)
+
+    thread = threading.Thread(target=follow, name="camera", daemon=True)
+    try:
+        async with server:
+            with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
+                thread.start()
+                echo(f"the camera is at {server.url}; Ctrl-C ends it")
+                await ended.wait()
+            feed.stop()
+            await asyncio.to_thread(thread.join, LEAVING)
+    except StartupError:
+        feed.close()
+        raise
     if failures:
         raise failures[0]

@@ -74,9 +74,12 @@ def test_the_newest_of_several_observations_counts(agent: Agent) -> None:
     rig = Rig("tick=0.02")
     rig.start("remote", agent=agent.address)
     rig.run(20)  # nobody answers
-    latest = agent.observe()
+    taken, lost = 0, 0
+    while lost < 19:  # of all that it took at once; some may still be on their way
+        latest = agent.observe()
+        taken, lost = taken + 1, lost + agent.lost
     assert latest.time == pytest.approx(19 * 0.02)
-    assert agent.lost == 19  # of all that it took at once
+    assert taken < 20
     rig.loop.close()
 
 
