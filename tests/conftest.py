@@ -4,6 +4,7 @@ import gc
 import os
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -54,6 +55,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.option.fast:
         config.option.markexpr = "not slow and not realtime"
+        sys.addaudithook(refuse_processes)
     elif config.option.realtime:
         config.option.markexpr = "realtime"
 
@@ -69,6 +71,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if realtime:
         return "mark.realtime" not in collection_path.read_text(encoding="utf-8") or None
     return is_slow(collection_path) or None
+
+
+def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
+    """A fast test starts none but those with which recordings ask for commit and machine."""
+    if event != "subprocess.Popen" or "PYTEST_CURRENT_TEST" not in os.environ:
+        return
+    if Path(what[0]).name not in {"git", "uname"}:
+        raise RuntimeError(f"a test with --fast starts {what[0]}: mark it slow")
 
 
 @cache

@@ -199,6 +199,7 @@ def test_a_state_folder_of_another_user_is_not_taken_away_from_him(
     assert "set state_folder" in mend
 
 
+@pytest.mark.slow
 def test_a_read_only_file_system_is_not_taken_for_a_permission(root: Path) -> None:
     (root / "state").mkdir()
     mount = 'mount -t tmpfs -o ro none "$0" && exec "$@"'
@@ -252,6 +253,7 @@ def test_a_button_that_nothing_can_read_is_not_passed_over(
     assert "make install-pi" in mend
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("priority", "words"),
     [

@@ -133,6 +133,7 @@ def test_the_option_for_a_policy_explains_itself_and_completes_names_and_files(
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_fishctl_that_only_asks_loads_no_numbers() -> None:
     program = (
         "import sys; from fishd.controllers import registry; from fishd.client import Fish; "

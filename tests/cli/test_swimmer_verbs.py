@@ -39,6 +39,7 @@ def test_the_wake_is_drawn_from_a_checkpoint(swum: Path, tmp_path: Path) -> None
     assert fishctl(*words, "--force", "--field", "pressure", "--limit", "5").returncode == 0
 
 
+@pytest.mark.slow
 def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> None:
     words = ("swimmer", "midlines", str(swum / "swim.npz"), "--to", str(tmp_path))
     done = fishctl(*words, "--settle", "0.5", "--form", "svg")

@@ -31,6 +31,8 @@ from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.i2c import I2cBus
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[2] / "docs" / "writing-a-driver.md"
 EXAMPLES = Path(__file__).parents[2] / "docs" / "example-drivers"
 VOLTS = {"x": 1e-3, "y": -2e-3}

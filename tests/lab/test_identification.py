@@ -189,6 +189,7 @@ def test_several_runs_are_one_fish(table: pd.DataFrame) -> None:
     assert width(both) < 0.8 * width(one)
 
 
+@pytest.mark.slow
 def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
     table = swum("plant.xi=0.3", seconds=68.0)
     short, long = table.iloc[:160], table.iloc[160:]

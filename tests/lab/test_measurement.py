@@ -118,6 +118,7 @@ def candidate(generator: np.random.Generator, half_beat: int) -> list[Sample]:
     return samples
 
 
+@pytest.mark.slow
 def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_power_are() -> None:
     generator = np.random.default_rng(3)
     alike: list[Step] = []

@@ -119,6 +119,7 @@ def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
             recover(writer.part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damaged", [False, True], ids=["cut off", "damaged"])
 def test_whenever_a_recovery_is_killed_the_next_one_finishes_it(
     tmp_path: Path, damaged: bool

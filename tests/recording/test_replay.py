@@ -17,6 +17,8 @@ from fishd.core.errors import StartupError
 from fishd.recording import open_run
 from fishd.recording.replay import Replay
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def replay(tmp_path: Path) -> Iterator[Replay]:

@@ -196,6 +196,7 @@ def test_a_fishd_without_the_extra_says_what_to_install(
     assert f": {package} is not installed: install fishd[policy], or onnx and onnx" in message
 
 
+@pytest.mark.slow
 def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path) -> None:
     path = write(tmp_path, to_onnx(linear(0.5), "tanh", card()))
     home = tmp_path / "home"

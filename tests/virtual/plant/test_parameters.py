@@ -8,6 +8,7 @@ from rigs.processes import call
 from fishd.virtual.plant.parameters import PlantParameters
 
 
+@pytest.mark.slow
 def test_reading_parameters_costs_no_numpy() -> None:
     program = "import sys, fishd.virtual.plant.parameters; sys.exit('numpy' in sys.modules)"
     assert call(sys.executable, "-c", program).returncode == 0

@@ -26,6 +26,7 @@ def test_the_example_is_a_swimmer_that_senses_its_tail() -> None:
     assert config.limits.virtual
 
 
+@pytest.mark.slow
 def test_a_configuration_is_checked_without_what_computes_the_fish() -> None:
     done = call(sys.executable, "-c", CHECKS)
     assert done.stdout == "[]\n"
@@ -88,6 +89,7 @@ def test_other_robots_do_not_mind_what_is_said_of_a_swimmer() -> None:
     assert load(None, ["swimmer.numerics.cell=0.005"]).robot == "simulated"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", [FISHD, FISHCTL])
 def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, program: str) -> None:
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['numba'] = None\n")
