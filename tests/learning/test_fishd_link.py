@@ -11,6 +11,7 @@ from rigs.processes import Daemon, Subscriber, running, sets
 
 from fishd.client import Agent, Fish, FishError, NoDaemon
 from fishd.config import load
+from fishd.core.signals import Status
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fishd_link import FishdLink
 from fishd.learning.env.link import Link, LinkLost
@@ -172,6 +173,25 @@ def test_a_stop_ends_it_and_a_reset_reacquires_control(env: SwimEnv, fish: Fish)
     assert fish.status().mode == "running"
     assert fish.status().seq > stopped
     assert swims(env)
+
+
+def test_a_close_that_takes_long_leaves_no_fault(
+    link: FishdLink, fish: Fish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status = Fish.status
+
+    def slow(asked: Fish) -> Status:
+        fish.set_parameters(misses=5)
+        seq = status(fish).seq
+        while status(fish).seq < seq + 12:  # more ticks than the agent may miss
+            time.sleep(0.02)
+        return status(asked)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Fish, "status", slow)
+        link.close()
+    found = fish.status()
+    assert (found.mode, found.reason) == ("idle", None)
 
 
 def test_another_controller_ends_it_and_a_reset_does_not_take_the_fish_from_it(
