@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 GIVE_UP = 2.0
 """After so long without frames the camera counts as lost [s]."""
+HAND_OVER = 20.0
+"""How long fishd may take to let another controller take over [s]."""
 REPORT = 1.0
 """Time between two lines [s]."""
 
@@ -73,6 +75,7 @@ def agent(
     from fishd.camera.live_sight import LiveSight
     from fishd.camera.pilot import Pilot
     from fishd.learning.env.fishd_link import FishdLink
+    from fishd.learning.env.link import LinkLost
 
     stopping = threading.Event()
     with on_signal(stopping.set), Fish(endpoint) as fish, ExitStack() as stack:
@@ -92,6 +95,8 @@ def agent(
             with _named(policy):
                 swim.run(stopping, seconds)
         except ControllerFault as fault:
+            with suppress(LinkLost):  # another controller swims already, or none
+                link.pause(HAND_OVER)
             raise PolicyError(f"{policy}: {fault}; {_hand_over(fish, fault)}") from None
         finally:
             link.close()  # neutral first, then whatever takes time

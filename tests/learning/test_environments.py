@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from msgspec.structs import replace
-from rigs.processes import Daemon
+from rigs.processes import Daemon, running, sets
 from rigs.swimming import BRIEF, Resting, brief_job
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
 
@@ -223,18 +223,16 @@ def test_the_environment_on_a_running_fishd_passes_both_checkers(daemon: Daemon)
         env.close()
 
 
-def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/agent"
-    env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address)
-    try:
-        env.reset()
-        env.unwrapped.pause()  # else fishd soon gives up an agent that does not answer
-        with Fish(daemon.endpoint) as fish:
-            assert fish.status().parameters["agent"] == address
-    finally:
-        env.close()
+    with running(tmp_path, *sets("lockstep=true")) as daemon:  # it waits for its agent
+        env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address)
+        try:
+            env.reset()
+            with Fish(daemon.endpoint) as fish:
+                assert fish.status().parameters["agent"] == address
+        finally:
+            env.close()
 
 
 def test_scales_for_another_amplitude_than_that_of_the_fishd_are_refused(daemon: Daemon) -> None:

@@ -14,6 +14,7 @@ from fishd.camera.frames import Stack, StackSettings
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.making import babble, make
@@ -50,6 +51,33 @@ def swum(
         stacks.append(env.stack)
         fins.append(link._loop.robot.truth().alpha)
     return stacks, np.array(fins), angles
+
+
+class Waiting(SimulatedLink):
+    """Knows whether it is in a pause."""
+
+    waits = False
+
+    def step(self, angle: float) -> StepResult:
+        self.waits = False
+        return super().step(angle)
+
+    def pause(self, seconds: float) -> None:
+        self.waits = True
+
+
+def test_the_fish_waits_while_its_eye_finds_out_what_it_has_seen_and_afterwards(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    eye = eye_of("nature")
+    link = Waiting(CONFIG, camera=Camera(DEFAULT, StackSettings()))
+    env = SwimEnv(link, CONFIG, EnvironmentSettings(longest_start=0), eye)
+    waited: list[bool] = []
+    monkeypatch.setattr(eye, "fit", lambda frames, angles: waited.append(link.waits))
+    env.reset(seed=0)
+    assert env.babble(0, 4)
+    assert waited == [True]
+    assert link.waits
 
 
 def fitted(kind: str, rig: SimulatedCameraSettings = DEFAULT, **settings: object) -> Eye:

@@ -92,16 +92,23 @@ def wait_until(true: Callable[[], bool]) -> None:
 
 
 class Process:
-    """A program that runs beside the test."""
+    """A program that runs beside the test; as a context manager it is gone afterwards."""
 
     def __init__(self, *command: str) -> None:
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
 
-    def finish(self) -> tuple[int, str, str]:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self.process:
+            self.process.kill()
+
+    def finish(self, patience: float = PATIENCE) -> tuple[int, str, str]:
         """Wait until it ends by itself; exit status, output and errors."""
-        out, err = self.process.communicate(timeout=PATIENCE)
+        out, err = self.process.communicate(timeout=patience)
         return self.process.returncode, out, err
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:

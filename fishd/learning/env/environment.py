@@ -245,8 +245,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         ticks: for how long
         stop: called after each of them; True ends it
 
-        False where it was stopped. Raises `LinkLost`, and `NoMotion` where the tail is not to be
-        seen.
+        False where it was stopped; else the fish is in a pause afterwards. Raises `LinkLost`, and
+        `NoMotion` where the tail is not to be seen.
         """
         assert self.eye
         assert self._shown
@@ -257,6 +257,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             self.advance(angle)
             frames.append(self._shown[0])
             angles.append(self.latest.instruction_angle)  # of a lost tick, another one
+        self.pause()  # to find it out takes longer than fishd waits
         self.eye.fit(np.stack(frames), np.array(angles))
         return True
 

@@ -178,6 +178,8 @@ class FishdLink:
         self._closed = True
         if self._begun:
             with contextlib.suppress(FishError):
+                if self._agent.active and self._agent.latest:
+                    self._agent.pause(PATIENCE)  # what follows may take longer than fishd waits
                 if self._is_ours(self._fish.status()):
                     self._fish.stop()
         self._agent.close()

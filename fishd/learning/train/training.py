@@ -180,7 +180,6 @@ class Training:
 
         if not env.babble(self._job.settings.seed, ticks, stop):
             return "interrupted", ""
-        env.pause()
         self._paused = True
         self._recorder.steps = self._model.num_timesteps = ticks
         return "finished", ""
