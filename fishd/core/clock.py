@@ -173,6 +173,8 @@ class Ticker:
         self._warm_up = warm_up
         self._margin = min(self.MARGIN, period / 4)
         self._warm_up_time = self._margin / 2
+        self._latest_warm_up = math.inf
+        """How long the latest one took [s]."""
         self._start = time.monotonic() + period
         self._index = -1
         self._timer = TimerFd()
@@ -216,7 +218,10 @@ class Ticker:
         self._warm_up_time *= 0.98
         if deadline - begun > self._warm_up_time:
             warm_up()
-            self._warm_up_time = max(self._warm_up_time, time.monotonic() - begun)
+            before, self._latest_warm_up = self._latest_warm_up, time.monotonic() - begun
+            # One that took much longer than that before it says something of the machine only.
+            usual = min(before, self._latest_warm_up)
+            self._warm_up_time = max(self._warm_up_time, usual)
             while time.monotonic() < deadline:
                 pass
 

@@ -111,3 +111,16 @@ def test_a_warm_up_for_which_there_is_no_time_is_left_out() -> None:
 
     asyncio.run(slots(20, warm_up=slow))
     assert len(warmed) == 1
+
+
+@pytest.mark.realtime
+def test_one_warm_up_during_which_the_machine_stood_still_does_not_end_them() -> None:
+    warmed: list[float] = []
+
+    def stopped_once() -> None:
+        warmed.append(time.monotonic())
+        if len(warmed) == 3:
+            time.sleep(10 * PERIOD)
+
+    asyncio.run(slots(20, warm_up=stopped_once))
+    assert len(warmed) >= 8

@@ -28,7 +28,7 @@ def test_a_signal_lets_the_fish_rest(daemon: Daemon, number: int) -> None:
 def test_nobody_swims_on_where_somebody_stops_the_fish(daemon: Daemon) -> None:
     process = comparing(daemon, "swing", "sine")
     wait_until(lambda: daemon.status().mode == "running")
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.stop()
     out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out) == (1, "")
@@ -39,7 +39,7 @@ def test_nobody_swims_on_where_somebody_stops_the_fish(daemon: Daemon) -> None:
 
 
 def test_a_latched_stop_and_a_wrong_option_are_one_line(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.estop("the net")
         done = daemon.fishctl("compare", "--on", "robot", "swing")
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)

@@ -142,7 +142,7 @@ def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None
         running(tmp_path / "other") as unnamed,
     ):
         assert left.fishctl("status").stdout.startswith("fish        left tank, simulated\n")
-        assert "  left tank  idle" in left.fishctl("watch", "--seconds", "0.7").stdout
+        assert "  left tank  idle" in left.fishctl("watch", "--seconds", "5").stdout
         with Subscriber(left.telemetry, b"status") as subscriber:
             assert subscriber.message()["name"] == "left tank"
         assert unnamed.status().name == socket.gethostname()[:40]

@@ -6,7 +6,7 @@ import time
 
 import msgspec
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, running, wait_until
+from rigs.processes import FISHCTL, PATIENCE, Daemon, Process, Subscriber, running, wait_until
 
 from fishd.client import Fish
 from fishd.core.errors import Refused
@@ -57,8 +57,9 @@ def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -
 
 
 def test_another_parameter_in_the_middle_ends_it_too(daemon: Daemon) -> None:
-    measuring = begun(daemon)
-    time.sleep(0.3)
+    with Subscriber(daemon.telemetry, b"tick") as ticks:
+        measuring = begun(daemon)
+        ticks.until(controller="swing", mode="running")
     assert daemon.fishctl("set-parameter", "C=0.1").returncode == 0
     status, _, err = measuring.finish()
     assert status == 1
@@ -83,7 +84,7 @@ def test_an_emergency_stop_ends_it_and_says_so(daemon: Daemon) -> None:
 
 
 def test_what_is_no_factor_is_refused_and_stops_no_fish(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         for factor, error in ((1e308, 1.0), (0.0, 1.0), (1.0, 1e308), (-1.0, 1.0)):
             with pytest.raises(Refused, match="calibrate-thrust: "):
                 fish.calibrate_thrust(factor, error)

@@ -14,7 +14,7 @@ LONGEST_END = 3.0
 
 def measured(*arguments: str) -> Any:
     """What the tool finds that writes docs/reliability.md."""
-    done = call(sys.executable, ROOT / "tools" / "reliability", *arguments, "--json", timeout=240)
+    done = call(sys.executable, ROOT / "tools" / "reliability", *arguments, "--json", timeout=200)
     assert done.returncode in (0, 1), done.stderr
     assert done.stdout, done.stderr
     return msgspec.json.decode(done.stdout)
@@ -24,37 +24,25 @@ SIGNALS = {"SIGTERM": 0, "SIGKILL": -9, "SIGSTOP": None, "SIGCONT": None}
 PHASES = ("statistics", "between ticks")
 
 
-@pytest.fixture(scope="module")
-def deaths() -> Any:
-    """Six fishds that die side by side."""
-    return measured("deaths", "--only", *SIGNALS, *PHASES)
-
-
 @pytest.mark.realtime
-@pytest.mark.parametrize(("name", "status"), SIGNALS.items())
-def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then(
-    deaths: Any, name: str, status: int | None
-) -> None:
-    found = deaths[name]
-    assert found["status"] == status
-    limit = 0.3 if status != 0 else 0.6  # a countdown in pigpiod; a fade of 0.4 s
-    assert found["neutral"] <= limit
-    assert found["neutral"] < found["off"] <= found["neutral"] + 0.8
-    if name == "SIGCONT":  # it goes on after a hang
-        assert found["reason"] == "overrun"
-
-
-@pytest.mark.realtime
-@pytest.mark.parametrize("phase", PHASES)
-def test_an_exception_outside_the_phases_ends_fishd_and_the_servo_comes_to_rest_first(
-    deaths: Any, phase: str
-) -> None:
-    assert deaths[phase]["status"] == 1
-    assert deaths[phase]["neutral"] < deaths[phase]["off"]
+def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then() -> None:
+    """One test of all six, who die side by side: judged again, they are measured again."""
+    deaths = measured("deaths", "--only", *SIGNALS, *PHASES)
+    for name, status in SIGNALS.items():
+        found = deaths[name]
+        assert found["status"] == status, name
+        limit = 0.3 if status != 0 else 0.6  # a countdown in pigpiod; a fade of 0.4 s
+        assert found["neutral"] <= limit, name
+        assert found["neutral"] < found["off"] <= found["neutral"] + 0.8, name
+    assert deaths["SIGCONT"]["reason"] == "overrun"  # it goes on after a hang
+    for phase in PHASES:  # an exception outside the phases of a tick
+        assert deaths[phase]["status"] == 1, phase
+        assert deaths[phase]["neutral"] < deaths[phase]["off"], phase
 
 
 def test_a_fishd_that_is_killed_at_any_moment_leaves_no_pulses() -> None:
-    kills = measured(*["kills", "--kills", "30", "--lanes", "6", "--seed", "4", "--limit", "60"])
+    # With this seed, two of the first six are a SIGSTOP.
+    kills = measured(*["kills", "--kills", "30", "--lanes", "6", "--seed", "10", "--limit", "100"])
     assert [kill for kill in kills if kill["off"] is None] == []
     assert len(kills) >= 10
     assert any(kill["swimming"] for kill in kills)

@@ -1,12 +1,11 @@
 """A true fishd and a true agent, in two processes, and what goes wrong between them."""
 
-import itertools
 import json
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -24,6 +23,7 @@ from rigs.processes import (
     sets,
     wait_until,
 )
+from rigs.scripted_agent import ScriptedAgent
 
 from fishd.client import Agent, Fish, Refused
 
@@ -32,6 +32,7 @@ import sys
 from fishd.client import Agent
 
 with Agent(sys.argv[1]) as agent:
+    print("bound", flush=True)
     for seen in agent:
         agent.act(0.25)
 """
@@ -39,12 +40,15 @@ with Agent(sys.argv[1]) as agent:
 
 @contextmanager
 def agent_process(address: str) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen([sys.executable, "-c", AGENT, address])
+    """An agent that has bound its address."""
+    process = subprocess.Popen([sys.executable, "-c", AGENT, address], stdout=subprocess.PIPE)
     try:
+        assert process.stdout
+        assert process.stdout.readline() == b"bound\n"
         yield process
     finally:
         process.kill()
-        process.wait(PATIENCE)
+        process.communicate(timeout=PATIENCE)
 
 
 @pytest.fixture
@@ -80,36 +84,36 @@ def test_an_agent_that_dies_leaves_a_fault_and_its_successor_swims_on(
             ticks.until(mode="running", phi_c=0.25)
 
 
-@pytest.mark.realtime
-def test_no_late_action_reaches_the_servo(daemon: Daemon, address: str) -> None:
+def test_no_late_action_reaches_the_servo(daemon: Daemon, tmp_path: Path) -> None:
     with (
-        Agent(address) as agent,
-        Fish(daemon.endpoint) as fish,
+        closing(ScriptedAgent(tmp_path)) as agent,
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
         Subscriber(daemon.telemetry, b"tick") as telemetry,
     ):
-        fish.set_controller("remote", agent=address, misses=1000)
-        late = 0
-        for seen in itertools.islice(agent, 40):
-            late += agent.lost
-            slow = seen.seq % 2 == 1
-            time.sleep(0.03 if slow else 0.0)  # of the 20 ms
-            agent.act(0.4 if slow else -0.1)
+        telemetry.connected()
+        fish.set_controller("remote", agent=agent.address, misses=1000)
+        for _ in range(20):
+            over = agent.next()["seq"]
+            agent.next()  # that tick is over, however slow this machine is
+            agent.send(agent.action(0.4, seq=over))
+            agent.send(agent.action(-0.1))
         fish.stop()
         ticks = [telemetry.until(controller="remote")]
         while ticks[-1]["controller"] == "remote":
             ticks.append(telemetry.message())
-    assert late >= 10
+    assert sum(seen["lost"] for seen in agent.seen) >= 20
     assert {tick["phi_c"] for tick in ticks[:-1]} == {0.0, -0.1}
 
 
 def test_an_agent_learns_for_seconds_and_then_swims_on(daemon: Daemon, address: str) -> None:
-    with Agent(address) as agent, Fish(daemon.endpoint) as fish:
-        fish.set_controller("remote", agent=address)
+    with Agent(address) as agent, Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        fish.set_controller("remote", agent=address, misses=1000)
         agent.observe()
         agent.act(0.2)
         agent.observe()
         agent.pause(30.0)
         time.sleep(1.0)  # twenty ticks
+        agent.poll()  # one that was sent before the pause had come
         assert agent.poll(0.3) is None
         assert fish.status().mode == "running"
         agent.resume()
@@ -127,7 +131,7 @@ def test_an_agent_and_telemetry_may_be_reached_over_ipv6(tmp_path: Path) -> None
     with (
         running(tmp_path, *telemetry) as daemon,
         Agent("tcp://[::1]:*", timeout=PATIENCE) as agent,
-        Fish(daemon.endpoint) as fish,
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
     ):
         fish.set_controller("remote", agent=agent.address, first_action=PATIENCE)
         assert agent.observe().session
@@ -138,7 +142,7 @@ def test_rubbish_is_a_fault_that_says_what_came(daemon: Daemon, address: str) ->
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     socket = context.socket(zmq.DEALER)  # may bind just as well
     socket.bind(address)
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("remote", agent=address)
         assert socket.poll(int(PATIENCE * 1e3))
         seen = msgspec.json.decode(socket.recv())
@@ -153,7 +157,10 @@ def test_rubbish_is_a_fault_that_says_what_came(daemon: Daemon, address: str) ->
 
 
 def test_a_deadline_beyond_the_tick_is_refused(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint) as fish, pytest.raises(Refused, match=r"at most 0\.0225 s"):
+    with (
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
+        pytest.raises(Refused, match=r"at most 0\.0225 s"),
+    ):
         fish.set_controller("remote", deadline=0.03)
     assert daemon.status().mode == "idle"
 
@@ -179,7 +186,11 @@ def waiting_daemon(folder: Path, address: str) -> Iterator[Daemon]:
 def test_in_lockstep_fishd_waits_for_its_agent_and_answers_meanwhile(
     tmp_path: Path, address: str
 ) -> None:
-    with waiting_daemon(tmp_path, address) as daemon, Fish(daemon.endpoint) as fish:
+    with (
+        waiting_daemon(tmp_path, address) as daemon,
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
+    ):
+        wait_until(lambda: fish.status().seq == 1)
         time.sleep(0.5)
         assert (fish.status().seq, fish.status().mode) == (1, "running")
         with Subscriber(daemon.telemetry, b"status") as telemetry:
@@ -221,7 +232,9 @@ def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(
     document = text_of(ROOT / "docs" / "remote.md")
     example = next(block for kind, block in FENCE.findall(document) if kind == "python")
     assert "400" in example
+    assert "agent=agent.address" in example
     brief = example.replace("400", "60")
+    brief = brief.replace("agent=agent.address", "agent=agent.address, misses=100")
     with (
         Subscriber(daemon.telemetry, b"tick") as ticks,
         subprocess.Popen(
@@ -238,7 +251,7 @@ def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(
 
 
 def test_a_fishd_does_not_take_the_socket_of_an_agent(daemon: Daemon, address: str) -> None:
-    with Agent(address) as agent, Fish(daemon.endpoint) as fish:
+    with Agent(address) as agent, Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         second = call(FISHD, *sets(f"control.address={address}"))
         assert second.returncode == 1
         assert f"already serves {address}" in second.stderr

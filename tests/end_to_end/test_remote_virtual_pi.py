@@ -3,12 +3,14 @@
 import time
 from pathlib import Path
 
+import pytest
 from rigs.processes import running
 from rigs.virtual_pi_process import virtual_pi
 
 from fishd.learning.env.fishd_link import FishdLink
 
 
+@pytest.mark.realtime
 def test_an_agent_swims_the_virtual_pi(tmp_path: Path) -> None:
     with virtual_pi(tmp_path) as pi, running(tmp_path, *pi.settings) as daemon:
         link = FishdLink(daemon.endpoint, deadline=0.0225)

@@ -15,6 +15,7 @@ MODULE = '''
 """Controllers with bad manners."""
 
 import time
+from pathlib import Path
 
 from fishd.controllers.base import Controller
 from fishd.controllers.hold import Hold
@@ -26,6 +27,16 @@ class Slow(Hold):
     def __init__(self, parameters, limits):
         super().__init__(parameters, limits)
         time.sleep(1.0)
+
+
+class Waiting(Hold):
+    """Loads until a file is there, and no longer than fishd waits for it."""
+
+    def __init__(self, parameters, limits):
+        super().__init__(parameters, limits)
+        go_on, deadline = Path(__file__).with_name("go_on"), time.monotonic() + 8.0
+        while not go_on.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
 
 
 class Shapeless(Controller):
@@ -66,6 +77,7 @@ class Untyped(Hold):
 '''
 CONTROLLERS = {
     "slow": "manners:Slow",
+    "waiting": "manners:Waiting",
     "shapeless": "manners:Shapeless",
     "explosive": "manners:Explosive",
     "drunk": "manners:Drunk",
@@ -137,7 +149,7 @@ def test_one_that_was_installed_since_and_cannot_be_imported_needs_a_restart(
     daemon: Daemon, site: Path
 ) -> None:
     install(site, {}, hidden="hidden:Hidden")
-    with Fish(daemon.endpoint) as fish, pytest.raises(Refused) as refusal:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish, pytest.raises(Refused) as refusal:
         fish.set_controller("hidden")
     assert str(refusal.value) == (
         "controller 'hidden' (hidden:Hidden in hidden 1.0) does not load: ModuleNotFoundError: "
@@ -157,12 +169,16 @@ def test_one_that_fails_in_the_tick_is_a_fault_with_its_reason(daemon: Daemon) -
 
 @pytest.mark.realtime
 def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
-    with Subscriber(daemon.telemetry, b"tick") as ticks:
-        before = ticks.message()
-        daemon.fishctl("set-controller", "slow")
-        after = ticks.until(controller="slow")
-    assert after["missed"] == before["missed"]
-    assert after["seq"] - before["seq"] > 15
+    def missed() -> int:
+        with Subscriber(daemon.at_rest().telemetry, b"tick") as ticks:
+            before = ticks.message()
+            daemon.fishctl("set-controller", "slow")
+            after = ticks.until(controller="slow")
+        assert after["seq"] - before["seq"] > 15
+        return int(after["missed"] - before["missed"])
+
+    # What costs a tick costs it each time; a machine that stands still for a moment does not.
+    assert any(missed() == 0 for _ in range(3))
 
 
 def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
@@ -170,8 +186,8 @@ def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
 ) -> None:
     with (
         ThreadPoolExecutor() as threads,
-        Fish(daemon.endpoint) as one,
-        Fish(daemon.endpoint) as other,
+        Fish(daemon.endpoint, timeout=PATIENCE) as one,
+        Fish(daemon.endpoint, timeout=PATIENCE) as other,
     ):
         loading = threads.submit(one.set_controller, "slow")
         while not loading.done():
@@ -182,25 +198,28 @@ def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
 
 @pytest.mark.parametrize("newer", ["stop", "estop"])
 def test_one_that_is_still_loading_does_not_undo_a_newer_request(
-    daemon: Daemon, newer: str
+    daemon: Daemon, site: Path, newer: str
 ) -> None:
+    go_on = site / "go_on"
+    go_on.unlink(missing_ok=True)
     refusals: list[str] = []
 
     def start() -> None:
-        with Fish(daemon.endpoint, timeout=10.0) as fish:
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             try:
-                fish.set_controller("slow")
+                fish.set_controller("waiting")
             except Refused as refusal:
                 refusals.append(refusal.code)
 
     loading = [threading.Thread(target=start) for _ in range(8)]
     for thread in loading:
         thread.start()
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         while refusals.count("busy") < 4:  # then all eight have been heard
             assert fish.status().mode == "idle"
         assert getattr(fish, newer)().mode == {"stop": "idle", "estop": "estop"}[newer]
         fish.clear_fault()
+        go_on.touch()
         for thread in loading:
             thread.join(PATIENCE)
         assert fish.status().mode == "idle"

@@ -8,12 +8,15 @@ from rigs.virtual_pi_process import virtual_pi
 
 
 def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_path: Path) -> None:
-    with virtual_pi(tmp_path) as pi, running(tmp_path, *pi.settings) as daemon:
-        with Subscriber(daemon.telemetry, b"tick") as ticks:
-            ticks.until(mode="running", servo_on=True)
-            pi.control("inject", "pigpiod-frozen")
-            ticks.until(mode="fault")
-        code, _, errors = daemon.end(signal.SIGTERM)
+    with virtual_pi(tmp_path) as pi:
+        # Loads the drivers: the next one has to come before pigpiod's countdown is over.
+        assert fishctl("release", *pi.settings).stdout == "there were no pulses\n"
+        with running(tmp_path, *pi.settings) as daemon:
+            with Subscriber(daemon.telemetry, b"tick") as ticks:
+                ticks.until(mode="running", servo_on=True)
+                pi.control("inject", "pigpiod-frozen")
+                ticks.until(mode="fault")
+            code, _, errors = daemon.end(signal.SIGTERM)
         assert code == 1
         last = errors.splitlines()[-1]
         assert "the servo could not be released and may keep its pulses: pigpiod at 127." in last

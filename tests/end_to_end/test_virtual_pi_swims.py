@@ -19,9 +19,8 @@ def test_the_shipped_configuration_swims_through_the_whole_hardware_path(
 ) -> None:
     _, daemon = swimming
     with Subscriber(daemon.telemetry, b"tick") as subscriber:
-        while (tick := subscriber.message())["thrust"] < 0.02:
+        while (tick := subscriber.message())["thrust"] < 0.02 or tick["samples"] < 4:
             assert tick["mode"] == "running", daemon.fishctl("status").stdout
-    assert tick["samples"] >= 4
     assert 1.2 < tick["frequency"] < 2.2
     status = daemon.status()
     assert status.robot == "virtual-pi"

@@ -15,6 +15,7 @@ import zmq
 
 from fishd.cli.main import main
 from fishd.client import Fish, NoDaemon
+from fishd.core.interruption import SIGNALS
 from fishd.core.signals import Status
 
 FISHD = str(Path(sys.executable).with_name("fishd"))
@@ -36,7 +37,7 @@ def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
     """
     out, err = io.StringIO(), io.StringIO()
     argv, sys.argv = sys.argv, ["fishctl", *arguments]
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             main()
@@ -44,7 +45,8 @@ def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
         status = ended.code
     finally:
         sys.argv = argv
-        signal.signal(signal.SIGTERM, handler)  # which `watch` has set
+        for number, handler in handlers.items():  # `watch` and `record` set some for good
+            signal.signal(number, handler)
     assert isinstance(status, int)
     return subprocess.CompletedProcess(arguments, status, out.getvalue(), err.getvalue())
 
@@ -197,7 +199,8 @@ class Subscriber:
     def connected(self) -> Self:
         """Wait until ticks come, from where on nothing is missed."""
         self.socket.subscribe(b"tick")
-        self.message()
+        while self.socket.recv_multipart()[0] != b"tick":  # but what was said before
+            pass
         self.socket.unsubscribe(b"tick")
         return self
 

@@ -42,12 +42,18 @@ class Fishd:
         command: Sequence[str] = FISHD,
         environment: dict[str, str] | None = None,
         output: int | None = None,
+        tcp: bool = False,
     ) -> None:
-        """command: what starts fishd; output: where standard output and error go, not to a log"""
+        """
+        command: what starts fishd; output: where standard output and error go, not to a log
+        tcp: telemetry over TCP; another program may take the port before fishd does
+        """
         self._folder = tempfile.TemporaryDirectory(prefix="fishd-")
         self.folder = Path(self._folder.name)
         self.endpoint = f"ipc://{self.folder}/control"
-        self.telemetry = f"tcp://127.0.0.1:{_free_port()}"
+        self.telemetry = f"ipc://{self.folder}/telemetry"
+        if tcp:
+            self.telemetry = f"tcp://127.0.0.1:{_free_port()}"
         self.log = self.folder / "log"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)

@@ -104,7 +104,7 @@ def attack(name: str, tick: float, seconds: float) -> Outcome:
     """Let one attack happen."""
     settings = (f"tick={tick}", f"realtime.priority={priorities()[-1]}")
     with ExitStack() as stack:
-        fishes = [stack.enter_context(Fishd(*settings)) for _ in range(2)]
+        fishes = [stack.enter_context(Fishd(*settings, tcp=True)) for _ in range(2)]
         for fishd in fishes:
             fishd.next_tick()
         time.sleep(SETTLE)

@@ -5,12 +5,13 @@ the servo pulses changed, from the moment of the deed. Ends by itself.
 """
 
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -101,6 +102,11 @@ PHASES = {
     "statistics": ("fishd.control.statistics", "Statistics", "add"),
     "between ticks": ("fishd.daemon.requests", "Operations", "status"),
 }
+ENDS = {
+    *("SIGTERM", "SIGINT", "SIGKILL", "SIGKILL of both", "SIGSEGV"),
+    *("statistics", "between ticks"),
+}
+"""After these fishd is to end; after the others it goes on, or hangs."""
 
 
 class Outcome(Struct):
@@ -161,6 +167,9 @@ def die(name: str, together: Barrier) -> Outcome:
         time.sleep(WATCHED + (2.0 if name == "frozen-code" else 0.0))
         pi.pigpiod.width(GPIO, time.monotonic())
         changes = [(when - begun, width) for when, width in pi.pigpiod.history(GPIO)]
+        if name in ENDS:
+            with suppress(subprocess.TimeoutExpired):
+                fishd.process.wait(PATIENCE)  # a busy machine may need longer than that
         status = fishd.process.poll()
         reason = None if status is not None or name == "SIGSTOP" else fault(fishd)
     return Outcome(*ending(changes), status, reason)

@@ -37,7 +37,7 @@ DOCUMENT = "reliability.md"
 GPIO = 18
 PATIENCE = 120.0
 BEGINNING = 5.0
-"""How long a fishd may take until it swims [s]; then another one is started."""
+"""How long a fishd may take until it swims [s]; then another one is started, which gets longer."""
 WATCHED = 1.5
 """How long after a kill no pulses may be left [s]."""
 STOPPED = 0.15
@@ -96,10 +96,12 @@ class Lane:
     def swim(self) -> None:
         """Start a fishd, and wait until its tail beats; again where a busy machine disturbs it."""
         deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
+        for attempt in itertools.count(1):
+            if time.monotonic() > deadline:
+                break
             self.start()
             beats = self._beats()
-            until = time.monotonic() + BEGINNING
+            until = time.monotonic() + BEGINNING * attempt
             while time.monotonic() < until:
                 if self._beats() >= beats + 3:
                     return
@@ -152,14 +154,14 @@ class Lane:
         """Let a fault of the virtual Pi begin."""
         self.pi.faults.inject(fault, seconds)
 
-    def kill(self, name: str, situation: Situation) -> Kill:
-        """Bring a fishd into a situation, kill it in there, and watch its pulses."""
+    def kill(self, name: str, stop: bool) -> Kill:
+        """Bring a fishd into a situation, kill or stop it in there, and watch its pulses."""
+        situation = SITUATIONS[name]
         self.swim()
         time.sleep(self.random.uniform(0.0, 0.2))
         situation.deed(self)
         after = self.random.uniform(0.0, situation.window)
         time.sleep(after)
-        stop = self.random.random() < STOPPED
         self.signal(signal.SIGSTOP if stop else signal.SIGKILL)
         dead = time.monotonic()
         swimming = self._width(dead) > 0.0
@@ -234,10 +236,15 @@ SITUATIONS = {
 }
 
 
-def order(kills: int, seed: int, only: str | None) -> list[str]:
-    """The situations of so many kills, in a random order that the seed decides."""
-    if only:
-        return [only] * kills
+def order(kills: int, seed: int, only: str | None) -> list[tuple[str, bool]]:
+    """So many kills, in a random order that the seed decides: the situation; a SIGSTOP instead?"""
+    names = [only] * kills if only else situations(kills, seed)
+    stops = random.Random(f"stops {seed}")
+    return [(name, stops.random() < STOPPED) for name in names]
+
+
+def situations(kills: int, seed: int) -> list[str]:
+    """The situations of so many kills."""
     hundred = [name for name, situation in SITUATIONS.items() for _ in range(situation.share)]
     shuffled = random.Random(seed)
     names = list(itertools.islice(itertools.cycle(shuffled.sample(hundred, len(hundred))), kills))
@@ -294,20 +301,20 @@ def lane(folder: Path, seed: int) -> Iterator[Lane]:
         os.wait()
 
 
-def work(names: list[str], seed: int, deadline: float, results: Connection) -> None:
+def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Connection) -> None:
     """Do these kills, one after another, and send what was seen."""
     with (
         tempfile.TemporaryDirectory(prefix="fishd-") as folder,
         lane(Path(folder), seed) as made,
     ):
-        for name in names:
+        for name, stop in kills:
             if time.monotonic() > deadline:
                 break
-            results.send(made.kill(name, SITUATIONS[name]))
+            results.send(made.kill(name, stop))
     results.close()
 
 
-def run(names: list[str], lanes: int, seed: int, limit: float) -> Iterator[Kill]:
+def run(kills: list[tuple[str, bool]], lanes: int, seed: int, limit: float) -> Iterator[Kill]:
     """The kills as they come in; those that do not fit into `limit` [s] are left out."""
     deadline = time.monotonic() + limit
     waiting: dict[Connection, int] = {}
@@ -317,7 +324,7 @@ def run(names: list[str], lanes: int, seed: int, limit: float) -> Iterator[Kill]
         if pid == 0:
             status = 1
             try:
-                work(names[number::lanes], seed * 1000 + number, deadline, theirs)
+                work(kills[number::lanes], seed * 1000 + number, deadline, theirs)
                 status = 0
             except BaseException as error:
                 print(f"lane {number}: {error!r}", file=sys.stderr, flush=True)
@@ -366,8 +373,8 @@ def measure(options: Namespace) -> Report:
     """Kill, and look; a quarter of an hour for 2000 with 8 lanes."""
     warm_up()
     kills = []
-    names = order(options.kills, options.seed, options.only)
-    for kill in run(names, options.lanes, options.seed, options.limit):
+    planned = order(options.kills, options.seed, options.only)
+    for kill in run(planned, options.lanes, options.seed, options.limit):
         kills.append(kill)
         if kill.off is None:
             progress(f"stuck: {kill}")
