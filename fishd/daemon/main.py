@@ -30,7 +30,7 @@ from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
 from fishd.daemon.lockstep import Lockstep
-from fishd.daemon.logs import LogWriter
+from fishd.daemon.logs import UNHURRIED, LogWriter
 from fishd.daemon.requests import Operations
 from fishd.daemon.shutdown import Shutdown, leave
 from fishd.daemon.slow_motion import SlowMotion
@@ -319,7 +319,10 @@ def fishd(
         log.critical("fishd failed; the servo is released", exc_info=True)
         return 1
     finally:
-        logs.close()
+        if shutdown.release:
+            logs.close()
+        else:  # it has driven nothing, and why is its only line
+            logs.close(UNHURRIED)
     return 0
 
 
