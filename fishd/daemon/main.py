@@ -209,7 +209,9 @@ class Daemon:
         """Where fishd failed and could not fade: neutral, and time to get there."""
         if self._loop.servo.on and self._loop.applied != 0.0:
             with suppress(Exception):  # closing it comes later, and says what could not be done
-                self._loop.robot.servo.write(0.0)
+                servo = self._loop.robot.servo
+                servo.write(0.0)
+                servo.write(0.0)  # a driver that forgives a late answer may not have sent the first
                 self._clock.sleep(REST)
 
     def _release(self) -> None:
