@@ -13,7 +13,7 @@ from fishd.core import text
 from fishd.core.console import complain, run
 from fishd.core.errors import FishdError
 from fishd.core.interruption import on_signal
-from fishd.daemon.logs import LogWriter
+from fishd.daemon.logs import UNHURRIED, LogWriter
 from fishd.daemon.shutdown import leave
 
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
         log.critical("fishd-camera failed", exc_info=True)
         return 1
     finally:
-        logs.close()
+        logs.close(UNHURRIED)
     return 0
 
 

@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import time
 from contextlib import suppress
 from typing import TypeVar, cast
 
@@ -11,7 +10,7 @@ import zmq
 
 from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
-from fishd.client.connection import milliseconds_until
+from fishd.client.connection import deadlines, milliseconds_until
 from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
@@ -64,10 +63,14 @@ class CameraRequests:
         identity = next(self._ids)
         request = protocol.Request(v=protocol.VERSION, id=identity, op=op)
         patience = self.timeout if timeout is None else timeout
-        deadline = time.monotonic() + patience
-        if self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
-            self._socket.send(protocol.encode(request))
-            while self._socket.poll(milliseconds_until(deadline)):
+        wanted = zmq.POLLOUT
+        hurry = timeout is not None  # within a tick there is no time for more
+        for deadline in deadlines(patience, again=not hurry):
+            while self._socket.poll(milliseconds_until(deadline), wanted):
+                if wanted == zmq.POLLOUT:
+                    self._socket.send(protocol.encode(request))
+                    wanted = zmq.POLLIN
+                    continue
                 with suppress(msgspec.DecodeError):
                     reply = protocol.decode_reply(self._socket.recv_multipart()[-1])
                     if reply.id != identity:
@@ -76,7 +79,7 @@ class CameraRequests:
                         raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
                     if reply.result:
                         return cast(T, decoder(kind)(reply.result))
-        if timeout is None and self._publishes():  # within a tick there is no time for it
+        if not hurry and self._publishes():
             raise CameraLost(
                 f"at {self.endpoint} a camera publishes its frames; requests go to another address "
                 f"of it: its publish.requests, {PublishSettings().requests} by default"

@@ -1,7 +1,5 @@
 """`AsyncFish`: the client for asyncio programs."""
 
-import asyncio
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import closing
 from typing import Any, Self, TypeVar
@@ -12,6 +10,7 @@ from fishd.client.connection import (
     SECOND_LOOK,
     TIMEOUT,
     Connection,
+    deadlines,
     dealer,
     milliseconds_until,
     subscriber,
@@ -148,16 +147,20 @@ class AsyncFish(Connection):
             self.check_endpoint()
             self._socket = dealer(self._context, self.endpoint)
         identity, request = self.request(op, args)
-        deadline = time.monotonic() + self.timeout + patience
-        try:
-            await asyncio.wait_for(self._socket.send(request), self.timeout)
-        except TimeoutError:
-            raise self.silent() from None
-        while await self._socket.poll(milliseconds_until(deadline)):
-            frames = await self._socket.recv_multipart()
-            result = self.result(frames, identity, kind)
-            if result is not None:
-                return result
+        wanted = zmq.POLLOUT
+        for deadline in deadlines(self.timeout + patience, again=True):
+            while await self._socket.poll(
+                milliseconds_until(deadline),
+                wanted,  # type: ignore[call-arg]  # which the stubs forget
+            ):
+                if wanted == zmq.POLLOUT:
+                    await self._socket.send(request)
+                    wanted = zmq.POLLIN
+                    continue
+                frames = await self._socket.recv_multipart()
+                result = self.result(frames, identity, kind)
+                if result is not None:
+                    return result
         raise self.silent(patience)
 
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:

@@ -4,7 +4,7 @@ import itertools
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -20,9 +20,9 @@ T = TypeVar("T")
 
 TIMEOUT = 2.0
 """How long to wait for an answer [s]."""
-SECOND_LOOK = 100
-"""Telemetry that has not come in time is looked for once more, for so long: of a process that was
-itself held up, by SIGSTOP say, it has come, but no thread has read it yet [ms].
+SECOND_LOOK = 500
+"""What has not come in time is looked for once more, for so long: of a process that was itself held
+up, by SIGSTOP say, it has come, but no thread has read it yet [ms].
 """
 
 
@@ -153,3 +153,13 @@ def _connect(socket: "zmq.Socket[Any]", address: str) -> None:
 def milliseconds_until(deadline: float) -> int:
     """Time left until a deadline [s, monotonic], rounded up; 0 after it [ms]."""
     return max(0, math.ceil((deadline - time.monotonic()) * 1e3))
+
+
+def deadlines(seconds: float, *, again: bool) -> Iterator[float]:
+    """Until when to wait for an answer, `seconds` from now, then for a second look [s, monotonic].
+
+    again: whether there is a second look
+    """
+    yield time.monotonic() + seconds
+    if again:
+        yield time.monotonic() + SECOND_LOOK * 1e-3

@@ -1,6 +1,5 @@
 """`Fish`: the client for ordinary programs."""
 
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from typing import Any, Self, TypeVar
@@ -11,6 +10,7 @@ from fishd.client.connection import (
     SECOND_LOOK,
     TIMEOUT,
     Connection,
+    deadlines,
     dealer,
     milliseconds_until,
     subscriber,
@@ -175,19 +175,24 @@ class Fish(Connection):
         return self._subscribe(kinds)
 
     def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
-        """Ask; patience: how long the answer may take, beyond the time-out [s]."""
+        """Ask; patience: how long the answer may take, beyond the time-out [s].
+
+        Where it is negative, the caller is in a hurry, and there is no second look.
+        """
         if self._socket is None:
             self.check_endpoint()
             self._socket = dealer(self._context, self.endpoint)
         identity, request = self.request(op, args)
-        deadline = time.monotonic() + self.timeout + patience
-        if not self._socket.poll(milliseconds_until(deadline), zmq.POLLOUT):
-            raise self.silent(patience)
-        self._socket.send(request)
-        while self._socket.poll(milliseconds_until(deadline)):
-            result = self.result(self._socket.recv_multipart(), identity, kind)
-            if result is not None:
-                return result
+        wanted = zmq.POLLOUT
+        for deadline in deadlines(self.timeout + patience, again=patience >= 0.0):
+            while self._socket.poll(milliseconds_until(deadline), wanted):
+                if wanted == zmq.POLLOUT:
+                    self._socket.send(request)
+                    wanted = zmq.POLLIN
+                    continue
+                result = self.result(self._socket.recv_multipart(), identity, kind)
+                if result is not None:
+                    return result
         raise self.silent(patience)
 
     def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:

@@ -11,7 +11,9 @@ import re
 import socket
 import stat
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -210,8 +212,10 @@ def listen(address: str, key: str, *, group: bool = False, in_use: str = IN_USE)
         else:
             server = socket.socket(socket.AF_INET6 if ":" in where.host else socket.AF_INET)
             server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            _bind_port(server, where)
-        server.listen(_BACKLOG)
+            host = "" if where.host == "*" else where.host  # "" is every address
+            _once_free(partial(server.bind, (host, int(where.port))))
+        # Two may have bound one port: with SO_REUSEADDR only the second to listen is told.
+        _once_free(partial(server.listen, _BACKLOG))
     except (OSError, ValueError) as error:
         if server:
             server.close()
@@ -221,12 +225,12 @@ def listen(address: str, key: str, *, group: bool = False, in_use: str = IN_USE)
     return server
 
 
-def _bind_port(server: socket.socket, where: Tcp) -> None:
+def _once_free(take: Callable[[], None]) -> None:
+    """Take an address, as soon as whoever is leaving it has gone; raises OSError."""
     given_up = time.monotonic() + unix_sockets.LEAVING
-    host = "" if where.host == "*" else where.host  # "" is every address
     while True:
         try:
-            return server.bind((host, int(where.port)))
+            return take()
         except OSError as error:
             if error.errno != errno.EADDRINUSE or time.monotonic() > given_up:
                 raise

@@ -23,6 +23,8 @@ _QUEUE = 1000
 """Lines kept while standard error is stuck; later ones are dropped."""
 _CLOSING = 0.3
 """How long the last lines may take to be written [s]."""
+UNHURRIED = 2.0
+"""The same where nothing is driven; on a busy machine the thread that writes may come late [s]."""
 _LONGEST_MESSAGE = 2000
 _LONGEST_TRACEBACK = 10_000
 """Longer ones are cut [characters]."""
@@ -126,11 +128,11 @@ class LogWriter:
         self._thread = threading.Thread(target=self._write, name="logs", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Write what is left, within a time limit; may be called twice."""
-        until = time.monotonic() + _CLOSING
+    def close(self, patience: float = _CLOSING) -> None:
+        """Write what is left, within `patience` [s]; may be called twice."""
+        until = time.monotonic() + patience
         with suppress(queue.Full):
-            self._lines.put(None, timeout=_CLOSING)
+            self._lines.put(None, timeout=patience)
         self._thread.join(max(0.0, until - time.monotonic()))
 
     def _write(self) -> None:

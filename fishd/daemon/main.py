@@ -30,7 +30,7 @@ from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
 from fishd.daemon.lockstep import Lockstep
-from fishd.daemon.logs import LogWriter
+from fishd.daemon.logs import UNHURRIED, LogWriter
 from fishd.daemon.requests import Operations
 from fishd.daemon.shutdown import Shutdown, leave
 from fishd.daemon.slow_motion import SlowMotion
@@ -209,7 +209,9 @@ class Daemon:
         """Where fishd failed and could not fade: neutral, and time to get there."""
         if self._loop.servo.on and self._loop.applied != 0.0:
             with suppress(Exception):  # closing it comes later, and says what could not be done
-                self._loop.robot.servo.write(0.0)
+                servo = self._loop.robot.servo
+                servo.write(0.0)
+                servo.write(0.0)  # a driver that forgives a late answer may not have sent the first
                 self._clock.sleep(REST)
 
     def _release(self) -> None:
@@ -319,7 +321,10 @@ def fishd(
         log.critical("fishd failed; the servo is released", exc_info=True)
         return 1
     finally:
-        logs.close()
+        if shutdown.release:
+            logs.close()
+        else:  # it has driven nothing, and why is its only line
+            logs.close(UNHURRIED)
     return 0
 
 

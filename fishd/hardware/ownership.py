@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 FOLDER = Path("/run/lock")
 """Where every user of the machine may make lock files."""
-TRIES, PAUSE = 5, 0.02
+TRIES, PAUSE = 50, 0.02
 """How often a claim is tried, as somebody may only be asking; and the time between [s]."""
 
 

@@ -1,7 +1,7 @@
 """A fish that an experiment tells to swim and to rest: of a running fishd, or in virtual time."""
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from fishd.client import Fish
@@ -22,6 +22,8 @@ from fishd.simulation import VirtualRun
 if TYPE_CHECKING:
     from fishd.recording.provenance import Source
     from fishd.recording.writer import RunWriter
+
+log = logging.getLogger(__name__)
 
 LOST = 0.02
 """A measurement may miss this share of its ticks."""
@@ -182,9 +184,9 @@ class LiveRig:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Stop what was begun here; what somebody else has begun since swims on."""
-        with suppress(FishError):
+        try:
             if self._asked:  # it may be loading still, and swim later
                 self._fish.stop()
             elif self._controller is not None:
@@ -192,6 +194,9 @@ class LiveRig:
                 ours = status.controller == self._controller or status.fallback
                 if status.mode == "running" and ours:
                     self._fish.stop()
+        except FishError as error:
+            if not any(isinstance(known, FishError) for known in exception):
+                log.warning("the fish could not be stopped and may swim on: %s", error)
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         """As `Rig.swim`; raises `NoDaemon` where fishd goes away."""

@@ -12,6 +12,8 @@ from rigs.doctor_tree import Examine, examiner
 from rigs.operator_rig import Bench, Dialogue, Talk, bench, pi_process
 from rigs.processes import Daemon
 
+from fishd.cli.doctor import base, service
+
 Shared = tuple[Bench, Daemon]
 
 
@@ -19,6 +21,20 @@ Shared = tuple[Bench, Daemon]
 def _no_service(monkeypatch: pytest.MonkeyPatch) -> None:
     """The configuration of a service on this machine is none of these tests' business."""
     monkeypatch.setenv("FISHD_CONFIG", "")
+
+
+@pytest.fixture(autouse=True)
+def _patient_doctor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fishd that answers does so, however busy the machine is."""
+    for module in (base, service):
+        monkeypatch.setattr(module, "PATIENCE", 10.0)
+
+
+@pytest.fixture
+def hurried_doctor(_patient_doctor: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gives up soon, where nothing answers and that is the point."""
+    for module in (base, service):
+        monkeypatch.setattr(module, "PATIENCE", 0.5)
 
 
 @pytest.fixture

@@ -3,13 +3,21 @@
 import re
 import signal
 import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from rigs.operator_rig import Bench, Talk, calibrations
 from rigs.processes import PATIENCE, Daemon, Subscriber
+from rigs.virtual_daemon import VirtualDaemon
 
+from fishd.cli.calibrate import servo, servo_lease
 from fishd.client import Fish
+from fishd.core.calibration import ServoCalibration
+from fishd.core.errors import FishError, NoDaemon, Refused
 from fishd.core.protocol import LEASE
+from fishd.core.signals import Tick
 
 
 def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
@@ -142,8 +150,11 @@ def test_a_lease_that_ends_of_itself_is_told_at_the_prompt(
             pi.wait_for_pulse(1499, 1501)
             dialogue.process.send_signal(signal.SIGCONT)
             said = dialogue.expect("[no-lease]\n")
+        else:
+            dialogue.process.send_signal(signal.SIGSTOP)  # so that it asks the second one first
     if what == "fishd is restarted":
         with pi.daemon():
+            dialogue.process.send_signal(signal.SIGCONT)
             said = dialogue.expect("[no-lease]\n")
     assert "the servo is at neutral; its calibration is as before\n" in said
     assert re.search(r"\nfishctl: this lease has ended[^\n]+\n$", said)
@@ -198,3 +209,70 @@ def test_the_servo_is_not_calibrated_while_the_fish_swims_or_after_a_fault(
         == "fishctl: swing is the active controller; stop it with 'fishctl stop' [running]\n"
     )
     assert re.fullmatch(r"fishctl: fishd is in estop: a test; [^\n]+\n", stopped.stderr)
+
+
+class Lagging(VirtualDaemon):
+    """Its telemetry lags: who subscribes hears some ticks from before first."""
+
+    def ticks(self) -> Iterator[Tick]:
+        yield from self._kept.ticks[-5:]
+        yield from super().ticks()
+
+
+def test_a_tick_from_before_a_request_is_not_taken_for_a_tail_that_stands_still(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(servo, "PAUSE", 0.0)
+    daemon = Lagging()
+    for _ in range(10):
+        daemon.run.tick()
+    tail = servo.Tail(cast(Fish, daemon), ServoCalibration())
+    assert tail.go(0.1)
+    assert (tail.angle, daemon.run.loop.applied) == (pytest.approx(0.1), pytest.approx(0.1))
+    tail.neutral()
+    assert (tail.angle, daemon.run.loop.applied) == (0.0, 0.0)
+
+
+class Asked:
+    """A fishd for a `Renewal`: it does not answer at times, which takes a while."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *takes: float) -> None:
+        """takes: how long each silence is waited for [s]; then it answers that the lease is over"""
+        self.asked = 0
+        self._takes = list(takes)
+        self._now = 0.0
+        clock = SimpleNamespace(monotonic=lambda: self._now)
+        monkeypatch.setattr(servo_lease, "time", clock)
+        monkeypatch.setattr(servo_lease, "Fish", lambda *_, **__: self)
+        monkeypatch.setattr(servo_lease, "_EVERY", 0.0)
+        monkeypatch.setattr(signal, "pthread_kill", lambda *_: None)
+
+    def __enter__(self) -> "Asked":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        pass
+
+    def renew_lease(self, lease: str) -> None:
+        self.asked += 1
+        if not self._takes:
+            raise Refused("no-lease", "over")
+        self._now += self._takes.pop(0)
+        raise NoDaemon("it hangs")
+
+
+@pytest.mark.parametrize(
+    ("takes", "asked", "problem"),
+    [((60.0,), 2, Refused), ((1.5,) * 9, 4, NoDaemon), ((60.0, 1.5, 1.5), 2, NoDaemon)],
+    ids=["fishctl was held up", "fishd hangs", "both"],
+)
+def test_a_silence_while_fishctl_was_held_up_says_nothing_of_fishd(
+    monkeypatch: pytest.MonkeyPatch,
+    takes: tuple[float, ...],
+    asked: int,
+    problem: type[FishError],
+) -> None:
+    fishd = Asked(monkeypatch, *takes)
+    renewal = servo_lease.Renewal(None, "a lease")
+    renewal.run()
+    assert (fishd.asked, type(renewal.problem)) == (asked, problem)

@@ -27,6 +27,7 @@ def findings(root: Path, endpoint: str, *overrides: str) -> dict[str, tuple[str,
         return dict(examine(context))
 
 
+@pytest.mark.usefixtures("hurried_doctor")
 def test_beside_a_fishd_that_hangs_no_hardware_is_touched(pi: Bench) -> None:
     with pi.daemon() as daemon:
         daemon.process.send_signal(signal.SIGSTOP)
@@ -81,6 +82,7 @@ def test_what_a_daemon_that_was_killed_leaves_behind_is_no_daemon(
     assert found["daemon"] == ("ok", "no fishd is running")
 
 
+@pytest.mark.usefixtures("hurried_doctor")
 def test_a_program_that_does_not_answer_is_not_taken_for_nobody(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp://127.0.0.1:{mute.getsockname()[1]}"

@@ -1,5 +1,6 @@
 """One fishd for one robot: a second one is refused, whoever runs it, until the first has ended."""
 
+import fcntl
 import os
 import shutil
 import signal
@@ -14,6 +15,7 @@ from rigs.doctor_process import doctor, free_telemetry
 from rigs.operator_rig import Bench
 from rigs.processes import FISHD, Daemon, running
 
+from fishd.core.lockfile import lock_path
 from fishd.hardware import ownership
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
@@ -148,3 +150,21 @@ def test_a_link_that_somebody_put_there_is_not_followed(tmp_path: Path) -> None:
     with ownership.owned([ownership.Part(tmp_path / "bus", "a bus", "force_sensor.bus")]):
         pass
     assert victim.read_text() == "precious"
+
+
+def test_whoever_only_asks_who_the_owner_is_keeps_no_fishd_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = ownership.Part(tmp_path / "fishd-part", "a part", "a.key")
+    slept: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        if sum(slept) > 0.5:  # it was held up meanwhile
+            asks.close()
+
+    monkeypatch.setattr("time.sleep", sleep)
+    with lock_path(part.path).open("w") as asks:
+        fcntl.flock(asks, fcntl.LOCK_SH)
+        with ownership.owned([part]):
+            assert asks.closed

@@ -97,3 +97,23 @@ def test_a_port_that_is_taken_is_named_with_its_key() -> None:
         address = served("tcp://127.0.0.1:0", server)
         with pytest.raises(StartupError, match=f"telemetry.address: cannot listen on {address}"):
             listen(address, "telemetry.address")
+
+
+def test_a_port_that_a_rival_has_bound_too_and_listens_at_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Second(socket.socket):
+        """The rival, which has bound this port, listens before it does."""
+
+        def bind(self, address: tuple[str, int]) -> None:
+            super().bind(address)
+            rival.listen()
+
+    with socket.socket() as rival:
+        rival.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        rival.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{rival.getsockname()[1]}"
+        monkeypatch.setattr(socket, "socket", Second)
+        monkeypatch.setattr("time.sleep", lambda seconds: rival.close())
+        with listen(address, "telemetry.address") as server:
+            assert served(address, server) == address

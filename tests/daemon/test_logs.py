@@ -2,14 +2,17 @@
 
 import io
 import logging
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
+from rigs.processes import PATIENCE
 
 from fishd.daemon.logs import JsonFormatter, LogWriter, TextFormatter
 
@@ -114,3 +117,37 @@ def test_what_cannot_be_logged_is_no_trouble(monkeypatch: pytest.MonkeyPatch) ->
         logging.error("on")
     assert said.getvalue().endswith("error root: on\n")
     assert said.getvalue().count("\n") == 1
+
+
+LATE = """
+import io, os, sys, time
+
+class Late(io.StringIO):
+    def write(self, text):
+        time.sleep(0.8)
+        return os.write(2, text.encode())
+
+sys.stderr = Late()
+from {module} import main
+sys.argv = sys.argv[1:]
+main()
+"""
+"""A program whose line takes a while to be written, as on a machine that is busy."""
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [
+        ("fishd.daemon.main", ("fishd", "--set", "control.address=ipc://{}/no/control")),
+        ("fishd.camera.main", ("fishd-camera", "--set", "publish.requests=ipc://{}/no/requests")),
+    ],
+)
+def test_what_cannot_start_says_why_however_late_its_line_is_written(
+    tmp_path: Path, module: str, arguments: tuple[str, ...]
+) -> None:
+    words = [word.format(tmp_path) for word in arguments]
+    command = [sys.executable, "-c", LATE.format(module=module), *words]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
+    assert ended.returncode == 1
+    assert f"{tmp_path}/no" in ended.stderr
+    assert ended.stderr.endswith("\n")

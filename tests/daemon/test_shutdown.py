@@ -1,6 +1,7 @@
 """A shutdown comes when it is asked for, however the process hangs."""
 
 import asyncio
+import contextlib
 import dataclasses
 import re
 import signal
@@ -8,9 +9,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rigs.harness import Wrapped, fragile_rig
+from rigs.pigpio_rig import TICK, Bench
 from rigs.processes import PATIENCE, Daemon
 
 from fishd.config import Config
@@ -110,7 +114,41 @@ def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdo
         daemon.release_at_once()
 
     asyncio.run(release())
-    assert robot.log == ([None] if countdown == 0.2 else [0.0, None])
+    assert robot.log == ([None] if countdown == 0.2 else [0.0, 0.0, None])
+
+
+def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral() -> None:
+    with contextlib.ExitStack() as stack:
+        bench = Bench(stack)
+        servo = bench.servo()
+        servo.write(0.5)
+        bench.wait(TICK)
+        assert bench.width == 1800
+        bench.faults.inject("pigpiod-frozen")
+        widths: list[float] = []
+
+        class Thawing:
+            """pigpiod answers again as soon as the first write has given up."""
+
+            def write(self, angle: float) -> None:
+                servo.write(angle)
+                bench.faults.clear()
+
+        def rest(seconds: float) -> None:
+            widths.append(bench.width)
+
+        loop: Any = SimpleNamespace(
+            servo=SimpleNamespace(on=True), applied=0.5, robot=SimpleNamespace(servo=Thawing())
+        )
+
+        async def come_to_rest() -> None:
+            daemon = Inside(Config(lockstep=True), print_status=False)
+            daemon._loop, daemon._clock = loop, SimpleNamespace(sleep=rest)  # type: ignore
+            daemon._come_to_rest()
+
+        asyncio.run(come_to_rest())
+        assert servo.driver.counters()["servo_late_answers"] == 1
+        assert widths == [1500]
 
 
 def test_where_fishd_fails_the_servo_is_released_before_a_controller_is_closed(

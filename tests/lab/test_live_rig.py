@@ -123,3 +123,23 @@ def test_a_swim_of_which_nothing_came_is_told() -> None:
     daemon.lost = set(range(1, 30))
     with rig_of(daemon) as rig, pytest.raises(Disturbed, match="20 of 20 ticks were lost"):
         rig.swim("swing", {}, 1.0)
+
+
+class Unstoppable(Late):
+    """It swims, and does not answer to `stop` either."""
+
+    def __init__(self, ended_by: type[BaseException]) -> None:
+        super().__init__(ended_by, loads=False)
+
+    def stop(self) -> State:
+        raise NoDaemon("no answer")
+
+
+@pytest.mark.parametrize(("ended_by", "lines"), [(KeyboardInterrupt, 1), (NoDaemon, 0)])
+def test_a_fish_that_could_not_be_stopped_may_swim_on_and_that_is_said_once(
+    caplog: pytest.LogCaptureFixture, ended_by: type[BaseException], lines: int
+) -> None:
+    with pytest.raises(ended_by), rig_of(Unstoppable(ended_by)) as rig:
+        rig.swim("swing", {}, 1.0)
+    said = "the fish could not be stopped and may swim on: no answer"
+    assert caplog.messages == [said] * lines

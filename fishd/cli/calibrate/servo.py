@@ -75,8 +75,8 @@ class Tail:
         while abs(wanted - self.angle) > _REACHED:
             step = max(-SLOW_STEP, min(SLOW_STEP, wanted - self.angle))
             target = round(self.angle + step, 9)
-            self._fish.set_controller("hold", angle=target)
-            self.angle = self._settled(target)
+            state = self._fish.set_controller("hold", angle=target)
+            self.angle = self._settled(target, state.seq)
             if abs(self.angle - target) > _REACHED:
                 return False
             time.sleep(PAUSE)
@@ -90,8 +90,8 @@ class Tail:
 
     def neutral(self) -> None:
         """Fade to neutral, and wait until the tail is there."""
-        self._fish.stop()
-        self.angle = self._settled(0.0)
+        state = self._fish.stop()
+        self.angle = self._settled(0.0, state.seq)
 
     def _try(self, calibration: ServoCalibration) -> None:
         """Let fishd use a calibration; raises `click.ClickException` while it is in fault."""
@@ -104,10 +104,16 @@ class Tail:
         found = self._fish.calibrate_servo(calibration, save=False, lease=self._lease)
         self._lease, self.calibration = found.lease, calibration
 
-    def _settled(self, target: float) -> float:
-        """Wait until the instruction angle is `target`, or stands still elsewhere; returns it."""
+    def _settled(self, target: float, first: int) -> float:
+        """Wait until the instruction angle is `target`, or stands still elsewhere; returns it.
+
+        first: number of the first tick that knows of the target; telemetry may lag behind answers,
+            and in a tick from before the tail stands still where it was
+        """
         angle = math.nan
         for tick in self._fish.ticks():
+            if tick.seq < first:
+                continue
             previous, angle = angle, tick.phi_c
             if abs(angle - target) < _REACHED or angle == previous:
                 break

@@ -16,6 +16,8 @@ from fishd.core.signals import Status
 
 _EVERY = 1.0
 """Time between two renewals [s]."""
+_HELD_UP = 3.0
+"""No renewal takes so long, unless fishctl itself was held up [s]."""
 _PATIENCE = 15.0
 """How long the way to neutral may take [s]."""
 _BRIEFLY = 2.0
@@ -37,13 +39,16 @@ class Renewal(threading.Thread):
         with Fish(self._endpoint, timeout=_EVERY) as fish:
             renewed = time.monotonic()
             while self.problem is None and not self._stopping.wait(_EVERY):
+                asked = time.monotonic()
                 try:
                     fish.renew_lease(self._lease)
                     renewed = time.monotonic()
                 except Refused as refusal:
                     self.problem = refusal
                 except NoDaemon as silence:
-                    if time.monotonic() - renewed > LEASE:
+                    now = time.monotonic()
+                    held_up = now - asked > _HELD_UP  # then it says nothing of fishd: once more
+                    if now - renewed > LEASE and not held_up:
                         self.problem = silence
         main = threading.main_thread().ident
         if self.problem and main and not self._stopping.is_set():

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fishd.client import Fish
+from fishd.client.connection import TIMEOUT
 from fishd.config import Config, assembly
 from fishd.config.drivers import CHOICES
 from fishd.core.addresses import find_control, socket_path
@@ -25,7 +26,7 @@ from fishd.hardware.checks import Machine, Result, skipped
 
 INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
 """Mends a missing driver."""
-PATIENCE = 1.0
+PATIENCE = TIMEOUT
 """How long a daemon may take to answer [s]."""
 
 

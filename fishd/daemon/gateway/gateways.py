@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -25,7 +26,7 @@ HEALTHY = 10.0
 RETURN = 1.0
 """How long clients may take to connect again [s]."""
 FAREWELL = 0.5
-"""How long it may take to pass on the last messages when fishd ends [s]."""
+"""How long it may take to pass on the last messages from when it is told to end [s]."""
 
 # Memory that a flood took goes back to the system.
 _ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "MALLOC_TRIM_THRESHOLD_": "1048576"}
@@ -95,6 +96,7 @@ class Gateway:
         if self._closed:
             return
         self._closed = True
+        self._farewell = time.monotonic() + FAREWELL
         for timer in (self._timer, self._telling):
             if timer:
                 timer.cancel()
@@ -106,7 +108,7 @@ class Gateway:
         """Wait until it has ended; may be called twice."""
         self.end()
         try:
-            self._process.wait(FAREWELL)
+            self._process.wait(max(0.0, self._farewell - time.monotonic()))
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -9,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 _PAGE = resource.getpagesize()
+_NICE = 5
+"""Nice value of a gateway, and by how much it is nicer than a fishd that is below 0."""
 _PAUSE = 0.1
 """Time between two looks at what is used [s]."""
 _MOST_FILES = 4096
@@ -33,7 +35,7 @@ class ResourceLimits:
         """
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)  # it ends when fishd does
-        os.setpriority(os.PRIO_PROCESS, 0, max(5, os.getpriority(os.PRIO_PROCESS, 0)))
+        _stand_back()
         with suppress(OSError):
             Path("/proc/self/oom_score_adj").write_text("500")  # rather than fishd
         highest = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -67,6 +69,22 @@ class ResourceLimits:
         if used > self._memory:
             return f"it used {used / 2**20:.0f} MB, more than {self._memory / 2**20:.0f} MB"
         return ""
+
+
+def _stand_back() -> None:
+    """Take a lower priority than fishd; where this process has begun anew, no lower one again."""
+    with suppress(ProcessLookupError):  # fishd has just ended, and so will this
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        fishd = os.getpriority(os.PRIO_PROCESS, os.getppid())
+        os.setpriority(os.PRIO_PROCESS, 0, _behind(own, fishd))
+
+
+def _behind(own: int, fishd: int) -> int:
+    """The nice value of a gateway, from its own so far and that of fishd.
+
+    That of a fishd that goes before others goes before them as well.
+    """
+    return max(own, min(_NICE, fishd + _NICE))
 
 
 def _files() -> int:

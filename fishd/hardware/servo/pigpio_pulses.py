@@ -130,9 +130,15 @@ def neutralise(
 
 
 def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool:
+    def look(seconds: float) -> None:
+        sleep(seconds)
+        client.within(ANSWER)  # each of many looks has its own time
+
     scripts = countdowns(client, gpio)
-    energised = pulses_on(client, gpio, sleep)
+    client.within(ANSWER)
+    energised = pulses_on(client, gpio, look)
     if energised:
+        client.within(ANSWER)
         # First a script of its own: this process may be killed, too.
         guard = install(client, gpio, _GUARD, OFF, sleep)
         remove(client, scripts)

@@ -1,10 +1,12 @@
 """The gateways of a real fishd: what happens to them does not happen to fishd."""
 
+import asyncio
 import contextlib
 import json
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -15,6 +17,8 @@ from rigs.documents import ROOT
 from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
 from fishd.client import Fish
+from fishd.daemon.gateway.gateways import FAREWELL, Gateways
+from fishd.daemon.gateway.limits import _behind
 
 ATTACKERS = ROOT / "tools" / "reliability" / "attackers.py"
 
@@ -270,3 +274,51 @@ def test_a_gateway_that_dies_again_and_again_is_reported_all_the_same(daemon: Da
     wait_until(lambda: daemon.status().counters["telemetry_restarts"] >= len(killed))
     _, _, errors = daemon.end()
     assert "the gateway of telemetry was started again: its process ended with status -9" in errors
+
+
+@pytest.mark.parametrize(
+    ("own", "fishd", "expected"),
+    [(0, 0, 5), (3, 3, 5), (10, 10, 10), (-20, -20, -15), (-3, -3, 2)],
+)
+def test_a_gateway_stands_back_behind_fishd_but_not_behind_everything(
+    own: int, fishd: int, expected: int
+) -> None:
+    assert _behind(own, fishd) == expected
+    assert _behind(expected, fishd) == expected  # where it has begun anew
+
+
+def nice(pid: int) -> int:
+    return os.getpriority(os.PRIO_PROCESS, pid)
+
+
+@pytest.mark.parametrize("more", [3, -9])
+def test_gateways_are_as_nice_as_that(tmp_path: Path, more: int) -> None:
+    with running(tmp_path, under=("nice", "-n", str(more))) as daemon:  # or, if forbidden, at 0
+        fishd = nice(daemon.process.pid)
+        expected = max(fishd, min(5, fishd + 5))
+        pids = gateways(daemon).values()
+        assert len(pids) == 2
+        wait_until(lambda: {nice(pid) for pid in pids} == {expected})
+
+
+def test_gateways_that_hang_are_waited_for_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[float] = []
+    really = subprocess.Popen.wait
+
+    def wait(process: "subprocess.Popen[bytes]", timeout: float | None = None) -> int:
+        if timeout is not None:
+            waited.append(timeout)
+        return really(process, timeout)
+
+    async def begin_and_end() -> None:
+        with contextlib.ExitStack() as stack:
+            made = Gateways(f"ipc://{tmp_path}/control", f"ipc://{tmp_path}/telemetry", stack)
+            for gateway in (made.control, made.telemetry):
+                os.kill(gateway._process.pid, signal.SIGSTOP)
+            monkeypatch.setattr(subprocess.Popen, "wait", wait)
+
+    asyncio.run(begin_and_end())
+    assert len(waited) == 2
+    assert sum(waited) <= FAREWELL

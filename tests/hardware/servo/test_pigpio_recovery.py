@@ -1,5 +1,8 @@
 """What the pigpio servo does about a past: killed predecessors, a lost pigpiod, a last resort."""
 
+import time
+from typing import Any
+
 import pigpio
 import pytest
 from msgspec.structs import replace
@@ -9,6 +12,7 @@ from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ServoError
 
 ALT5 = 2
+READ = pigpio._PI_CMD_READ
 
 
 def test_a_fishd_that_starts_after_another_was_killed_ends_its_pulses_gently(bench: Bench) -> None:
@@ -214,6 +218,23 @@ def test_a_pin_that_is_the_peripherals_but_has_no_pulses_is_left_alone(bench: Be
     assert bench.daemon.history(GPIO) == []
     with bench.client() as client:
         assert client.get_mode(GPIO) == ALT5
+
+
+def test_each_of_many_looks_at_a_pin_has_its_own_time_limit(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench.client() as client:
+        client.set_mode(GPIO, ALT5)
+    commands = bench.daemon._commands
+    execute = commands.execute
+
+    def slow(when: float, number: int, *rest: Any) -> tuple[int, bytes]:
+        if number == READ:
+            time.sleep(0.01)  # 1.3 s for all of them
+        return execute(when, number, *rest)
+
+    monkeypatch.setattr(commands, "execute", slow)
+    assert bench.last_resort() is False
 
 
 def test_software_pwm_of_another_program_counts_as_pulses_too(bench: Bench) -> None:
