@@ -28,11 +28,13 @@ class FailsOnce:
 
     def __init__(self) -> None:
         self.runs = 0
+        self.goes_on = threading.Event()
 
     def run(self, sink: Sink, stopping: Stopping) -> None:
         self.runs += 1
         if self.runs == 1:
             raise ZeroDivisionError("in a library")
+        self.goes_on.wait(PATIENCE)
         sink.begin(Timeline(False, "", None))
         picture = np.full((120, 160), 7, np.uint8)
         number = 0
@@ -90,13 +92,12 @@ def serving(
             thread.join(PATIENCE)
 
 
-def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "AGAIN", 3.0)
-    with serving(tmp_path, FailsOnce()) as client:
+def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(tmp_path: Path) -> None:
+    source = FailsOnce()
+    with serving(tmp_path, source) as client:
         problem = "a camera cannot be used: ZeroDivisionError: in a library"
         wait_until(lambda: client.status().problem == problem)
+        source.goes_on.set()
         (frame, *_) = client.poll(PATIENCE)
         assert np.all(frame.pixels == 7)
         wait_until(lambda: client.status().state == "streaming")
