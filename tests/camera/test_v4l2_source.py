@@ -166,6 +166,27 @@ def test_time_stamps_of_another_clock_are_replaced_by_those_of_arrival(good: V4l
     good.until(lambda state: not state.degraded)
 
 
+def test_frames_that_have_waited_in_the_driver_are_dropped_and_counted(good: V4l2Rig) -> None:
+    before = good.until(lambda state: not state.degraded)
+    with good.client() as client:
+        good.set(late=4)
+        found = published(client, 1)
+        while found[-1].header.dropped < before.dropped + 4:
+            found += published(client, 1)
+        after = client.status()
+    assert (after.session, after.degraded) == (before.session, ())
+    assert all(each.header.available - each.header.time < 3.0 for each in found)
+    assert all(a.header.time < b.header.time for a, b in pairwise(found))
+
+
+def test_if_all_frames_seem_to_have_waited_their_clock_is_another_one(good: V4l2Rig) -> None:
+    good.set(late=10**6)
+    state = good.until(lambda state: bool(state.degraded))
+    assert "times are those of arrival" in state.degraded[0]
+    good.set()
+    good.until(lambda state: not state.degraded)
+
+
 def test_controls_are_set_and_tell_the_exposure(tmp_path: Path) -> None:
     controls = (
         "v4l2.controls.auto_exposure=1",
