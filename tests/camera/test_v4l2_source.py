@@ -41,7 +41,7 @@ def test_frames_come_with_the_times_of_the_kernel(good: V4l2Rig) -> None:
     with good.client() as client:
         frames = [each.header for each in published(client, 10)]
         state = client.status()
-    assert all(0.0 < b.time - a.time < 1.0 for a, b in pairwise(frames))
+    assert all(0.0 < b.time - a.time < 5.0 for a, b in pairwise(frames))
     assert 0.0 < time.monotonic() - frames[-1].time < 5.0
     assert state.degraded == ()
     assert (state.picture_width, state.picture_height, state.width) == (640, 480, 84)
@@ -114,9 +114,11 @@ def test_a_camera_that_is_unplugged_is_said_and_followed_when_it_is_back(good: V
 
 
 def test_a_client_is_told_that_the_camera_is_unplugged(good: V4l2Rig) -> None:
-    with good.client(timeout=0.5) as client:
+    with good.client() as client:
         published(client, 2)
         good.set(unplugged=True)
+        good.is_in("unplugged")
+        client._timeout = 0.5  # of silence only: an answer may take as long as it likes
         with pytest.raises(CameraLost, match=r"has been unplugged for \d+ s: /dev/video7: there"):
             for _ in client.frames():
                 pass
