@@ -41,6 +41,8 @@ WAITING = 256
 """Messages that may wait for a client that is busy."""
 _ASK = 0.5
 """In lockstep the camera is asked after so long without a word [s]."""
+_BETWEEN = 0.02
+"""Longest time between two looks at whether all has come that an answer speaks of [s]."""
 
 
 class CameraClient:
@@ -86,6 +88,8 @@ class CameraClient:
         self._heard = time.monotonic()
         self._until: float | None = None
         self._until_moved = False
+        self._seen = 0
+        """Up to this number all frames of the session have come that will come."""
         self._complaint = ""
         try:
             self._requests = CameraRequests(self.endpoint, self._context, timeout)
@@ -189,22 +193,38 @@ class CameraClient:
         deadline = time.monotonic() + patience
         while self._until is None or self._until < tick - EQUAL:
             heard = self._heard
-            self.poll(min(_ASK, max(0.0, deadline - time.monotonic())) if self._until else 0.02)
+            wait = min(_ASK, max(0.0, deadline - time.monotonic())) if self._until else _BETWEEN
+            self.poll(wait)
             if self._until is not None and self._until >= tick - EQUAL:
                 return
             if self._heard > heard and time.monotonic() < deadline:
                 continue
-            self._follow(self.status())
-            if self.state.until is None:
+            state = self.status()
+            self._follow(state)
+            if state.until is None:
                 return  # this fishd has not ended a tick since the camera knows it
+            self._await_frames(state, deadline)
+            if self._session != state.session:
+                continue
             # What was published before this client had subscribed will not come any more.
-            self._until = max(self._until or 0.0, self.state.until)
+            self._until = max(self._until or 0.0, state.until)
             if self._until < tick - EQUAL and time.monotonic() >= deadline:
                 raise CameraLost(
                     f"the camera at {self.endpoint} has no frames for the tick at {tick:.3f} s: it "
                     f"has come to {self._until:.3f} s and is {self.state.state}"
                     + self._in_its_words()
                 )
+
+    def _await_frames(self, state: CameraState, deadline: float) -> None:
+        """Wait for the frames that an answer speaks of: it may overtake them.
+
+        Their socket brings the state twice a second, too, behind all frames that it counts.
+        """
+        while self._session == state.session and self._seen < state.seq:
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return
+            self.poll(min(_BETWEEN, left))
 
     def _why(self, silent: float) -> str:
         camera = f"the camera at {self.endpoint}"
@@ -264,6 +284,7 @@ class CameraClient:
                 self._heard = time.monotonic()
             else:
                 self._follow(message)
+                self._seen = max(self._seen, message.seq)
         return found
 
     def _take(self, published: PublishedFrame) -> Frame | None:
@@ -273,6 +294,7 @@ class CameraClient:
         if self.latest and self.latest.header.session == header.session:
             self.missed += max(0, header.seq - self.latest.header.seq - 1)
         self.latest = published
+        self._seen = max(self._seen, header.seq)
         offset = self._seconds_to_add(header)
         if offset is None:
             return None
@@ -302,6 +324,7 @@ class CameraClient:
         if session != self._session:
             self._session = session
             self._until = None
+            self._seen = 0
             self.history.clear()
             self._camera_clock.forget()
             if self._fishd_clock:

@@ -1,6 +1,7 @@
 """Records a running fishd: a process of its own that subscribes to telemetry."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -43,8 +44,11 @@ ABOUT = (
     "realtime",
 )
 """What is kept of the status of each fishd."""
+UNTOLD = 100
+"""Lines that fishd has not been told yet: older ones are forgotten."""
 WAITING = 20000
 """Messages that may wait for a recorder that is held up: a quarter of an hour."""
+TAKEN_OVER = "another fishd has taken over: the recording goes on with it"
 
 
 class Recorder:
@@ -76,6 +80,8 @@ class Recorder:
         self._writer: RunWriter | None = None
         self._described: Description | None = None
         self._seq = 0
+        self._untold: deque[str] = deque(maxlen=UNTOLD)
+        """What fishd could not be told, as it did not answer in time."""
         self._gone = False
         self._refused = 0
         """Messages that are none of fishd's."""
@@ -151,11 +157,20 @@ class Recorder:
         news, frames = camera.take()
         for line in news:
             self._tell(line)
-            with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
-                fish.mark(text.line(line))
+            self._untold.append(text.line(line))
+        if self._untold and not self._gone:
+            self._mark_untold()
         for head, pixels in frames:
             if lost := self.writer.frame(head, pixels):
                 self._tell(f"just before frame {head.seq}, frames were lost: {lost}")
+
+    def _mark_untold(self) -> None:
+        """Put it into the events; what a fishd that does not answer misses is tried again."""
+        with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
+            while self._untold:
+                with suppress(Refused):
+                    fish.mark(self._untold[0])
+                self._untold.popleft()
 
     def _close(self) -> None:
         self._telemetry.close()
@@ -168,7 +183,7 @@ class Recorder:
         self._described.write(self._writer)
 
     def _take(self, topic: str, payload: bytes) -> None:
-        known = len(self.writer.gaps)
+        known, restarts = len(self.writer.gaps), self.writer.tally.restarts
         try:
             message = self.writer.message(topic, payload)
         except msgspec.DecodeError:
@@ -178,7 +193,7 @@ class Recorder:
             return
         if isinstance(message, TickHead):
             if message.seq <= self._seq:
-                self._tell("another fishd has taken over: the recording goes on with it")
+                self._tell(TAKEN_OVER)
             elif self._gone:
                 self._tell("fishd is heard again: the recording goes on")
             self._gone = False
@@ -188,6 +203,8 @@ class Recorder:
             for gap in self.writer.gaps[known:]:
                 self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
         elif isinstance(message, Status):
+            if self.writer.tally.restarts > restarts:  # its ticks had higher numbers
+                self._tell(TAKEN_OVER)
             # Once its ticks come, so that the file says whose they are.
             if message.pid != self.status.pid and self._seq <= message.seq:
                 self._ask_again()

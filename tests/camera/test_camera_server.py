@@ -11,12 +11,16 @@ from rigs.processes import PATIENCE, wait_until
 
 from fishd.camera import server
 from fishd.camera.client import CameraClient
+from fishd.camera.frames import StackSettings
+from fishd.camera.messages import CameraState
 from fishd.camera.server import Server
 from fishd.camera.settings import load
+from fishd.camera.sockets import Publisher
 from fishd.camera.sources.base import Shot, Sink, Source, Timeline
 
 Stopping = Callable[[float], bool]
 pytestmark = pytest.mark.slow
+TICK = 0.05
 
 
 class FailsOnce:
@@ -24,11 +28,13 @@ class FailsOnce:
 
     def __init__(self) -> None:
         self.runs = 0
+        self.goes_on = threading.Event()
 
     def run(self, sink: Sink, stopping: Stopping) -> None:
         self.runs += 1
         if self.runs == 1:
             raise ZeroDivisionError("in a library")
+        self.goes_on.wait(PATIENCE)
         sink.begin(Timeline(False, "", None))
         picture = np.full((120, 160), 7, np.uint8)
         number = 0
@@ -49,8 +55,29 @@ class Hangs:
             sink.put(Shot(1.0, 1.0, np.zeros((120, 160), np.uint8)))
 
 
+class TwoTicks:
+    """In lockstep; each tick comes once it is let."""
+
+    device = "a camera"
+
+    def __init__(self) -> None:
+        self.lets = threading.Semaphore(0)
+
+    def run(self, sink: Sink, stopping: Stopping) -> None:
+        sink.begin(Timeline(True, "", None))
+        for number in (1, 2):
+            self.lets.acquire(timeout=PATIENCE)
+            picture = np.full((120, 160), number, np.uint8)
+            sink.put(Shot(number * TICK, number * TICK, picture))
+            sink.covered(number * TICK)
+        while not stopping(0.01):
+            sink.alive()
+
+
 @contextmanager
-def serving(folder: Path, source: Source) -> Iterator[CameraClient]:
+def serving(
+    folder: Path, source: Source, stack: StackSettings | None = None
+) -> Iterator[CameraClient]:
     stopping = threading.Event()
     endpoint = f"ipc://{folder}/r"
     pairs = (f"publish.requests={endpoint}", f"publish.frames=ipc://{folder}/f")
@@ -58,20 +85,19 @@ def serving(folder: Path, source: Source) -> Iterator[CameraClient]:
         thread = threading.Thread(target=each.run, args=(stopping.is_set,))
         thread.start()
         try:
-            with CameraClient(endpoint, timeout=PATIENCE) as client:
+            with CameraClient(endpoint, stack=stack, timeout=PATIENCE) as client:
                 yield client
         finally:
             stopping.set()
             thread.join(PATIENCE)
 
 
-def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "AGAIN", 3.0)
-    with serving(tmp_path, FailsOnce()) as client:
+def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(tmp_path: Path) -> None:
+    source = FailsOnce()
+    with serving(tmp_path, source) as client:
         problem = "a camera cannot be used: ZeroDivisionError: in a library"
         wait_until(lambda: client.status().problem == problem)
+        source.goes_on.set()
         (frame, *_) = client.poll(PATIENCE)
         assert np.all(frame.pixels == 7)
         wait_until(lambda: client.status().state == "streaming")
@@ -88,3 +114,36 @@ def test_a_driver_that_hangs_is_said_while_requests_are_answered(
         assert "it hangs" in client.status().problem
         source.goes_on.set()
         wait_until(lambda: client.status().state == "streaming")
+
+
+def test_an_answer_that_comes_before_its_frame_does_not_leave_that_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    holding, held, send = threading.Event(), list[list[bytes]](), Publisher.send
+
+    def send_later(publisher: Publisher, parts: list[bytes]) -> None:
+        held.append(parts)
+        while held and not holding.is_set():
+            send(publisher, held.pop(0))
+
+    monkeypatch.setattr(Publisher, "send", send_later)
+    source = TwoTicks()
+    with serving(tmp_path, source, StackSettings(frames=1)) as client:
+        ask = client.status
+
+        def ask_and_let_go() -> CameraState:
+            state = ask()
+            holding.clear()
+            return state
+
+        source.lets.release()
+        wait_until(lambda: ask().until == TICK)
+        first = client.stack_at(TICK)
+        holding.set()
+        source.lets.release()
+        wait_until(lambda: ask().until == 2 * TICK)
+        monkeypatch.setattr(client, "status", ask_and_let_go)
+        second = client.stack_at(2 * TICK)
+    assert first
+    assert second
+    assert (first[0][0, 0], second[0][0, 0]) == (1, 2)

@@ -34,13 +34,15 @@ def test_a_file_is_played_at_its_own_rate_again_and_again(tmp_path: Path, video:
         camera.client() as client,
     ):
         frames = []
-        while len(frames) < 30:
+        while len(frames) < 60:
             frames += client.poll(PATIENCE)
         state = client.status()
     levels = [round(float(np.median(frame.pixels[:, 5:35])) / 10) * 10 for frame in frames]
     numbers = [(each - level(0)) // 10 for each in levels]
     assert all(after == (before + 1) % 12 for before, after in pairwise(numbers))
-    assert frames[-1].time - frames[0].time >= 29 / 50.0 - 0.03
+    # After a stop of the machine it catches up: the longest time of 30 frames is judged.
+    longest = max(b.time - a.time for a, b in zip(frames[:-29], frames[29:], strict=True))
+    assert longest >= 29 / 50.0 - 0.03
     assert state.degraded == ("times are those of playing: a file is no camera",)
     assert (state.picture_width, state.picture_height) == (160, 120)
 

@@ -41,7 +41,7 @@ def test_frames_come_with_the_times_of_the_kernel(good: V4l2Rig) -> None:
     with good.client() as client:
         frames = [each.header for each in published(client, 10)]
         state = client.status()
-    assert all(0.0 < b.time - a.time < 1.0 for a, b in pairwise(frames))
+    assert all(0.0 < b.time - a.time < 5.0 for a, b in pairwise(frames))
     assert 0.0 < time.monotonic() - frames[-1].time < 5.0
     assert state.degraded == ()
     assert (state.picture_width, state.picture_height, state.width) == (640, 480, 84)
@@ -114,9 +114,11 @@ def test_a_camera_that_is_unplugged_is_said_and_followed_when_it_is_back(good: V
 
 
 def test_a_client_is_told_that_the_camera_is_unplugged(good: V4l2Rig) -> None:
-    with good.client(timeout=0.5) as client:
+    with good.client() as client:
         published(client, 2)
         good.set(unplugged=True)
+        good.is_in("unplugged")
+        client._timeout = 0.5  # of silence only: an answer may take as long as it likes
         with pytest.raises(CameraLost, match=r"has been unplugged for \d+ s: /dev/video7: there"):
             for _ in client.frames():
                 pass
@@ -162,6 +164,27 @@ def test_time_stamps_of_another_clock_are_replaced_by_those_of_arrival(good: V4l
     with good.client() as client:
         header = published(client, 1)[0].header
     assert abs(time.monotonic() - header.time) < 5.0
+    good.set()
+    good.until(lambda state: not state.degraded)
+
+
+def test_frames_that_have_waited_in_the_driver_are_dropped_and_counted(good: V4l2Rig) -> None:
+    before = good.until(lambda state: not state.degraded)
+    with good.client() as client:
+        good.set(late=4)
+        found = published(client, 1)
+        while found[-1].header.dropped < before.dropped + 4:
+            found += published(client, 1)
+        after = client.status()
+    assert (after.session, after.degraded) == (before.session, ())
+    assert all(each.header.available - each.header.time < 3.0 for each in found)
+    assert all(a.header.time < b.header.time for a, b in pairwise(found))
+
+
+def test_if_all_frames_seem_to_have_waited_their_clock_is_another_one(good: V4l2Rig) -> None:
+    good.set(late=10**6)
+    state = good.until(lambda state: bool(state.degraded))
+    assert "times are those of arrival" in state.degraded[0]
     good.set()
     good.until(lambda state: not state.degraded)
 

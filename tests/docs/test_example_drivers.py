@@ -211,8 +211,13 @@ PCA9685 = ["servo.driver=pca9685", "servo.bus=177", "force_sensor.bus=178"]
     ids=["hx711", "pca9685"],
 )
 def test_a_second_fishd_on_the_same_chip_is_refused(
-    tmp_path: Path, settings: list[str], part: int, complaint: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: list[str],
+    part: int,
+    complaint: str,
 ) -> None:
+    monkeypatch.setattr(ownership, "FOLDER", tmp_path)
     config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])
     with (
         ownership.owned(assembly.parts_of(config)[part : part + 1]),
@@ -220,9 +225,6 @@ def test_a_second_fishd_on_the_same_chip_is_refused(
         pytest.raises(StartupError, match=complaint),
     ):
         assembly.open_robot(config, VirtualClock(), stack)
-    for name in ("gpio2[567]", "i2c-17[78]*"):
-        for lock in ownership.FOLDER.glob(f"fishd-{name}.lock"):
-            lock.unlink()
 
 
 class ServoBoard:

@@ -62,7 +62,7 @@ def test_frames_and_forces_are_in_one_file_on_one_clock(
     ahead = [tick.t - tick.time for tick in run.ticks]
     for frame in frames:
         assert min(ahead) - 1e-3 < frame.t - frame.time < max(ahead) + 1e-3
-        assert 0.03 <= frame.available - frame.time < 2.0
+        assert 0.03 <= frame.available - frame.time < 10.0
     listed = fishctl("runs").stdout
     assert f"{len(frames)} frames" in listed
     assert "lost" not in listed.splitlines()[1]
@@ -110,11 +110,13 @@ def test_a_recording_with_a_camera_does_not_begin_without_one(
 def test_what_follows_the_option_is_the_camera_only_where_it_is_an_address(
     daemon: Daemon, camera: CameraProcess, runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    named = daemon.fishctl("record", "--camera", camera.endpoint, "first", "--for", "1")
-    monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
-    alone = daemon.fishctl("record", "--for", "1", "--camera", "second")
-    assert (named.returncode, alone.returncode) == (0, 0), named.stderr + alone.stderr
-    assert all(open_run(runs / f"{name}.mcap").frame_heads for name in ("first", "second"))
+    for words in (("--camera", camera.endpoint, "first"), ("--camera", "second")):
+        process = Process(FISHCTL, "--endpoint", daemon.endpoint, "record", *words)
+        wait_until(lambda: bool(heads_in(runs)))
+        status, _, complaints = process.end(signal.SIGINT)
+        assert status == 0, complaints
+        assert open_run(runs / f"{words[-1]}.mcap").frame_heads
+        monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
     refused = one_line(daemon.fishctl("record", "third", "--camera", "config/camera.yaml"))
     assert "'config/camera.yaml' is a file" in refused
 

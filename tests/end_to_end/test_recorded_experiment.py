@@ -1,12 +1,12 @@
 """An experiment on a running fishd, recorded while the fish swims."""
 
 import signal
-import time
 from pathlib import Path
 
 from rigs.processes import FISHCTL, Daemon, Process, wait_until
 
 from fishd.client import Fish
+from fishd.core.errors import RecordingError
 from fishd.lab.rig import LiveRig
 from fishd.lab.rig_recording import recorded
 from fishd.recording import open_run
@@ -29,6 +29,14 @@ def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path:
     assert all(each.from_start and each.equal == each.ticks >= 30 for each in found)
 
 
+def excited_in(part: Path) -> int:
+    """How many ticks of the excitation a recording that is being written has so far."""
+    try:
+        return open_run(part).summary.swimming.get("excitation", 0)
+    except RecordingError:
+        return 0
+
+
 def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     daemon: Daemon, tmp_path: Path
 ) -> None:
@@ -36,7 +44,7 @@ def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     words = ("identify", "--experiment", "--on", "robot", "--for", "40", "--record", str(path))
     swims = Process(FISHCTL, "--endpoint", daemon.endpoint, *words)
     wait_until(lambda: daemon.status().mode == "running")
-    time.sleep(1.0)
+    wait_until(lambda: excited_in(path.with_name("run.mcap.part")) >= 15)
     status, out, err = swims.end(signal.SIGTERM)
     assert (status, out) == (130, "")
     assert err.endswith(

@@ -7,6 +7,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import ClassVar, Self
 
 import msgspec
 import pytest
@@ -15,10 +16,14 @@ from rigs.harness import Rig
 from rigs.kills import ends_before
 from rigs.recordings import recorded, status, swum, write
 
-from fishd.core.errors import RecordingError
+from fishd.config import Config
+from fishd.core.errors import NoDaemon, RecordingError, Refused
+from fishd.core.signals import Tick
 from fishd.recording import Gap, RunWriter, open_run, read
+from fishd.recording import recorder as recorder_module
+from fishd.recording.camera_tap import Taken
 from fishd.recording.folder import find, glance, glances, paths
-from fishd.recording.recorder import Recorder
+from fishd.recording.recorder import Description, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
 from fishd.simulation import simulate
@@ -274,6 +279,75 @@ def test_a_flood_of_what_is_none_of_fishds_is_counted_and_told_twice(tmp_path: P
         "messages that are none of fishd's, left out: 3",
     ]
     assert len(open_run(tmp_path / "run.mcap").ticks) == 1
+
+
+@pytest.mark.parametrize("seq", [3, 30], ids=["lower", "higher"])
+def test_it_is_told_once_that_another_fishd_has_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seq: int
+) -> None:
+    ticks, said = swum().recorder.ticks, list[str]()
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
+    now = [description_of(ticks[0], pid=1)]
+    monkeypatch.setattr(recorder, "_ask", lambda: now[-1])
+    recorder._described = now[-1]
+    recorder._open()
+    for tick in ticks[:20]:
+        hear(recorder, tick, pid=1)
+    now.append(description_of(ticks[seq], pid=2))
+    for tick in ticks[seq:]:
+        hear(recorder, tick, pid=2)
+    recorder.__exit__(None, None, None)
+    assert [line for line in said if "another fishd" in line] == [
+        "another fishd has taken over: the recording goes on with it"
+    ]
+    run = open_run(tmp_path / "run.mcap")
+    assert run.summary.restarts == 1
+    assert [each["pid"] for each in run.daemons] == ["1", "2"]
+
+
+def description_of(tick: Tick, pid: int) -> Description:
+    return Description(status(tick, pid), msgspec.to_builtins(Config()), None)
+
+
+def hear(recorder: Recorder, tick: Tick, pid: int) -> None:
+    """A tick, and a status behind it."""
+    recorder._take("tick", msgspec.json.encode(tick))
+    recorder._take("status", msgspec.json.encode(status(tick, pid)))
+
+
+def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached: list[Exception | None] = [NoDaemon(), None, Refused("full", ""), None, None]
+    marks: list[str] = []
+
+    class Fishd:
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        def __enter__(self) -> Self:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def mark(self, line: str) -> None:
+            if error := reached.pop(0):
+                raise error
+            marks.append(line)
+
+    class Camera:
+        news: ClassVar = [["it is gone"], [], ["it is back", "and again"], ["and well"]]
+
+        def take(self) -> Taken:
+            return Taken(self.news.pop(0), [])
+
+    monkeypatch.setattr(recorder_module, "Fish", Fishd)
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lambda line: None)
+    for _ in range(4):
+        recorder._take_frames(Camera())
+    recorder._close()
+    assert marks == ["it is gone", "and again", "and well"]
 
 
 def test_a_run_that_never_began_leaves_no_file(tmp_path: Path) -> None:

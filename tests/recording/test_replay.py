@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from rigs.processes import FISHCTL, Process, Subscriber, fishctl, one_line, wait_until
+from rigs.processes import FISHCTL, PATIENCE, Process, Subscriber, fishctl, one_line, wait_until
 from rigs.recordings import recorded, swum
 
 from fishd.client import Fish, Refused
@@ -30,12 +30,18 @@ def replay(tmp_path: Path) -> Iterator[Replay]:
 def test_a_replay_is_the_recorded_bytes_at_the_recorded_speed(replay: Replay) -> None:
     recorded = [entry.payload for entry in replay._run.entries]
     with Subscriber(replay.telemetry) as subscriber:
+
+        def hears() -> bool:
+            replay._publisher.send_multipart([b"probe", b""])
+            return bool(subscriber.socket.poll(20))
+
+        wait_until(hears)
         player = threading.Thread(target=replay.play, args=(5.0,))
         player.start()
         heard = []
         while len(heard) < len(recorded):
             topic, payload = subscriber.socket.recv_multipart()
-            if topic != b"status":  # of a virtual run, in which none was recorded
+            if topic not in (b"probe", b"status"):  # of a virtual run, none was recorded
                 heard.append(payload)
         player.join()
     assert heard == recorded
@@ -52,21 +58,27 @@ def test_a_replay_ends_by_a_signal_and_leaves_no_socket(tmp_path: Path, number: 
     assert not socket.exists()
 
 
-def test_a_client_sees_the_replay_and_cannot_steer_it(replay: Replay) -> None:
-    player = threading.Thread(target=replay.play, args=(3.0,))
-    player.start()
-    with Fish(replay.control) as fish:
-        status = fish.status()
-        assert (status.name, status.telemetry) == ("replay of run", replay.telemetry)
-        (first, second) = (tick for _, tick in zip(range(2), fish.ticks(), strict=False))
-        assert second.seq == first.seq + 1
-        after = fish.status()
-        assert (after.mode, after.controller) == ("running", "swing")
-        assert after.seq >= second.seq
-        assert fish.config()["tick"] == 0.05
-        with pytest.raises(Refused, match="it can be watched, not steered"):
-            fish.stop()
-    player.join()
+def test_a_client_sees_the_replay_and_cannot_steer_it(tmp_path: Path) -> None:
+    run = recorded(swum(30.0), tmp_path / "run", source="simulation")
+    control, telemetry = f"ipc://{tmp_path}/control", f"ipc://{tmp_path}/telemetry"
+    words = ("--speed", "0.5", "--address", telemetry, "--control", control)
+    player = Process(FISHCTL, "replay", str(run), *words)
+    try:
+        wait_until((tmp_path / "control").exists)
+        with Fish(control, timeout=PATIENCE) as fish:
+            status = fish.status()
+            assert (status.name, status.telemetry) == ("replay of run", telemetry)
+            (first, second) = (tick for _, tick in zip(range(2), fish.ticks(), strict=False))
+            assert second.seq == first.seq + 1
+            after = fish.status()
+            assert (after.mode, after.controller) == ("running", "swing")
+            assert after.seq >= second.seq
+            assert fish.config()["tick"] == 0.05
+            with pytest.raises(Refused, match="it can be watched, not steered"):
+                fish.stop()
+    finally:
+        ended = player.end(signal.SIGINT)[0]
+    assert ended == 0
 
 
 def test_an_address_in_use_is_said_in_one_line(replay: Replay, tmp_path: Path) -> None:

@@ -46,6 +46,8 @@ class Faults(msgspec.Struct, frozen=True):
     """Bytes between the end of the image and its end marker, as many cameras send."""
     realtime_stamps: bool = False
     """Time stamps are of another clock than the monotonic one."""
+    late: int = 0
+    """So many frames come with time stamps that are 3 s old, as if they had waited so long."""
     end_of_frame: bool = False
     formats: tuple[str, ...] = FORMATS
     rate: float | None = None
@@ -90,6 +92,7 @@ class V4l2Camera:
         self._buffers = 0
         self._streaming = False
         self._sequence = -1
+        self._late = 0
         self._start_reading()
         threading.Thread(target=self._live, daemon=True).start()
 
@@ -236,18 +239,19 @@ class V4l2Camera:
         self._done.clear()
 
     def _start_reading(self) -> None:
-        self._stamp = 0
+        self._content = b""
         self._read_faults()
 
     def _read_faults(self) -> None:
         try:
-            stamp = self._file.stat().st_mtime_ns
-            if stamp == self._stamp:
+            content = self._file.read_bytes()
+            if content == self._content:
                 return
-            self._stamp = stamp
-            self.faults = msgspec.json.decode(self._file.read_bytes(), type=Faults)
+            self.faults = msgspec.json.decode(content, type=Faults)
         except (OSError, msgspec.DecodeError):
             return
+        self._content = content
+        self._late = self.faults.late
         if self.faults.unplugged and self._event is not None and self._ours is not None:
             self._gone.add(self._event)
             self._streaming = False
@@ -277,6 +281,9 @@ class V4l2Camera:
         begun = time.monotonic() - exposure - 0.005
         stamp = begun + exposure if faults.end_of_frame else begun
         flags = 0x2000 | (0 if faults.end_of_frame else 0x10000)
+        if self._late:
+            self._late -= 1
+            stamp -= 3.0
         if faults.realtime_stamps:
             stamp, flags = time.time(), 0x10000
         self._done.append((index, len(data), self._sequence, stamp, flags))

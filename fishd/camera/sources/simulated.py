@@ -20,7 +20,7 @@ from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
-from fishd.client.connection import subscriber
+from fishd.client.connection import SECOND_LOOK, subscriber
 from fishd.core.addresses import find_control
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError
@@ -154,7 +154,8 @@ class SimulatedSource:
                     heard = time.monotonic()
                     if fish.status().pid != status.pid:
                         return
-                    view.idle()
+                    if not socket.poll(SECOND_LOOK):  # else this process itself was held up
+                        view.idle()
                 view.ahead = offset.update().seconds
         finally:
             context.destroy(linger=0)

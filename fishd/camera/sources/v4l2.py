@@ -12,7 +12,7 @@ from linuxpy.video.device import Frame
 from fishd.camera.settings import V4l2Settings
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.camera.sources.decoding import Broken, grey
-from fishd.camera.sources.v4l2_device import OpenCamera, explained, opened
+from fishd.camera.sources.v4l2_device import BUFFERS, OpenCamera, explained, opened
 from fishd.core.clock import boot_id
 
 AGAIN = 1.0
@@ -64,6 +64,8 @@ class _Stream:
         self._capture, self._format, self._exposure, self._degraded = camera
         self._stamped: bool | None = None
         """Do its time stamps count?"""
+        self._late = 0
+        """Frames in a row that were too old."""
         self._number: int | None = None
 
     def take(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
@@ -114,6 +116,9 @@ class _Stream:
             if 0 < lost < _MOST_LOST:
                 sink.lost(dropped=lost)
         self._number = number
+        if self._is_late(frame, arrived):
+            sink.lost(dropped=1)
+            return None
         found = self._format
         try:
             if frame.buff.flags & _ERROR:
@@ -127,6 +132,20 @@ class _Stream:
         moment = self._moment(frame, arrived, sink)
         sink.put(Shot(moment, time.monotonic(), picture, self._exposure))
         return None
+
+    def _is_late(self, frame: Frame, arrived: float) -> bool:
+        """Did it wait in the driver while this process stood still?
+
+        No more can wait than the driver holds: if all that come are as old, it is another clock.
+        """
+        late = (
+            self._stamped is True
+            and frame.buff.flags & _CLOCK_MASK == _MONOTONIC
+            and arrived - frame.timestamp >= _OLDEST
+            and self._late < BUFFERS
+        )
+        self._late = self._late + 1 if late else 0
+        return late
 
     def _moment(self, frame: Frame, arrived: float, sink: Sink) -> float:
         """Middle of the exposure [s, monotonic]."""
