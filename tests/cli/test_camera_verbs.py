@@ -8,7 +8,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import pytest
 from playwright.sync_api import expect
 from rigs.browser import needs_browser, opened
 from rigs.camera_process import CameraProcess, running_camera
+from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import (
     FISHCTL,
     PATIENCE,
@@ -32,6 +33,7 @@ from rigs.processes import (
 from fishd.camera.settings import load
 from fishd.client import Fish
 
+FRAME = re.compile(r"frame (\d+),")
 TICK = 0.05
 OFF, TILT, LATENCY = 3.0, 0.04, 0.05
 CAMERA = (
@@ -93,21 +95,23 @@ def width_of(picture: Path) -> int:
     return found.shape[1]
 
 
-def in_terminal(columns: int, *words: str, seconds: float = 0.0) -> str:
-    """What a verb draws on a terminal; ended by Ctrl-C after so long."""
+def in_terminal(
+    columns: int, *words: str, until: Callable[[str], bool] | None = None, **env: str
+) -> str:
+    """What a verb draws on a terminal.
+
+    until: press Ctrl-C once this is true of what was drawn so far
+    """
     pid, terminal = pty.fork()
     if pid == 0:
-        environment = os.environ | {
-            "TERM": "xterm-256color",
-            "COLUMNS": str(columns),
-            "LINES": "30",
-        }
+        screen = {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": "30"}
+        environment = os.environ | screen | env
         os.execve(FISHCTL, ["fishctl", "camera", *words], environment)
     drawn, begun = b"", time.monotonic()
     while time.monotonic() - begun < PATIENCE:
-        if seconds and drawn and time.monotonic() - begun > seconds:
+        if until and until(drawn.decode(errors="replace")):
             os.write(terminal, b"\x03")
-            seconds = 0.0
+            until = None
         if select.select([terminal], [], [], 0.1)[0]:
             try:
                 drawn += os.read(terminal, 65536)
@@ -157,9 +161,19 @@ def test_a_view_in_a_terminal_is_a_picture_that_fits_its_width() -> None:
 
 
 def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemon) -> None:
-    drawn = in_terminal(100, "view", "--follow", seconds=3.0)
-    assert len(set(re.findall(r"frame (\d+),", drawn))) > 5
-    assert drawn.count("\x1b[?1049h") == drawn.count("\x1b[?1049l") == 1  # the screen is restored
+    drawn = in_terminal(
+        100, "view", "--follow", until=lambda drawn: len(set(FRAME.findall(drawn))) > 5
+    )
+    assert len(set(FRAME.findall(drawn))) > 5
+    assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1  # the screen is restored
+
+
+def test_ctrl_c_at_the_moment_when_a_view_takes_the_screen_gives_it_back(
+    camera: CameraProcess, tmp_path: Path
+) -> None:
+    drawn = in_terminal(100, "view", "--follow", **signal_as_drawing_begins(tmp_path, "SIGINT"))
+    assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1
+    assert "Traceback" not in drawn
 
 
 def test_a_view_is_written_with_the_axis_once_that_is_looked_for(

@@ -19,13 +19,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 from rich.screen import Screen
+from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import FISHCTL, PATIENCE, Daemon, running
 
 from fishd.cli.watch_screen import View
 from fishd.client import Fish
 from fishd.core.signals import Percentiles, Reason, Status, Tick, Timing
 
-ENTER_SCREEN, LEAVE_SCREEN = "\x1b[?1049h", "\x1b[?1049l"
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
 BRAILLE = re.compile("[\u2801-\u28ff]")
@@ -156,6 +156,17 @@ def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
     figures = ("swing", "thrust", "tail beat", "late", "busy", "missed", "lost")
     for word in (*figures, "fx mN", "fy mN", "phi_c rad"):
         assert word in terminal.text
+    assert "Traceback" not in terminal.text
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_at_the_moment_when_it_takes_the_screen_gives_it_back(
+    daemon: Daemon, tmp_path: Path, name: str
+) -> None:
+    terminal = Terminal(daemon, **signal_as_drawing_begins(tmp_path, name))
+    assert terminal.finish() == 0
+    assert ENTER_SCREEN in terminal.text
+    assert terminal.restored
     assert "Traceback" not in terminal.text
 
 
