@@ -12,7 +12,7 @@ import struct
 import subprocess
 import termios
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,12 +59,13 @@ class Terminal:
     def resize(self, columns: int, rows: int) -> None:
         fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
 
-    def wait_for(self, pattern: str) -> None:
-        """Read until `pattern` turns up in what is new."""
+    def wait_for(self, pattern: str, meanwhile: Callable[[], object] = lambda: None) -> None:
+        """Read until `pattern` turns up in what is new; meanwhile: done again and again."""
         deadline = time.monotonic() + PATIENCE
         start = len(self.text)
         while not re.search(pattern, self.text[start:]):
             assert time.monotonic() < deadline, self.text
+            meanwhile()
             self._read()
             time.sleep(0.02)
 
@@ -100,7 +101,7 @@ class Terminal:
 
 
 def test_json_streams_every_tick_as_one_line(daemon: Daemon) -> None:
-    ended = daemon.fishctl("watch", "--json", "--seconds", "1.5")
+    ended = daemon.fishctl("watch", "--json", "--seconds", "3")
     assert (ended.returncode, ended.stderr) == (0, "")
     ticks = [json.loads(line) for line in ended.stdout.splitlines()]
     first = ticks[0]["seq"]
@@ -142,9 +143,11 @@ def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
 ) -> None:
     terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
-    with Fish(daemon.endpoint) as fish:
-        fish.mark("a weight on the sensor")
-        terminal.wait_for("mark: a weight on the sensor")
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        # Events have a subscription of their own, which may begin after the first tick is drawn.
+        terminal.wait_for(
+            "mark: a weight on the sensor", meanwhile=lambda: fish.mark("a weight on the sensor")
+        )
         fish.estop("the net")
     terminal.wait_for("estop: the net")
     terminal.signal(number)
