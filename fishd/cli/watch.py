@@ -11,6 +11,7 @@ from contextlib import suppress
 
 import click
 
+from fishd.cli.drawing import whole_screen
 from fishd.cli.options import FiniteRange, daemon_options
 from fishd.cli.output import echo, measured, print_json_line, time_of_day
 from fishd.client import AsyncFish
@@ -64,8 +65,6 @@ async def _print_lines(fish: AsyncFish) -> None:
 
 
 async def _draw(fish: AsyncFish) -> None:
-    from rich.live import Live
-
     from fishd.cli.watch_screen import View
 
     view = View(await fish.status())
@@ -73,7 +72,7 @@ async def _draw(fish: AsyncFish) -> None:
     events = asyncio.create_task(view.collect(fish.events()))
     drawn = -math.inf
     try:
-        with Live(screen=True, auto_refresh=False) as live:
+        with whole_screen() as live:
             async for tick in fish.ticks():
                 view.add(tick)
                 # Counted from the end of a drawing: what a slow terminal held up is read first.

@@ -45,6 +45,18 @@ def interrupted_once() -> Iterator[None]:
 
 
 @contextmanager
+def held_back(signals: Iterable[int] = SIGNALS) -> Iterator[None]:
+    """What comes while this lasts acts as before as soon as it ends."""
+    came: list[int] = []
+    try:
+        with handled(signals, lambda number, _: came.append(number)):
+            yield
+    finally:
+        for number in came:
+            signal.raise_signal(number)
+
+
+@contextmanager
 def handled(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
     """While this lasts, these go to `handler`, in the main thread; yields who had them before.
 

@@ -47,7 +47,7 @@ def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
     assert "lowest stays at -1.2" in dialogue.answer("Save it?", "y")
     assert dialogue.finish() == 0
     assert dialogue.text.endswith(f"saved in {rig.files('servo')[-1]}\n")
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         found = fish.calibrations()
         assert (found.servo.trim, found.servo.direction) == (30.0, -1)
         assert (found.servo.lowest, found.servo.highest) == (-1.2, 0.1)
@@ -73,7 +73,7 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_what_was_in_force(
     assert "Traceback" not in dialogue.text
     assert calibrations(daemon) == before
     assert rig.files("servo") == []
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         assert fish.status().mode == "idle"
     rig.wait_for_pulse(1499, 1501)
 
@@ -169,7 +169,7 @@ def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_befor
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.expect("trim +25 µs> ")
     rig.pi.inject("unplugged")
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         for status in iter(fish.status, None):
             if status.mode == "fault":
                 break

@@ -8,7 +8,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import pytest
 from playwright.sync_api import expect
 from rigs.browser import needs_browser, opened
 from rigs.camera_process import CameraProcess, running_camera
+from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import (
     FISHCTL,
     PATIENCE,
@@ -32,8 +33,9 @@ from rigs.processes import (
 from fishd.camera.settings import load
 from fishd.client import Fish
 
+FRAME = re.compile(r"frame (\d+),")
 TICK = 0.05
-OFF, TILT, LATENCY = 3.0, 0.04, 0.05
+OFF, TILT, LATENCY = 3.0, 0.04, 0.03
 CAMERA = (
     "simulated.rate=30", f"simulated.latency={LATENCY}", "simulated.jitter=0.003",
     f"simulated.off_axis={OFF}", f"simulated.tilt={TILT}", "simulated.noise=6",
@@ -65,7 +67,7 @@ def daemon(daemon_of_all: Daemon, camera: CameraProcess) -> Daemon:
 
 @pytest.fixture
 def swimming(daemon: Daemon) -> Daemon:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("swing")
     return daemon
 
@@ -93,21 +95,23 @@ def width_of(picture: Path) -> int:
     return found.shape[1]
 
 
-def in_terminal(columns: int, *words: str, seconds: float = 0.0) -> str:
-    """What a verb draws on a terminal; ended by Ctrl-C after so long."""
+def in_terminal(
+    columns: int, *words: str, until: Callable[[str], bool] | None = None, **env: str
+) -> str:
+    """What a verb draws on a terminal.
+
+    until: press Ctrl-C once this is true of what was drawn so far
+    """
     pid, terminal = pty.fork()
     if pid == 0:
-        environment = os.environ | {
-            "TERM": "xterm-256color",
-            "COLUMNS": str(columns),
-            "LINES": "30",
-        }
+        screen = {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": "30"}
+        environment = os.environ | screen | env
         os.execve(FISHCTL, ["fishctl", "camera", *words], environment)
     drawn, begun = b"", time.monotonic()
     while time.monotonic() - begun < PATIENCE:
-        if seconds and drawn and time.monotonic() - begun > seconds:
+        if until and until(drawn.decode(errors="replace")):
             os.write(terminal, b"\x03")
-            seconds = 0.0
+            until = None
         if select.select([terminal], [], [], 0.1)[0]:
             try:
                 drawn += os.read(terminal, 65536)
@@ -157,9 +161,19 @@ def test_a_view_in_a_terminal_is_a_picture_that_fits_its_width() -> None:
 
 
 def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemon) -> None:
-    drawn = in_terminal(100, "view", "--follow", seconds=3.0)
-    assert len(set(re.findall(r"frame (\d+),", drawn))) > 5
-    assert drawn.count("\x1b[?1049h") == drawn.count("\x1b[?1049l") == 1  # the screen is restored
+    drawn = in_terminal(
+        100, "view", "--follow", until=lambda drawn: len(set(FRAME.findall(drawn))) > 5
+    )
+    assert len(set(FRAME.findall(drawn))) > 5
+    assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1  # the screen is restored
+
+
+def test_ctrl_c_at_the_moment_when_a_view_takes_the_screen_gives_it_back(
+    camera: CameraProcess, tmp_path: Path
+) -> None:
+    drawn = in_terminal(100, "view", "--follow", **signal_as_drawing_begins(tmp_path, "SIGINT"))
+    assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1
+    assert "Traceback" not in drawn
 
 
 def test_a_view_is_written_with_the_axis_once_that_is_looked_for(
@@ -175,7 +189,7 @@ def test_a_view_is_written_with_the_axis_once_that_is_looked_for(
 
 
 def test_no_axis_is_found_while_the_fish_rests(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         ticks = fish.ticks()
         wait_until(lambda: abs(float(next(ticks).alpha)) < 1e-4)  # type: ignore[arg-type]
     complaint = one_line(fishctl("camera", "view", "--axis"))
@@ -211,7 +225,7 @@ def test_alignment_needs_a_fish_that_swims(daemon: Daemon) -> None:
 
 
 def test_a_fish_that_swims_without_moving_has_no_axis(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("hold")
     complaint = one_line(fishctl("camera", "align", "--for", "3"))
     assert "let the fish swim, and see that the camera looks at its tail" in complaint
@@ -245,7 +259,7 @@ def test_alignment_lets_the_fish_swim_where_it_is_told_to_and_rest_afterwards(
 
 def test_a_swim_goes_on_after_the_program_was_itself_held_up(daemon: Daemon) -> None:
     process = Process(FISHCTL, "camera", "align", "--swim", "--for", "6")
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         wait_until(lambda: fish.status().mode == "running")
         ticks = fish.ticks()
         first = next(ticks).seq
@@ -261,7 +275,7 @@ def test_a_swim_goes_on_after_the_program_was_itself_held_up(daemon: Daemon) -> 
 
 def test_ctrl_c_stops_the_fish(daemon: Daemon) -> None:
     process = Process(FISHCTL, "camera", "latency")
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         deadline = time.monotonic() + PATIENCE
         while fish.status().mode != "running":
             assert time.monotonic() < deadline
@@ -290,7 +304,7 @@ def test_a_fishd_that_is_in_lockstep_is_not_let_swim(tmp_path: Path) -> None:
         running(tmp_path, "--set", "lockstep=true") as daemon,
         running_camera(tmp_path, f"simulated.fishd={daemon.endpoint}") as camera,
     ):
-        camera.until(lambda state: state.virtual or state.state == "waiting")
+        camera.until(lambda state: state.virtual)
         words = ("--endpoint", daemon.endpoint, "--camera", camera.endpoint)
         complaint = one_line(fishctl("camera", "align", "--swim", "--for", "3", *words))
     assert "lockstep" in complaint
@@ -305,11 +319,13 @@ def test_the_page_shows_the_view_live_with_the_axis_in_a_true_browser(swimming: 
         url = re.fullmatch(r"the camera is at (http://127\.0\.0\.1:\d+/); Ctrl-C ends it\n", line)
         assert url
         with opened(url[1]) as (page, complaints):
-            page.wait_for_selector(".pill.streaming")
+            page.wait_for_selector(".pill.streaming", timeout=PATIENCE * 1e3)
             expect(page.locator("#axis")).to_contain_text("px", timeout=PATIENCE * 1e3)
             before = page.inner_text("#seq")
-            expect(page.locator("#seq")).not_to_have_text(before)
-            row = page.evaluate(RED_ROW)
+            expect(page.locator("#seq")).not_to_have_text(before, timeout=PATIENCE * 1e3)
+            page.evaluate(KEEP_RED_ROW)
+            wait_until(lambda: page.evaluate("window.redRow !== undefined"))
+            row = page.evaluate("window.redRow")
             assert row == pytest.approx((83 / 2 + OFF + 0.5) / 84, abs=2 / 84)
             assert "lost" not in page.inner_text("#state")
             assert complaints == []
@@ -330,12 +346,20 @@ def test_a_page_whose_port_is_taken_is_refused(swimming: Daemon) -> None:
     )
 
 
-RED_ROW = """() => {
-  const middle = Math.floor(canvas.width / 2);
-  const data = context.getImageData(middle, 0, 1, canvas.height).data;
-  const rows = [];
-  for (let row = 0; row < canvas.height; row++)
-    if (data[4 * row] > 200 && data[4 * row + 2] < 120) rows.push(row);
-  return rows.reduce((sum, row) => sum + row, 0) / rows.length / canvas.height;
+KEEP_RED_ROW = """() => {
+  const drawn = draw;
+  draw = (image, facts) => {
+    drawn(image, facts);
+    if (!facts.axis) return;
+    draw = drawn;
+    const middle = Math.floor(canvas.width / 2);
+    const data = context.getImageData(middle, 0, 1, canvas.height).data;
+    const rows = [];
+    for (let row = 0; row < canvas.height; row++)
+      if (data[4 * row] > 200 && data[4 * row + 2] < 120) rows.push(row);
+    window.redRow = rows.reduce((sum, row) => sum + row, 0) / rows.length / canvas.height;
+  };
 }"""
-"""How far down the axis is in the middle column, as a share of the height."""
+"""Keeps how far down the axis is in the middle column, as a share of the height, once it is drawn.
+
+Facts are told before the picture that they belong to is drawn."""

@@ -49,7 +49,7 @@ def test_a_healthy_virtual_pi_is_all_well_with_and_without_a_daemon(pi: Bench) -
     assert alone["pigpiod"][0] in WELL
     assert "not clipped, not frozen" in alone["force"][1]
     with pi.daemon() as daemon:
-        status, asked = doctor(pi.folder, *pi.settings)
+        status, asked = doctor(pi.folder, *pi.settings, *free_telemetry())
         assert status == 0
         assert asked["adc"][0] == "skipped"
         assert asked["force"][0] in WELL

@@ -75,10 +75,12 @@ def test_what_a_daemon_that_was_killed_leaves_behind_is_no_daemon(
         with socket.socket(socket.AF_UNIX) as left:
             left.bind(str(tmp_path / "old"))
         endpoint = f"ipc://{tmp_path}/old"
+        _, found = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
     else:
-        with socket.create_server(("127.0.0.1", 0)) as left:
-            endpoint = f"tcp://127.0.0.1:{left.getsockname()[1]}"
-    _, found = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
+        with socket.socket() as port:  # as no program listens there, and none may begin to
+            port.bind(("127.0.0.1", 0))
+            endpoint = f"tcp://127.0.0.1:{port.getsockname()[1]}"
+            _, found = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
     assert found["daemon"] == ("ok", "no fishd is running")
 
 

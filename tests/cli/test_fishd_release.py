@@ -13,7 +13,8 @@ from pathlib import Path
 import pigpio
 import pytest
 from rigs.operator_rig import Bench
-from rigs.processes import Process, call, fishctl, wait_until
+from rigs.pigpiod_client import dispose
+from rigs.processes import PATIENCE, Process, call, fishctl, wait_until
 
 from fishd.client import Fish
 from fishd.core.calibration import ServoCalibration
@@ -69,13 +70,13 @@ def pulses_of_another(pi: Bench) -> Iterator[None]:
         pi.wait_for_pulse(1750, 1750)
         yield
     finally:
-        client.stop()
+        dispose(client)
 
 
 def kill_one(pi: Bench, file: Path, calibration: ServoCalibration | None = None) -> None:
     with pi.daemon("--config", str(file)) as daemon:
         if calibration:
-            with Fish(daemon.endpoint) as fish:
+            with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
                 fish.calibrate_servo(calibration, save=True)
         daemon.kill()
 

@@ -14,13 +14,13 @@ import pytest
 from rigs.doctor_process import doctor, free_telemetry
 from rigs.operator_rig import Bench
 from rigs.processes import FISHD, Daemon, running
+from rigs.spare_bus import ANOTHER, spare_bus
 
 from fishd.core.lockfile import lock_path
 from fishd.hardware import ownership
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
-BUS = 150 + os.getpid() % 50
-"""A bus that no machine has, and no other test just now."""
+BUS = spare_bus()
 PI = [
     *("--set", "robot=pi", "--set", f"force_sensor.bus={BUS}"),
     *("--set", "servo.host=127.0.0.2", "--set", f"servo.port={20000 + BUS}"),
@@ -75,11 +75,11 @@ def test_a_second_fishd_on_the_same_bus_is_refused_and_told_the_pid(
         said = refusal(other, *pi_settings(other))
         assert f"another fishd (pid {first.process.pid}) drives /dev/i2c-{BUS}; " in said
         assert "force_sensor.bus" in said
-        elsewhere = [*pi_settings(other), "--set", f"force_sensor.bus={BUS + 50}"]
+        elsewhere = [*pi_settings(other), "--set", f"force_sensor.bus={BUS + ANOTHER}"]
         said = refusal(other, *elsewhere)
         assert f"another fishd (pid {first.process.pid}) drives the servo on GPIO 18" in said
         assert first.fishctl("status").returncode == 0
-    (ownership.FOLDER / f"fishd-i2c-{BUS + 50}.lock").unlink()
+    (ownership.FOLDER / f"fishd-i2c-{BUS + ANOTHER}.lock").unlink()
 
 
 def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(

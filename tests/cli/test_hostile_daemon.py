@@ -132,8 +132,8 @@ VERBS = (
     ("estop",),
     ("clear-fault",),
     ("mark", "now"),
-    ("watch", "--seconds", "1"),
-    ("watch", "--json", "--seconds", "1"),
+    ("watch", "--seconds", "5"),
+    ("watch", "--json", "--seconds", "5"),
     ("doctor",),
     ("tare",),
 )
@@ -164,11 +164,11 @@ def test_no_refusal_says_anything_to_the_terminal(hostile: Hostile, verb: tuple[
 def test_rubbish_is_one_line_that_says_where_it_comes_from(
     hostile: Hostile, rubbish: bytes
 ) -> None:
-    with Fish(hostile.endpoint) as fish:
+    with Fish(hostile.endpoint, timeout=PATIENCE) as fish:
         telemetry = fish.status().telemetry
     hostile.rubbish = rubbish
     where = f"what answers at {hostile.endpoint} is no fishd of this version: "
-    with Fish(hostile.endpoint, telemetry=telemetry) as fish:
+    with Fish(hostile.endpoint, timeout=PATIENCE, telemetry=telemetry) as fish:
         with pytest.raises(FishError, match=f"^{re.escape(where)}[^\n]+$"):
             fish.status()
         with pytest.raises(FishError, match=f"^{re.escape(where)}[^\n]+$"):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from rigs.operator_rig import Bench, fishctl_alone
-from rigs.processes import Daemon, one_line
+from rigs.processes import PATIENCE, Daemon, one_line
 
 from fishd.client import Fish
 
@@ -100,7 +100,7 @@ def test_loads_measured_earlier_are_fitted_without_a_question(rig: Bench, daemon
     measured.write_text("\n".join(["fx_g, fy_g, vx_V, vy_V, remark", *lines, ""]))
     ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
     assert (ended.returncode, ended.stderr) == (0, "")
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         found = fish.calibrations().force
     assert (found.xx, found.xy, found.x0) == pytest.approx((0.5, 0.0, -0.15))
     assert (found.yx, found.yy, found.y0) == pytest.approx((0.0, 1 / 1.5, 0.2 / 1.5))

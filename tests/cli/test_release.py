@@ -11,6 +11,7 @@ from pathlib import Path
 import pigpio
 import pytest
 from rigs.operator_rig import Bench
+from rigs.pigpiod_client import dispose
 from rigs.processes import fishctl
 
 from fishd.core.calibration import ServoCalibration
@@ -24,7 +25,7 @@ def other_program(pi: Bench) -> Iterator[pigpio.pi]:
     client.set_servo_pulsewidth(18, 1750)
     pi.wait_for_pulse(1750, 1750)
     yield client
-    client.stop()
+    dispose(client)
 
 
 def release(*settings: str, **env: str) -> subprocess.CompletedProcess[str]:
@@ -86,7 +87,7 @@ def test_pulses_of_the_pwm_peripheral_that_pigpiod_may_not_know_of_end_too(
 ) -> None:
     client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
     client.hardware_PWM(18, 50, 1740 * 50)
-    client.stop()
+    dispose(client)
     if restarted:
         pi.pi.inject("pigpiod-restart")
     pi.wait_for_pulse(1739, 1741)

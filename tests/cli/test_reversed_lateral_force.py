@@ -1,16 +1,21 @@
 """A reversed F_y as an operator meets it: in status, in doctor, and in calibrate force."""
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from rigs.doctor_process import doctor
 from rigs.operator_rig import Bench
-from rigs.processes import Daemon, wait_until
+from rigs.processes import PATIENCE, Daemon, wait_until
 
 from fishd.client import Fish
 from fishd.core.calibration import ForceCalibration
 
 LINE = "F_y is reversed: it pushed the way in which the tail set off, so swing and policies fail"
+
+REST, FIRST_PUSH = 50, 40
+"""More than what the sign of F_y takes to be judged [ticks]."""
 
 
 def loads(folder: Path, sign: int) -> str:
@@ -22,17 +27,31 @@ def loads(folder: Path, sign: int) -> str:
     return str(file)
 
 
+def swim_until_judged(fish: Fish) -> None:
+    """Set off from rest, once more where a stall of the machine took the first push."""
+    deadline = time.monotonic() + PATIENCE
+    while fish.status().fy_reversed is None:
+        assert time.monotonic() < deadline
+        wait_until(lambda: fish.status().phi_c == 0.0)
+        wait_for_ticks(fish, REST, lambda: False)
+        fish.set_controller("square", frequency=1.0)
+        wait_for_ticks(fish, FIRST_PUSH, lambda: fish.status().fy_reversed is not None)
+        fish.stop()
+
+
+def wait_for_ticks(fish: Fish, ticks: int, earlier: Callable[[], bool]) -> None:
+    """Wait for so many ticks, or until the other is true."""
+    seq = fish.status().seq
+    wait_until(lambda: fish.status().seq > seq + ticks or earlier())
+
+
 @pytest.fixture
 def interchanged(rig: Bench, daemon: Daemon) -> Daemon:
     """A fishd that was calibrated with +y and -y interchanged, and has swum since."""
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.calibrate_force(ForceCalibration(yy=-1.0, loads=5))
         assert fish.status().fy_reversed is None
-        seq = fish.status().seq
-        wait_until(lambda: fish.status().seq > seq + 50)
-        fish.set_controller("square", frequency=1.0)
-        wait_until(lambda: fish.status().fy_reversed is not None)
-        fish.stop()
+        swim_until_judged(fish)
     return daemon
 
 
@@ -59,13 +78,9 @@ def test_status_doctor_and_calibrate_force_say_it_and_the_right_calibration_ends
 def test_a_calibration_that_would_turn_a_right_force_round_is_doubted(
     rig: Bench, daemon: Daemon
 ) -> None:
-    with Fish(daemon.endpoint) as fish:
-        seq = fish.status().seq
-        wait_until(lambda: fish.status().seq > seq + 50)
-        fish.set_controller("square", frequency=1.0)
-        wait_until(lambda: fish.status().fy_reversed is not None)
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        swim_until_judged(fish)
         assert fish.status().fy_reversed is False
-        fish.stop()
         wait_until(lambda: fish.status().phi_c == 0.0)
     ended = daemon.fishctl("calibrate", "force", "--loads", loads(rig.folder, -1), "--yes")
     assert "turns F_y round, which was right when the tail last set off" in ended.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from rigs.operator_rig import Bench, calibrations
-from rigs.processes import fishctl
+from rigs.processes import PATIENCE, fishctl
 
 from fishd.client import Fish
 from fishd.config import load
@@ -39,7 +39,7 @@ def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Benc
     now = datetime.datetime.now().astimezone()
     saved, _ = folder.save(ServoCalibration(trim=-500.0, scale=2000.0), now)
     with pi.daemon() as daemon:
-        with Fish(daemon.endpoint) as fish:
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             status = fish.status()
         (line,) = (line for line in status.degraded if "servo" in line)
         assert line == (

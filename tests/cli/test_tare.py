@@ -16,7 +16,7 @@ def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(
 ) -> None:
     before = forces(daemon)
     assert math.hypot(*before) > 0.3  # the voltages of the bridge without a load
-    ended = daemon.fishctl("tare", "--seconds", "0.3")
+    ended = daemon.fishctl("tare", "--seconds", "0.6")
     assert (ended.returncode, ended.stderr) == (0, "")
     assert re.search(r"before +x0 +\+0\.00 mN", ended.stdout)
     assert str(rig.files("force")[-1]) in ended.stdout
@@ -27,10 +27,10 @@ def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(rig: Bench, daemon
     rig.pi.load(0.0, 0.0, shaking=0.1)
     restless = daemon.fishctl("tare", "--seconds", "1.2")
     rig.pi.load(0.5, 0.0)
-    large = daemon.fishctl("tare", "--seconds", "0.3")
+    large = daemon.fishctl("tare", "--seconds", "0.6")
     rig.pi.load(0.0, 0.0)
     daemon.fishctl("set-controller", "swing")
-    swimming = daemon.fishctl("tare", "--seconds", "0.3")
+    swimming = daemon.fishctl("tare", "--seconds", "0.6")
     for ended, code in ((restless, "not-still"), (large, "too-large"), (swimming, "running")):
         assert (ended.returncode, ended.stdout) == (1, "")
         assert re.fullmatch(rf"fishctl: [^\n]+ \[{code}\]\n", ended.stderr)
@@ -41,10 +41,11 @@ def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(rig: Bench, daemon
 def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
     rig: Bench, daemon: Daemon, how: int
 ) -> None:
-    tare = Process(FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", "3")
+    seconds = 6.0
+    tare = Process(FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", str(seconds))
     time.sleep(1.5)  # it measures
     assert tare.end(how)[0] != 0
-    time.sleep(3.0)  # its measurement would have ended
+    forces(daemon, seconds)  # begun later and as long: its measurement would have ended
     assert math.hypot(*forces(daemon)) > 0.3
     assert rig.files("force") == []
 

@@ -12,20 +12,20 @@ import struct
 import subprocess
 import termios
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 from rich.screen import Screen
+from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import FISHCTL, PATIENCE, Daemon, running
 
 from fishd.cli.watch_screen import View
 from fishd.client import Fish
 from fishd.core.signals import Percentiles, Reason, Status, Tick, Timing
 
-ENTER_SCREEN, LEAVE_SCREEN = "\x1b[?1049h", "\x1b[?1049l"
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
 BRAILLE = re.compile("[\u2801-\u28ff]")
@@ -59,12 +59,13 @@ class Terminal:
     def resize(self, columns: int, rows: int) -> None:
         fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
 
-    def wait_for(self, pattern: str) -> None:
-        """Read until `pattern` turns up in what is new."""
+    def wait_for(self, pattern: str, meanwhile: Callable[[], object] = lambda: None) -> None:
+        """Read until `pattern` turns up in what is new; meanwhile: done again and again."""
         deadline = time.monotonic() + PATIENCE
         start = len(self.text)
         while not re.search(pattern, self.text[start:]):
             assert time.monotonic() < deadline, self.text
+            meanwhile()
             self._read()
             time.sleep(0.02)
 
@@ -100,7 +101,7 @@ class Terminal:
 
 
 def test_json_streams_every_tick_as_one_line(daemon: Daemon) -> None:
-    ended = daemon.fishctl("watch", "--json", "--seconds", "1.5")
+    ended = daemon.fishctl("watch", "--json", "--seconds", "3")
     assert (ended.returncode, ended.stderr) == (0, "")
     ticks = [json.loads(line) for line in ended.stdout.splitlines()]
     first = ticks[0]["seq"]
@@ -142,9 +143,11 @@ def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
 ) -> None:
     terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
-    with Fish(daemon.endpoint) as fish:
-        fish.mark("a weight on the sensor")
-        terminal.wait_for("mark: a weight on the sensor")
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        # Events have a subscription of their own, which may begin after the first tick is drawn.
+        terminal.wait_for(
+            "mark: a weight on the sensor", meanwhile=lambda: fish.mark("a weight on the sensor")
+        )
         fish.estop("the net")
     terminal.wait_for("estop: the net")
     terminal.signal(number)
@@ -156,6 +159,17 @@ def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
     figures = ("swing", "thrust", "tail beat", "late", "busy", "missed", "lost")
     for word in (*figures, "fx mN", "fy mN", "phi_c rad"):
         assert word in terminal.text
+    assert "Traceback" not in terminal.text
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_at_the_moment_when_it_takes_the_screen_gives_it_back(
+    daemon: Daemon, tmp_path: Path, name: str
+) -> None:
+    terminal = Terminal(daemon, **signal_as_drawing_begins(tmp_path, name))
+    assert terminal.finish() == 0
+    assert ENTER_SCREEN in terminal.text
+    assert terminal.restored
     assert "Traceback" not in terminal.text
 
 

@@ -144,7 +144,7 @@ class Bench:
         self.pi.clear()
         wait_until(lambda: not daemon.status().sensor_lost)
         daemon.at_rest()
-        with Fish(daemon.endpoint) as fish:
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             wait_until(lambda: not fish.status().calibrating)
             fish.calibrate_force(ForceCalibration())
             fish.calibrate_servo(ServoCalibration(), save=True)
@@ -237,16 +237,16 @@ Talk = Callable[..., Dialogue]
 """Begins a `Dialogue` with a fishctl that is gone after the test."""
 
 
-def forces(daemon: Daemon, seconds: float = 0.3) -> tuple[float, float]:
+def forces(daemon: Daemon, seconds: float = 0.6) -> tuple[float, float]:
     """F_x and F_y as the daemon measures them now [N]."""
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         sample = fish.sample_force(seconds)
     return sample.fx, sample.fy
 
 
 def calibrations(daemon: Daemon) -> Calibrations:
     """What fishd uses now."""
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         return fish.calibrations()
 
 

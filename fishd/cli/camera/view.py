@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fishd.cli.camera.options import camera_option, check_png, png_option
+from fishd.cli.drawing import whole_screen
 from fishd.cli.output import echo
 from fishd.core.errors import FishdError
 
@@ -112,12 +113,11 @@ def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
             echo(facts(client, watch))
             _pass(client, watch, 1.0)
     from rich.console import Group
-    from rich.live import Live
     from rich.text import Text
 
     from fishd.cli.camera.terminal import TerminalPicture
 
-    with Live(screen=True, auto_refresh=False) as live:
+    with whole_screen() as live:
         while True:
             drawn = TerminalPicture(_picture(client, watch, whole))
             live.update(Group(drawn, Text(facts(client, watch), no_wrap=True)), refresh=True)
