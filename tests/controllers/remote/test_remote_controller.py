@@ -2,12 +2,15 @@
 
 import math
 import time
+from contextlib import closing
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
 from rigs.harness import LIMITS, Rig
+from rigs.processes import wait_until
 from rigs.scripted_agent import (
     ScriptedAgent,
     answered,
@@ -21,6 +24,7 @@ from rigs.scripted_agent import (
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.remote.wire import Wire
+from fishd.core.clock import Slot
 from fishd.core.errors import ConfigError, ParameterError
 
 
@@ -174,6 +178,26 @@ def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> No
     assert rig.mode == "running"
     rig.run(2)
     assert rig.reason == "remote-silent"
+
+
+def test_in_virtual_time_an_agent_that_comes_unseen_is_asked_as_well(
+    still: Rig, agent: ScriptedAgent, tmp_path: Path
+) -> None:
+    """The ticking thread looks before the connection is lost, and when the next one is there."""
+    still.start("remote", agent=agent.address)
+    controller = remote(still)
+    turn = still.loop.observe(Slot(0, 0.0, 0.0, 0))
+    wait_until(lambda: controller.ready(turn.observation) or controller._seq == 1)
+    asked = agent.next()
+    agent.close()
+    with closing(ScriptedAgent(tmp_path)) as successor:
+        successor.wait_for_fishd()
+        time.sleep(0.05)  # until fishd's side knows it as well
+        wait_until(lambda: controller.ready(turn.observation) or successor.has_message())
+        assert successor.next() == asked
+        successor.send(successor.action(0.1))
+        still.loop.act(turn)
+    assert still.recorder.ticks[-1].phi_c == 0.1
 
 
 def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) -> None:
