@@ -1,7 +1,6 @@
 """Agents that say exactly what a test wants: bare sockets, as any language would have them."""
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -103,17 +102,19 @@ def remote(rig: Rig) -> Remote:
 
 
 def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]:
-    """Make `remote` active, and tick until its first observation has come; that."""
+    """Make `remote` active, and let it send its first observation; that."""
     before = {message["session"] for message in agent.seen}
     rig.start("remote", agent=agent.address, **parameters)
-    for _ in range(100):
-        rig.run()
-        if remote(rig)._seq:
-            while (message := agent.next())["session"] in before:
-                pass
-            return message
-        time.sleep(0.01)
-    raise AssertionError("no observation was sent")
+    connected(rig)
+    rig.run()
+    while (message := agent.next())["session"] in before:
+        pass
+    return message
+
+
+def connected(rig: Rig) -> None:
+    """Wait until the next tick can send its observation."""
+    wait_until(lambda: remote(rig)._wire.state()[0])
 
 
 def arrived(rig: Rig) -> None:
