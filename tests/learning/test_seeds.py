@@ -17,10 +17,11 @@ from pathlib import Path
 import pytest
 from joblib.externals.loky import get_reusable_executor
 from rigs.processes import FISHCTL, fishctl
-from rigs.swimming import LONG_ENOUGH, Done, wait_for, while_it_trains
+from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
 from fishd.lab import parallel
 from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluations, write_summary
+from fishd.learning.train.seeds import _train
 
 SETTINGS = """\
 steps: {steps}
@@ -181,6 +182,16 @@ def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "latest policies of 2 seeds" in done.stdout
     assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 1025, 64))
+
+
+def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> None:
+    """Where one process is killed all are, and what another one had just done is asked for anew."""
+    job = brief_job(tmp_path / "seed-0")
+    first = _train(job, lambda: False)
+    assert first.ended == "finished"
+    (job.folder / ".step-000128.part").mkdir()
+    assert _train(job, lambda: False) == first
+    assert not list(job.folder.glob(".*"))
 
 
 @pytest.mark.parametrize("name", ["seed-0/policy", "stop"])
