@@ -6,10 +6,8 @@ Processes that train take seconds to import torch: those of this process are lef
 import csv
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -162,9 +160,19 @@ def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
 
 def test_ctrl_c_before_any_has_begun_is_heeded_as_well(tmp_path: Path) -> None:
     with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG) as process:
-        wait_for(lambda: trainers(process.pid))  # which have all to import as yet
-        time.sleep(0.1)
+        held: set[int] = set()
+
+        def both_are_held() -> bool:
+            for trainer in {*trainers(process.pid)} - held:  # which has all to import as yet
+                os.kill(trainer, signal.SIGSTOP)
+                held.add(trainer)
+            return len(held) == 2
+
+        wait_for(both_are_held)
         os.killpg(process.pid, signal.SIGINT)
+        wait_for((tmp_path / "run" / "stop").exists)
+        for trainer in held:
+            os.kill(trainer, signal.SIGCONT)
         _, errors = process.communicate(timeout=LONG_ENOUGH)
         assert process.returncode == 130
         wait_for(lambda: not members(process.pid))
@@ -209,15 +217,12 @@ def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path, name: str) -> Non
 def cluster(tmp_path: Path) -> Iterator[str]:
     """A Dask scheduler and one worker, processes of their own on the loopback interface."""
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    elsewhere = tmp_path / "worker"
+    json_load_robust = distributed.utils.json_load_robust
+    elsewhere, file = tmp_path / "worker", tmp_path / "scheduler.json"
     elsewhere.mkdir()
-    here = ["--host", "127.0.0.1", "--no-dashboard"]
-    port = address.rpartition(":")[2]
+    here = ["--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard"]
     one = ["--nworkers", "1", "--nthreads", "1", "--no-nanny", "--death-timeout", "60"]
-    commands = (["scheduler", "--port", port, *here], ["worker", address, *one, *here])
+    commands = (["scheduler", "--port", "0", *here], ["worker", *one, *here])
     processes = [
         subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.dask_{kind}", *rest],
@@ -228,6 +233,7 @@ def cluster(tmp_path: Path) -> Iterator[str]:
         for kind, *rest in commands
     ]
     try:
+        address = json_load_robust(file, timeout=LONG_ENOUGH)["address"]
         with distributed.Client(address, timeout=LONG_ENOUGH) as client:
             client.wait_for_workers(1, timeout=LONG_ENOUGH)
         yield address
