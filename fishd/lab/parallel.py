@@ -50,6 +50,7 @@ class Workers:
     """Whoever computes: processes of this machine, or the workers of a cluster."""
 
     def __init__(self, stop: Stop, jobs: int | None, cluster: str | None, event: Any) -> None:
+        """event: that of the cluster which means stop"""
         self.stop = stop
         self._jobs = jobs
         self._cluster = cluster
@@ -84,7 +85,7 @@ class Workers:
     def _once(self, function: Callable[[T], R], tasks: dict[int, T]) -> Iterator[tuple[int, R]]:
         calls = [joblib.delayed(_numbered)(function, index, task) for index, task in tasks.items()]
         if self._cluster:
-            with joblib.parallel_config(backend="dask", scheduler_host=self._cluster):
+            with joblib.parallel_config(backend="dask", client=self._event.client):
                 try:
                     yield from joblib.Parallel(return_as="generator_unordered")(calls)
                 except FishdError:

@@ -93,6 +93,7 @@ def test_a_timer_in_the_past_expires_at_once_and_can_be_closed_twice() -> None:
     asyncio.run(run())
 
 
+@pytest.mark.realtime
 def test_a_warm_up_comes_just_before_each_deadline_and_delays_no_tick() -> None:
     warmed: list[float] = []
     first = asyncio.run(slots(20, warm_up=lambda: warmed.append(time.monotonic())))[0]
@@ -102,6 +103,7 @@ def test_a_warm_up_comes_just_before_each_deadline_and_delays_no_tick() -> None:
         assert 0 < to_go < Ticker.MARGIN
 
 
+@pytest.mark.realtime
 def test_a_warm_up_for_which_there_is_no_time_is_left_out() -> None:
     warmed: list[float] = []
 

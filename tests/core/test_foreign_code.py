@@ -86,12 +86,13 @@ def test_a_loop_in_python_ends_when_it_is_given_up() -> None:
 
 
 def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
-    go, taken = threading.Event(), threading.Event()
+    begun, go, taken = threading.Event(), threading.Event(), threading.Event()
     results: list[str] = []
 
     def deliver() -> str:
         while True:
             try:
+                begun.set()
                 go.wait(PATIENCE)
             except BaseException:  # what gives it up
                 continue
@@ -102,6 +103,7 @@ def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
         taken.set()
 
     attempt = Attempt(deliver, late=take)
+    assert begun.wait(PATIENCE)
     assert attempt.give_up()
     go.set()
     assert taken.wait(PATIENCE)

@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
-from rigs.processes import FISHCTL, call, one_line, running
+from rigs.processes import FISHCTL, PATIENCE, call, one_line, running, wait_until
 
 from fishd.client import Fish, NoDaemon
 from fishd.core import addresses
@@ -91,7 +91,7 @@ def test_an_estop_is_not_sent_to_a_folder_that_another_user_planted(
         assert not any(planted.told)  # a connection that says nothing, at most
         with Fish(f"ipc://{path}", timeout=0.5) as fish, pytest.raises(NoDaemon, match="no answer"):
             fish.estop()  # which is the user's own word
-        assert any(planted.told)
+        wait_until(lambda: any(planted.told))
     assert str(caught.value) == (
         f"what listens at ipc://{path} is not asked, it may be anybody: {path.parent} belongs to "
         f"user {OTHER}; where you trust it, name it with --endpoint or $FISHD_ENDPOINT"
@@ -158,5 +158,5 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
 def test_a_fishd_of_the_same_user_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "fishd").mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with running(tmp_path / "fishd"), Fish() as fish:
+    with running(tmp_path / "fishd"), Fish(timeout=PATIENCE) as fish:
         assert fish.status().mode == "idle"

@@ -25,6 +25,22 @@ def test_its_processes_leave_ctrl_c_and_hang_up_to_the_one_that_has_begun_them(
     assert not blocked(0)
 
 
+def test_a_cluster_has_one_connection_which_is_closed(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+
+    def connections() -> int:
+        return sum(one.status != "closed" for one in distributed.Client._instances)
+
+    here = {"host": "127.0.0.1", "protocol": "tcp://", "local_directory": str(tmp_path)}
+    alone = {"processes": False, "n_workers": 1, "threads_per_worker": 1}
+    with distributed.LocalCluster(**here, **alone, dashboard_address=None) as cluster:
+        before = connections()
+        with workers(tmp_path / "stop", cluster=cluster.scheduler_address) as crew:
+            for _ in crew.run(abs, [-1, -2]):
+                assert connections() == before + 1
+        assert connections() == before
+
+
 def test_what_one_that_was_killed_told_its_processes_does_not_stop_the_next(tmp_path: Path) -> None:
     stop = tmp_path / "stop"
     stop.touch()

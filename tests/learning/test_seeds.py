@@ -6,10 +6,8 @@ Processes that train take seconds to import torch: those of this process are lef
 import csv
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,10 +15,11 @@ from pathlib import Path
 import pytest
 from joblib.externals.loky import get_reusable_executor
 from rigs.processes import FISHCTL, fishctl
-from rigs.swimming import LONG_ENOUGH, Done, wait_for, while_it_trains
+from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
 from fishd.lab import parallel
 from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluations, write_summary
+from fishd.learning.train.seeds import _train
 
 SETTINGS = """\
 steps: {steps}
@@ -161,9 +160,19 @@ def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
 
 def test_ctrl_c_before_any_has_begun_is_heeded_as_well(tmp_path: Path) -> None:
     with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG) as process:
-        wait_for(lambda: trainers(process.pid))  # which have all to import as yet
-        time.sleep(0.1)
+        held: set[int] = set()
+
+        def both_are_held() -> bool:
+            for trainer in {*trainers(process.pid)} - held:  # which has all to import as yet
+                os.kill(trainer, signal.SIGSTOP)
+                held.add(trainer)
+            return len(held) == 2
+
+        wait_for(both_are_held)
         os.killpg(process.pid, signal.SIGINT)
+        wait_for((tmp_path / "run" / "stop").exists)
+        for trainer in held:
+            os.kill(trainer, signal.SIGCONT)
         _, errors = process.communicate(timeout=LONG_ENOUGH)
         assert process.returncode == 130
         wait_for(lambda: not members(process.pid))
@@ -183,6 +192,16 @@ def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 1025, 64))
 
 
+def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> None:
+    """Where one process is killed all are, and what another one had just done is asked for anew."""
+    job = brief_job(tmp_path / "seed-0")
+    first = _train(job, lambda: False)
+    assert first.ended == "finished"
+    (job.folder / ".step-000128.part").mkdir()
+    assert _train(job, lambda: False) == first
+    assert not list(job.folder.glob(".*"))
+
+
 @pytest.mark.parametrize("name", ["seed-0/policy", "stop"])
 def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path, name: str) -> None:
     kept = tmp_path / "run" / name
@@ -198,15 +217,12 @@ def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path, name: str) -> Non
 def cluster(tmp_path: Path) -> Iterator[str]:
     """A Dask scheduler and one worker, processes of their own on the loopback interface."""
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    elsewhere = tmp_path / "worker"
+    json_load_robust = distributed.utils.json_load_robust
+    elsewhere, file = tmp_path / "worker", tmp_path / "scheduler.json"
     elsewhere.mkdir()
-    here = ["--host", "127.0.0.1", "--no-dashboard"]
-    port = address.rpartition(":")[2]
+    here = ["--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard"]
     one = ["--nworkers", "1", "--nthreads", "1", "--no-nanny", "--death-timeout", "60"]
-    commands = (["scheduler", "--port", port, *here], ["worker", address, *one, *here])
+    commands = (["scheduler", "--port", "0", *here], ["worker", *one, *here])
     processes = [
         subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.dask_{kind}", *rest],
@@ -217,6 +233,7 @@ def cluster(tmp_path: Path) -> Iterator[str]:
         for kind, *rest in commands
     ]
     try:
+        address = json_load_robust(file, timeout=LONG_ENOUGH)["address"]
         with distributed.Client(address, timeout=LONG_ENOUGH) as client:
             client.wait_for_workers(1, timeout=LONG_ENOUGH)
         yield address

@@ -9,8 +9,11 @@ from typing import Any
 import msgspec
 import zmq
 
+from fishd.controllers.remote.controller import Remote
+from fishd.core.clock import Slot
+from fishd.core.signals import Tick
 from rigs.harness import Rig
-from rigs.processes import PATIENCE
+from rigs.processes import PATIENCE, wait_until
 
 Answer = dict[str, Any] | bytes | None
 
@@ -22,6 +25,7 @@ class ScriptedAgent:
         self.address = f"ipc://{folder}/agent"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
+        self._connected = self._socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
         self._socket.bind(self.address)
         self._peer = b""
         self.seen: list[dict[str, Any]] = []
@@ -37,6 +41,14 @@ class ScriptedAgent:
         message: dict[str, Any] = msgspec.json.decode(payload)
         self.seen.append(message)
         return message
+
+    def has_message(self) -> bool:
+        return bool(self._socket.poll(0))
+
+    def wait_for_fishd(self) -> None:
+        """Until one has connected."""
+        assert self._connected.poll(int(PATIENCE * 1e3)), "nobody has connected"
+        self._connected.recv_multipart()
 
     def drain(self) -> list[dict[str, Any]]:
         """Everything that has come by now."""
@@ -82,23 +94,56 @@ class ScriptedAgent:
             thread.join(PATIENCE)
 
 
+def remote(rig: Rig) -> Remote:
+    """The active controller."""
+    controller = rig.loop.active.controller
+    assert isinstance(controller, Remote), rig.reason
+    return controller
+
+
 def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]:
-    """Make `remote` active, and tick until its first observation has come; that."""
+    """Make `remote` active, and let it send its first observation; that."""
     before = {message["session"] for message in agent.seen}
     rig.start("remote", agent=agent.address, **parameters)
-    for _ in range(100):
-        rig.run()
-        for message in agent.drain():
-            if message["session"] not in before:
-                return message
-    raise AssertionError("no observation has come")
+    connected(rig)
+    rig.run()
+    while (message := agent.next())["session"] in before:
+        pass
+    return message
+
+
+def connected(rig: Rig) -> None:
+    """Wait until the next tick can send its observation."""
+    wait_until(lambda: remote(rig)._wire.state()[0])
+
+
+def arrived(rig: Rig) -> None:
+    """Wait until something that the agent has sent is there, for the next tick."""
+    wait_until(lambda: remote(rig)._wire.state()[1])
+
+
+def answered(rig: Rig, agent: ScriptedAgent, angle: float, **changes: Any) -> Tick:
+    """One tick; its answer is there before its deadline begins to count.
+
+    changes: to the action that is the answer
+    """
+    controller, deadline = remote(rig), rig.index * rig.config.tick
+    before = controller._seq
+    rig.clock.now = max(rig.clock.now, deadline)
+    turn = rig.loop.observe(Slot(rig.index, deadline, rig.clock.now, 0))
+    rig.index += 1
+    wait_until(lambda: controller.ready(turn.observation) or controller._seq > before)
+    while agent.next().get("seq") != controller._seq:
+        pass
+    agent.send(agent.action(angle, **changes))
+    arrived(rig)
+    rig.loop.act(turn)
+    return rig.recorder.ticks[-1]
 
 
 def swim(rig: Rig, agent: ScriptedAgent, angle: float = 0.2) -> None:
-    """Tick until an action is in force."""
-    with agent.answering(lambda seen: agent.action(angle)):
-        while rig.run()[-1].phi_c == 0.0:
-            pass
+    """One tick in which an action is in force."""
+    assert answered(rig, agent, angle).phi_c == angle
 
 
 def reason(rig: Rig) -> str:

@@ -84,7 +84,7 @@ class Remote(Controller[RemoteParameters]):
 
     def __init__(self, parameters: RemoteParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
-        self._wire = Wire(parameters.agent)
+        self._wire = Wire(parameters.agent, counted=limits.virtual)
         self._limit = DwellLimit(parameters.dwell, limits, limits.amplitude)
         self._session = secrets.token_hex(8)
         self._observation: Observation | None = None
@@ -94,6 +94,8 @@ class Remote(Controller[RemoteParameters]):
         self._seq = 0
         self._open = 0
         """The observation whose action is waited for; 0 for none."""
+        self._asked_over = 0
+        """Number of the connection over which it was sent."""
         self.action = None
         self._resting = False
         """Is this tick part of a pause?"""
@@ -217,7 +219,7 @@ class Remote(Controller[RemoteParameters]):
         """Send and receive whatever is possible without waiting."""
         for _ in range(MOST_AT_ONCE):
             writable, readable = self._wire.state()
-            if self.limits.virtual and self._open and not writable:
+            if self._open and self._wire.connections != self._asked_over:
                 self._unsent = True  # the agent is gone: its successor has to be asked again
             if self._unsent and writable:
                 self._send()
@@ -229,6 +231,7 @@ class Remote(Controller[RemoteParameters]):
     def _send(self) -> None:
         self._wire.send(self._question)
         self._unsent = False
+        self._asked_over = self._wire.connections
         if not self._open:  # else it is the same one, once more
             self._seq += 1
             self._open = self._seq

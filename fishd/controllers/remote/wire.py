@@ -1,6 +1,7 @@
 """The socket between the controller `remote` and its agent; only `wait` blocks."""
 
 import re
+import secrets
 import select
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -43,20 +44,31 @@ _decode_version: Callable[[bytes], _Versioned] = decoder(_Versioned)
 class Wire:
     """A DEALER socket that connects to the agent, and connects again when it was lost."""
 
-    def __init__(self, address: str) -> None:
-        """Raises `ParameterError` where ZeroMQ refuses the address."""
+    def __init__(self, address: str, *, counted: bool = False) -> None:
+        """
+        counted: count the connections
+
+        Raises `ParameterError` where ZeroMQ refuses the address.
+        """
         self._address = address
+        self.connections = 0
+        """How many there were until the latest `state`, where they are counted."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self._socket = context.socket(zmq.DEALER)
         self._socket.set(zmq.IMMEDIATE, 1)  # nothing old waits for an agent that comes late
         self._socket.set(zmq.SNDHWM, _QUEUE)
         self._socket.set(zmq.RCVHWM, _QUEUE)
         self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE)
+        self._connected: zmq.Socket[bytes] | None = None
+        """Has a message for each connection, before anything can be sent over it."""
+        if counted:
+            name = f"inproc://remote-{secrets.token_hex(8)}"
+            self._connected = self._socket.get_monitor_socket(zmq.EVENT_CONNECTED, name)
         try:
             self._socket.set(zmq.IPV6, is_ipv6(address))
             self._socket.connect(address)
         except zmq.ZMQError as error:
-            self._socket.close(linger=0)
+            self._end(linger=0)
             raise ParameterError(
                 f"agent: cannot connect to '{address}': {zmq.strerror(error.errno or 0)}; {FORM}",
                 ("agent",),
@@ -69,6 +81,9 @@ class Wire:
     def state(self) -> tuple[bool, bool]:
         """Can a message be sent, and is there one to receive?"""
         events = int(self._socket.get(zmq.EVENTS))
+        while self._has_connected():  # then the events may have been those of a lost connection
+            self.connections += 1
+            events = int(self._socket.get(zmq.EVENTS))
         return bool(events & zmq.POLLOUT), bool(events & zmq.POLLIN)
 
     def send(self, payload: bytes) -> None:
@@ -102,7 +117,20 @@ class Wire:
             return
         if self.state()[0]:
             self._socket.send(farewell, zmq.DONTWAIT)
-        self._socket.close(linger=_FAREWELL)
+        self._end(linger=_FAREWELL)
+
+    def _has_connected(self) -> bool:
+        """Has it since this was last asked?"""
+        if self._connected is None or not int(self._connected.get(zmq.EVENTS)) & zmq.POLLIN:
+            return False
+        self._connected.recv_multipart(zmq.DONTWAIT)
+        return True
+
+    def _end(self, linger: int) -> None:
+        if self._connected:
+            self._socket.disable_monitor()
+            self._connected.close(linger=0)
+        self._socket.close(linger=linger)
 
     def _bad(self, what: str) -> ControllerFault:
         return ControllerFault("remote-error", f"the agent at {self._address} sent {what}")

@@ -68,6 +68,10 @@ class State(Struct, frozen=True):
     swims: int = 0
     """How often the best was measured in a tank."""
 
+    def is_finished(self, steps: int) -> bool:
+        """Has a training of so many steps nothing left to do?"""
+        return self.steps >= steps and (self.steps > 0 or self.imitated)
+
 
 class Constant(Struct, frozen=True):
     """A constant of an eye."""

@@ -192,7 +192,7 @@ class RunRecorder:
                 f"fish, begin a new run: --on {job.on} --from {job.folder}"
             )
         card = self._checked_card(self.checkpoint)
-        if state.steps >= job.settings.steps and (state.steps or state.imitated):
+        if state.is_finished(job.settings.steps):
             raise ConfigError(
                 f"{job.folder} is finished, with {state.steps} steps; to train it for longer, give "
                 f"a larger total, such as --steps {state.steps + job.settings.steps}"

@@ -117,6 +117,9 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
 
     try:
         if checkpoints.all_in(job.folder):
+            finished = _finished(job)
+            if finished:
+                return finished
             job = replace(job, resume=True, parent=None)
         elif job.folder.exists():
             shutil.rmtree(job.folder)
@@ -124,6 +127,27 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
     except Exception as error:
         text = str(error) if isinstance(error, FishdError) else f"{type(error).__name__}: {error}"
         return _failed(job, text)
+
+
+def _finished(job: Job) -> Outcome | None:
+    """Of a seed that was finished, but whose outcome was lost with a process that was killed."""
+    from fishd.learning.run_folder import checkpoints
+
+    checkpoints.sweep(job.folder)
+    newest = checkpoints.newest(job.folder)
+    state = checkpoints.read_state(newest)
+    if not state.is_finished(job.settings.steps):
+        return None
+    return Outcome(
+        folder=job.folder,
+        steps=state.steps,
+        tank_time=state.tank_time,
+        ended="finished",
+        checkpoint=newest,
+        best=checkpoints.best(job.folder),
+        latest_evaluation=state.latest,
+        best_evaluation=state.best,
+    )
 
 
 def _failed(job: Job, message: str) -> Outcome:

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 import zmq
 from rigs.harness import Rig
-from rigs.processes import PATIENCE
+from rigs.processes import PATIENCE, wait_until
+from rigs.scripted_agent import connected, remote
 
 from fishd.client import Agent, FishError, NoDaemon
 from fishd.core.errors import ParameterError
@@ -73,6 +74,7 @@ def test_a_pause_gives_the_observation_anew(agent: Agent) -> None:
 def test_the_newest_of_several_observations_counts(agent: Agent) -> None:
     rig = Rig("tick=0.02")
     rig.start("remote", agent=agent.address)
+    connected(rig)
     rig.run(20)  # nobody answers
     taken, lost = 0, 0
     while lost < 19:  # of all that it took at once; some may still be on their way
@@ -123,15 +125,14 @@ def test_whoever_asks_last_is_served(agent: Agent) -> None:
     while not agent.poll(0.01):
         first.run()
     second.start("remote", agent=agent.address)
-    old = agent.latest
-    while agent.latest is old:
+    old, new = remote(first)._session, remote(second)._session
+    while not (agent.latest and agent.latest.session == new):
         second.run()
         agent.poll(0.01)
-    new = agent.latest
-    assert new
     first.run(3)
-    assert agent.poll(0.1) is None
-    assert agent.latest is new
+    while found := agent.poll(0.1):  # of the second, some may still be on their way
+        assert found.session == new != old
+    assert agent.latest.session == new
     for rig in (first, second):
         rig.loop.close()
 
@@ -168,6 +169,8 @@ def test_when_another_controller_takes_over_it_says_so(tmp_path: Path) -> None:
         while not agent.poll(0.01):
             rig.run()
         rig.start("hold")
+        while agent.active:
+            agent.poll(0.01)
         with pytest.raises(NoDaemon, match="another controller is active, or none"):
             agent.observe()
 
@@ -179,6 +182,7 @@ def test_what_is_no_message_of_a_fishd_is_left_aside(tmp_path: Path) -> None:
         stranger.connect(agent.address)
         stranger.send(b'{"kind":"ended","session":"\xff"}')
         stranger.send(b"hello")
+        wait_until(lambda: agent.poll() is None and "malformed" in agent._strange)
         with pytest.raises(NoDaemon, match="but what is none: JSON is malformed"):
             agent.observe()
     context.destroy(linger=0)

@@ -2,16 +2,30 @@
 
 import math
 import time
+from contextlib import closing
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 from rigs.harness import LIMITS, Rig
-from rigs.scripted_agent import ScriptedAgent, connect, reason, swim
+from rigs.processes import wait_until
+from rigs.scripted_agent import (
+    ScriptedAgent,
+    answered,
+    arrived,
+    connect,
+    connected,
+    reason,
+    remote,
+    swim,
+)
 
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.remote.wire import Wire
+from fishd.core.clock import Slot
 from fishd.core.errors import ConfigError, ParameterError
 
 
@@ -65,9 +79,11 @@ def test_silence_is_neutral_and_after_some_ticks_a_fault(rig: Rig, agent: Script
 
 
 def test_one_answer_in_time_forgives_the_silence_before(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent, misses=3)
-    with agent.answering(lambda seen: agent.action(0.2) if seen["seq"] % 3 == 0 else None):
-        rig.run(20)
+    connect(rig, agent, misses=3, deadline=0.001)
+    swim(rig, agent)
+    for _ in range(6):
+        assert {tick.phi_c for tick in rig.run(2)} == {0.0}
+        assert answered(rig, agent, 0.2).phi_c == 0.2
     assert rig.mode == "running"
 
 
@@ -85,7 +101,7 @@ def test_a_late_action_is_for_no_other_tick(rig: Rig, agent: ScriptedAgent) -> N
     connect(rig, agent, deadline=0.02)
     for _ in range(10):
         agent.send(agent.action(0.3))  # the tick that asked is over
-        time.sleep(0.01)
+        arrived(rig)
         assert rig.run()[-1].phi_c == 0.0
         agent.drain()
     assert agent.seen[-1]["answered"] == 0
@@ -100,6 +116,8 @@ def test_what_was_lost_is_told_with_the_next_observation(rig: Rig, agent: Script
         lambda seen: None if seen["seq"] in silent or seen["seq"] < 2 else agent.action(0.1)
     ):
         ticks = rig.run(14)
+    while agent.seen[-1]["seq"] < remote(rig)._seq:
+        agent.next()
     angles = {round(n * 0.2, 6): tick.phi_c for n, tick in enumerate(ticks, rig.index - 14)}
     seen = [message for message in agent.seen if message["seq"] > first["seq"]]
     assert [message["seq"] for message in seen] == [first["seq"] + n for n in range(1, 15)]
@@ -114,29 +132,27 @@ def test_ticks_without_an_observation_are_lost_too(rig: Rig, agent: ScriptedAgen
     rig.start("remote", agent=f"{agent.address}-later", deadline=0.001)
     rig.run(7)
     agent._socket.bind(f"{agent.address}-later")
-    for _ in range(100):
-        rig.run()
-        if agent.drain():
-            break
-    assert agent.seen[0]["seq"] == 1
-    assert agent.seen[0]["lost"] == rig.index - 1 >= 7
+    connected(rig)
+    rig.run()
+    first = agent.next()
+    assert first["seq"] == 1
+    assert first["lost"] == 7
 
 
 def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2)
     swim(rig, agent)
-    agent.drain()
+    before = agent.seen[-1]
     agent.send(agent.pause(100.0))
-    time.sleep(0.02)
+    arrived(rig)
     assert {tick.phi_c for tick in rig.run(50)} == {0.0}
-    assert agent.drain() == []
-    answered = agent.seen[-1]
+    assert remote(rig)._seq == before["seq"]
     agent.send(agent.pause(0.0))
-    time.sleep(0.02)
+    arrived(rig)
     rig.run()
-    (fresh,) = agent.drain()
-    assert fresh["seq"] == answered["seq"] + 1
-    assert fresh["answered"] == answered["seq"]
+    fresh = agent.next()
+    assert fresh["seq"] == before["seq"] + 1
+    assert fresh["answered"] == before["seq"]
     assert fresh["lost"] == 0
     assert fresh["time"] == pytest.approx((rig.index - 1) * 0.2)
     assert rig.mode == "running"
@@ -153,15 +169,35 @@ def test_a_pause_in_place_of_an_action_ends_the_wait(rig: Rig, agent: ScriptedAg
 
 
 def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent, misses=2, deadline=0.001)
+    connect(rig, agent, misses=2)
     swim(rig, agent)
-    agent.drain()
+    rig.retune(deadline=0.001)
     agent.send(agent.pause(1.0))
-    time.sleep(0.02)
+    arrived(rig)
     rig.run(5)
     assert rig.mode == "running"
     rig.run(2)
     assert rig.reason == "remote-silent"
+
+
+def test_in_virtual_time_an_agent_that_comes_unseen_is_asked_as_well(
+    still: Rig, agent: ScriptedAgent, tmp_path: Path
+) -> None:
+    """The ticking thread looks before the connection is lost, and when the next one is there."""
+    still.start("remote", agent=agent.address)
+    controller = remote(still)
+    turn = still.loop.observe(Slot(0, 0.0, 0.0, 0))
+    wait_until(lambda: controller.ready(turn.observation) or controller._seq == 1)
+    asked = agent.next()
+    agent.close()
+    with closing(ScriptedAgent(tmp_path)) as successor:
+        successor.wait_for_fishd()
+        time.sleep(0.05)  # until fishd's side knows it as well
+        wait_until(lambda: controller.ready(turn.observation) or successor.has_message())
+        assert successor.next() == asked
+        successor.send(successor.action(0.1))
+        still.loop.act(turn)
+    assert still.recorder.ticks[-1].phi_c == 0.1
 
 
 def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) -> None:
@@ -183,8 +219,9 @@ def test_each_take_over_is_a_session_whose_end_is_told(rig: Rig, agent: Scripted
     first = connect(rig, agent)["session"]
     second = connect(rig, agent)["session"]
     rig.start("hold")
-    agent.drain()
     assert first != second
+    while agent.next()["kind"] != "ended":
+        pass
     ended = [m["session"] for m in agent.seen if m["kind"] == "ended"]
     assert ended == [first, second]
 
@@ -226,8 +263,13 @@ def test_parameters_that_cannot_work_are_refused(values: dict[str, Any], complai
     "address",
     ["tcp://127.0.0.1:9873", "tcp://my-pi_4.local:1", "tcp://[::1]:65535", "ipc:///" + 106 * "a"],
 )
-def test_what_passes_as_an_address_can_be_connected_to(address: str) -> None:
+def test_what_passes_as_an_address_can_be_connected_to(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own: zmq.Context[zmq.Socket[bytes]] = zmq.Context()  # a name may be looked up for long
+    monkeypatch.setattr(zmq.Context, "instance", lambda: own)
     registry.create("remote", {"agent": address}, LIMITS).close()
+    own.destroy(linger=0)
 
 
 def test_what_only_zeromq_refuses_is_a_parameter_error() -> None:
