@@ -22,8 +22,10 @@ PATIENCE = 2.0
 """Time from a signal until fishd no longer waits for an orderly shutdown [s]."""
 _RELEASE = 0.5
 """Time that the last resort has to release the servo then [s]."""
+_WORDS = 0.4
+"""Time that it has to say so, and more if the release left some: a busy machine is slow [s]."""
 _FLUSH = 0.1
-"""Time to write the rest of the output at the very end [s]."""
+"""Time to write the rest of the output at the very end, the last part of that [s]."""
 
 
 class Shutdown:
@@ -78,6 +80,7 @@ class Shutdown:
 
     def _end_at_once(self, name: str) -> NoReturn:
         """Waits for no lock: the thread that hangs may hold any, that of logging too."""
+        end = time.monotonic() + _RELEASE + _WORDS
         if not self.release:
             what = "it has not begun to drive the servo;"
         elif _within(_RELEASE, self.release):
@@ -88,8 +91,8 @@ class Shutdown:
         line = (
             f"{name} came {PATIENCE:g} s ago, and fishd hangs {place}: {what} the process is ended"
         )
-        _within(_FLUSH, partial(log.critical, "%s", line))
-        _within(_FLUSH, self.last_words)
+        _within(end - _FLUSH - time.monotonic(), partial(log.critical, "%s", line))
+        _within(max(_FLUSH, end - time.monotonic()), self.last_words)
         os._exit(1)
 
 
@@ -112,7 +115,7 @@ def _within(seconds: float, function: Callable[[], object]) -> bool:
 
     thread = threading.Thread(target=call, daemon=True)
     thread.start()
-    thread.join(seconds)
+    thread.join(max(0.0, seconds))
     return returned.is_set()
 
 

@@ -18,6 +18,7 @@ class Stuck:
     """Calls that nothing ends until they are let go."""
 
     def __init__(self) -> None:
+        self.entered = threading.Event()
         self._go = threading.Event()
         self.threads: list[threading.Thread] = []
 
@@ -25,6 +26,7 @@ class Stuck:
         self.threads.append(threading.current_thread())
         while not self._go.is_set():
             try:
+                self.entered.set()  # from here on nothing ends it
                 self._go.wait(PATIENCE)
             except BaseException:
                 continue
@@ -53,6 +55,7 @@ def test_one_that_takes_too_long_is_refused_in_time_and_others_go_on() -> None:
         assert {answer.code for answer in answers} == {"too-slow"}
         assert str(answers[0]) == "it has not loaded within 0.1 s; it is given up"
         background.check_busy()  # those that are given up no longer count
+        background.patience = PATIENCE
         assert await background.call("", lambda: 42) == 42
 
     asyncio.run(run())
@@ -63,25 +66,31 @@ def test_four_at_once_are_all() -> None:
     stuck = Stuck()
 
     async def run() -> None:
-        background = BackgroundCalls(0.3)
-        pending = [asyncio.create_task(refusal(background, stuck)) for _ in range(MOST_AT_ONCE)]
-        await asyncio.sleep(0.05)
+        background = BackgroundCalls(PATIENCE)
+        pending = [asyncio.create_task(background.call("", stuck)) for _ in range(MOST_AT_ONCE)]
+        await asyncio.sleep(0)  # all of them begin
         with pytest.raises(Refused, match="4 requests are reading files; try again"):
             background.check_busy()
+        stuck.let_go()
         await asyncio.gather(*pending)
+        background.check_busy()
 
     asyncio.run(run())
-    stuck.let_go()
 
 
 def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
     stuck = Stuck()
 
     async def run() -> None:
-        background = BackgroundCalls(0.02)
+        background = BackgroundCalls(PATIENCE)
         for _ in range(MOST_GIVEN_UP):
             background.check_busy()
-            await refusal(background, stuck)
+            stuck.entered.clear()
+            call = asyncio.create_task(background.call("", stuck))
+            await asyncio.to_thread(stuck.entered.wait, PATIENCE)
+            call.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await call
         with pytest.raises(Refused, match="of controllers mostly, still run; restart fishd"):
             background.check_busy()
         stuck.let_go()
@@ -99,24 +108,20 @@ def test_a_process_does_not_wait_for_one_that_never_ends() -> None:
 
 def test_a_call_whose_client_is_gone_is_given_up() -> None:
     late: list[int] = []
-    go = threading.Event()
+    stuck = Stuck()
 
     def load() -> int:
-        while not go.is_set():
-            try:
-                go.wait(PATIENCE)
-            except BaseException:
-                continue
+        stuck()
         return 42
 
     async def run() -> None:
         background = BackgroundCalls(PATIENCE)
         call = asyncio.create_task(background.call("", load, late=late.append))
-        await asyncio.sleep(0.05)
+        await asyncio.to_thread(stuck.entered.wait, PATIENCE)
         call.cancel()
         with pytest.raises(asyncio.CancelledError):
             await call
-        go.set()
+        stuck.let_go()
         await asyncio.to_thread(wait_until, lambda: bool(late))
 
     asyncio.run(run())

@@ -55,7 +55,9 @@ def test_a_json_line_is_one_line_of_json() -> None:
 
 
 @contextmanager
-def writer(monkeypatch: pytest.MonkeyPatch, stderr: io.TextIOBase) -> Iterator[LogWriter]:
+def writer(
+    monkeypatch: pytest.MonkeyPatch, stderr: io.TextIOBase, patience: float = PATIENCE
+) -> Iterator[LogWriter]:
     """A log writer, and after it everything as it was."""
     root = logging.getLogger()
     monkeypatch.setattr(sys, "stderr", stderr)
@@ -66,7 +68,7 @@ def writer(monkeypatch: pytest.MonkeyPatch, stderr: io.TextIOBase) -> Iterator[L
     try:
         yield logs
     finally:
-        logs.close()
+        logs.close(patience)
         logging.captureWarnings(False)
         root.handlers = handlers
         root.setLevel(level)
@@ -95,7 +97,7 @@ class Stuck(io.StringIO):
 @pytest.mark.realtime
 def test_it_closes_soon_where_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     stuck = Stuck()
-    with writer(monkeypatch, stuck) as logs:
+    with writer(monkeypatch, stuck, patience=0.3) as logs:
         begun = time.monotonic()
         for _ in range(2000):
             logging.error("a line")

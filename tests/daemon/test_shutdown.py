@@ -25,7 +25,10 @@ from fishd.hardware.base import Robot
 
 PROGRAM = """
 import logging, sys, threading, time
+from fishd.daemon import shutdown as module
 from fishd.daemon.shutdown import Shutdown, leave
+
+{limits}
 
 shutdown = Shutdown()
 asked = threading.Event()
@@ -33,17 +36,29 @@ shutdown.when_asked(asked.set)
 shutdown.release = lambda: (print("released", flush=True), {release})
 logging.basicConfig(format="%(message)s", stream=sys.stdout)
 shutdown.last_words = sys.stdout.flush
+{last}
 print("up", flush=True)
 {hang}
 asked.wait()
 leave(7)
 """
 LIMIT = 3.0
+UNHURRIED = "module._WORDS = 10.0"
+"""For what the last resort says, and not how soon: what has come to its end is not waited for."""
 
 
-def end(hang: str = "", release: str = "None", number: int = signal.SIGTERM) -> tuple[int, str]:
-    """Exit status and output of a process that hangs, and is asked to end."""
-    program = PROGRAM.format(hang=hang, release=release)
+def end(
+    hang: str = "",
+    release: str = "None",
+    number: int = signal.SIGTERM,
+    limits: str = "",
+    last: str = "",
+) -> tuple[int, str]:
+    """Exit status and output of a process that hangs, and is asked to end within 3 s.
+
+    limits, last: statements before and after the last resort is made
+    """
+    program = PROGRAM.format(hang=hang, release=release, limits=limits, last=last)
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -57,11 +72,13 @@ def end(hang: str = "", release: str = "None", number: int = signal.SIGTERM) -> 
     return process.returncode, output
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_an_orderly_shutdown_needs_no_last_resort(number: int) -> None:
     assert end(number=number) == (7, "")
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     "hang",
     [
@@ -73,18 +90,35 @@ def test_an_orderly_shutdown_needs_no_last_resort(number: int) -> None:
     ids=["loop", "sleep", "block", "handler taken"],
 )
 def test_a_process_that_hangs_lets_go_of_the_servo_and_ends(hang: str) -> None:
-    status, output = end(hang)
+    status, output = end(hang, limits=f"{UNHURRIED}; module._RELEASE = 10.0")
     assert (status, output.partition("\n")[0]) == (1, "released")
     assert re.search(r"fishd hangs in .+: the servo is released and the process is ended", output)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("release", ["time.sleep(60)", "1 / 0"])
 def test_a_servo_that_is_not_released_keeps_nobody_and_is_named(release: str) -> None:
-    status, output = end("time.sleep(60)", release)
+    status, output = end("time.sleep(60)", release, limits=UNHURRIED)
     assert (status, output.partition("\n")[0]) == (1, "released")
     assert "the servo may keep its pulses ('fishctl release' releases it)" in output
 
 
+@pytest.mark.realtime
+def test_a_busy_machine_has_time_for_the_last_line() -> None:
+    slow = "module.log.addFilter(lambda record: time.sleep(0.3) or True)"
+    status, output = end("time.sleep(60)", last=slow)
+    assert status == 1
+    assert "fishd hangs in" in output
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("what", ["module.log.critical", "shutdown.last_words"])
+def test_last_words_that_hang_keep_nobody(what: str) -> None:
+    hangs = f"{what} = lambda *arguments: time.sleep(60)"
+    assert end("time.sleep(60)", "time.sleep(60)", last=hangs)[0] == 1
+
+
+@pytest.mark.realtime
 def test_a_thread_that_a_controller_left_behind_keeps_nobody() -> None:
     assert end("threading.Thread(target=time.sleep, args=(60,)).start()") == (7, "")
 

@@ -11,7 +11,7 @@ from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
-from fishd.hardware.servo.pigpio_client import Client, opened
+from fishd.hardware.servo.pigpio_client import ANSWER, SCRIPTS, Client, opened
 from fishd.hardware.servo.pigpio_link import PigpioLink
 from fishd.hardware.servo.pigpio_pulses import neutralise
 from fishd.virtual.pi.faults import Faults
@@ -79,8 +79,12 @@ class Bench:
 
     def scripts(self) -> int:
         """How many scripts pigpiod holds."""
+        found = 0
         with self.client() as client:
-            return sum(bool(client.script_status(script)[1]) for script in range(32))
+            for script in range(SCRIPTS):
+                client.within(ANSWER)
+                found += bool(client.script_status(script)[1])
+        return found
 
     def refuse(self, command: int, value: int) -> None:
         """From now on pigpiod refuses this command with this second parameter."""

@@ -32,7 +32,10 @@ def main(kind: str, link_number: str, listener_number: str, address: str) -> int
     gateway.configure(server)
     server.set(zmq.USE_FD, os.dup(int(listener_number)))  # which is closed when this begins anew
     server.bind(address)
-    why = gateway.run(connection, server, ResourceLimits(gateway.MEMORY, gateway.CONNECTIONS))
+    limits = ResourceLimits(gateway.MEMORY, gateway.CONNECTIONS)
+    with suppress(OSError):  # as below
+        connection.send(link.READY)
+    why = gateway.run(connection, server, limits)
     if why:
         with suppress(OSError):  # fishd has ended, or takes nothing just now
             connection.send(link.NOTICE + why.encode())

@@ -17,14 +17,25 @@ from fishd.core import addresses
 from fishd.core.errors import StartupError
 from fishd.core.signals import Event, Status, Tick
 from fishd.daemon.control_server import ControlServer
-from fishd.daemon.gateway.link import CONTROL, END, LONGEST, NOTICE, TELEMETRY, pair, published
+from fishd.daemon.gateway.link import (
+    CONTROL,
+    END,
+    LONGEST,
+    NOTICE,
+    READY,
+    TELEMETRY,
+    pair,
+    published,
+)
 
 PAUSES = 0.05, 2.0
 """Shortest and longest pause before a gateway is started again [s]."""
 HEALTHY = 10.0
 """A gateway that ran for so long is started again after the shortest pause [s]."""
 RETURN = 1.0
-"""How long clients may take to connect again [s]."""
+"""How long clients may take to connect again, once a gateway serves [s]."""
+START = 30.0
+"""A restart is told of after so long even where the new gateway never serves [s]."""
 FAREWELL = 0.5
 """How long it may take to pass on the last messages from when it is told to end [s]."""
 
@@ -56,11 +67,12 @@ class Gateway:
         self._listener = listener
         self._events = asyncio.get_running_loop()
         self._link: socket.socket | None = None
-        self._wanted = kind == TELEMETRY  # its only message is why it ends
+        self._wanted = kind == TELEMETRY  # it says but that it serves, and why it ends
         self._reading = False
         self._pause = PAUSES[0]
         self._why = ""
         self._telling: asyncio.TimerHandle | None = None
+        self._tell_by = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
         try:
@@ -145,6 +157,8 @@ class Gateway:
             message = b""
         if not message:
             self._ended()
+        elif message == READY:
+            self._serves()
         elif message.startswith(NOTICE):
             self._tell(message[1:].decode(errors="replace"))
         else:
@@ -152,6 +166,8 @@ class Gateway:
 
     def _ended(self) -> None:
         self._drop_link()
+        if self._telling:  # nobody would hear it now
+            self._tell_at(self._tell_by)
         lived = self._events.time() - self._started
         self._pause = PAUSES[0] if lived > HEALTHY else min(2.0 * self._pause, PAUSES[1])
         self._timer = self._events.call_later(self._pause, self._start_again)
@@ -166,16 +182,27 @@ class Gateway:
             self._start()
             self._tell(f"its process ended with status {status}")
         except OSError as error:  # Python was renewed, say, and is not there just now
-            self._tell(f"it cannot be started: {error.strerror}")
+            self._tell(f"it cannot be started: {error.strerror}", RETURN)
             self._pause = PAUSES[1]
             self._timer = self._events.call_later(self._pause, self._start_again)
 
-    def _tell(self, why: str) -> None:
-        """Count a restart, and report it soon: subscribers are still on their way back."""
+    def _tell(self, why: str, within: float = START) -> None:
+        """Count a restart, and report it once subscribers are back, or `within` so long [s]."""
         self.restarts += 1
         self._why = why
         if self._telling is None:
-            self._telling = self._events.call_later(RETURN, self._told)
+            self._tell_by = self._events.time() + within
+        self._tell_at(self._tell_by)
+
+    def _serves(self) -> None:
+        """From now on subscribers can come back, and hear of the restart then."""
+        if self._telling:
+            self._tell_at(min(self._tell_by, self._events.time() + RETURN))
+
+    def _tell_at(self, when: float) -> None:
+        if self._telling:
+            self._telling.cancel()
+        self._telling = self._events.call_at(when, self._told)
 
     def _told(self) -> None:
         self._telling = None

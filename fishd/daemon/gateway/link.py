@@ -9,8 +9,9 @@ LONGEST = 65536
 TELEMETRY, CONTROL = "telemetry", "control"
 """The kinds of gateways."""
 
-REQUEST, NOTICE, END = b"?", b"!", b"."
-"""First bytes: a client's request, why a gateway ends, and that fishd does."""
+REQUEST, READY, NOTICE, END = b"?", b"^", b"!", b"."
+"""First bytes: a client's request, that a gateway serves from now on, why it ends, and that fishd
+does."""
 _PART, _LAST = b"+", b"="
 
 _HEAD = 9

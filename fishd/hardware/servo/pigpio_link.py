@@ -167,6 +167,8 @@ class PigpioLink:
             client = self._opening = Client(
                 self._settings.host, self._settings.port, self._patience(limit), self._standstill
             )
+            if self._closed.is_set():  # by one who may not have seen it
+                raise ConnectionError("closed")
             client.get_pigpio_version()
             allowed = preparation
             client.within(self._patience(preparation))

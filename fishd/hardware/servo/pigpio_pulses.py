@@ -56,10 +56,15 @@ def armed(gpio: int, count: int, width: float) -> list[int]:
     return [count, gpio, round(width)]
 
 
-def countdowns(client: Client, gpio: int) -> list[int]:
-    """The scripts on this pin that an earlier connection or a killed fishd left behind."""
+def countdowns(client: Client, gpio: int, limit: float | None = None) -> list[int]:
+    """The scripts on this pin that an earlier connection or a killed fishd left behind.
+
+    limit: of each of its many commands [s]; without it all of them share that of the client
+    """
     found = []
     for script in range(SCRIPTS):
+        if limit is not None:
+            client.within(limit)
         _, parameters = client.script_status(script)
         if parameters and parameters[1] == gpio and parameters[-1] == MAGIC:
             found.append(script)
@@ -125,7 +130,7 @@ def neutralise(
     except BaseException:
         with suppress(ServoError), opened(host, port) as client:
             client.set_servo_pulsewidth(gpio, OFF)
-            remove(client, countdowns(client, gpio))
+            remove(client, countdowns(client, gpio, ANSWER))
         raise
 
 
@@ -134,7 +139,7 @@ def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool
         sleep(seconds)
         client.within(ANSWER)  # each of many looks has its own time
 
-    scripts = countdowns(client, gpio)
+    scripts = countdowns(client, gpio, ANSWER)
     client.within(ANSWER)
     energised = pulses_on(client, gpio, look)
     if energised:

@@ -5,6 +5,7 @@ import time
 
 import pytest
 from rigs.force_rig import TICK, ForceRig
+from rigs.processes import wait_until
 
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import SystemClock
@@ -49,7 +50,7 @@ def test_a_thread_samples_in_real_time_until_closed() -> None:
         wait_for_pair(sensor)
         assert len(sampler_threads()) == 1
         sensor.close()
-        assert not sampler_threads()
+        wait_until(lambda: not sampler_threads())
 
 
 @pytest.mark.realtime

@@ -1,10 +1,11 @@
 """A whole robot with a power meter: on a virtual Pi, in real threads, and in the configuration."""
 
-import time
-from contextlib import ExitStack
+import threading
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
+from rigs.processes import PATIENCE, wait_until
 
 from fishd.config import load
 from fishd.config.assembly import parts_of
@@ -46,49 +47,60 @@ def test_the_force_sensor_loses_few_samples_to_the_power_meter() -> None:
     assert counts[0] > 0.94 * counts[1]
 
 
-class Stuck(PowerMeterDriver[PowerMeterSettings]):
-    """A meter whose transfers hang."""
+class Steady(PowerMeterDriver[PowerMeterSettings]):
+    """A meter that is always there."""
 
     Settings = PowerMeterSettings
-    place = "a stuck meter"
+    place = "a meter"
 
     def open(self) -> None:
         """There it is."""
 
     def sample(self) -> PowerSample:
-        """Hang."""
-        time.sleep(0.3)
-        return PowerSample(self.clock.monotonic(), 1.0)
+        """The same at any time."""
+        return PowerSample(self.clock.monotonic(), 2.5)
 
     def close(self) -> None:
         """Gone."""
 
 
 def test_a_meter_that_hangs_does_not_delay_a_read() -> None:
+    entered, go, left = threading.Event(), threading.Event(), threading.Event()
+
+    class Stuck(Steady):
+        def sample(self) -> PowerSample:
+            entered.set()
+            go.wait(PATIENCE)
+            left.set()
+            return super().sample()
+
     clock = SystemClock()
     driver = Stuck(PowerMeterSettings(driver="stuck"), clock, 0.0125)
     with ExitStack() as stack:
         meter = SampledPower(driver, clock, threaded=True, tick=0.05)
         stack.callback(meter.close)
-        time.sleep(0.05)
-        begun = time.perf_counter()
-        with pytest.raises(SensorError, match="a stuck meter has not delivered"):
+        stack.callback(go.set)
+        assert entered.wait(PATIENCE)
+        with pytest.raises(SensorError, match="a meter has not delivered"):
             meter.read(clock.monotonic())
-        assert time.perf_counter() - begun < 0.05
+        assert not left.is_set()
 
 
 def test_a_thread_reads_the_meter_of_a_robot_in_real_time() -> None:
-    class Steady(Stuck):
-        def sample(self) -> PowerSample:
-            return PowerSample(self.clock.monotonic(), 2.5)
-
     clock = SystemClock()
     driver = Steady(PowerMeterSettings(driver="steady"), clock, 0.0125)
     with ExitStack() as stack:
         meter = SampledPower(driver, clock, threaded=True, tick=0.05)
         stack.callback(meter.close)
-        time.sleep(0.1)
-        assert meter.read(clock.monotonic()) == 2.5
+        powers: list[float] = []
+
+        def read() -> bool:
+            with suppress(SensorError):  # none yet
+                powers.append(meter.read(clock.monotonic()))
+            return bool(powers)
+
+        wait_until(read)
+        assert powers == [2.5]
 
 
 def test_a_meter_at_the_address_of_the_force_sensor_is_refused() -> None:

@@ -4,6 +4,8 @@ import contextlib
 import socket
 import struct
 import threading
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rigs.pigpio_rig import Bench
@@ -11,6 +13,7 @@ from rigs.processes import PATIENCE
 
 from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import ServoError
+from fishd.hardware.servo import pigpio_link
 from fishd.hardware.servo.pigpio import PigpioSettings
 from fishd.hardware.servo.pigpio_client import Client, opened
 from fishd.hardware.servo.pigpio_link import PigpioLink
@@ -58,7 +61,8 @@ def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, messag
     server = Server(answer, dies=dies)
     try:
         host, port = server.settings.host, server.settings.port
-        with pytest.raises(ServoError, match=message), opened(host, port, 0.2) as client:
+        limit = PATIENCE if dies else 0.2
+        with pytest.raises(ServoError, match=message), opened(host, port, limit) as client:
             client.script_status(0)
     finally:
         server.close()
@@ -82,8 +86,10 @@ def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: Bench) -> No
             raise IndexError("out of range")
 
     link = PigpioLink(bench.settings(), SystemClock(), prepare, threaded=True)
+    assert link._connected.wait(PATIENCE)
     with contextlib.closing(link), link.session(last=True) as client:
         assert client is attempts[1]
+        attempts[0].within(PATIENCE)
         with pytest.raises(OSError, match="Bad file descriptor"):
             attempts[0].get_pigpio_version()
 
@@ -92,11 +98,49 @@ def test_an_unforeseen_error_is_the_reason_why_there_is_no_connection(bench: Ben
     def prepare(client: Client) -> None:
         raise IndexError("out of range")
 
+    stands_still = bench.daemon.stands_still
     with (
         contextlib.closing(
-            PigpioLink(bench.settings(), VirtualClock(), prepare, threaded=False)
+            PigpioLink(
+                bench.settings(), VirtualClock(), prepare, threaded=False, standstill=stands_still
+            )
         ) as link,
         pytest.raises(ServoError, match="not connected: out of range"),
         link.session(),
     ):
         pass
+
+
+def test_a_link_that_is_closed_while_it_connects_asks_for_nothing_more(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connected, go = threading.Event(), threading.Event()
+    asked: list[Client] = []
+
+    class Held(Client):
+        """It has a connection, and nobody knows of it yet."""
+
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            connected.set()
+            go.wait(PATIENCE)
+
+        def get_pigpio_version(self) -> int:
+            asked.append(self)
+            return 79
+
+    monkeypatch.setattr(pigpio_link, "Client", Held)
+    monkeypatch.setattr(pigpio_link, "START", 0.0)
+    link = PigpioLink(bench.settings(), SystemClock(), asked.append, threaded=True)
+    thread = link._thread
+    assert thread
+    assert connected.wait(PATIENCE)
+
+    def join(limit: float) -> None:
+        go.set()  # close has done all that it does before it waits
+        thread.join(PATIENCE)
+
+    monkeypatch.setattr(link, "_thread", SimpleNamespace(join=join))
+    link.close()
+    assert not thread.is_alive()
+    assert asked == []

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from rigs.coarse_swimmer import OPTIONS
-from rigs.processes import Daemon, running, wait_until
+from rigs.processes import PATIENCE, Daemon, running, wait_until
 
 from fishd.client import Agent, Fish
 
@@ -26,7 +26,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 def test_its_ticks_are_evenly_spaced_in_its_time_and_slower_in_that_of_people(
     daemon: Daemon,
 ) -> None:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         ticks = fish.ticks()
         seen = [next(ticks) for _ in range(40)]
     first, last = seen[0], seen[-1]
@@ -37,6 +37,7 @@ def test_its_ticks_are_evenly_spaced_in_its_time_and_slower_in_that_of_people(
 
 
 def test_its_status_says_so_and_no_tick_is_late(daemon: Daemon) -> None:
+    assert daemon.fishctl("set-controller", "swing").returncode == 0
     wait_until(lambda: daemon.status().seq > 20)
     status = daemon.status()
     (line,) = status.degraded
@@ -84,7 +85,7 @@ def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> No
     slow = ("--set", "swimmer.slow_motion=100")  # a tick a second
     with (
         running(tmp_path, *OPTIONS, *slow) as daemon,
-        Fish(daemon.endpoint) as fish,
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
         Agent(f"ipc://{tmp_path}/agent") as agent,
     ):
         fish.set_controller("remote", agent=agent.address)
