@@ -2,7 +2,7 @@
 
 import random
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -16,6 +16,7 @@ from fishd.camera.simulated.camera import Tail
 from fishd.camera.sources import simulated
 from fishd.camera.sources.base import Shot, Timeline, Trouble
 from fishd.camera.sources.simulated import Foresight, SimulatedSource, Swimmer, TickTruth
+from fishd.client import Fish
 from fishd.config import Config
 from fishd.core.signals import Status, Tick
 from fishd.virtual.fish import SimulatedFish
@@ -162,7 +163,7 @@ def test_a_camera_that_was_held_up_itself_does_not_say_that_fishd_does_not_tick(
     heard = Heard([swim.tick() for _ in range(20)])
     monkeypatch.setattr(simulated, "SILENCE", -1.0)  # it has been as long at each look
     monkeypatch.setattr(simulated, "subscriber", lambda *_: heard)
-    source = SimulatedSource(SimulatedSettings(), 84)
-    source._follow(Fishd(swum(0.2).recorder.ticks[0]), sink, lambda _: sink.frames > 3)  # type: ignore[arg-type]
+    source, fishd = SimulatedSource(SimulatedSettings(), 84), Fishd(swum(0.2).recorder.ticks[0])
+    source._follow(cast(Fish, fishd), sink, lambda _: sink.frames > 3)
     assert sink.frames > 3
     assert sink.troubles == []

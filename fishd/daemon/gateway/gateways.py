@@ -67,7 +67,7 @@ class Gateway:
         self._listener = listener
         self._events = asyncio.get_running_loop()
         self._link: socket.socket | None = None
-        self._wanted = kind == TELEMETRY  # it says but that it serves, and why it ends
+        self._wanted = kind == TELEMETRY  # its only messages: that it serves, and why it ends
         self._reading = False
         self._pause = PAUSES[0]
         self._why = ""
