@@ -1,5 +1,6 @@
 """The force sensor in real time: its thread, how it keeps out of the tick's way, how it ends."""
 
+import contextlib
 import threading
 import time
 
@@ -42,14 +43,13 @@ def sampler_threads() -> list[threading.Thread]:
 
 def test_a_thread_samples_in_real_time_until_closed() -> None:
     with ForceRig(clock=SystemClock()):
-        sensor = threaded()
-        begun = time.monotonic()
-        measured = wait_for_pair(sensor)
-        assert begun <= measured.time <= time.monotonic()
-        assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
-        wait_for_pair(sensor)
-        assert len(sampler_threads()) == 1
-        sensor.close()
+        begun = time.monotonic()  # the thread may have a pair before `threaded` returns
+        with contextlib.closing(threaded()) as sensor:
+            measured = wait_for_pair(sensor)
+            assert begun <= measured.time <= time.monotonic()
+            assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+            wait_for_pair(sensor)
+            assert len(sampler_threads()) == 1
         wait_until(lambda: not sampler_threads())
 
 
