@@ -1,9 +1,9 @@
 """The number of an I2C bus for tests that need one which nobody else drives."""
 
+import atexit
 import socket
 from functools import cache
 
-_HELD: list[socket.socket] = []
 LOWEST, BEYOND = 100, 178
 ANOTHER = BEYOND - LOWEST
 """So much larger is the number of a second bus, spare as well."""
@@ -19,6 +19,6 @@ def spare_bus() -> int:
         except OSError:
             held.close()
             continue
-        _HELD.append(held)
+        atexit.register(held.close)
         return bus
     raise AssertionError("no bus is spare")
