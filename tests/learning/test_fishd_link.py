@@ -283,15 +283,15 @@ def test_a_fishd_that_is_gone_or_was_restarted_ends_it(tmp_path: Path) -> None:
         assert swims(env)
         second.process.kill()
         second.process.wait()
-    with running(tmp_path, *sets("tick=0.1")) as third:
+    with running(tmp_path, *sets("tick=0.1")) as third, Fish(third.endpoint) as fish:
         pids = f"it is process {third.process.pid} now, and was {second.process.pid}"
         with losing(f"^fishd was restarted: {pids}$"):
             swim_for_ever(env.link)
         env.reset()
+        fish.set_parameters(misses=MANY)  # or it may be a fault before it is closed
         assert swims(env)
         env.close()
-        with Fish(third.endpoint) as fish:
-            assert fish.status().mode == "idle"
+        assert fish.status().mode == "idle"
 
 
 def test_a_closed_link_says_so(link: FishdLink) -> None:
