@@ -158,17 +158,26 @@ def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
     assert (run / "seeds.csv").exists()
 
 
-def test_ctrl_c_before_any_has_begun_is_heeded_as_well(tmp_path: Path) -> None:
+STOPS_ITSELF = """\
+import os, signal, sys
+if any("popen_loky" in word for word in sys.orig_argv):
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
+"""Run by every Python that starts: a trainer waits for SIGCONT before it has loaded anything."""
+
+
+def is_stopped(process: int) -> bool:
+    return "\nState:\tT" in Path(f"/proc/{process}/status").read_text()
+
+
+def test_ctrl_c_before_any_has_begun_is_heeded_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(STOPS_ITSELF)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG) as process:
-        held: set[int] = set()
-
-        def both_are_held() -> bool:
-            for trainer in {*trainers(process.pid)} - held:  # which has all to import as yet
-                os.kill(trainer, signal.SIGSTOP)
-                held.add(trainer)
-            return len(held) == 2
-
-        wait_for(both_are_held)
+        wait_for(lambda: sum(map(is_stopped, trainers(process.pid))) == 2)
+        held = trainers(process.pid)
         os.killpg(process.pid, signal.SIGINT)
         wait_for((tmp_path / "run" / "stop").exists)
         for trainer in held:
