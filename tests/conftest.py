@@ -113,7 +113,8 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
             break
         if terminal := item.config.pluginmanager.get_plugin("terminalreporter"):
             taken = f"failed while the host took {stolen() - before:.2f} s away: judged again"
-            terminal.write_line(f"\n{item.nodeid}: {taken}")
+            failures = "\n".join(report.longreprtext for report in reports if report.failed)
+            terminal.write_line(f"\n{item.nodeid}: {taken}\n{failures}")
         item.session._setupstate.teardown_exact(None)
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
