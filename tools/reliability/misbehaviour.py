@@ -205,14 +205,18 @@ def importing() -> Outcome:
 
 def ask(endpoint: str, method: str, way: str) -> None:
     """Let a method hang, and wait until it does; one that loads holds up nobody."""
-    zoo = {"name": "zoo", "parameters": {"deed": way, "method": method}}
+    zoo = {"deed": way, "method": method}
     with Fish(endpoint, timeout=PATIENCE) as fish:
-        send(endpoint, fish.request("set-controller", zoo)[1])
         if method in ("retune", "close"):
-            await_mode(fish, "running")
-            nudge = {"parameters": {"nudge": 1}}
-            retune = ("set-parameter", nudge) if method == "retune" else ("stop", {})
-            send(endpoint, fish.request(*retune)[1])
+            fish.set_controller("zoo", **zoo)  # answered once it is active
+        match method:
+            case "retune":
+                request = fish.request("set-parameter", {"parameters": {"nudge": 1}})
+            case "close":
+                request = fish.request("stop", {})
+            case _:
+                request = fish.request("set-controller", {"name": "zoo", "parameters": zoo})
+        send(endpoint, request[1])
     if method in ("check", "__init__"):
         time.sleep(0.5)
     else:
