@@ -52,13 +52,13 @@ STEPS = 6400
 @click.option(
     "--folder",
     type=click.Path(path_type=Path),
-    help="Where everything goes; one that began in it is gone on with. [default: "
+    help="Where everything goes; an adaptation that began there is resumed. [default: "
     "runs/adapt-DATE-TIME]",
 )
 @click.option(
     "--no-command",
     is_flag=True,
-    help="On a robot: leave the fish at rest, instead of the winner in command.",
+    help="On a robot: leave the fish at rest; without it, the winner swims on.",
 )
 @click.option(
     "--config",
@@ -83,10 +83,10 @@ def adapt(
 ) -> int:
     """Find the best gait of a fish that nobody has seen, in five minutes of tank time.
 
-    It swims excitation, and a fish is fitted to its forces. swing --C auto searches its C, and a
+    It swims excitation, and a fish is fitted to its forces. swing --C auto finds its C, and a
     search the best square wave. A policy is trained on the cloud of fish that the fit leaves
-    possible. All three are measured on the fish, and the winner takes command of it. Nothing is
-    assumed of plant and rig, also where the configuration says something of them.
+    possible. All three are measured on the fish, and the winner swims it from then on. Nothing is
+    assumed of plant and rig, even if the configuration describes them.
 
     Ctrl-C lets the fish rest; the same command with the --folder goes on, and measures nothing
     again.
@@ -134,7 +134,7 @@ def adapt(
         winner = _winner(state)
         if fish and not no_command:
             fish.set_controller(winner.controller, **winner.parameters)
-            echo(f"{winner.name} is in command; to have it again: {words}", err=as_json)
+            echo(f"{winner.name} swims the fish now; to have it again: {words}", err=as_json)
         else:
             echo(f"to have it again: {words}", err=as_json)
     return 0

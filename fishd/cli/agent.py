@@ -63,8 +63,8 @@ def agent(
     """Let a policy swim the fish of a running fishd, tick by tick, until Ctrl-C.
 
     It chooses each angle in this program, as the agent of fishd's controller `remote`: on the
-    robot's own computer or on another one. So a policy that sees pictures swims, which fishd itself
-    has none of; they come from a running fishd-camera. Policies that see forces swim, too.
+    robot's own computer or on another one. So a policy that sees pictures can swim, although fishd
+    has no pictures: they come from a running fishd-camera. Policies that see forces swim, too.
 
     Without frames for 0.25 s the fish waits at neutral; after 2 s the camera counts as lost.
     However this ends, the fish is at neutral. Exit status 1 where the policy does not fit the robot

@@ -43,7 +43,7 @@ _SYMBOLS = {
 
 @click.command()
 @click.argument("runs", nargs=-1, metavar="[RUN]...")
-@click.option("--experiment", is_flag=True, help="Let a fish swim what tells most about it, first.")
+@click.option("--experiment", is_flag=True, help="First let a fish swim what tells most about it.")
 @click.option(
     "--on",
     type=click.Choice(["simulation", "robot"]),

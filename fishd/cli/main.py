@@ -32,7 +32,7 @@ VERBS = {
         "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
         "compare": Verb("compare", "compare", "Compare controllers and policies on one fish."),
         "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
-        "optimise": Verb("optimise", "optimise", "Search the best parameters of a controller."),
+        "optimise": Verb("optimise", "optimise", "Find the best parameters of a controller."),
         "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
         "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
     },

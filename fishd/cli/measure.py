@@ -64,9 +64,9 @@ def measure_options(function: Any) -> Any:
 def measure() -> None:
     """Find a controller's thrust, with its 95 % interval.
 
-    The fish swims and rests in turn, about 6 s and 3 s, so that a drift of the force sensor can be
-    told apart; only whole beats count. The fish must be at rest before, and is at rest afterwards.
-    A running fishd shows its thrust by this measurement from then on.
+    The fish swims and rests in turn, about 6 s and 3 s, which separates the thrust from a
+    drift of the force sensor; only whole beats count. The fish must be at rest before, and is at
+    rest afterwards. A running fishd shows its thrust by this measurement from then on.
     """
 
 

@@ -52,19 +52,19 @@ def optimise_options(function: Any) -> Any:
         click.option(
             "--folder",
             type=click.Path(path_type=Path),
-            help="Where table, recordings and picture go; a search that began in it is gone on "
-            "with. [default: runs/optimise-DATE-TIME]",
+            help="Where table, recordings and picture go; a search that began there is "
+            "resumed. [default: runs/optimise-DATE-TIME]",
         ),
         click.option(
             "--at-least",
             type=FiniteRange(min=0.0, min_open=True),
             metavar="MN",
-            help="A thrust [mN]: search what gives it for the least power.",
+            help="A thrust [mN]: find the parameters that give it for the least power.",
         ),
         click.option(
             "--objective",
             type=click.Choice(["thrust", "thrust-per-watt"]),
-            help="What is to be the most; with a watt, of the servo's electrical power. "
+            help="What to maximise: thrust, or thrust per watt of the servo's electrical power. "
             "[default: thrust]",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the search."),
@@ -73,7 +73,7 @@ def optimise_options(function: Any) -> Any:
             type=FiniteRange(0.0, 1.0),
             default=0.01,
             show_default=True,
-            help="Stop where another trial is expected to give no more, as a share of the thrust.",
+            help="Stop once another trial is expected to gain less than this share of the thrust.",
         ),
         click.option(
             "--budget",

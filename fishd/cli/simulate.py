@@ -172,7 +172,7 @@ def _chosen(report: "Report") -> list[tuple[str, str]]:
     if report.parameters.get("C") != "auto" or "criterion" not in report.quantities:
         return []
     found = report.quantities
-    ahead = f", of the speed that is foreseen {found['lead']:g} s ahead" if found["lead"] else ""
+    ahead = f", of the speed that is predicted {found['lead']:g} s ahead" if found["lead"] else ""
     turns = ", in turn with another one" if found["halfway"] else ""
     return [("", f"C = {found['criterion']:g} at the end{ahead}{turns}")]
 

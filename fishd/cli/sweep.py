@@ -46,8 +46,8 @@ def sweep_options(function: Any) -> Any:
         click.option(
             "--folder",
             type=click.Path(path_type=Path),
-            help="Where table, recordings and picture go; a sweep that began in it is gone on "
-            "with. [default: runs/sweep-DATE-TIME]",
+            help="Where table, recordings and picture go; a sweep that began there is "
+            "resumed. [default: runs/sweep-DATE-TIME]",
         ),
         click.option(
             "--for",

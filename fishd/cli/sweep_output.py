@@ -141,7 +141,7 @@ def _measured(found: "WholeTicks", force_unit: str) -> str:
 
 
 def again(folder: Path) -> str:
-    """The command line that goes on with a sweep."""
+    """The command line that resumes a sweep."""
     words = sys.argv[1:]
     if not any(word == "--folder" or word.startswith("--folder=") for word in words):
         words = [*words, "--folder", str(folder)]

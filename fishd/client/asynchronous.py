@@ -127,7 +127,7 @@ class AsyncFish(Connection):
         return await self._call(Calibrations, "renew-lease", lease=lease)
 
     async def end_lease(self, lease: str) -> Calibrations:
-        """Begin to end a lease: neutral, then the calibration of before is used again."""
+        """Begin to end a lease: neutral, then the previous calibration is used again."""
         return await self._call(Calibrations, "end-lease", lease=lease)
 
     def ticks(self) -> AsyncIterator[Tick]:

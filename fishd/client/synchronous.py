@@ -145,7 +145,7 @@ class Fish(Connection):
         return self._call(Calibrations, "renew-lease", lease=lease)
 
     def end_lease(self, lease: str) -> Calibrations:
-        """Begin to end a lease: neutral, then the calibration of before is used again.
+        """Begin to end a lease: neutral, then the previous calibration is used again.
 
         That is done when `calibrations` says no `lease` any more.
         """

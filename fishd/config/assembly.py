@@ -165,7 +165,7 @@ def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtual
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
     """Let the I2C bus and the pins of this process be those of the virtual Pi that is running.
 
-    Raises `StartupError` where there is none, or a package is missing.
+    Raises `StartupError` if none runs, or a package is missing.
     """
     from fishd.virtual.pi.lgpio import EmulatedLgpio
     from fishd.virtual.pi.link import RemotePi

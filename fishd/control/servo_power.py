@@ -19,7 +19,7 @@ class ServoPower:
     def __init__(self, robot: Robot, reporter: Reporter, tick: float) -> None:
         """tick: period of the loop [s]"""
         self.trouble = ""
-        """Why it cannot be read, one line; empty where it can, or where there is none."""
+        """Why it cannot be read, one line; empty while it can, and without a power meter."""
         self._read = robot.power
         self._reporter = reporter
         self._latest: deque[float] = deque(maxlen=max(1, round(SPAN / tick)))

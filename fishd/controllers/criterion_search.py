@@ -21,7 +21,7 @@ class Rung(NamedTuple):
     C: float
     """When the fin's speed falls to this share of its last maximum,"""
     lead: float = 0.0
-    """or rather the speed that is foreseen so far ahead [s]."""
+    """or rather the speed that is predicted so far ahead [s]."""
 
 
 LADDER = (
@@ -82,7 +82,7 @@ class Phase(Enum):
 
 
 class CriterionSearch:
-    """Chooses the rung, told of the force in each tick."""
+    """Chooses the rung from the force of each tick."""
 
     def __init__(self) -> None:
         from fishd.controllers.ripple import ripples  # with numpy, which fishctl does without
@@ -253,7 +253,7 @@ class CriterionSearch:
         self._try_next()
 
     def _try_next(self) -> None:
-        """Begin a trial; watch where there is none left."""
+        """Begin the next trial; once all are made, watch."""
         while self._trials and not self._may_try(self._place + self._trials[0]):
             self._trials.pop(0)
         if not self._trials:

@@ -21,7 +21,7 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
         float,
         unit(
             "Hz",
-            "Frequency at which it turns back; at two ticks a beat it does in any case.",
+            "Frequency at which it turns back, or that of a beat of two ticks if that is lower.",
             gt=0,
             le=10,
         ),

@@ -43,7 +43,7 @@ def quantity(unit: str, description: str) -> Any:
     the tick. It is left out before it is assigned, and while it is None or no finite real number;
     to read it before it is assigned raises AttributeError.
 
-    unit: in SI notation, `1` where there is none
+    unit: in SI notation, `1` for a pure number
     description: one sentence
     """
     return _Declared(unit, description)

@@ -11,7 +11,7 @@ beyond 1 s it is that of 1 s: noise lasts no longer because somebody is ready to
 FIRST_PUSH = 0.2
 """Who begins from neutral does not reverse sooner: until the servo acts, all speed is noise [s]."""
 SLOPE_OVER = 0.05
-"""The speed ahead is foreseen from its change over so long, or a tick where that is longer [s]."""
+"""The speed ahead is predicted from its change over this time, or a tick if that is longer [s]."""
 
 
 class Reversal:
@@ -46,7 +46,7 @@ class Reversal:
         """Take in a tick.
 
         C: share of the top speed
-        lead: the speed that counts is foreseen so far ahead [s]
+        lead: the speed that counts is predicted so far ahead [s]
         longest: half period after which it reverses in any case [s]
         """
         self.since_reversal += observation.dt

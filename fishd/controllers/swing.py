@@ -16,7 +16,7 @@ LONGEST_TICK = 0.15
 """Of C auto: with longer ones a half beat has two or three, and its ripple cannot be told [s]."""
 BLIND = 4
 """With a lead, so many half beats come first that C = 0.6 ends: the speed of a fin that only begins
-to swing is not foreseen."""
+to swing is not predicted."""
 
 
 class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -47,8 +47,8 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Go by the speed that is foreseen so far ahead, if it goes on changing as it does; the "
-            "first two beats are with C = 0.6. C auto finds its own.",
+            "Compare the speed predicted this far ahead, from how it changes now; the first two "
+            "beats are with C = 0.6 and without it. C auto finds its own.",
             ge=0,
             le=1,
         ),
@@ -70,7 +70,7 @@ class Swing(Controller[SwingParameters]):
     reversal_speed: float = quantity("1", "C times `top_speed`: the tail reverses when so slow.")
     since_reversal: float = quantity("s", "Time since the last reversal.")
     criterion: float | None = quantity("1", "With C auto: the C in use, or on trial.")
-    lead: float | None = quantity("s", "With C auto: how far ahead the speed is foreseen.")
+    lead: float | None = quantity("s", "With C auto: how far ahead the speed is predicted.")
     halfway: float | None = quantity(
         "1", "With C auto: 1 where the two sides of a beat go by two C, or leads, in turn; else 0."
     )

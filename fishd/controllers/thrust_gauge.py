@@ -57,7 +57,7 @@ class ThrustGauge:
     """Told of each tick; knows the thrust after each half beat."""
 
     def __init__(self, coefficient: float | None) -> None:
-        """coefficient: the factor, by a model of the fish; None where there is none"""
+        """coefficient: the factor, by a model of the fish; None without a model"""
         self.latest: float | None = None
         """Thrust of the latest beat; None while not known [N]."""
         self.thrust: float | None = None

@@ -37,7 +37,7 @@ def lock_path(path: Path) -> Path:
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterator[None]:
-    """Hold the lock file of `path`, and make it where there is none.
+    """Hold the lock file of `path`, and make it if it does not exist.
 
     shared: every user of this machine may lock it, and may have made it
     remove: take the lock file away at the end, where that is permitted

@@ -77,7 +77,7 @@ class Plugins(Generic[T]):
         return (found.requires or []) if found else []
 
     def find(self, name: str) -> type[T]:
-        """The class of that name; raises `unknown` where there is none, or it does not load.
+        """The class of that name; raises `unknown` if it does not exist, or does not load.
 
         `problems` keeps why one does not load, until it does.
         """

@@ -245,7 +245,7 @@ OPERATIONS = {
         ServoLease, _CALIBRATIONS, f"lets the lease last for {LEASE:g} s from now"
     ),
     "end-lease": Operation(
-        ServoLease, _CALIBRATIONS, "begins to end it: neutral, then the calibration of before"
+        ServoLease, _CALIBRATIONS, "begins to end it: neutral, then the previous calibration"
     ),
     "calibrate-thrust": Operation(
         CalibrateThrust,

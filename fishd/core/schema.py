@@ -34,7 +34,7 @@ Scalar = bool | int | float | str | None
 def unit(symbol: str, description: str, *, file: str = "", **constraints: Any) -> Meta:
     """What a field means: `Annotated[float, unit("Hz", "Frequency of the command.", gt=0, le=10)]`.
 
-    symbol: the unit in SI notation, `1` where there is none
+    symbol: the unit in SI notation, `1` for a pure number
     file: suffix, such as `.onnx`, where a text may be the path of a file
     constraints: those of `msgspec.Meta`, such as gt, ge, lt, le, min_length, pattern
     """
@@ -61,7 +61,7 @@ class Field(Struct, frozen=True, omit_defaults=True):
     optional: bool
     """True where null is permitted."""
     required: bool = False
-    """True where there is no default."""
+    """True if it has no default."""
     file: str = ""
     """Suffix, such as `.onnx`, where a text may be the path of a file: see `names_file`."""
     words: tuple[str, ...] = ()

@@ -297,7 +297,7 @@ class QuantityInfo(Struct, frozen=True):
 
     name: str
     unit: str
-    """In SI notation, `1` where there is none."""
+    """In SI notation, `1` for a pure number."""
     description: str
 
 

@@ -31,7 +31,7 @@ class ControlServer:
         self._left = self._per_tick
         self._tasks: set[asyncio.Task[None]] = set()
         self.send: Callable[[bytes], bool] = lambda message: True
-        """Takes a message for the gateway, without waiting; False where there is no room for it."""
+        """Takes a message for the gateway, without waiting; False if the pipe is full."""
         self.read: Callable[[bool], object] = lambda wanted: None
         """Says whether the gateway is to hand over more requests."""
 

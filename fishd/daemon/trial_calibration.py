@@ -55,7 +55,7 @@ def _check_rest(loop: ControlLoop) -> None:
 
 
 class _Lease:
-    """A trial calibration: its holder, its end, and the calibration of before."""
+    """A trial calibration: its holder, its end, and the previous calibration."""
 
     def __init__(self, before: ServoCalibration, now: float) -> None:
         self.identity = secrets.token_hex(8)  # that of a daemon before this one is another
@@ -145,7 +145,7 @@ class TrialCalibration:
         self._mine(lease).until = self._now() + LEASE
 
     def end(self, lease: str) -> None:
-        """Begin to end a lease: neutral, then the calibration of before. Raises `Refused`."""
+        """Begin to end a lease: neutral, then the previous calibration. Raises `Refused`."""
         self._end(self._mine(lease), "given back")
 
     def _mine(self, identity: str) -> _Lease:
@@ -154,7 +154,7 @@ class TrialCalibration:
             raise Refused(
                 "no-lease",
                 f"this lease has ended: it was given back, or not renewed for {LEASE:g} s, or "
-                "fishd was restarted; the calibration of before is used again",
+                "fishd was restarted; the previous calibration is used again",
             )
         return lease
 

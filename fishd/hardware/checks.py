@@ -63,7 +63,7 @@ class Machine(ABC):
 
 
 class Check(NamedTuple):
-    """A function of the machine; it returns None where there is nothing to check."""
+    """A function of the machine; it returns None if there is nothing to check."""
 
     name: str
     function: Callable[[Any], Result | None]

@@ -172,7 +172,7 @@ def _speed(machine: Machine, number: int) -> Result:
 
 
 def _set_speed(machine: Machine, number: int) -> int | None:
-    """The bus's clock in the device tree [bit/s]; None where there is none."""
+    """The bus's clock in the device tree [bit/s]; None if the tree does not name it."""
     for folder in _ADAPTERS:
         place = machine.path(f"{folder}/i2c-{number}/of_node/clock-frequency")
         with suppress(OSError):

@@ -40,7 +40,7 @@ def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
 def write(config: str, function: str, neutral: float, arguments: dict[str, Any]) -> None:
     """Leave the recipe for the fishd that runs with a configuration file; atomic.
 
-    The rest is for `carry_out`. Where it cannot be written there is none, and `fishd-release`
+    The rest is for `carry_out`. If it cannot be written, `fishd-release` does without it, and
     takes its time.
     """
     recipe = {"function": function, "neutral": neutral, "arguments": arguments}
@@ -68,7 +68,7 @@ def remove(config: str) -> None:
 
 
 def read(config: str) -> dict[str, Any] | None:
-    """The recipe of the latest fishd that ran with a configuration file; None where there is none.
+    """The recipe of the latest fishd that ran with a configuration file; None if it left none.
 
     Its key `fresh` says whether the file has not changed since. One that somebody else may have
     written, or that is not whole, is none.

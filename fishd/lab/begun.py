@@ -1,4 +1,4 @@
-"""The folder of an experiment that can be gone on with: whose it is, and with what it was begun."""
+"""The folder of an experiment that can be resumed: whose it is, and with what it was begun."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -14,7 +14,7 @@ class Table:
     """A CSV file with a head; every row is passed to the operating system at once."""
 
     def __init__(self, path: Path, columns: Iterable[str]) -> None:
-        """Makes the file where there is none; raises OSError."""
+        """Makes the file if it does not exist; raises OSError."""
         self.path = path
         self.columns = tuple(columns)
         if not path.exists():

@@ -138,7 +138,7 @@ def _read(file: IO[bytes], offset: int, size: int) -> tuple[int, bytes | None]:
 
 
 def _resume(file: IO[bytes], offset: int, size: int) -> int | None:
-    """Where the next record is that can be told from damaged bytes; None where there is none."""
+    """Where the next intact record begins; None if all the rest is damaged."""
     while offset < size:
         file.seek(offset)
         window = file.read(_WINDOW)

@@ -54,8 +54,8 @@ class Run:
         self.daemons: list[dict[str, str]] = []
         """Each fishd that was recorded: version, process, robot."""
         self.configs: dict[int, dict[str, Any]] = {}
-        """The configuration of each, by its number in the recording, from 0; of one that ended
-        before it could be asked there is none."""
+        """The configuration of each, by its number in the recording, from 0; one that ended before
+        it could be asked has no entry."""
         self.calibrations: list[Calibrations] = []
         """The calibrations that were in use, one after the other."""
         self.finished = False

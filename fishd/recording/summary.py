@@ -13,7 +13,7 @@ class Gap(NamedTuple):
     """Ticks that fishd made and that are not in the recording."""
 
     after: float
-    """Time of the last tick before it; of the first one after it where there is none [s, unix]."""
+    """Time of the last tick before it; without one, of the first tick after it [s, unix]."""
     seq: int
     """Number of the first tick that is missing."""
     lost: int
@@ -220,7 +220,7 @@ def to_metadata(summary: Summary) -> dict[str, str]:
 
 
 def from_metadata(data: dict[str, str]) -> Summary | None:
-    """The summary in the metadata of a recording; None where there is none."""
+    """The summary in the metadata of a recording; None if it was never written."""
     known = {name: data[name] for name in Summary.__struct_fields__ if name in data}
     try:
         raw = {name: msgspec.json.decode(value) for name, value in known.items()}

@@ -154,7 +154,7 @@ def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> 
         assert (await client.ask("calibrations")).lease is None
         for op in ("renew-lease", "end-lease"):
             assert await client.refused(op, lease=lease) == "no-lease"
-        with pytest.raises(Refused, match="calibration of before is used again"):
+        with pytest.raises(Refused, match="previous calibration is used again"):
             await client.calibrate(WIDE, lease=lease)
 
     tell(rig, story)

@@ -1,4 +1,4 @@
-"""Sweeps: measured once, kept, gone on with, and safe to interrupt."""
+"""Sweeps: measured once, kept, resumed, and safe to interrupt."""
 
 import csv
 import os

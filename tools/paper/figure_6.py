@@ -154,7 +154,7 @@ def _bars(
     label: str,
     line: Any,
 ) -> None:
-    """Hollow where the speed still changed, and where there is no line."""
+    """Hollow where the speed still changed, and without a line."""
     axes.errorbar(
         column(rows, over),
         column(rows, "speed_mm_per_s"),

@@ -86,7 +86,7 @@ def _continuous_time() -> dict[tuple[float, float], float]:
 
 
 def _map(name: str) -> Array:
-    """A column of the table, of shape (criteria, ratios); NaN where there is nothing."""
+    """A column of the table, of shape (criteria, ratios); NaN where nothing was measured."""
     values = [np.nan if value == "" else value for value in column(read(NAME), name)]
     return np.array(values, dtype=np.float64).reshape(_SHAPE)
 
@@ -134,7 +134,7 @@ def verdicts(median: Array) -> tuple[str, str]:
 
 
 def percent(value: float, exact: float = np.nan) -> str:
-    """A share in percent, and in brackets what it should be; a dash where there is none."""
+    """A share in percent, and in brackets what it should be; a dash if nothing is known."""
     known = "" if np.isnan(exact) else f" ({percent(exact)})"
     return "–" if np.isnan(value) else f"{100 * value:.1f}{known}"
 

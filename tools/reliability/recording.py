@@ -70,7 +70,7 @@ def recorder(fishd: Fishd, folder: Path, name: str) -> Iterator[subprocess.Popen
 
 
 def ticks_in(path: Path) -> list[int]:
-    """The numbers of the ticks of a recording; none where there is none yet."""
+    """The numbers of the ticks of a recording; empty before it exists."""
     try:
         return [tick.seq for tick in open_run(path).ticks]
     except RecordingError:

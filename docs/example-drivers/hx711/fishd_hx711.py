@@ -59,7 +59,7 @@ class Hx711(ForceSensorDriver[Hx711Settings]):
     place = "the HX711 chips"
 
     def __init__(self, settings: Hx711Settings, clock: Clock) -> None:
-        """Raises `StartupError` where there is no RPi.GPIO; opens nothing yet."""
+        """Raises `StartupError` if RPi.GPIO is missing; opens nothing yet."""
         super().__init__(settings, clock)
         self.names = f"F_x (GPIO {settings.data_x})", f"F_y (GPIO {settings.data_y})"
         self._gpio = header.load()

@@ -21,7 +21,7 @@ class News(NamedTuple):
     facts: bytes
     """State, rate, age, losses and axis, as one JSON object."""
     jpeg: bytes | None
-    """The picture; None where there is no new one."""
+    """The picture; None if it is not new."""
 
 
 class Feed:

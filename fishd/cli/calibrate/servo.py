@@ -1,7 +1,7 @@
 """`fishctl calibrate servo`: trim, direction and limits by small steps.
 
 A calibration that is tried out is used for as long as a lease is renewed. Without the operator's
-yes at the end the calibration of before is used again, whatever happens.
+yes at the end the previous calibration is used again, whatever happens.
 """
 
 import math
@@ -126,7 +126,7 @@ def servo(endpoint: str | None) -> None:
     """Find the servo's trim, direction and limits by small steps.
 
     Watch the tail meanwhile. A positive angle moves it to the fish's left. The fish must be at
-    rest. Nothing is saved before you say yes; on Ctrl-C or any error the calibration of before is
+    rest. Nothing is saved before you say yes; on Ctrl-C or any error the previous calibration is
     in use again.
     """
     with Fish(endpoint) as fish, input_interrupted():

@@ -108,7 +108,7 @@ def _end(endpoint: str | None, lease: str, before: ServoCalibration) -> str:
     except FishError as error:
         return (
             f"where the servo is cannot be told: {error}; a fishd that still runs goes back to "
-            f"the calibration of before by itself within {LEASE:g} s"
+            f"the previous calibration by itself within {LEASE:g} s"
         )
     return f"{_servo(status)}; {_calibration(found, lease, before)}"
 

@@ -91,7 +91,7 @@ def rig_of(fish: Fish, seconds: float) -> Iterator["LiveRig"]:
 
 
 def fish_of(endpoint: str | None, stack: ExitStack) -> Fish | None:
-    """The fishd that runs, until `stack` is closed; None where there is none and none was named."""
+    """The fishd that runs, until `stack` is closed; None if none runs and none was named."""
     fish = stack.enter_context(Fish(endpoint))
     try:
         fish.status()

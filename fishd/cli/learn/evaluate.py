@@ -66,8 +66,8 @@ def evaluate(
 
     A contestant is a policy by name or file, or a controller with parameters, as for `fishctl
     compare`. Figures are shares of each fish's own best square wave, of its true thrust. The fish
-    differ from the configured one, by the keys that --json tells. "another took over" counts the
-    runs in which a policy lost command because it insisted on reversing too fast; "shaken" is the
+    differ from the configured one, by the keys that --json shows. "another took over" counts the
+    runs in which a policy was replaced because it insisted on reversing too fast; "shaken" is the
     longest stretch of reversals in consecutive ticks.
     Exit status 1 when a run ends in mode fault.
     """

@@ -28,7 +28,7 @@ LONGEST = 1e9
 def runs(folder: Path | None, as_json: bool) -> int:
     """List the recordings, the oldest first.
 
-    'thrust' is the mean while it swam, in mN unless another unit is told, with its 95 % interval.
+    'thrust' is the mean while it swam, in mN unless another unit is shown, with its 95 % interval.
     Where the zero of the sensor was never known, it is the mean force as measured, drift
     and offset included, ± ?. 'power' went into the servo meanwhile. 'lost' are ticks that fishd
     made and that are not in the file.

@@ -35,7 +35,7 @@ HEALTHY = 10.0
 RETURN = 1.0
 """How long clients may take to connect again, once a gateway serves [s]."""
 START = 30.0
-"""A restart is told of after so long even where the new gateway never serves [s]."""
+"""After this time a restart is reported, even if the new gateway does not serve yet [s]."""
 FAREWELL = 0.5
 """How long it may take to pass on the last messages from when it is told to end [s]."""
 
@@ -83,7 +83,7 @@ class Gateway:
             ) from None
 
     def send(self, message: bytes) -> bool:
-        """Send without waiting; False where there is no room for it, which counts as lost.
+        """Send without waiting; False if the pipe is full: the message counts as lost.
 
         What is sent while there is no process is lost as well: nobody waits for it there.
         """

@@ -47,7 +47,7 @@ class Estimate:
 
     @property
     def unit(self) -> str:
-        """In SI notation, `1` where there is none."""
+        """In SI notation, `1` for a pure number."""
         return UNITS[self.name]
 
 

@@ -15,7 +15,7 @@ class Aim(NamedTuple):
     """What is looked for."""
 
     objective: Literal["thrust", "thrust-per-watt"] = "thrust"
-    """What is to be the most, unless there is a target."""
+    """What to maximise, unless there is a target."""
     target: float | None = None
     """The thrust that is to be reached at the least power [N]."""
 

@@ -28,7 +28,7 @@ _COLUMNS = ("thrust", "error", "power", "power_error", "swum", "passed")
 
 
 class Begun(Struct, frozen=True):
-    """With what a search began; a folder is gone on with only by the same."""
+    """With what a search began; a folder is resumed only with the same."""
 
     on: str
     controller: str
@@ -53,7 +53,7 @@ class SearchFolder:
     """
 
     def __init__(self, path: Path, begun: Begun) -> None:
-        """Makes the folder, or goes on with one; raises `ConfigError` where that is of another."""
+        """Makes the folder, or resumes one; raises `ConfigError` if that began with another."""
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)

@@ -64,7 +64,7 @@ def trials(
 
     fixed: parameters that are not searched
     budget: time in the tank [s]
-    before: the last one of a search that is gone on with, which `search` knows already
+    before: the last one of a search that is resumed, which `search` knows already
     observe: told of each candidate, for `search` to know it; by default, its thrust
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """

@@ -55,7 +55,7 @@ class Best(Struct, frozen=True):
     x: float | None
     """The best value of that; None where nothing was varied."""
     x_low: float | None
-    """Its 95 % interval; None where there is none to tell."""
+    """Its 95 % interval; None if the points do not tell it."""
     x_high: float | None
     value: float
     """Of the thrust [N] or the speed [m/s]."""

@@ -25,7 +25,7 @@ On = Literal["simulation", "robot"]
 
 
 class Begun(Struct, frozen=True):
-    """What all points of a sweep have in common; a folder is gone on with only by the same."""
+    """What all points of a sweep have in common; a folder is resumed only with the same."""
 
     on: On
     config: dict[str, Any]
@@ -45,7 +45,7 @@ class SweepFolder:
     """A folder in which points are kept as they are measured; `results` has them by their key."""
 
     def __init__(self, path: Path, begun: Begun, columns: Sequence[str]) -> None:
-        """Makes the folder, or goes on with one.
+        """Makes the folder, or resumes one.
 
         columns: names of what differs from point to point, as in `Point.columns`
         Raises `ConfigError` where it is of another sweep.
@@ -146,7 +146,7 @@ class SweepFolder:
 
 
 def _other(head: Sequence[str], measured: tuple[str, ...]) -> str:
-    """Why a table with another head is not gone on with."""
+    """Why a table with another head is not resumed."""
     measured = (*measured, RECORDING)
     if tuple(head[-len(measured) :]) == measured:
         return (

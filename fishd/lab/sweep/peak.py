@@ -18,7 +18,7 @@ class Peak(NamedTuple):
 
     x: float
     x_low: float | None
-    """The 95 % interval of `x`; None where there is none to tell."""
+    """The 95 % interval of `x`; None if the points do not tell it."""
     x_high: float | None
     y: float
     y_error: float | None

@@ -21,7 +21,7 @@ RECORDED = ".mcap"
 
 
 class Begun(Struct, frozen=True):
-    """With what an adaptation began; a folder is gone on with only by the same."""
+    """With what an adaptation began; a folder is resumed only with the same."""
 
     on: str
     steps: int
@@ -149,7 +149,7 @@ class AdaptFolder:
     """A folder in which each step is kept as it is done; `state` has those that were there."""
 
     def __init__(self, path: Path, begun: Begun) -> None:
-        """Makes the folder, or goes on with one; raises `ConfigError` where that is of another."""
+        """Makes the folder, or resumes one; raises `ConfigError` if that began with another."""
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)

@@ -296,7 +296,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.link.close()
 
     def _look(self) -> bool:
-        """Take the stack of this tick; False where there is none."""
+        """Take the stack of this tick; False if the camera has not shown it."""
         self.stack = self.link.look()
         self._shown = self.stack or self._shown
         return self.stack is not None

@@ -52,7 +52,7 @@ class Link(Protocol):
     def look(self) -> Stack | None:
         """The frames for the latest observation.
 
-        None where the camera has not shown them, or there is none; to be asked once a tick.
+        None if the camera has not shown them yet, and without a camera; to be asked once a tick.
         """
 
     def pause(self, seconds: float) -> None:

@@ -87,7 +87,7 @@ def write_settings(folder: Path, settings: TrainingSettings) -> None:
 def read(folder: Path) -> tuple[Config, TrainingSettings]:
     """Configuration and settings of a run; raises `ConfigError`."""
     if not (folder / SETTINGS).is_file():
-        why = f"it has no {SETTINGS}" if folder.exists() else "there is none"
+        why = f"it has no {SETTINGS}" if folder.exists() else "it does not exist"
         raise ConfigError(f"{folder}: not the folder of a training: {why}")
     for file, kind in ((folder / CONFIG, Config), (folder / SETTINGS, TrainingSettings)):
         _check_complete(file, kind)

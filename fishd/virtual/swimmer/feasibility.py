@@ -38,7 +38,7 @@ _MARGIN = 1.2
 
 
 class Estimate(NamedTuple):
-    """What can be told of a swimmer before it swims."""
+    """What is known of a swimmer before it swims."""
 
     deflection: float
     """Of the tail at rest with full activation [m]."""

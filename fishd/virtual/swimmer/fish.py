@@ -15,8 +15,8 @@ from fishd.virtual.swimmer.settings import SwimmerSettings
 FRONT = 0.4
 """The front body: this share of the length, which hardly bends; heading and tail refer to it."""
 REAR = 0.8
-"""The rear body begins here. Its middle is what the angle of the tail is told of: the tip, which is
-thin, flutters."""
+"""The rear body begins here. The angle of the tail is that of its middle: the tip, which is thin,
+flutters."""
 FOLLOW_TIME = 0.05
 """The grid takes on the speed of the fish with this time constant [s]."""
 RECENTRE = 2.0

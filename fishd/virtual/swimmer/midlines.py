@@ -28,7 +28,7 @@ class Midlines:
 
     @property
     def start(self) -> float:
-        """Time of the first one; infinite where there is none [s]."""
+        """Time of the first one; infinite while there are none [s]."""
         return self._time[0] if self._time else math.inf
 
     def add(self, swimmer: Swimmer) -> None:
