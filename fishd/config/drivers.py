@@ -78,7 +78,7 @@ def convert_sections(
 def driver_of(section: str, name: str) -> type[Any]:
     """The driver or plant of that name; raises `Problem` that lists those there are."""
     plugins, key = CHOICES[section].plugins, CHOICES[section].key
-    if name not in plugins.names():
+    if not plugins.has(name):
         close = nearest(name, plugins.names())
         meant = f", {close}" if close.startswith("did") else ""
         raise Problem(

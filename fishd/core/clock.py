@@ -4,7 +4,6 @@ Deadlines are absolute, t0 + k·period, so nothing drifts. A late tick runs as s
 that have passed meanwhile are skipped and counted, and the phase is kept.
 """
 
-import asyncio
 import ctypes
 import itertools
 import math
@@ -169,6 +168,8 @@ class Ticker:
 
         warm_up: called just before each deadline, if there is time for it
         """
+        import asyncio  # a tenth of the start of those that have only the clocks from here
+
         self._period = period
         self._warm_up = warm_up
         self._margin = min(self.MARGIN, period / 4)

@@ -4,7 +4,6 @@ Whatever a name leads to, a pipe, a device or a file without an end, the answer 
 """
 
 import os
-import secrets
 import stat
 from contextlib import suppress
 from pathlib import Path
@@ -143,4 +142,4 @@ def check_writable(path: Path) -> None:
 
 def _beside(path: Path) -> Path:
     """A temporary name in the same folder, no other writer's, and of permitted length."""
-    return path.parent / f".{path.name[:50]}.{secrets.token_hex(6)}.part"
+    return path.parent / f".{path.name[:50]}.{os.urandom(6).hex()}.part"

@@ -85,7 +85,8 @@ class Daemon:
             self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._mock_ticks = None if self._virtual else mock_ticks(config)
             controllers = registry.describe_all()  # imports what other packages offer
-            preload()  # which would hold up the ticks later
+            if not self._virtual:
+                preload()  # which would hold up the ticks later
             robot = assembly.open_robot(config, self._clock, stack, self._file)
             if self._slow:
                 robot = _slowed(robot, self._slow)

@@ -4,6 +4,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 from msgspec import Struct
@@ -86,6 +87,17 @@ def test_a_package_installed_later_is_found(
     assert gadgets.find("late") is Gadget
     assert gadgets.package("late") == "late_package 1.0"
     assert gadgets.package("key") == "fishd", "one that is built in is replaced by nobody"
+
+
+def test_a_package_in_an_archive_is_found(
+    gadgets: Plugins[Gadget], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ZipFile(tmp_path / "packages.zip", "w") as archive:
+        archive.writestr("packed-1.0.dist-info/METADATA", "Name: packed\nVersion: 1.0\n")
+        line = f"[fishd.gadgets]\npacked = {__name__}:Gadget\n"
+        archive.writestr("packed-1.0.dist-info/entry_points.txt", line)
+    monkeypatch.syspath_prepend(str(tmp_path / "packages.zip"))
+    assert gadgets.find("packed") is Gadget
 
 
 def test_a_package_with_broken_entry_points_does_not_hide_the_others(

@@ -4,6 +4,7 @@ KIND: telemetry or control. LINK and LISTENER: file descriptors that fishd has o
 it and the socket that clients connect to, which outlives this process. Only fishd starts it.
 """
 
+import gc
 import importlib
 import os
 import socket
@@ -11,10 +12,7 @@ import sys
 import time
 from contextlib import suppress
 
-import zmq
-
 from fishd.daemon.gateway import link
-from fishd.daemon.gateway.limits import ResourceLimits
 
 _PAUSE = 0.3
 """Time until connections are accepted again [s]."""
@@ -24,9 +22,16 @@ _FAREWELL = 100
 
 def main(kind: str, link_number: str, listener_number: str, address: str) -> int:
     """Serve until fishd ends; begin anew, with nothing, when a limit is exceeded."""
+    gc.disable()  # nothing that is loaded is garbage: to look for it takes a tenth of the time
+    import zmq
+
+    from fishd.daemon.gateway.limits import ResourceLimits
+
     connection = socket.socket(fileno=int(link_number))
     name = {link.TELEMETRY: "publisher", link.CONTROL: "router"}[kind]
     gateway = importlib.import_module(f"fishd.daemon.gateway.{name}")  # and not the other one
+    gc.freeze()
+    gc.enable()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     server = context.socket(gateway.SOCKET)
     gateway.configure(server)
