@@ -129,16 +129,18 @@ class _Angle:
         self.first, self.last = float(edges[0]), float(edges[-1])
         self._fine = np.arange(self.first, self.last, _STEP)
         self._impulse = -_smooth(self._fine, edges, impulse)
+        # A power of two is the quickest; of twice the length, so that nothing comes round again.
+        self._size = 2 ** (2 * len(self._fine) - 1).bit_length()
+        self._spectrum = np.fft.rfft(self._impulse, self._size)
         self._kept: dict[float, Floats] = {}
 
     def at(self, times: Floats, rate: float) -> Floats:
         """α · K where K_d/K is `rate` [1/s]: the solution of α̇ + rate · α = −(∫ F_y dt)/K."""
         course = self._kept.get(rate)
         if course is None:
-            size = 2 * len(self._fine)
             kernel = np.exp(-rate * _STEP * np.arange(len(self._fine)))
-            spectrum = np.fft.rfft(self._impulse, size) * np.fft.rfft(kernel, size)
-            course = np.fft.irfft(spectrum, size)[: len(self._fine)] * _STEP
+            spectrum = self._spectrum * np.fft.rfft(kernel, self._size)
+            course = np.fft.irfft(spectrum, self._size)[: len(self._fine)] * _STEP
             # Each step holds half of what is added at its own point.
             course -= 0.5 * _STEP * self._impulse
             self._kept = {rate: course}

@@ -35,7 +35,7 @@ def find_tails(pictures: NDArray[np.uint8]) -> Tails:
     light = pictures.mean(axis=(1, 2), dtype=np.float32)
     values *= (float(light.mean()) / np.maximum(light, 1.0))[:, None]
     values -= np.median(values, axis=0)
-    if float((values.astype(np.float64) ** 3).sum()) < 0.0:
+    if float(np.einsum("ij,ij,ij->", values, values, values, dtype=np.float64)) < 0.0:
         values = -values
     values -= _SHARE * float(np.quantile(values, 0.99))
     np.maximum(values, 0.0, out=values)

@@ -1,5 +1,6 @@
 """The active controller. It may be anybody's code, so whatever it raises becomes an Exception."""
 
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -39,7 +40,7 @@ class ActiveController:
 
     def replace(self, name: str, controller: Controller[Any]) -> None:
         """Make a ready-made controller the active one; raises what its parameters raise."""
-        units = {each.name: each.unit for each in quantities_of(type(controller))}
+        units = _units(type(controller))
         former, self.parameters = self.controller, _plain(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
         self.wave = _wave(name, controller, self.parameters)
@@ -84,6 +85,12 @@ class ActiveController:
     def warm_up(self) -> None:
         """Let it warm up for the next update, which is imminent; raises what it raises."""
         contained(self.controller.warm_up)
+
+
+@lru_cache(maxsize=64)
+def _units(controller: type[Controller[Any]]) -> dict[str, str]:
+    """The units of its quantities, by name; of a class, which does not change."""
+    return {each.name: each.unit for each in quantities_of(controller)}
 
 
 def told(error: ControllerFault) -> tuple[str, Successor | None]:

@@ -95,8 +95,11 @@ class Supervisor:
     @property
     def sensor_lost(self) -> bool:
         """Whether the latest reads gave no force, or none to believe."""
-        sensor = ("sensor-stale", "sensor-range")
-        return any(self._failures[code] >= FAULTS[code].in_a_row for code in sensor)
+        failures = self._failures
+        return (
+            failures["sensor-stale"] >= FAULTS["sensor-stale"].in_a_row
+            or failures["sensor-range"] >= FAULTS["sensor-range"].in_a_row
+        )
 
     def overrun(self, overran: bool) -> None:
         """Count a tick; too many overruns latch the fault overrun."""

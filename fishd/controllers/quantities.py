@@ -76,6 +76,8 @@ def values_of(controller: object, names: Iterable[str]) -> dict[str, float]:
     held, found = vars(controller), {}
     for name in names:
         value = held.get(name)
+        if value is None:
+            continue
         if type(value) is not float:
             try:
                 value = contained(real_number, value, name)

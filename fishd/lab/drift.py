@@ -62,34 +62,40 @@ def fit(blocks: Blocks) -> Fit:
     seconds = time - time[0]
     noise = np.diag(variance / variance.mean())
     known = np.column_stack((swims, np.ones(n), seconds - seconds.mean()))
+    seen = np.column_stack((known, force))[np.newaxis]
     degrees = n - known.shape[1]
     weights, forces, variances, drifts = [], [], [], []
     for wandering in _covariances(seconds):
         factor = np.linalg.cholesky(noise + wandering)
-        white = np.linalg.solve(factor, np.column_stack((known, force)))
-        q, r = np.linalg.qr(white[:, :-1])
-        beta = np.linalg.solve(r, q.T @ white[:, -1])
-        left = white[:, -1] - white[:, :-1] @ beta
-        scale = left @ left / degrees
+        white = np.linalg.solve(factor, seen)
+        q, r = np.linalg.qr(white[..., :-1])
         inverse = np.linalg.inv(r)
+        beta = inverse @ (q.swapaxes(1, 2) @ white[..., -1:])
+        left = white[..., -1:] - white[..., :-1] @ beta
+        scale = (left**2).sum(axis=(1, 2)) / degrees
         weights.append(
-            -np.log(np.diag(factor)).sum()
-            - np.log(np.abs(np.diag(r))).sum()
+            -np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+            - np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
             - 0.5 * degrees * np.log(scale)
         )
-        forces.append(beta[0])
-        variances.append(scale * inverse[0] @ inverse[0] * degrees / max(1, degrees - 2))
-        drifts.append(known[:, 1:] @ beta[1:] + wandering @ np.linalg.solve(factor.T, left))
-    weight = np.exp(np.array(weights) - max(weights))
+        forces.append(beta[:, 0, 0])
+        unsure = (inverse[:, 0] ** 2).sum(axis=1)
+        variances.append(scale * unsure * degrees / max(1, degrees - 2))
+        pulled = np.linalg.solve(factor.swapaxes(1, 2), left)
+        drifts.append((known[:, 1:] @ beta[:, 1:] + wandering @ pulled)[..., 0])
+    likely = np.concatenate(weights)
+    weight = np.exp(likely - likely.max())
     weight /= weight.sum()
-    mean = float(weight @ forces)
-    spread = float(weight @ (np.array(variances) + (np.array(forces) - mean) ** 2))
-    return Fit(mean, 1.96 * spread**0.5, weight @ np.array(drifts))
+    found = np.concatenate(forces)
+    mean = float(weight @ found)
+    spread = float(weight @ (np.concatenate(variances) + (found - mean) ** 2))
+    return Fit(mean, 1.96 * spread**0.5, weight @ np.concatenate(drifts))
 
 
 def _covariances(seconds: Array) -> Iterator[Array]:
-    """Of each drift that is tried, at these times; over the variance of a block.
+    """Of all drifts that are tried, at these times; over the variance of a block.
 
+    Several at once, shape (·, n, n), since numpy takes as long to be called as for a small matrix.
     Each counts as much as any other before the forces are seen: a kind that is added here with n
     strengths counts n times.
     """
@@ -98,5 +104,4 @@ def _covariances(seconds: Array) -> Iterator[Array]:
     for time in TIMES:
         smooth = np.exp(-0.5 * (gap / time) ** 2)
         for strength in STRENGTHS:
-            for step in WALKS:
-                yield step * walk + strength * smooth
+            yield np.multiply.outer(WALKS, walk) + strength * smooth

@@ -33,6 +33,9 @@ T = TypeVar("T")
 TOPICS = dict(enumerate((*CHANNELS, images.TOPIC), start=1))
 """Topics of channels as `RunWriter` numbers them, for a file in which that part is damaged."""
 
+_LOADER = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
+"""libyaml's takes a tenth of the time."""
+
 
 class Entry(NamedTuple):
     """One message of a recording."""
@@ -228,7 +231,7 @@ class Run:
 
     def _take_attachment(self, name: str, data: bytes) -> None:
         if name == CONFIG:
-            self.configs[int(self.daemons[-1]["number"])] = yaml.safe_load(data)
+            self.configs[int(self.daemons[-1]["number"])] = yaml.load(data, _LOADER)
         elif name == CALIBRATIONS:
             self.calibrations.append(decoder(Calibrations)(data))
 

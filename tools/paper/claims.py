@@ -33,27 +33,19 @@ class Claim(NamedTuple):
 
 def sections() -> list[tuple[str, str, str]]:
     """Document, name of the markers, and what belongs between them."""
+    return [(DOCUMENT, name, section(name)) for name in SECTIONS]
+
+
+def section(name: str) -> str:
+    """What belongs between the markers of this name."""
+    if name == REFINEMENT:
+        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.CELLS)
+        return table(f"speed (mm/s), cells of | {cells}", refinement())
     words = {True: "yes", False: "**no**", None: "–"}
-    return [
-        (
-            DOCUMENT,
-            name,
-            table(
-                "the paper | computed here | agrees",
-                ((claim.paper, claim.computed, words[claim.agrees]) for claim in claims()),
-            ),
-        )
-        for name, claims in GROUPS.items()
-    ] + [
-        (
-            DOCUMENT,
-            "refinement",
-            table(
-                "speed (mm/s), cells of | " + " | ".join(f"{cell:g} mm" for cell in figure_6.CELLS),
-                refinement(),
-            ),
-        )
-    ]
+    return table(
+        "the paper | computed here | agrees",
+        ((claim.paper, claim.computed, words[claim.agrees]) for claim in GROUPS[name]()),
+    )
 
 
 def constants() -> Iterator[Claim]:
@@ -312,3 +304,5 @@ GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
     "learning": learning,
     "free swimming": swimming,
 }
+REFINEMENT = "refinement"
+SECTIONS = (*GROUPS, REFINEMENT)

@@ -61,12 +61,13 @@ def config(cell: float) -> Config:
     )
 
 
-def swim(case: Case) -> SpeedResult:
+def swim(case: Case, lengths: Lengths | None = None) -> SpeedResult:
     """As `fishctl sweep` does; raises SystemExit where the fish could not go on."""
     name = "C" if case.controller == "swing" else "frequency"
     fish = config(case.cell)
     point = Point(case.controller, {name: case.setting})
-    found = swim_freely(point, fish, Lengths.of(fish, None, None), EncodingPublisher())
+    lengths = lengths or Lengths.of(fish, None, None)
+    found = swim_freely(point, fish, lengths, EncodingPublisher())
     assert found
     if found.trouble:
         raise SystemExit(f"{point.label()} at {case.cell:g} mm: {found.trouble}")

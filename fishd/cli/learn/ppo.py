@@ -2,6 +2,7 @@
 
 import statistics
 import threading
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -278,6 +279,8 @@ def _train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) 
     """Train them all, a line as each ends, and a summary; the exit status."""
     from fishd.learning.train import seeds as training
 
+    if not cluster and find_spec("torch") is None:  # only the processes that train will load it
+        raise ModuleNotFoundError("torch is missing", name="torch")
     click.echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps")
     outcomes = training.train_seeds(job, seeds, jobs, cluster, _print_seed)
     for name, evaluations in (

@@ -128,8 +128,9 @@ class SweepFolder:
             raise ConfigError(
                 f"{path}: not the table of a sweep; move it away, and its points are measured again"
             ) from None
-        text = tables.lines([head, *complete])
-        if text != path.read_text(encoding="utf-8"):
+        there = path.read_text(encoding="utf-8")
+        plain = "".join(f"{','.join(row)}\n" for row in (head, *complete))  # soon, and mostly so
+        if there != plain and there != (text := tables.lines([head, *complete])):
             write_atomically(path, text)
 
     def _rows(self) -> list[list[str]]:

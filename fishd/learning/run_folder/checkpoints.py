@@ -12,15 +12,12 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from zipfile import ZipFile
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
-from stable_baselines3 import PPO
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
@@ -29,8 +26,12 @@ from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes import making as eyes
 from fishd.learning.eyes.base import Eye
-from fishd.learning.ppo import make_policy
 from fishd.learning.settings import TrainingSettings
+
+# What brings torch is imported where it is used: most of this is asked for without any networks.
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.policies import ActorCriticPolicy
 
 MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.msgpack"
 
@@ -82,7 +83,7 @@ class Constant(Struct, frozen=True):
 
 
 def save(
-    folder: Path, kind: str, model: PPO, card: Card, state: State, eye: Eye | None = None
+    folder: Path, kind: str, model: "PPO", card: Card, state: State, eye: Eye | None = None
 ) -> Path:
     """Write a checkpoint; kind: step or best, of which only the newest is kept."""
     name = f"{kind}-{state.steps:06d}"
@@ -195,7 +196,7 @@ def read_state(checkpoint: Path) -> State:
         raise CheckpointError(f"{checkpoint / STATE}: {_brief(error)}; {_ADVICE}") from None
 
 
-def load_parameters(model: PPO, checkpoint: Path, *, optimiser: bool = True) -> None:
+def load_parameters(model: "PPO", checkpoint: Path, *, optimiser: bool = True) -> None:
     """Load networks, and optimiser, into a model of the same shape; raises `CheckpointError`."""
     fresh = model.get_parameters()["policy.optimizer"]
     with _readable(checkpoint / MODEL) as parameters:
@@ -210,8 +211,10 @@ def read_parameters(checkpoint: Path) -> dict[str, Any]:
         return parameters
 
 
-def load_policy(checkpoint: Path) -> tuple[ActorCriticPolicy, Perception]:
+def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
     """The networks of a checkpoint, and what they are given; raises `CheckpointError`."""
+    from fishd.learning.ppo import make_policy
+
     card = read_card(checkpoint)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
     eye = eyes.make(settings)
@@ -256,6 +259,8 @@ def _readable(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _tensors(path: Path) -> dict[str, Any]:
+    from stable_baselines3.common.save_util import load_from_zip_file
+
     content = files.read(path, LARGEST_MODEL, "a checkpoint")
     try:
         with ZipFile(io.BytesIO(content)) as archive:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from stable_baselines3.common.logger import KVWriter
 
 from fishd.core.errors import ConfigError
 from fishd.core.files import FileProblem, NoFile, write_atomically
@@ -71,22 +70,6 @@ class Table(tables.Table):
             ) from None
         rewritten = [[row.get(column, "") for column in self.columns] for row in kept]
         write_atomically(self.path, tables.lines([self.columns, *rewritten]))
-
-
-class ProgressWriter(KVWriter):
-    """Writes what stable-baselines3 logs in an update as a row of progress.csv."""
-
-    def __init__(self, table: Table) -> None:
-        self._table = table
-
-    def write(
-        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
-    ) -> None:
-        """One row."""
-        self._table.add({column: key_values.get(key) for column, key in PROGRESS.items()})
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec.structs import replace
 from stable_baselines3 import PPO
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
 from fishd.controllers.policy.card import Card
 from fishd.core.errors import ConfigError
@@ -19,9 +19,25 @@ from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError, State
 from fishd.learning.run_folder.runs import make_card
-from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, ProgressWriter, Table
+from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, Table
 from fishd.learning.train.candidates import Candidate
 from fishd.learning.train.jobs import Job
+
+
+class ProgressWriter(KVWriter):
+    """Writes what stable-baselines3 logs in an update as a row of progress.csv."""
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+
+    def write(
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
+    ) -> None:
+        """One row."""
+        self._table.add({column: key_values.get(key) for column, key in PROGRESS.items()})
+
+    def close(self) -> None:
+        """Nothing is held open."""
 
 
 class RunRecorder:

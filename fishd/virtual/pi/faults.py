@@ -89,6 +89,11 @@ class Faults:
         until = self._until[name]
         return until > -math.inf and until > self._clock.monotonic()
 
+    @property
+    def none(self) -> bool:
+        """True while no fault can be active: quicker than to ask for each."""
+        return self._latest == -math.inf
+
     def listing(self) -> dict[str, float | None]:
         """The active faults and the seconds that each has left; None: until it is cleared."""
         now = self._clock.monotonic()
@@ -105,7 +110,7 @@ class Faults:
 
     def transfer_error(self) -> str | None:
         """The error that the next I2C transfer meets: one that is active, or a random one."""
-        if self._latest > -math.inf:
+        if not self.none:
             for name in TRANSFER_ERRORS:
                 if self.active(name):
                     return name

@@ -88,7 +88,7 @@ class I2cBus:
         """
         with self._lock:
             error = self._faults.transfer_error()
-            reached = messages[: self._reach(error, len(messages))]
+            reached = messages[: self._reach(error, len(messages))] if error else messages
             duration = self.OVERHEAD + self._time_on_wire(reached)
             if asked is not None and 0.0 <= (spent := self._clock.monotonic() - asked) < duration:
                 duration -= spent + self.WAY_BACK

@@ -133,22 +133,26 @@ class Tank:
     def _swim(self, until: int) -> tuple[float, float]:
         """Swim until a step; the impulses of F_x and F_y on the way [N s]."""
         impulse_x = impulse_y = 0.0
+        fish = self._fish
         while self._now < until:
-            angle = self._angle_at(self._now)
-            end = self._change(angle, min(until, self._now + _PIECE))
-            rate = self._fish.state.alpha_rate
-            window = self._fish.advance(angle, (end - self._now) * STEP, 1)
-            self._steps += end - self._now
+            now = self._now
+            angle = self._angle_at(now)
+            end = self._change(angle, min(until, now + _PIECE))
+            rate = fish.state.alpha_rate
+            window = fish.advance(angle, (end - now) * STEP, 1)
+            duration = window.duration
+            self._steps += end - now
             self._now = end
-            self._energy += (energy := window.power * window.duration)
+            self._energy += (energy := window.power * duration)
             self._spent += energy
-            self._past.append((self._now, self._spent))
-            impulse_x += window.thrust * window.duration
-            impulse_y += window.lateral_force * window.duration
-            state = self._fish.state
+            self._past.append((end, self._spent))
+            impulse_x += window.thrust * duration
+            impulse_y += window.lateral_force * duration
+            state = fish.state
             turned = rate * state.alpha_rate < 0.0  # only then is the peak within the window
             peak = window.fin_peak if turned else abs(state.alpha)
-            self._fin_peak = max(self._fin_peak, peak)
+            if peak > self._fin_peak:
+                self._fin_peak = peak
         self._impulse += impulse_x
         return impulse_x, impulse_y
 

@@ -96,8 +96,14 @@ class Beam:
     def shape(self, q: Array) -> tuple[Array, Array]:
         """Places of the slices, shape (slices, 2) [m], and their angles, shape (slices,) [rad]."""
         angle = self._weights @ q[2:]
-        steps = self.spacing * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return q[:2] + np.cumsum(steps, axis=0) - 0.5 * steps, angle
+        steps = np.empty((self.slices, 2))
+        np.cos(angle, out=steps[:, 0])
+        np.sin(angle, out=steps[:, 1])
+        steps *= self.spacing
+        places = steps.cumsum(axis=0)
+        places += q[:2]
+        places -= 0.5 * steps
+        return places, angle
 
     def motion(self, angle: Array) -> Array:
         """How the slices move with the unknowns: shape (slices, 3, size), for vx, vy and θ̇."""

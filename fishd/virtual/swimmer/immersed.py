@@ -140,15 +140,14 @@ class Immersed:
         """The cells around the body; raises `LeftTheGrid` where they are not all small."""
         grid = self.flow.grid
         ranges = []
-        for axis, edges in ((0, grid.x), (1, grid.y)):
+        for axis, edges, all_sizes in ((0, grid.x, grid.dx), (1, grid.y, grid.dy)):
             low = places[:, axis].min() - half_thickness - 2.0 * grid.h
             high = places[:, axis].max() + half_thickness + 2.0 * grid.h
             if not (edges[1] < low and high < edges[-2]):
                 raise LeftTheGrid("the body left the water")
             first, last = np.searchsorted(edges, [low, high])
             ranges.append(slice(int(first) - 1, int(last)))
-            sizes = np.diff(edges[ranges[-1].start : ranges[-1].stop + 1])
-            if sizes.max() > SAME * grid.h:
+            if all_sizes[ranges[-1]].max() > SAME * grid.h:
                 raise LeftTheGrid("the body left the part of the grid with small cells")
         return ranges[0], ranges[1]
 

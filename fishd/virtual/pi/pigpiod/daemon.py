@@ -107,7 +107,10 @@ class Pigpiod:
         now = self._clock.monotonic()
         if not self._running:
             return now
-        gone, frozen = self._faults.active("pigpiod-gone"), self._faults.active("pigpiod-frozen")
+        faults = self._faults
+        gone = frozen = False
+        if not faults.none:
+            gone, frozen = faults.active("pigpiod-gone"), faults.active("pigpiod-frozen")
         if gone != self._gone:
             self._gone = gone
             if gone:
