@@ -58,6 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
         sys.addaudithook(refuse_processes)
     elif config.option.realtime:
         config.option.markexpr = "realtime"
+        os.environ["JUDGES_REAL_TIME"] = "1"
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -1,14 +1,18 @@
 """The axis, followed while frames come."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from rigs.filmed_swim import filmed, swum
+from rigs import filmed_swim
+from rigs.filmed_swim import filmed
 
 from fishd.camera.axis_watch import AGAIN, FEWEST, AxisWatch
 from fishd.camera.frames import Frame
 from fishd.camera.simulated.settings import DEFAULT, WEB
 
+swum = cache(filmed_swim.swum)  # nobody changes a tick
 CAMERA = replace(DEFAULT, off_axis=3.0, tilt=0.05)
 
 

@@ -35,7 +35,9 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Both]:
     folder = tmp_path_factory.mktemp("camera")
     with (
         running(folder) as daemon,
-        running_camera(folder, f"simulated.fishd={daemon.endpoint}", "simulated.rate=60") as camera,
+        running_camera(
+            folder, f"simulated.fishd={daemon.endpoint}", "simulated.rate=120"
+        ) as camera,
     ):
         camera.is_in("streaming")
         yield daemon, camera
@@ -166,7 +168,7 @@ def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess
 
 def test_the_settings_can_be_asked_for(camera: CameraProcess) -> None:
     with camera.client() as client:
-        assert client.settings().simulated.rate == 60.0
+        assert client.settings().simulated.rate == 120.0
 
 
 def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
@@ -231,7 +233,7 @@ def test_the_doctor_says_how_the_camera_is(
     monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
     found = service.camera(context)
     assert found
-    assert (found.level, found.message[:5]) == ("ok", "60.0 ")
+    assert (found.level, found.message[:5]) == ("ok", "120.0")
     monkeypatch.setenv("FISHD_CAMERA", f"ipc://{tmp_path}/nobody")
     assert service.camera(context) is None
 

@@ -1,10 +1,12 @@
 """The delay of a camera, told from its frames and the lateral force."""
 
 import random
+from functools import cache
 
 import pytest
 from msgspec.structs import replace
-from rigs.filmed_swim import felt, filmed, swum
+from rigs import filmed_swim
+from rigs.filmed_swim import felt, filmed
 
 from fishd.camera.axis import NoMotion
 from fishd.camera.frames import Frame
@@ -12,6 +14,13 @@ from fishd.camera.latency import NoDelay, find_latency
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 
 BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)
+
+swum = cache(filmed_swim.swum)  # nobody changes a tick or a frame
+
+
+@cache
+def film(camera: SimulatedCameraSettings) -> list[Frame]:
+    return filmed(swum(40.0), camera)
 
 
 def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
@@ -30,7 +39,7 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
     camera: SimulatedCameraSettings, within: float, late: float
 ) -> None:
     ticks = swum(40.0)
-    found = find_latency(stamped_late(filmed(ticks, camera), late), felt(ticks))
+    found = find_latency(stamped_late(film(camera), late), felt(ticks))
     assert found.stamps == pytest.approx(late, abs=within)
     assert found.whole == pytest.approx(camera.latency, abs=within + 1e-3)
     assert abs(found.stamps - late) < 1.5 * found.error
@@ -50,10 +59,8 @@ def test_no_parameter_of_the_fish_is_needed(other: str) -> None:
 
 
 def test_ticks_that_are_lost_do_no_harm() -> None:
-    ticks = swum(40.0)
-    frames = filmed(ticks, WEB)
-    kept = [tick for tick in ticks if tick.seq % 97]
-    assert find_latency(frames, felt(kept)).stamps == pytest.approx(0.0, abs=3e-3)
+    kept = [tick for tick in swum(40.0) if tick.seq % 97]
+    assert find_latency(film(WEB), felt(kept)).stamps == pytest.approx(0.0, abs=3e-3)
 
 
 def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped() -> None:
@@ -66,24 +73,22 @@ def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped(
 
 
 def test_ninety_nine_of_a_hundred_frames_arrive_within_what_is_said() -> None:
-    ticks = swum(30.0)
-    found = find_latency(filmed(ticks, WEB), felt(ticks))
+    found = find_latency(film(WEB), felt(swum(40.0)))
     assert 0.055 < found.latest < 0.07
     assert found.arrival == pytest.approx(0.05, abs=2e-3)
 
 
 def test_frames_of_another_swim_are_refused() -> None:
-    ticks = swum(30.0)
-    frames = filmed(ticks, DEFAULT)
+    frames = film(DEFAULT)
     pixels = [frame.pixels for frame in frames]
     random.Random(1).shuffle(pixels)
     mixed = [frame._replace(pixels=one) for frame, one in zip(frames, pixels, strict=True)]
     with pytest.raises(NoDelay, match=r"agree by .* only: is it the same fish"):
-        find_latency(mixed, felt(ticks))
+        find_latency(mixed, felt(swum(40.0)))
 
 
 def test_a_fish_that_rests_tells_no_delay() -> None:
-    ticks = swum(30.0, controller="hold")
+    ticks = swum(12.0, controller="hold")
     with pytest.raises(NoMotion, match="nothing moves"):
         find_latency(filmed(ticks, DEFAULT), felt(ticks))
 

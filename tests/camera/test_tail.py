@@ -1,12 +1,17 @@
 """Where the tail is in a picture."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from rigs.filmed_swim import filmed, swum
+from rigs import filmed_swim
+from rigs.filmed_swim import filmed
 
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.camera.tail import find_tails
+
+swum = cache(filmed_swim.swum)  # nobody changes a tick
 
 
 @pytest.mark.parametrize("camera", [DEFAULT, WEB, replace(DEFAULT, off_axis=6.0, tilt=0.1)])

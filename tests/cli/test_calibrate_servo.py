@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from rigs.operator_rig import Bench, Talk, calibrations
+from rigs.operator_rig import Bench, Dialogue, Talk, calibrations
 from rigs.processes import PATIENCE, Daemon, Subscriber
 from rigs.virtual_daemon import VirtualDaemon
 
@@ -136,29 +136,39 @@ def test_where_pulses_end_before_the_amplitude_the_limit_is_there_and_saved_afte
     assert (found.trim, found.highest, found.lowest) == (10.0, 0.0166, -1.2)
 
 
-@pytest.mark.parametrize("what", ["fishctl is stopped", "fishd is restarted"])
-def test_a_lease_that_ends_of_itself_is_told_at_the_prompt(
-    talk: Talk, pi: Bench, what: str
+def test_a_lease_that_ends_while_fishctl_is_stopped_is_told_at_the_prompt(
+    talk: Talk, rig: Bench, daemon: Daemon
+) -> None:
+    dialogue = a_trim_of_25(talk, rig, daemon)
+    dialogue.process.send_signal(signal.SIGSTOP)
+    rig.wait_for_pulse(1499, 1501)
+    says_that_its_lease_has_ended(dialogue)
+
+
+def test_a_lease_that_ends_as_fishd_is_restarted_is_told_at_the_prompt(
+    talk: Talk, pi: Bench
 ) -> None:
     with pi.daemon() as first:
-        dialogue = talk(first, "calibrate", "servo")
-        dialogue.answer("trim +0 µs> ", "++")
-        dialogue.expect("trim +25 µs> ")
-        pi.wait_for_pulse(1524, 1526)
-        if what == "fishctl is stopped":
-            dialogue.process.send_signal(signal.SIGSTOP)
-            pi.wait_for_pulse(1499, 1501)
-            dialogue.process.send_signal(signal.SIGCONT)
-            said = dialogue.expect("[no-lease]\n")
-        else:
-            dialogue.process.send_signal(signal.SIGSTOP)  # so that it asks the second one first
-    if what == "fishd is restarted":
-        with pi.daemon():
-            dialogue.process.send_signal(signal.SIGCONT)
-            said = dialogue.expect("[no-lease]\n")
+        dialogue = a_trim_of_25(talk, pi, first)
+        dialogue.process.send_signal(signal.SIGSTOP)  # so that it asks the second one first
+    with pi.daemon():
+        says_that_its_lease_has_ended(dialogue)
+
+
+def a_trim_of_25(talk: Talk, rig: Bench, daemon: Daemon) -> Dialogue:
+    dialogue = talk(daemon, "calibrate", "servo")
+    dialogue.answer("trim +0 µs> ", "++")
+    dialogue.expect("trim +25 µs> ")
+    rig.wait_for_pulse(1524, 1526)
+    return dialogue
+
+
+def says_that_its_lease_has_ended(stopped: Dialogue) -> None:
+    stopped.process.send_signal(signal.SIGCONT)
+    said = stopped.expect("[no-lease]\n")
     assert "the servo is at neutral; its calibration is as before\n" in said
     assert re.search(r"\nfishctl: this lease has ended[^\n]+\n$", said)
-    assert dialogue.process.wait(PATIENCE) == 1
+    assert stopped.process.wait(PATIENCE) == 1
 
 
 def test_a_fault_in_the_middle_ends_it_in_one_line_with_the_calibration_of_before(

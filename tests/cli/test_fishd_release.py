@@ -3,16 +3,18 @@
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pigpio
 import pytest
-from rigs.operator_rig import Bench
+from rigs.operator_rig import Bench, bench
 from rigs.pigpiod_client import dispose
 from rigs.processes import PATIENCE, Process, call, fishctl, wait_until
 
@@ -46,17 +48,56 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def file(pi: Bench) -> Path:
     """A configuration file for the virtual Pi."""
-    path = pi.folder / "fishd.yaml"
-    path.write_text(fishctl("config", "show", *pi.settings).stdout)
-    return path
+    return file_for(pi)
+
+
+Left = tuple[Bench, Path, Path]
+"""A virtual Pi, the configuration file of the fishd that was killed on it, and its recipe."""
+
+
+@pytest.fixture(scope="module")
+def left_by_one(process: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Left]:
+    folder = tmp_path_factory.mktemp("killed")
+    with bench(process, folder) as pi:
+        file = file_for(pi)
+        with pytest.MonkeyPatch.context() as environment:
+            environment.setenv("RUNTIME_DIRECTORY", str(folder))
+            kill_one(pi, file)
+        (recipe,) = folder.glob("release-*")
+        yield pi, file, recipe
 
 
 @pytest.fixture
-def killed(pi: Bench, file: Path) -> Iterator[None]:
-    """A fishd that was killed; another program keeps its pulses where they were."""
-    kill_one(pi, file)
-    with pulses_of_another(pi):
+def left(left_by_one: Left, runtime: Path) -> Iterator[Left]:
+    """What a fishd that was killed has left, and as it has left it."""
+    pi, file, recipe = left_by_one
+    yield pi, file, Path(shutil.copy2(recipe, runtime))
+    pi.pi.clear()
+
+
+@pytest.fixture
+def killed(left: Left) -> Iterator[Left]:
+    """The same, while another program keeps its pulses where they were."""
+    with pulses_of_another(left[0]):
+        yield left
+
+
+@contextmanager
+def changed(file: Path) -> Iterator[None]:
+    """Meanwhile the file is another; then it is as before for `release_recipe`, too."""
+    text, status = file.read_text(), file.stat()
+    file.write_text(f"{text}# changed\n")
+    try:
         yield
+    finally:
+        file.write_text(text)
+        os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+def file_for(pi: Bench) -> Path:
+    path = pi.folder / "fishd.yaml"
+    path.write_text(fishctl("config", "show", *pi.settings).stdout)
+    return path
 
 
 @contextmanager
@@ -90,8 +131,8 @@ def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in ended.stderr.splitlines() if not line.startswith("loaded:")]
 
 
-@pytest.mark.usefixtures("killed")
-def test_it_ends_pulses_at_neutral_and_costs_next_to_nothing(pi: Bench, file: Path) -> None:
+def test_it_ends_pulses_at_neutral_and_costs_next_to_nothing(killed: Left) -> None:
+    pi, file, _ = killed
     ended = release("--config", str(file), SERVICE_RESULT="signal")
     assert ended.returncode == 0
     assert ended.stderr == "loaded:\n"
@@ -117,11 +158,8 @@ def test_neutral_is_that_of_a_calibration_made_while_it_ran(pi: Bench, file: Pat
     assert pi.pi.widths()[-2:] == [1460, 0]
 
 
-def test_without_a_sound_recipe_it_does_what_fishctl_does(
-    pi: Bench, file: Path, runtime: Path
-) -> None:
-    kill_one(pi, file)
-    (path,) = runtime.glob("release-*")
+def test_without_a_sound_recipe_it_does_what_fishctl_does(left: Left) -> None:
+    pi, file, path = left
     sound = path.read_text()
 
     def check() -> None:
@@ -143,30 +181,27 @@ def test_without_a_sound_recipe_it_does_what_fishctl_does(
     check()
 
 
-@pytest.mark.usefixtures("killed")
-def test_a_file_that_has_changed_since_counts_too(pi: Bench, file: Path) -> None:
-    file.write_text(file.read_text() + "# changed\n")
-    ended = release("--config", str(file))
+def test_a_file_that_has_changed_since_counts_too(killed: Left) -> None:
+    _, file, _ = killed
+    with changed(file):
+        ended = release("--config", str(file))
     assert (ended.returncode, said(ended)) == (0, [])
     assert ended.stdout == "pulses were on: neutral, then off\nthere were no pulses\n"
 
 
-@pytest.mark.usefixtures("killed")
 def test_a_simulated_fish_leaves_the_recipe_of_a_robot_alone_unless_the_file_has_changed(
-    pi: Bench, file: Path, runtime: Path
+    left: Left, runtime: Path
 ) -> None:
-    assert list(runtime.glob("release-*"))
-    with pi.daemon("--config", str(file), "--set", "robot=simulated"):
-        assert list(runtime.glob("release-*"))
-    file.write_text(file.read_text() + "\n")
-    with pi.daemon("--config", str(file), "--set", "robot=simulated"):
+    pi, file, recipe = left
+    simulated = ("--config", str(file), "--set", "robot=simulated")
+    with pi.daemon(*simulated):
+        assert list(runtime.glob("release-*")) == [recipe]
+    with changed(file), pi.daemon(*simulated):
         assert list(runtime.glob("release-*")) == []
 
 
-@pytest.mark.usefixtures("killed")
-def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(
-    pi: Bench, file: Path
-) -> None:
+def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(killed: Left) -> None:
+    pi, file, _ = killed
     pi.pi.inject("pigpiod-gone")
     ended = release("--config", str(file))
     assert (ended.returncode, ended.stdout) == (1, "")

@@ -4,6 +4,7 @@ import math
 import re
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -50,20 +51,25 @@ def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
     assert rig.files("force") == []
 
 
-def test_a_simulated_fish_can_be_tared_for_as_long_as_it_lives(tmp_path: Path) -> None:
-    with running(tmp_path, "--set", "simulation.offset_x=0.02") as daemon:
-        assert forces(daemon)[0] == pytest.approx(0.02, abs=2e-3)
-        ended = daemon.fishctl("tare")
-        assert ended.stdout.splitlines()[-1] == "in use, until this fish ends"
-        assert forces(daemon)[0] == pytest.approx(0.0, abs=2e-3)
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    folder = tmp_path_factory.mktemp("simulated")
+    with running(folder, "--set", "simulation.offset_x=0.02") as daemon:
+        yield daemon
 
 
-def test_a_simulated_fish_has_nothing_to_calibrate(tmp_path: Path) -> None:
-    with running(tmp_path) as daemon:
-        for verb in (("calibrate", "force"), ("calibrate", "servo")):
-            ended = daemon.fishctl(*verb)
-            assert ended.returncode == 1
-            assert re.fullmatch(r"fishctl: a simulated fish .* \[simulated\]\n", ended.stderr)
+def test_a_simulated_fish_can_be_tared_for_as_long_as_it_lives(simulated: Daemon) -> None:
+    assert forces(simulated)[0] == pytest.approx(0.02, abs=2e-3)
+    ended = simulated.fishctl("tare")
+    assert ended.stdout.splitlines()[-1] == "in use, until this fish ends"
+    assert forces(simulated)[0] == pytest.approx(0.0, abs=2e-3)
+
+
+def test_a_simulated_fish_has_nothing_to_calibrate(simulated: Daemon) -> None:
+    for verb in (("calibrate", "force"), ("calibrate", "servo")):
+        ended = simulated.fishctl(*verb)
+        assert ended.returncode == 1
+        assert re.fullmatch(r"fishctl: a simulated fish .* \[simulated\]\n", ended.stderr)
 
 
 def test_without_a_daemon_nothing_can_be_calibrated(tmp_path: Path) -> None:

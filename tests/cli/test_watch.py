@@ -20,7 +20,7 @@ import pytest
 from rich.console import Console
 from rich.screen import Screen
 from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
-from rigs.processes import FISHCTL, PATIENCE, Daemon, running
+from rigs.processes import FISHCTL, PATIENCE, Daemon, running, wait_until
 
 from fishd.cli.watch_screen import View
 from fishd.client import Fish
@@ -31,10 +31,19 @@ COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
 BRAILLE = re.compile("[\u2801-\u28ff]")
 
 
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Daemon]:
-    with running(tmp_path, "--set", "start.controller=swing") as daemon:
+@pytest.fixture(scope="module")
+def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with running(tmp_path_factory.mktemp("daemon")) as daemon:
         yield daemon
+
+
+@pytest.fixture
+def daemon(daemon_of_all: Daemon) -> Daemon:
+    """It swims, as from its start, whatever the test before has done with it."""
+    with Fish(daemon_of_all.at_rest().endpoint, timeout=PATIENCE) as fish:
+        fish.set_controller("swing")
+        wait_until(lambda: fish.status().phi_c != 0.0)
+    return daemon_of_all
 
 
 class Terminal:
@@ -173,10 +182,11 @@ def test_a_signal_at_the_moment_when_it_takes_the_screen_gives_it_back(
     assert "Traceback" not in terminal.text
 
 
-def test_the_death_of_the_daemon_is_one_line_on_a_restored_terminal(daemon: Daemon) -> None:
-    terminal = Terminal(daemon)
-    terminal.wait_for("RUNNING")
-    daemon.process.kill()
+def test_the_death_of_the_daemon_is_one_line_on_a_restored_terminal(tmp_path: Path) -> None:
+    with running(tmp_path, "--set", "start.controller=swing") as daemon:
+        terminal = Terminal(daemon)
+        terminal.wait_for("RUNNING")
+        daemon.process.kill()
     assert terminal.finish() == 1
     assert terminal.restored
     after = terminal.text.rpartition(LEAVE_SCREEN)[2].replace(SHOW_CURSOR, "")

@@ -32,8 +32,14 @@ FADE = 0.57
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[LockstepRig]:
-    with lockstep_rig(tmp_path) as rig:
+def data_rate() -> int:
+    """Conversions of the force sensor per second: few, where what breaks is not the sensor."""
+    return 250
+
+
+@pytest.fixture
+def rig(tmp_path: Path, data_rate: int) -> Iterator[LockstepRig]:
+    with lockstep_rig(tmp_path, f"force_sensor.data_rate={data_rate}") as rig:
         rig.start("swing")
         rig.run_for(1.0)
         assert rig.mode == "running"
@@ -92,6 +98,7 @@ def test_whoever_latches_a_fault_the_servo_gets_what_its_row_says(code: str) -> 
     assert rig.recorder.kinds() == ["controller", "mode", "mode" if released else "fault"]
 
 
+@pytest.mark.parametrize("data_rate", [860], ids=["default-rate"])
 @pytest.mark.parametrize("name", SENSOR_FAULTS)
 def test_a_force_that_is_lost_or_not_to_be_believed_ends_in_neutral_and_recovers_after_a_clear(
     rig: LockstepRig, name: str

@@ -16,7 +16,7 @@ from fishd.hardware.base import Robot
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[LockstepRig]:
-    with lockstep_rig(tmp_path) as rig:
+    with lockstep_rig(tmp_path, "force_sensor.data_rate=250") as rig:  # no sensor is judged here
         rig.start("hold", angle=0.3)
         rig.run_for(1.0)
         assert rig.pulse > NEUTRAL + 100

@@ -47,7 +47,7 @@ def test_a_soak_keeps_its_promises(arguments: list[str], promise: str) -> None:
             "objects are left behind per tick",
         ),
         (
-            ["virtual-pi", "--ticks", "800"],
+            ["virtual-pi", "--ticks", "300"],
             "from fishd.hardware.force_sensor.sampled_sensor import SampledSensor\n"
             "read, kept = SampledSensor.read, []\n"
             "SampledSensor.read = lambda *given: kept.append(read(*given)) or kept[-1]",

@@ -1,14 +1,16 @@
 """A shutdown comes when it is asked for, however the process hangs."""
 
 import asyncio
-import contextlib
 import dataclasses
 import re
-import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGTERM
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,85 +49,95 @@ UNHURRIED = "module._WORDS = 10.0"
 """For what the last resort says, and not how soon: what has come to its end is not waited for."""
 
 
-def end(
+def ends(*hangs: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """Exit status and output of processes that are asked to end within 3 s, each by itself and all
+    at the same time: what they do meanwhile is to wait.
+    """
+    with ExitStack() as stack:
+        processes = [stack.enter_context(started(**hang)) for hang in hangs]
+        for process in processes:
+            stack.callback(process.kill)
+            assert process.stdout
+            assert process.stdout.readline() == "up\n"
+        time.sleep(0.1)
+        pool = stack.enter_context(ThreadPoolExecutor(len(hangs)))
+        return list(pool.map(asked, processes, [hang.get("number", SIGTERM) for hang in hangs]))
+
+
+def started(
     hang: str = "",
     release: str = "None",
-    number: int = signal.SIGTERM,
+    number: int = SIGTERM,
     limits: str = "",
     last: str = "",
-) -> tuple[int, str]:
-    """Exit status and output of a process that hangs, and is asked to end within 3 s.
-
-    limits, last: statements before and after the last resort is made
-    """
+) -> "subprocess.Popen[str]":
+    """limits, last: statements before and after the last resort is made"""
     program = PROGRAM.format(hang=hang, release=release, limits=limits, last=last)
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout
-        assert process.stdout.readline() == "up\n"
-        time.sleep(0.1)
-        begun = time.monotonic()
-        process.send_signal(number)
-        output = process.communicate(timeout=PATIENCE)[0]
-        assert time.monotonic() - begun <= LIMIT
+    return subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+
+
+def asked(process: "subprocess.Popen[str]", number: int) -> tuple[int, str]:
+    begun = time.monotonic()
+    process.send_signal(number)
+    output = process.communicate(timeout=PATIENCE)[0]
+    assert time.monotonic() - begun <= LIMIT
     return process.returncode, output
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_an_orderly_shutdown_needs_no_last_resort(number: int) -> None:
-    assert end(number=number) == (7, "")
+def test_an_orderly_shutdown_needs_no_last_resort() -> None:
+    signals = (SIGTERM, SIGINT, SIGHUP)
+    assert ends(*({"number": number} for number in signals)) == [(7, "")] * 3
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize(
-    "hang",
-    [
+def test_a_process_that_hangs_lets_go_of_the_servo_and_ends() -> None:
+    hangs = [
         "while True: pass",
         "time.sleep(60)",
         "threading.Lock().acquire(); import os; os.read(os.pipe()[0], 1)",
         "signal = __import__('signal'); signal.signal(15, lambda *_: None); time.sleep(60)",
-    ],
-    ids=["loop", "sleep", "block", "handler taken"],
-)
-def test_a_process_that_hangs_lets_go_of_the_servo_and_ends(hang: str) -> None:
-    status, output = end(hang, limits=f"{UNHURRIED}; module._RELEASE = 10.0")
-    assert (status, output.partition("\n")[0]) == (1, "released")
-    assert re.search(r"fishd hangs in .+: the servo is released and the process is ended", output)
+    ]
+    limits = f"{UNHURRIED}; module._RELEASE = 10.0"
+    for status, output in ends(*({"hang": hang, "limits": limits} for hang in hangs)):
+        assert (status, output.partition("\n")[0]) == (1, "released")
+        said = r"fishd hangs in .+: the servo is released and the process is ended"
+        assert re.search(said, output)
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("release", ["time.sleep(60)", "1 / 0"])
-def test_a_servo_that_is_not_released_keeps_nobody_and_is_named(release: str) -> None:
-    status, output = end("time.sleep(60)", release, limits=UNHURRIED)
-    assert (status, output.partition("\n")[0]) == (1, "released")
-    assert "the servo may keep its pulses ('fishctl release' releases it)" in output
+def test_a_servo_that_is_not_released_keeps_nobody_and_is_named() -> None:
+    releases = ("time.sleep(60)", "1 / 0")
+    hang = {"hang": "time.sleep(60)", "limits": UNHURRIED}
+    for status, output in ends(*(hang | {"release": release} for release in releases)):
+        assert (status, output.partition("\n")[0]) == (1, "released")
+        assert "the servo may keep its pulses ('fishctl release' releases it)" in output
 
 
 @pytest.mark.realtime
 def test_a_busy_machine_has_time_for_the_last_line() -> None:
     slow = "module.log.addFilter(lambda record: time.sleep(0.3) or True)"
-    status, output = end("time.sleep(60)", last=slow)
+    ((status, output),) = ends({"hang": "time.sleep(60)", "last": slow})
     assert status == 1
     assert "fishd hangs in" in output
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("what", ["module.log.critical", "shutdown.last_words"])
-def test_last_words_that_hang_keep_nobody(what: str) -> None:
-    hangs = f"{what} = lambda *arguments: time.sleep(60)"
-    assert end("time.sleep(60)", "time.sleep(60)", last=hangs)[0] == 1
+def test_last_words_that_hang_keep_nobody() -> None:
+    hang = {"hang": "time.sleep(60)", "release": "time.sleep(60)"}
+    what = ("module.log.critical", "shutdown.last_words")
+    lasts = [f"{each} = lambda *arguments: time.sleep(60)" for each in what]
+    assert [status for status, _ in ends(*(hang | {"last": last} for last in lasts))] == [1, 1]
 
 
 @pytest.mark.realtime
 def test_a_thread_that_a_controller_left_behind_keeps_nobody() -> None:
-    assert end("threading.Thread(target=time.sleep, args=(60,)).start()") == (7, "")
+    assert ends({"hang": "threading.Thread(target=time.sleep, args=(60,)).start()"}) == [(7, "")]
 
 
 def test_below_nohup_a_terminal_that_closes_is_nothing(tmp_path: Path) -> None:
     daemon = Daemon(tmp_path, under=["nohup"]).wait_until_up()
-    daemon.process.send_signal(signal.SIGHUP)
+    daemon.process.send_signal(SIGHUP)
     with pytest.raises(subprocess.TimeoutExpired):
         daemon.process.wait(0.5)
     assert daemon.end()[0] == 0
@@ -152,7 +164,7 @@ def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdo
 
 
 def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral() -> None:
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         bench = Bench(stack)
         servo = bench.servo()
         servo.write(0.5)

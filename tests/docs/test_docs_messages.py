@@ -62,9 +62,9 @@ def templates() -> tuple[Template, ...]:
     """Every message of the sources, docstrings left out; and what Linux says."""
     found: set[Template] = {(os.strerror(number),) for number in errno.errorcode}
     for source in sources():
-        tree = ast.parse(source)
-        about = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        for node in ast.walk(tree):
+        nodes = list(ast.walk(ast.parse(source)))
+        about = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        for node in nodes:
             if isinstance(node, ast.expr) and id(node) not in about and (t := template_of(node)):
                 found.add(t)
     return tuple(t for t in found if len(re.findall(r"[a-zA-Z]", "".join(t))) >= ENOUGH)
@@ -128,19 +128,23 @@ def is_message(text: str) -> bool:
     return any(is_hint(text[place:]) and is_message(text[:place]) for place in places)
 
 
+@cache
+def hints() -> tuple[Template, ...]:
+    return tuple(template for template in templates() if template[0].startswith("; "))
+
+
 def is_hint(text: str) -> bool:
     """Is it what may follow a message, such as `; reconnecting`?"""
-    hints = (template for template in templates() if template[0].startswith("; "))
-    return any(fits(template, text) for template in hints)
+    return any(fits(template, text) for template in hints())
 
 
 def could_fit(template: Template, text: str) -> bool:
     """A quick look, for the many that do not: much of a message is not values."""
     return (
-        (max(map(len, template)) > 12 or 4 * sum(map(len, template)) >= len(text))
-        and text.startswith(template[0])
+        text.startswith(template[0])
         and text.endswith(template[-1])
         and all(part in text for part in template)
+        and (max(map(len, template)) > 12 or 4 * sum(map(len, template)) >= len(text))
     )
 
 

@@ -1,11 +1,13 @@
 """The package in docs/example-controller, installed and used as its reader would."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rigs import processes
 from rigs.documents import ROOT
-from rigs.example_packages import fishctl, install
+from rigs.example_packages import fishctl, forget_drivers, install
 
 pytestmark = pytest.mark.slow  # it starts processes
 
@@ -18,9 +20,18 @@ def laptop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_example_swims_in_virtual_time_and_sweeps_its_frequency(laptop: Path) -> None:
+@pytest.fixture
+def _installed(laptop: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(laptop))
+    forget_drivers()
+    yield
+    forget_drivers()
+
+
+@pytest.mark.usefixtures("_installed")
+def test_the_example_swims_in_virtual_time_and_sweeps_its_frequency() -> None:
     def frequency(*run: str) -> float:
-        done = fishctl(laptop, "simulate", "chirp", "--json", *run)
+        done = processes.fishctl("simulate", "chirp", "--json", *run)
         assert done.returncode == 0, done.stderr
         report = json.loads(done.stdout)
         assert report["mode"] == "running"
@@ -35,8 +46,10 @@ def test_the_example_swims_in_virtual_time_and_sweeps_its_frequency(laptop: Path
     assert on_the_way_down == pytest.approx(1.0, abs=0.1)
 
 
-def test_its_options_show_bounds_units_and_defaults(laptop: Path) -> None:
-    shown = " ".join(fishctl(laptop, "simulate", "chirp", "--help").stdout.split())
+@pytest.mark.usefixtures("_installed")
+def test_its_options_show_bounds_units_and_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    shown = " ".join(processes.fishctl("simulate", "chirp", "--help").stdout.split())
     assert "Sweep a square wave's frequency up and down" in shown
     assert "--lowest NUMBER Frequency at which the sweep begins. A number in (0, 10] Hz" in shown
     assert "--sweep-time NUMBER Time from lowest to highest. A number in [1, 3600] s;" in shown
@@ -60,6 +73,7 @@ def test_it_can_be_named_in_the_configuration(laptop: Path, tmp_path: Path) -> N
     assert fishctl(laptop, "config", "check", str(file)).returncode == 0
 
 
+@pytest.mark.usefixtures("_installed")
 @pytest.mark.parametrize(
     ("option", "complaint"),
     [
@@ -69,8 +83,8 @@ def test_it_can_be_named_in_the_configuration(laptop: Path, tmp_path: Path) -> N
     ],
     ids=["out of its bounds", "at odds with another", "beyond the robot"],
 )
-def test_a_bad_parameter_is_one_line(laptop: Path, option: str, complaint: str) -> None:
-    done = fishctl(laptop, "simulate", "chirp", option)
+def test_a_bad_parameter_is_one_line(option: str, complaint: str) -> None:
+    done = processes.fishctl("simulate", "chirp", option)
     assert done.returncode == 1
     assert done.stderr.startswith(f"fishctl: {complaint}")
     assert done.stderr.count("\n") == 1

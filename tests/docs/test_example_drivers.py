@@ -166,8 +166,8 @@ def test_hx711_a_fish_swims_on_it(tmp_path: Path) -> None:
         sensor = rig.robot.calibrated.sensor
         sensor.recalibrate(ForceCalibration(xx=newton, yy=newton))
         rig.start("square", frequency=1.7)
-        rig.run_for(5.0)
-        ticks = rig.run_for(20.0)
+        rig.run_for(3.0)
+        ticks = rig.run_for(10.0)
         assert rig.mode == "running"
         assert sensor.counters() == {"sensor_errors": 0, "sensor_reconnects": 0}
     assert sum(tick.fx for tick in ticks) / len(ticks) == pytest.approx(THRUST, rel=0.05)
@@ -374,8 +374,8 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
     with ExitStack() as stack:
         rig = ServoBoardRig(tmp_path, stack, *settings)
         rig.start("square", frequency=1.7)
-        rig.run_for(5.0)
-        ticks = rig.run_for(20.0)
+        rig.run_for(3.0)
+        ticks = rig.run_for(10.0)
         assert rig.mode == "running"
         assert min(tick.samples for tick in ticks) >= 10
         widths = {round(width / 10) * 10 for _, width in rig.board.pulses.history if width}

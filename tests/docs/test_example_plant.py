@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rigs import processes
 from rigs.documents import ROOT
 from rigs.example_packages import fishctl, forget_drivers, install
 from rigs.processes import running, sets, wait_until
@@ -56,14 +57,16 @@ def test_without_a_tip_it_is_the_fish_of_the_paper() -> None:
         assert window.fin_peak == pytest.approx(expected.fin_peak, rel=1e-3)
 
 
-def test_it_swims_in_simulate_and_in_a_sweep_of_its_own_key(site: Path, tmp_path: Path) -> None:
-    done = fishctl(site, "simulate", "swing", "--C", "0.6", "--set", MODEL, "--json")
+@pytest.mark.usefixtures("_installed")
+def test_it_swims_in_simulate_and_in_a_sweep_of_its_own_key(tmp_path: Path) -> None:
+    brief = ["--seconds", "20", "--settle", "8", "--json"]
+    done = processes.fishctl("simulate", "swing", "--C", "0.6", "--set", MODEL, *brief)
     report = json.loads(done.stdout)
     assert report["mean_thrust"] == pytest.approx(THRUST, rel=0.01)
     assert 0.95 < report["efficiency"] <= 1.01  # of its own best square wave
     sweep = ["sweep", "square", "--frequency", "1.4", "--vary", "plant.tip_share=0.1,0.3"]
-    out = ["--periods", "8", "--jobs", "1", "--settle", "4", "--folder", str(tmp_path / "sweep")]
-    done = fishctl(site, *sweep, *out, "--set", MODEL)
+    out = ["--periods", "3", "--jobs", "1", "--settle", "2", "--folder", str(tmp_path / "sweep")]
+    done = processes.fishctl(*sweep, *out, "--set", MODEL)
     assert done.returncode == 0, done.stderr
     rows = (tmp_path / "sweep" / "points.csv").read_text().splitlines()
     column = rows[0].split(",").index("thrust")
@@ -74,7 +77,7 @@ def test_it_swims_in_simulate_and_in_a_sweep_of_its_own_key(site: Path, tmp_path
 @pytest.mark.usefixtures("_installed")
 def test_it_swims_behind_the_drivers_of_a_virtual_pi() -> None:
     config = load(None, [MODEL, "robot=virtual-pi"])
-    report = simulate(config, "swing", {"C": 0.6}, 8.0, 3.0)
+    report = simulate(config, "swing", {"C": 0.6}, 6.0, 2.5)
     assert report.mode == "running"
     assert report.mean_thrust == pytest.approx(THRUST, rel=0.05)
 
@@ -107,8 +110,9 @@ def test_a_configuration_with_it_can_be_written_and_read(tmp_path: Path) -> None
     assert load(tmp_path / "fish.yaml") == config
 
 
-def test_what_it_has_no_equation_for_is_refused_by_key(site: Path) -> None:
-    done = fishctl(site, "simulate", "swing", *sets(MODEL, "plant.backlash=0.1"))
+@pytest.mark.usefixtures("_installed")
+def test_what_it_has_no_equation_for_is_refused_by_key() -> None:
+    done = processes.fishctl("simulate", "swing", *sets(MODEL, "plant.backlash=0.1"))
     assert done.returncode == 78
     assert done.stderr == (
         "fishctl: --set plant.backlash=0.1: plant.backlash: 0.1 is not valid: this "

@@ -136,7 +136,7 @@ def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_that_was_asked_for_bef
 def test_a_flood_of_requests_and_garbage_costs_no_tick(own_daemon: Daemon) -> None:
     with Subscriber(own_daemon.telemetry, b"tick") as subscriber:
         before = subscriber.message()
-        shooter = threading.Thread(target=shoot, args=(own_daemon, 3.0))
+        shooter = threading.Thread(target=shoot, args=(own_daemon, 2.4))
         shooter.start()
         while shooter.is_alive():
             during = subscriber.message()

@@ -43,7 +43,7 @@ with zmq.Context() as context:
     finally:
         context.destroy(linger=0)
 """
-LONG = "x" * 5_000_000
+LONG = "x" * 1_000_000
 """Makes an answer take a moment to be read, once the client goes on."""
 IDLE = State(1, "idle", None, "hold", {"text": LONG})
 CAMERA_SETTINGS = CameraSettings(simulated=SimulatedSettings(fishd=LONG))

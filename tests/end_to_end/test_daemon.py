@@ -92,7 +92,7 @@ def test_the_shipped_configuration_rests_swims_and_says_so_every_second(
 @pytest.mark.realtime
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_fades_to_neutral_and_exits_with_0(tmp_path: Path, number: int) -> None:
-    with running(tmp_path, "--config", SHIPPED) as daemon:
+    with running(tmp_path, "--config", SHIPPED, *sets("start.rest=0.5")) as daemon:
         with Subscriber(daemon.telemetry, b"tick") as subscriber:
             subscriber.until(phi_c=0.42)
             daemon.process.send_signal(number)

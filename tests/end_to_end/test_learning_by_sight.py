@@ -12,6 +12,8 @@ from rigs.camera_process import CameraProcess, running_camera
 from rigs.processes import Daemon, fishctl, running, sets
 from rigs.swimming import rows, while_it_trains
 
+from fishd.learning.env import fishd_link
+
 if find_spec("torch") is None:
     pytest.skip("learning needs torch", allow_module_level=True)
 
@@ -20,6 +22,12 @@ see: camera
 steps: 320
 camera: {babble: 128}
 ppo: {n_steps: 64}
+evaluation: {every: 0}
+"""
+BRIEFEST = """
+see: camera
+camera: {babble: 64}
+ppo: {n_steps: 32, batch_size: 32}
 evaluation: {every: 0}
 """
 
@@ -33,9 +41,9 @@ class Rig(NamedTuple):
 
 
 @contextmanager
-def rig_of(folder: Path, *settings: str) -> Iterator[Rig]:
+def rig_of(folder: Path, *settings: str, brief: str = BRIEF) -> Iterator[Rig]:
     file = folder / "brief.yaml"
-    file.write_text(BRIEF, encoding="utf-8")
+    file.write_text(brief, encoding="utf-8")
     run = folder / "run"
     with running(folder, *sets(*settings)) as daemon:
         fishd = f"simulated.fishd={daemon.endpoint}"
@@ -62,15 +70,21 @@ def test_it_learns_from_the_frames_of_each_tick_in_lockstep(lockstep: Rig) -> No
 
 
 @pytest.mark.realtime
-def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(tmp_path: Path) -> None:
-    with rig_of(tmp_path, "tick=0.05", "start.controller=hold") as rig:
+def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with rig_of(tmp_path, "tick=0.05", "start.controller=hold", brief=BRIEFEST) as rig:
         begun = rig.folder / "progress.csv"
+
+        def kill_camera() -> None:
+            rig.camera.process.send_signal(signal.SIGKILL)
+            monkeypatch.setattr(fishd_link, "GIVE_UP", 2.0)
+
         done = while_it_trains(
             lambda: begun.exists() and rows(begun),
-            lambda: rig.camera.process.send_signal(signal.SIGKILL),
+            kill_camera,
             *rig.words,
-            "--steps",
-            "100000",
+            *("--steps", "100000"),
         )
         assert done.returncode == 1
         assert f"camera at {rig.camera.endpoint}" in done.stderr

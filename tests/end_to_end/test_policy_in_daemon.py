@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from rigs.policy_files import FLIP, card, linear, random_layers, write
-from rigs.processes import PATIENCE, Daemon, Subscriber, install, one_line, running
+from rigs.processes import PATIENCE, Daemon, Subscriber, install, one_line, running, sets
 
 from fishd.client import Fish, Refused
 from fishd.controllers.policy.network import to_onnx
@@ -193,7 +193,11 @@ def test_a_running_fishd_warms_up_its_controller(tmp_path: Path) -> None:
     site = tmp_path / "site"
     install(site, {"warming": WARMING}, warming="warming:Warming")
     under = ("env", f"PYTHONPATH={site}")
-    with running(tmp_path, under=under) as daemon, Subscriber(daemon.telemetry, b"tick") as ticks:
+    warm = sets("realtime.warm_up=true")
+    with (
+        running(tmp_path, *warm, under=under) as daemon,
+        Subscriber(daemon.telemetry, b"tick") as ticks,
+    ):
         daemon.fishctl("set-controller", "warming")
         ticks.until(controller="warming")
         while ticks.message()["phi_c"] < 5.5e-3:  # where there is no time, it is left out

@@ -45,7 +45,7 @@ class Pi:
         """words: the name of a script, or of a function of install_pi.sh and its arguments"""
         environment = {**os.environ, "DESTDIR": str(self.disk), "PYTHON": sys.executable}
         environment |= {"FISHD_WHEEL": str(self._wheel), "PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1"}
-        environment |= {"FISHD_GPIO": "none", "PIP_NO_COMPILE": "1", "PIP_NO_CACHE_DIR": "1"}
+        environment |= {"FISHD_GPIO": "none", "PIP_COMPILE": "0", "PIP_NO_CACHE_DIR": "1"}
         command = [str(CHECKOUT / "tools" / words[0])]
         if not words[0].endswith(".sh"):  # sourced, the script only defines its functions
             step = f'source {CHECKOUT}/tools/install_pi.sh; workspace=$(mktemp -d); "$@"'
@@ -60,8 +60,13 @@ class Pi:
         )
 
     def copy(self, folder: Path) -> "Pi":
-        shutil.copytree(self.disk, folder, symlinks=True)
+        shutil.copytree(self.disk, folder, symlinks=True, copy_function=self._copied)
         return Pi(folder, self._wheel)
+
+    def _copied(self, source: str, target: str) -> None:
+        """pip and Python replace the files of packages, and never write into one."""
+        copy = os.link if "/site-packages/" in source else shutil.copy2
+        copy(source, target)
 
 
 @pytest.fixture(scope="session")

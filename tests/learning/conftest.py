@@ -1,11 +1,19 @@
-"""Without the extra 'learn', only tests that do not need it are collected; and a fishd for them."""
+"""Without the extra 'learn', only tests that do not need it are collected; and what they share."""
 
+import fcntl
+import os
+import pickle
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from msgspec.structs import replace
 from rigs.processes import Daemon, running, sets
+
+if TYPE_CHECKING:
+    from fishd.learning.train.jobs import Outcome
 
 EXTRA = ("gymnasium", "joblib", "onnx", "onnxruntime", "stable_baselines3", "tensorboard", "torch")
 MISSING = [name for name in EXTRA if find_spec(name) is None]
@@ -32,3 +40,41 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 def daemon(shared_daemon: Daemon) -> Daemon:
     """One for all tests of a module, at rest whatever the test before has done with it."""
     return shared_daemon.at_rest()
+
+
+def once(factory: pytest.TempPathFactory, name: str, **settings: Any) -> "Outcome":
+    """A training that takes seconds: the first of the workers does it, the others wait for it."""
+    from rigs.swimming import brief_job
+
+    from fishd.learning.settings import TrainingSettings
+    from fishd.learning.train.training import train
+
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    kept = folder / "outcome"
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not kept.exists():
+            job = replace(brief_job(folder / "run"), settings=TrainingSettings(**settings))
+            kept.write_bytes(pickle.dumps(train(job)))
+        found: Outcome = pickle.loads(kept.read_bytes())
+    return found
+
+
+@pytest.fixture(scope="session")
+def by_force(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
+    """A run that has learned to swim in a thousand steps; its folder must not be changed."""
+    from fishd.learning.settings import EvaluationSettings
+
+    evaluation = EvaluationSettings(seconds=10.0, settle=5.0)
+    return once(tmp_path_factory, "by-force", steps=1024, evaluation=evaluation)
+
+
+@pytest.fixture(scope="session")
+def by_sight(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
+    """One that has learned by sight; its folder must not be changed."""
+    from fishd.learning.settings import EvaluationSettings
+
+    evaluation = EvaluationSettings(seconds=6.0, settle=2.0)
+    return once(tmp_path_factory, "by-sight", see="camera", steps=1024, evaluation=evaluation)

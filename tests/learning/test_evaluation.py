@@ -125,7 +125,8 @@ def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
 
 def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Path) -> None:
     settings = TrainingSettings(
-        steps=768,
+        steps=384,
+        seed=3,  # with which another policy is the best on its own fish
         randomisation=Randomisation(omega0=0.2, coupling=0.2),
         evaluation=EvaluationSettings(seconds=8.0, settle=3.0, others=3),
     )

@@ -384,7 +384,7 @@ def test_export_finds_the_best_of_a_tank(tmp_path: Path, beating: list[Policy]) 
 
 
 def test_in_lockstep_a_fishd_gives_the_evaluations_of_a_fish_in_process(tmp_path: Path) -> None:
-    changes = {"steps": 512, "seed": 249, "ppo": PpoSettings()}
+    changes = {"steps": 256, "seed": 249, "ppo": PpoSettings()}
     here = on_robot(tmp_path / "here", **changes)
     Training(here, SimulatedLink(here.config), Display(), lambda: False).run()
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"

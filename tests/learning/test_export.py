@@ -22,17 +22,9 @@ from fishd.learning.export import export, export_model
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
-from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
+from fishd.learning.settings import PpoSettings
 from fishd.learning.train.jobs import Outcome
 from fishd.learning.train.training import train
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    """A run that has learned to swim."""
-    settings = TrainingSettings(steps=768, evaluation=EvaluationSettings(seconds=8.0, settle=4.0))
-    job = brief_job(tmp_path_factory.mktemp("trained") / "run")
-    return train(replace(job, settings=settings))
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +35,12 @@ def stalled(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
 
 
 def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
-    tmp_path: Path, trained: Outcome
+    tmp_path: Path, by_force: Outcome
 ) -> None:
-    assert trained.best
-    found = export(trained.best, tmp_path / "policy.onnx")
+    assert by_force.best
+    found = export(by_force.best, tmp_path / "policy.onnx")
     controller = registry.create("ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, dwell=0.0))
-    policy, perception = checkpoints.load_policy(trained.best)
+    policy, perception = checkpoints.load_policy(by_force.best)
     decide = DeterministicPolicy(policy, perception, 0.42)
     draw = np.random.default_rng(1)
     for _ in range(200):
@@ -57,9 +49,9 @@ def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
         assert controller.update(seen) == pytest.approx(decide(seen), abs=1e-5)
 
 
-def test_it_swims_on_the_loop_of_the_robot(tmp_path: Path, trained: Outcome) -> None:
-    assert trained.best
-    found = export(trained.best, tmp_path / "policy.onnx")
+def test_it_swims_on_the_loop_of_the_robot(tmp_path: Path, by_force: Outcome) -> None:
+    assert by_force.best
+    found = export(by_force.best, tmp_path / "policy.onnx")
     rig = Rig(*NOISY)
     rig.start("ppo", policy=str(found.path))
     rig.run_for(5.0)
@@ -68,13 +60,13 @@ def test_it_swims_on_the_loop_of_the_robot(tmp_path: Path, trained: Outcome) -> 
     assert thrust == pytest.approx(found.evaluation.thrust, rel=0.05)
 
 
-def test_the_card_says_how_it_swims_and_carries_the_note(tmp_path: Path, trained: Outcome) -> None:
-    assert trained.best
-    assert trained.best_evaluation
-    past = export(trained.best, tmp_path / "p.onnx", note="for the small tail").card.provenance
+def test_the_card_says_how_it_swims_and_carries_the_note(tmp_path: Path, by_force: Outcome) -> None:
+    assert by_force.best
+    assert by_force.best_evaluation
+    past = export(by_force.best, tmp_path / "p.onnx", note="for the small tail").card.provenance
     assert past.note == "for the small tail"
-    assert past.efficiency == pytest.approx(trained.best_evaluation.efficiency)
-    assert past.frequency == pytest.approx(trained.best_evaluation.frequency)
+    assert past.efficiency == pytest.approx(by_force.best_evaluation.efficiency)
+    assert past.frequency == pytest.approx(by_force.best_evaluation.frequency)
 
 
 def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
@@ -90,7 +82,7 @@ def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
 
 
 def test_a_file_that_would_say_something_else_is_never_put_in_place(
-    tmp_path: Path, trained: Outcome, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, by_force: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from fishd.learning import export as exporting
 
@@ -98,53 +90,53 @@ def test_a_file_that_would_say_something_else_is_never_put_in_place(
     monkeypatch.setattr(  # relu where the policy was trained with tanh
         exporting, "to_onnx", lambda layers, _, card, sight: whole(layers, "relu", card, sight)
     )
-    assert trained.best
+    assert by_force.best
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):
-        export(trained.best, tmp_path / "policy.onnx")
+        export(by_force.best, tmp_path / "policy.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_another_tick_than_that_of_the_training_is_refused(
-    tmp_path: Path, trained: Outcome
+    tmp_path: Path, by_force: Outcome
 ) -> None:
-    assert trained.best
-    found = export(trained.best, tmp_path / "policy.onnx")
+    assert by_force.best
+    found = export(by_force.best, tmp_path / "policy.onnx")
     with pytest.raises(ParameterError, match="tick"):
         registry.create("ppo", {"policy": str(found.path)}, Limits(amplitude=0.42, tick=0.02))
 
 
-def test_a_broken_checkpoint_is_one_line(tmp_path: Path, trained: Outcome) -> None:
+def test_a_broken_checkpoint_is_one_line(tmp_path: Path, by_force: Outcome) -> None:
     broken = tmp_path / "step-000064"
     broken.mkdir()
     (broken / "model.zip").write_bytes(b"PK")
     with pytest.raises(CheckpointError, match=r"card\.json: no such file"):
         export(broken, tmp_path / "p.onnx")
-    assert trained.best
+    assert by_force.best
     for name in ("card.json", "state.json"):
-        (broken / name).write_bytes((trained.best / name).read_bytes())
+        (broken / name).write_bytes((by_force.best / name).read_bytes())
     with pytest.raises(CheckpointError, match=r"model\.zip: cannot be read: "):
         export(broken, tmp_path / "p.onnx")
 
 
 def test_the_verb_takes_the_best_of_a_run_or_a_checkpoint(
-    tmp_path: Path, trained: Outcome, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, by_force: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert trained.best
-    assert trained.checkpoint
+    assert by_force.best
+    assert by_force.checkpoint
 
     def written(*arguments: str) -> str:
         found = CliRunner().invoke(fishctl, ["learn", "export", *arguments])
         assert found.exit_code == 0, found.output
         return found.output
 
-    output = written(str(trained.folder))
+    output = written(str(by_force.folder))
     assert output.startswith("run.onnx: ")
-    assert f"from {trained.best}" in output
+    assert f"from {by_force.best}" in output
     assert "it swims with" in output
     assert "fishctl set-controller ppo --policy run.onnx" in output
-    assert f"from {trained.checkpoint}" in written(str(trained.folder), "--newest", "--force")
-    assert f"from {trained.checkpoint}" in written(str(trained.checkpoint), "--to", "a/b.onnx")
+    assert f"from {by_force.checkpoint}" in written(str(by_force.folder), "--newest", "--force")
+    assert f"from {by_force.checkpoint}" in written(str(by_force.checkpoint), "--to", "a/b.onnx")
     assert (tmp_path / "a" / "b.onnx").exists()
 
 
@@ -204,9 +196,9 @@ def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -
 
 
 def test_a_file_that_ppo_would_not_take_for_a_policy_is_not_written(
-    tmp_path: Path, trained: Outcome
+    tmp_path: Path, by_force: Outcome
 ) -> None:
-    words = ["learn", "export", str(trained.best), "--to", str(tmp_path / "mine.pt")]
+    words = ["learn", "export", str(by_force.best), "--to", str(tmp_path / "mine.pt")]
     refused = CliRunner().invoke(fishctl, words)
     assert isinstance(refused.exception, PolicyError)
     assert str(refused.exception).endswith("the name of a policy file must end in .onnx")
@@ -214,11 +206,11 @@ def test_a_file_that_ppo_would_not_take_for_a_policy_is_not_written(
 
 
 def test_the_command_overwrites_a_file_only_when_it_is_forced_to(
-    tmp_path: Path, trained: Outcome
+    tmp_path: Path, by_force: Outcome
 ) -> None:
     target = tmp_path / "mine.onnx"
     target.write_text("precious")
-    words = ["learn", "export", str(trained.best), "--to", str(target)]
+    words = ["learn", "export", str(by_force.best), "--to", str(target)]
     refused = CliRunner().invoke(fishctl, words)
     assert isinstance(refused.exception, PolicyError)
     assert str(refused.exception) == (

@@ -9,7 +9,6 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 from rigs.seeing_policies import babbled
-from rigs.swimming import brief_job
 from stable_baselines3 import PPO
 
 from fishd.camera.frames import StackSettings
@@ -32,13 +31,11 @@ from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (
     EnvironmentSettings,
-    EvaluationSettings,
     PpoSettings,
     TrainingSettings,
     VisionSettings,
 )
 from fishd.learning.train.jobs import Outcome
-from fishd.learning.train.training import train
 
 
 def settings_of(eye: str, **values: Any) -> TrainingSettings:
@@ -149,39 +146,30 @@ def test_a_model_of_ones_own_that_sees_pictures_is_refused(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    """A run that has learned to swim by sight."""
-    settings = replace(
-        settings_of("modes"), steps=2048, evaluation=EvaluationSettings(seconds=8.0, settle=4.0)
-    )
-    job = brief_job(tmp_path_factory.mktemp("trained") / "run")
-    return train(replace(job, settings=settings))
-
-
 @pytest.mark.slow
-def test_what_was_learned_by_sight_swims_from_its_file(tmp_path: Path, trained: Outcome) -> None:
-    assert trained.best
-    assert trained.best_evaluation
-    found = export(trained.best, tmp_path / "eye.onnx")
+def test_what_was_learned_by_sight_swims_from_its_file(tmp_path: Path, by_sight: Outcome) -> None:
+    assert by_sight.best
+    assert by_sight.best_evaluation
+    found = export(by_sight.best, tmp_path / "eye.onnx")
     past = found.card.provenance
-    assert past.efficiency == pytest.approx(trained.best_evaluation.efficiency)
+    assert past.efficiency == pytest.approx(by_sight.best_evaluation.efficiency)
     assert file.read(found.path).card.pictures == StackSettings()
     standings, _ = compare(Config(), [str(found.path)], seconds=20.0, settle=5.0)
     assert standings[0].efficiency == pytest.approx(past.efficiency, abs=0.05)
 
 
 @pytest.mark.slow
-def test_what_was_learned_by_sight_looks_at_the_tail(tmp_path: Path, trained: Outcome) -> None:
-    assert trained.best
-    path = export(trained.best, tmp_path / "eye.onnx").path
+def test_what_was_learned_by_sight_looks_at_the_tail(tmp_path: Path, by_sight: Outcome) -> None:
+    assert by_sight.best
+    path = export(by_sight.best, tmp_path / "eye.onnx").path
     found = look(str(path), Config(), DEFAULT, 10.0)  # by the camera that it has learned with
     assert found.share > 2.0 * found.area
 
 
 @pytest.mark.slow
-def test_the_verb_says_who_lets_it_swim(tmp_path: Path, trained: Outcome) -> None:
+def test_the_verb_says_who_lets_it_swim(tmp_path: Path, by_sight: Outcome) -> None:
     path = tmp_path / "eye.onnx"
-    found = CliRunner().invoke(fishctl, ["learn", "export", str(trained.folder), "--to", str(path)])
+    words = ["learn", "export", str(by_sight.folder), "--to", str(path)]
+    found = CliRunner().invoke(fishctl, words)
     assert found.exit_code == 0, found.output
     assert found.output.endswith(f"it sees pictures; to let it swim: fishctl agent {path}\n")

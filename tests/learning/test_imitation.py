@@ -1,6 +1,8 @@
 """Learning from the best square waves of many fish, before PPO or in its place."""
 
 import re
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from fishd.learning.settings import (
     TrainingSettings,
     check,
 )
+from fishd.learning.train.jobs import Outcome
 from fishd.learning.train.progress import LineDisplay
 from fishd.learning.train.training import train
 from fishd.virtual.plant.optimum import best_square_wave
@@ -30,13 +33,21 @@ from fishd.virtual.plant.optimum import best_square_wave
 SEEING = EnvironmentSettings(
     observation=("fy", "instruction_angle", "fin_velocity", "side_time"), history=4
 )
-SHORT = ImitationSettings(rounds=2, fish=20, ticks=60, batch_size=128)
+SHORT = ImitationSettings(rounds=2, fish=10, ticks=60, batch_size=128)
 CHANGES = {
     "steps": 0,
     "environment": SEEING,
     "randomisation": Randomisation(omega0=0.3),
     "imitation": SHORT,
 }
+
+
+@pytest.fixture(scope="module")
+def imitated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, str]:
+    """A run that only imitates, which must not be changed, and what was said meanwhile."""
+    with redirect_stdout(StringIO()) as said:
+        job = brief_job(tmp_path_factory.mktemp("imitated") / "run", **CHANGES)
+        return train(job, LineDisplay()), said.getvalue()
 
 
 def test_half_beats_are_compared_by_their_thrust() -> None:
@@ -56,18 +67,18 @@ def test_it_is_right_to_stay_until_the_best_half_beat_is_over() -> None:
 
 
 def test_a_policy_that_only_imitated_swims_and_says_how_it_learned(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, imitated: tuple[Outcome, str]
 ) -> None:
-    outcome = train(brief_job(tmp_path / "run", **CHANGES), LineDisplay())
+    outcome, said = imitated
     assert outcome.ended == "finished"
     assert outcome.steps == 0
     assert outcome.best_evaluation
     assert outcome.best_evaluation.efficiency > 0.9
-    assert "imitation 2 of 2: 9" in capsys.readouterr().out
+    assert "imitation 2 of 2: 9" in said
     assert outcome.best
     past = read(export(outcome.best, tmp_path / "policy.onnx").path).card.provenance
     assert past.algorithm == "imitation"
-    assert past.settings["imitation"]["fish"] == 20
+    assert past.settings["imitation"]["fish"] == 10
 
 
 def test_ppo_goes_on_with_what_was_imitated(tmp_path: Path) -> None:
@@ -82,7 +93,7 @@ def test_ppo_goes_on_with_what_was_imitated(tmp_path: Path) -> None:
 
 def test_a_training_that_was_stopped_meanwhile_imitates_anew(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", **CHANGES)
-    asked = iter([False] * 30 + [True] * 99)
+    asked = iter([False] * 15 + [True] * 99)
     assert train(job, stop=lambda: next(asked)).ended == "interrupted"
     assert not checkpoints.read_state(tmp_path / "run" / "step-000000").imitated
     resumed = train(replace(job, resume=True))
@@ -92,8 +103,10 @@ def test_a_training_that_was_stopped_meanwhile_imitates_anew(tmp_path: Path) -> 
         train(replace(job, resume=True))
 
 
-def test_who_begins_with_another_run_does_not_imitate_again(tmp_path: Path) -> None:
-    parent = train(brief_job(tmp_path / "first", **CHANGES)).best
+def test_who_begins_with_another_run_does_not_imitate_again(
+    tmp_path: Path, imitated: tuple[Outcome, str]
+) -> None:
+    parent = imitated[0].best
     found: list[Evaluation] = []
     display = LineDisplay()
     display.evaluated = found.append  # type: ignore[method-assign]

@@ -48,12 +48,12 @@ def complaint(*arguments: str) -> tuple[int, str]:
 
 def test_it_trains_and_says_how_it_went(tmp_path: Path, settings: str) -> None:
     folder = tmp_path / "run"
-    found = learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "768")
+    found = learn("ppo", "--settings", settings, "--folder", str(folder), "--steps", "512")
     assert found.returncode == 0, found.stderr
-    assert "768 steps in 0:3" in found.stdout
+    assert "512 steps in 0:2" in found.stdout
     assert f"fishctl learn export {folder}" in found.stdout
     assert found.stdout.count(" in the tank: ") >= 2  # a line for each evaluation
-    assert runs.read(folder)[1].steps == 768
+    assert runs.read(folder)[1].steps == 512
 
 
 def test_it_goes_on_with_more_steps(tmp_path: Path, settings: str) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from joblib.externals.loky import get_reusable_executor
-from rigs.processes import FISHCTL, fishctl
+from rigs.processes import FISHCTL, fishctl, one_line
 from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
 from fishd.lab import parallel
@@ -194,11 +194,11 @@ def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     done = while_it_trains(
         lambda: list((run / "seed-0").glob("step-*")),
         lambda: os.kill(trainers(os.getpid())[0], signal.SIGKILL),
-        *command(tmp_path, "--seeds", "2", "--jobs", "2", steps=1024),
+        *command(tmp_path, "--seeds", "2", "--jobs", "2", steps=512),
     )
     assert done.returncode == 0, done.stderr
     assert "latest policies of 2 seeds" in done.stdout
-    assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 1025, 64))
+    assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 513, 64))
 
 
 def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> None:
@@ -278,3 +278,11 @@ def test_a_cluster_that_does_not_answer_is_one_line(
 def test_a_summary_of_seeds_that_got_nowhere_is_a_head(tmp_path: Path) -> None:
     write_summary(tmp_path / "seeds.csv", [tmp_path / "seed-0"])
     assert (tmp_path / "seeds.csv").read_text() == ",".join(SUMMARY) + "\n"
+
+
+def test_without_torch_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fishd.cli.learn.ppo.find_spec", lambda name: None)
+    done = fishctl(*command(tmp_path, "--seeds", "2"))
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "torch is not installed" in one_line(done)
+    assert not (tmp_path / "run").exists()

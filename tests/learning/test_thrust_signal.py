@@ -114,7 +114,7 @@ def test_one_fish_is_learned_from_without_it_and_a_new_one_in_each_episode_as_it
 
 def test_a_policy_learns_to_swim_a_rig_whose_sensor_is_turned_and_drifts(tmp_path: Path) -> None:
     rig = ("simulation.noise=0.002", TURNED, "simulation.offset_x=0.02", "simulation.drift=0.01")
-    job = brief_job(tmp_path / "run", steps=1536)
+    job = brief_job(tmp_path / "run", steps=1152)
     settings = replace(job.settings, ppo=type(BRIEF.ppo)())
     job = replace(
         job,

@@ -23,7 +23,6 @@ from fishd.learning.settings import (
     EnvironmentSettings,
     EvaluationSettings,
     PpoSettings,
-    TrainingSettings,
 )
 from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.progress import Display
@@ -56,17 +55,16 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize("dwell", [False, True])
-def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path, dwell: bool) -> None:
-    settings = TrainingSettings(
-        environment=EnvironmentSettings(dwell=dwell),
-        evaluation=EvaluationSettings(seconds=10.0, settle=5.0),
-    )
-    job = replace(brief_job(tmp_path / "run"), settings=replace(settings, steps=1024))
-    outcome = train(job)
+def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path, by_force: Outcome, dwell: bool) -> None:
+    outcome = by_force
+    if not dwell:
+        config, settings = runs.read(by_force.folder)
+        free = replace(settings, environment=EnvironmentSettings(dwell=False))
+        outcome = train(Job(config=config, settings=free, folder=tmp_path / "run"))
     assert (outcome.ended, outcome.steps) == ("finished", 1024)
     assert outcome.best_evaluation
     assert outcome.best_evaluation.efficiency > 0.9
-    untrained = rows(job.folder / "progress.csv")[0]
+    untrained = rows(outcome.folder / "progress.csv")[0]
     # Who moves at random, but not too fast, swims not that badly.
     better = 1.2 if dwell else 3.0
     assert outcome.best_evaluation.thrust > better * float(untrained["thrust"])
@@ -142,7 +140,7 @@ def never() -> EvaluationSettings:
 
 def test_the_best_policy_is_kept_beside_the_newest(tmp_path: Path) -> None:
     witness = Witness()
-    job = brief_job(tmp_path / "run", steps=1024)
+    job = brief_job(tmp_path / "run", steps=448)
     outcome = train(job, witness)
     swimming = [e for e in witness.evaluations if not e.stalled]
     assert outcome.best_evaluation == max(swimming, key=lambda e: (e.efficiency, e.steps))
@@ -348,15 +346,15 @@ def test_networks_with_other_scales_or_sizes_are_refused(
 
 
 def test_in_lockstep_it_gives_the_numbers_of_a_training_in_process(tmp_path: Path) -> None:
-    here = train(brief_job(tmp_path / "here", steps=512, evaluation=never()))
+    here = train(brief_job(tmp_path / "here", steps=256, evaluation=never()))
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
     settings = sets("lockstep=true", "start.controller=remote", agent, *NOISY)
     with running(tmp_path, *settings) as fishd:
-        job = brief_job(tmp_path / "there", steps=512, evaluation=never())
+        job = brief_job(tmp_path / "there", steps=256, evaluation=never())
         there = train(replace(job, on="robot", endpoint=fishd.endpoint))
         with Fish(fishd.endpoint) as fish:
             assert fish.status().mode == "idle"
-    assert (there.steps, there.tank_time) == (512, here.tank_time)
+    assert (there.steps, there.tank_time) == (256, here.tank_time)
     tables = [(outcome.folder / "progress.csv").read_text() for outcome in (here, there)]
     assert tables[0] == tables[1]
 

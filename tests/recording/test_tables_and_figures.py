@@ -53,8 +53,9 @@ def test_a_recording_is_drawn_as_a_picture_and_as_a_page_that_loads_nothing(
     assert "<b>stiff</b>" not in html
     resting = Rig()
     resting.run_for(0.5)
-    rest = fishctl("plot", str(recorded(resting, tmp_path / "rest")), "--to", str(tmp_path))
-    assert "phase portrait" not in Path(rest.stdout.split()[1]).read_text()
+    run = str(recorded(resting, tmp_path / "rest"))
+    rest = fishctl("plot", run, "--to", str(tmp_path), "--html")
+    assert "phase portrait" not in Path(rest.stdout.strip()).read_text()
     again = fishctl("plot", str(path), "--to", str(tmp_path), "--png", "--force")
     assert again.stdout == f"{picture}\n"
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))

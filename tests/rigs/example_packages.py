@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fishd.config.assembly import assemble
+from fishd.controllers import registry
 from fishd.core.clock import VirtualClock
 from fishd.hardware.base import Robot
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS
@@ -51,8 +52,8 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def forget_drivers() -> None:
-    """Look for the drivers and plants of other packages again."""
-    for plugins in (FORCE_SENSORS, SERVOS, PLANTS):
+    """Look for the drivers, plants and controllers of other packages again."""
+    for plugins in (FORCE_SENSORS, SERVOS, PLANTS, registry._found):
         plugins._found.clear()
 
 

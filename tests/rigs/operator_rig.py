@@ -123,7 +123,7 @@ class Bench:
             "servo.countdown=2",
             f"state_folder={self.folder}/state",
             "force_sensor.tare_limit=0.5",
-            "force_sensor.data_rate=128",  # enough for them, and a third of the work
+            "force_sensor.data_rate=64",  # enough for them, and a fifth of the work
         )
 
     def files(self, kind: str) -> list[Path]:

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections import deque
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +30,7 @@ DEVICE = "/dev/video7"
 BUFFER = 2**20
 FORMATS = ("MJPG", "YUYV", "GREY")
 TICKS_OF_EXPOSURE = 100e-6
+LEVELS = 18
 
 
 class Faults(msgspec.Struct, frozen=True):
@@ -291,17 +293,11 @@ class V4l2Camera:
         os.eventfd_write(self._ours, 1)
 
     def _picture(self) -> bytes:
-        fourcc, width, height = self._format
-        grey = picture(self._sequence, width, height)
-        if fourcc == "GREY":
-            return b"".join(bytes(line) + bytes(16) for line in grey)
-        if fourcc == "YUYV":
-            lines = np.full((height, 2 * width), 128, np.uint8)
-            lines[:, ::2] = grey
-            return lines.tobytes()
-        if self.faults.garbage:
+        if self.faults.garbage and self._format[0] == "MJPG":
             return os.urandom(5000)
-        data: bytes = simplejpeg.encode_jpeg(grey[:, :, np.newaxis], 90, colorspace="GRAY")
+        data = encoded(self._sequence % LEVELS, *self._format)
+        if self._format[0] != "MJPG":
+            return data
         if self.faults.broken:
             return data[: len(data) // 2]
         if self.faults.extraneous:
@@ -311,7 +307,7 @@ class V4l2Camera:
 
 def level(number: int) -> int:
     """Grey level of the left half of a picture."""
-    return 40 + 10 * (number % 18)
+    return 40 + 10 * (number % LEVELS)
 
 
 def picture(number: int, width: int, height: int) -> "np.ndarray[Any, np.dtype[np.uint8]]":
@@ -320,6 +316,20 @@ def picture(number: int, width: int, height: int) -> "np.ndarray[Any, np.dtype[n
     found[:, : width // 2] = level(number)
     found[: height // 2, width // 2 :] = 0
     return found
+
+
+@cache
+def encoded(number: int, fourcc: str, width: int, height: int) -> bytes:
+    """A picture as a camera sends it."""
+    grey = picture(number, width, height)
+    if fourcc == "GREY":
+        return b"".join(bytes(line) + bytes(16) for line in grey)
+    if fourcc == "YUYV":
+        lines = np.full((height, 2 * width), 128, np.uint8)
+        lines[:, ::2] = grey
+        return lines.tobytes()
+    data: bytes = simplejpeg.encode_jpeg(grey[:, :, np.newaxis], 90, colorspace="GRAY")
+    return data
 
 
 if __name__ == "__main__":

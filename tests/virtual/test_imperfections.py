@@ -100,7 +100,8 @@ def test_a_spike_leaves_the_noise_as_it_was_and_decays_in_the_fin_velocity() -> 
 @pytest.mark.slow
 def test_on_a_virtual_pi_a_spike_is_one_bad_conversion() -> None:
     rig = ["simulation.noise=0", "simulation.spike_rate=2", "simulation.spike_size=0.2"]
-    config = load(None, ["robot=virtual-pi", "virtual_pi.adc_noise=0", *rig])
+    few = "force_sensor.data_rate=250"  # conversions, of which each takes as long to emulate
+    config = load(None, ["robot=virtual-pi", "virtual_pi.adc_noise=0", *rig, few])
     with ExitStack() as stack:
         robot, _ = open_in_virtual_time(config, stack)
         found = [robot.sensor.read(TICK * k) for k in range(400)]

@@ -11,9 +11,9 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from threading import Barrier, Lock
 
@@ -219,8 +219,8 @@ def measure(options: Namespace) -> Report:
     """Every death, one after the other; half a minute."""
     outcomes = {}
     for names in [options.only] if options.only else [[name] for name in (*DEATHS, *PHASES)]:
-        with ThreadPool(len(names)) as pool:
-            found = pool.map(partial(die, together=Barrier(len(names))), names)
+        with ThreadPoolExecutor(len(names)) as pool:
+            found = list(pool.map(partial(die, together=Barrier(len(names))), names))
         outcomes |= dict(zip(names, found, strict=True))
         for name in names:
             progress(*row(name, outcomes[name]))

@@ -11,8 +11,8 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 import zmq
@@ -28,12 +28,21 @@ DOCUMENT = "reliability.md"
 ZOO = DOCS.parent / "tests" / "rigs" / "zoo"
 LONGEST_END = 3.0
 """What fishd may take from a signal to its end, whatever hangs [s]."""
+IMPATIENT_FISHD = """
+from fishd.core import protocol
+protocol.LOADING = {loading}
+from fishd.__main__ import fishd
+fishd()
+"""
 METHODS = ("check", "__init__", "activate", "update", "warm_up", "retune", "close")
 DEAD_LINE = 'raise SystemExit("no")\n'
 HANGING_LINE = "import threading\n\nthreading.Event().wait()\n"
 
 sys.path.insert(0, str(ZOO))
 from fishd_zoo import BAD, GOOD, HANGS, RAISED  # noqa: E402
+
+COMPUTE = ("loop",)
+"""Those of `HANGS` that take all that a processor gives."""
 
 
 class Outcome(Struct):
@@ -68,13 +77,21 @@ def install(folder: Path, bad_imports: bool = False) -> Path:
 
 
 @contextlib.contextmanager
-def running(bad_imports: bool = False, output: int | None = None) -> Iterator[tuple[Fishd, Fish]]:
-    """A fishd that is up, with the zoo installed, and a client of it."""
+def running(
+    bad_imports: bool = False, output: int | None = None, loading: float | None = None
+) -> Iterator[tuple[Fishd, Fish]]:
+    """A fishd that is up, with the zoo installed, and a client of it.
+
+    loading: what a load may take [s], if not LOADING
+    """
+    command: tuple[str, ...] = (str(BIN / "fishd"),)
+    if loading is not None:
+        command = (sys.executable, "-c", IMPATIENT_FISHD.format(loading=loading))
     with tempfile.TemporaryDirectory(prefix="fishd-") as folder:
         fishd = Fishd(
             # A controller that computes for ever must not hold up what else runs in real time.
             "realtime.priority=5",
-            command=(str(BIN / "fishd"), "--print-status"),
+            command=(*command, "--print-status"),
             environment={"PYTHONPATH": str(install(Path(folder), bad_imports))},
             output=output,
         )
@@ -148,26 +165,29 @@ def numbers() -> Outcome:
     return Outcome("odd numbers as an angle", does, len(GOOD) + len(BAD), ended)
 
 
-def loading() -> Outcome:
+def loading(patience: float | None = None) -> Outcome:
     """Loads that never end: each is refused, and others load.
 
     Three fishds at once. Those that compute for ever share one: a core is left for who asks.
+
+    patience: what a load may take [s], if not LOADING
     """
     cases = [(method, way) for way in HANGS for method in ("check", "__init__")]
-    computing = [case for case in cases if case[1] == "loop"]
-    waiting = [case for case in cases if case[1] != "loop"]
+    computing = [case for case in cases if case[1] in COMPUTE]
+    waiting = [case for case in cases if case[1] not in COMPUTE]
     groups = computing, waiting[:MOST_AT_ONCE], waiting[MOST_AT_ONCE:]
-    with ThreadPool(len(groups)) as pool:
-        found = pool.map(refused_loads, groups)
+    with ThreadPoolExecutor(len(groups)) as pool:
+        found = list(pool.map(partial(refused_loads, patience=patience), groups))
     ended, times, statuses = zip(*found, strict=True)
-    does, what = f"refusal `too-slow` after {LOADING:g} s; others load", "a load that never ends"
+    does = f"refusal `too-slow` after {patience or LOADING:g} s; others load"
+    what = "a load that never ends"
     return Outcome(what, does, len(cases), sum(ended), max(times), sorted(set(statuses)))
 
 
-def refused_loads(cases: list[tuple[str, str]]) -> tuple[int, float, int]:
+def refused_loads(cases: list[tuple[str, str]], patience: float | None) -> tuple[int, float, int]:
     """How many loads were not refused, the time to the end of fishd [s], its exit status."""
-    with running() as (fishd, fish), ThreadPool(len(cases)) as pool:
-        refusals = pool.map(partial(refusal_of_load, fishd.endpoint), cases)
+    with running(loading=patience) as (fishd, fish), ThreadPoolExecutor(len(cases)) as pool:
+        refusals = list(pool.map(partial(refusal_of_load, fishd.endpoint), cases))
         fish.set_controller("square")
         await_mode(fish, "running")
         ended = len(cases) - refusals.count("too-slow")
@@ -203,10 +223,11 @@ def importing() -> Outcome:
     return Outcome("an import that raises or never ends", does, 2, ended, took, [status])
 
 
-def ask(endpoint: str, method: str, way: str) -> None:
+def ask(fishd: Fishd, method: str, way: str) -> None:
     """Let a method hang, and wait until it does; one that loads holds up nobody."""
-    zoo = {"deed": way, "method": method}
-    with Fish(endpoint, timeout=PATIENCE) as fish:
+    begun = fishd.folder / "begun"
+    zoo = {"deed": way, "method": method, "begun": str(begun)}
+    with Fish(fishd.endpoint, timeout=PATIENCE) as fish:
         if method in ("retune", "close"):
             fish.set_controller("zoo", **zoo)  # answered once it is active
         match method:
@@ -216,27 +237,12 @@ def ask(endpoint: str, method: str, way: str) -> None:
                 request = fish.request("stop", {})
             case _:
                 request = fish.request("set-controller", {"name": "zoo", "parameters": zoo})
-        send(endpoint, request[1])
-    if method in ("check", "__init__"):
-        time.sleep(0.5)
-    else:
-        await_silence(endpoint)
-
-
-def await_silence(endpoint: str) -> None:
-    """Raises TimeoutError when fishd goes on answering."""
+        send(fishd.endpoint, request[1])
     deadline = time.monotonic() + PATIENCE
-    silent = 0
-    with Fish(endpoint, timeout=0.7) as fish:
-        while silent < 2:  # once may be a busy machine
-            if time.monotonic() > deadline:
-                raise TimeoutError("fishd does not hang")
-            try:
-                fish.status()
-                silent = 0
-            except NoDaemon:
-                silent += 1
-            time.sleep(0.01)
+    while not begun.exists():
+        if time.monotonic() > deadline:
+            raise TimeoutError("fishd does not hang")
+        time.sleep(0.01)
 
 
 def send(endpoint: str, request: bytes) -> None:
@@ -251,15 +257,11 @@ def hanging(method: str) -> Callable[[], Outcome]:
     """SIGTERM while a method hangs, in every way, with one processor for all of fishd."""
 
     def measure() -> Outcome:
-        times, statuses = [], []
-        for way in HANGS:
-            with running() as (fishd, _):
-                for thread in Path(f"/proc/{fishd.pid}/task").iterdir():
-                    with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-                        os.sched_setaffinity(int(thread.name), {min(os.sched_getaffinity(0))})
-                ask(fishd.endpoint, method, way)
-                times.append(fishd.end(signal.SIGTERM))
-                statuses.append(fishd.process.returncode)
+        # Side by side, but for what would take the processor from the others.
+        found = ends(method, [way for way in HANGS if way not in COMPUTE])
+        for way in COMPUTE:
+            found += ends(method, [way])
+        times, statuses = zip(*found, strict=True)
         load = method in ("check", "__init__")
         does = "goes on ticking" if load else "the countdown ends the pulses; ends when asked to"
         what = f"`{method}` hangs" + (" while it loads" if load else "")
@@ -267,6 +269,27 @@ def hanging(method: str) -> Callable[[], Outcome]:
         return Outcome(what, does, len(HANGS), ended, max(times), sorted(set(statuses)))
 
     return measure
+
+
+def ends(method: str, ways: list[str]) -> list[tuple[float, int]]:
+    """The time from SIGTERM to the end of a fishd that hangs [s], and its exit status, of each way.
+
+    None is sent a SIGTERM before all of them hang: their starts would disturb it.
+    """
+
+    def hang(way: str) -> Fishd:
+        fishd, _ = stack.enter_context(running())
+        for thread in Path(f"/proc/{fishd.pid}/task").iterdir():
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setaffinity(int(thread.name), {min(os.sched_getaffinity(0))})
+        ask(fishd, method, way)
+        return fishd
+
+    def end(fishd: Fishd) -> tuple[float, int]:
+        return fishd.end(signal.SIGTERM), fishd.process.returncode
+
+    with contextlib.ExitStack() as stack, ThreadPoolExecutor(len(ways)) as pool:
+        return list(pool.map(end, list(pool.map(hang, ways))))
 
 
 def unread(number: signal.Signals, terminal: bool) -> Callable[[], Outcome]:

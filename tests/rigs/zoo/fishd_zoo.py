@@ -8,6 +8,7 @@ import logging
 import os
 import time
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,8 @@ class ZooParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     deed: str = ""
     method: str = "update"
     nudge: int = 0
+    begun: str = ""
+    """A file that is there once the deed begins."""
 
 
 class Zoo(Controller[ZooParameters]):
@@ -168,6 +171,8 @@ def _act(method: str, parameters: ZooParameters) -> Any:
     deed = parameters.deed
     if method != parameters.method:
         return 0.0
+    if parameters.begun:
+        Path(parameters.begun).touch()
     if deed in RAISED:
         raise RAISED[deed]
     if deed in HANGS:

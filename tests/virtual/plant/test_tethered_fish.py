@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -45,7 +47,7 @@ instructions = st.one_of(st.none(), angles)
 
 
 def dead_band(angle: float, slack: float) -> float:
-    return float(np.sign(angle)) * max(abs(angle) - slack, 0.0)
+    return math.copysign(max(abs(angle) - slack, 0.0), angle)
 
 
 def integrate(
@@ -58,7 +60,7 @@ def integrate(
         command = state.phi + dead_band(command - state.phi, p.servo_dead_zone)
 
     def turn(phi: float) -> float:
-        return 0.0 if command is None else np.tanh((command - phi) / p.servo_lag) * p.servo_speed
+        return 0.0 if command is None else math.tanh((command - phi) / p.servo_lag) * p.servo_speed
 
     def acceleration(phi: float, alpha: float, rate: float) -> float:
         # The wheel turns one way all window long, and the tail was where it is.
@@ -67,18 +69,18 @@ def integrate(
         braking = p.quadratic_drag * abs(rate) * rate
         return -p.xi * p.omega0 * rate - braking - p.omega0**2 * (alpha - drive)
 
-    def forces(phi: float, alpha: float, rate: float) -> tuple[float, float]:
-        a = acceleration(phi, alpha, rate)
+    def forces(alpha: float, rate: float, a: float) -> tuple[float, float]:
         side = p.thrust_coefficient * a + p.lateral_drag * rate
         side += p.lateral_quadratic_drag * abs(rate) * rate
         return -p.thrust_coefficient * alpha * a, -side
 
     def derivative(_: float, y: np.ndarray) -> list[float]:
-        phi, alpha, rate = y[:3]
-        reaction = (-p.servo_reaction * turn(phi) - y[5]) / REACTION_TIME
-        thrust, lateral_force = forces(phi, alpha, rate)
-        acceleration_now = acceleration(phi, alpha, rate)
-        return [turn(phi), rate, acceleration_now, thrust, lateral_force + reaction, reaction]
+        # Called thousands of times: NumPy's floats are several times as slow as Python's.
+        phi, alpha, rate, _, _, felt = y.tolist()
+        turning, a = turn(phi), acceleration(phi, alpha, rate)
+        reaction = (-p.servo_reaction * turning - felt) / REACTION_TIME
+        thrust, lateral_force = forces(alpha, rate, a)
+        return [turning, rate, a, thrust, lateral_force + reaction, reaction]
 
     solution = solve_ivp(
         derivative,
@@ -92,7 +94,10 @@ def integrate(
     )
     phi, alpha, rate, thrust, lateral_force, reaction = solution.y[:, -1]
     instants = (np.arange(samples) + 0.5) * duration / samples
-    sampled = np.mean([forces(*solution.sol(t)[:3]) for t in instants], axis=0).tolist()
+    states = [solution.sol(t)[:3].tolist() for t in instants]
+    sampled = np.mean(
+        [forces(alpha, rate, acceleration(phi, alpha, rate)) for phi, alpha, rate in states], axis=0
+    ).tolist()
     window = FinWindow(
         duration,
         thrust / duration,
