@@ -19,12 +19,14 @@ run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
 	$(BIN)/fishd --config config/simulated.yaml --print-status
 
 # What judges real time goes ahead of the others, where that is permitted; else it follows alone.
-SHARED := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not realtime"
-ALONE := $(BIN)/python -m pytest --realtime
+# Signals as in a terminal, also below nohup or in the background of a script.
+PYTEST := env --default-signal=HUP,INT,QUIT $(BIN)/python -m pytest
+SHARED := $(PYTEST) -n $(JOBS) --dist worksteal -m "not realtime"
+ALONE := $(PYTEST) --realtime
 
 test: $(VENV)/installed-dev  ## Run the whole test suite
 	@if [ -n "$(AHEAD)" ]; then \
-	  env --default-signal=INT,QUIT $(AHEAD) $(ALONE) >$(VENV)/realtime.txt 2>&1 & \
+	  $(AHEAD) $(ALONE) >$(VENV)/realtime.txt 2>&1 & \
 	  $(SHARED); shared=$$?; wait $$!; alone=$$?; cat $(VENV)/realtime.txt; \
 	else \
 	  $(SHARED); shared=$$?; $(ALONE); alone=$$?; \
