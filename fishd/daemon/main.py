@@ -81,6 +81,7 @@ class Daemon:
             stack.enter_context(addresses.claimed(address))
             stack.enter_context(addresses.claimed(config.telemetry.address))
             self._gateways = Gateways(address, config.telemetry.address, stack)
+            stack.callback(realtime.leave)  # before they end, after the servo is released
             wire.start_context(stack)
             self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._mock_ticks = None if self._virtual else mock_ticks(config)

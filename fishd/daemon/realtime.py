@@ -53,6 +53,17 @@ def enter(priority: int, lock_memory: bool) -> bool:
     return scheduled
 
 
+def leave() -> None:
+    """Give the real-time priority of this thread back; call it once nothing has to be on time.
+
+    Who reaps a process at that priority may spin in the kernel (Linux, `shrink_dcache_parent`) for
+    up to a second, until the process, which it has preempted, has left /proc; and the processor
+    with it.
+    """
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def limit_for(priority: int) -> int:
     """The RLIMIT_RTPRIO that it takes: a thread one above the loop ends it where it hangs."""
     return min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO))

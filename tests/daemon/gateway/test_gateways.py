@@ -293,6 +293,20 @@ def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path
         assert daemon.status().counters["control_restarts"] == 1
 
 
+def test_fishd_waits_for_the_end_of_its_gateways_without_a_real_time_priority(
+    daemon: Daemon,
+) -> None:
+    for pid in gateways(daemon).values():
+        os.kill(pid, signal.SIGSTOP)
+    daemon.process.send_signal(signal.SIGTERM)
+    seen = set()
+    while daemon.process.poll() is None:
+        seen.add(os.sched_getscheduler(daemon.process.pid))
+        time.sleep(0.02)
+    assert os.SCHED_OTHER in seen
+    assert daemon.process.returncode == 0
+
+
 @pytest.mark.realtime
 def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(
     daemon: Daemon,
