@@ -124,5 +124,6 @@ def test_one_warm_up_during_which_the_machine_stood_still_does_not_end_them() ->
         if len(warmed) == 3:
             time.sleep(10 * PERIOD)
 
-    asyncio.run(slots(20, warm_up=stopped_once))
+    # The one after it may take a few ms on a busy machine, and leave out some more.
+    asyncio.run(slots(100, warm_up=stopped_once))
     assert len(warmed) >= 8
