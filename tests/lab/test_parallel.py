@@ -33,7 +33,7 @@ def test_a_cluster_has_one_connection_which_is_closed(tmp_path: Path) -> None:
 
     here = {"host": "127.0.0.1", "protocol": "tcp://", "local_directory": str(tmp_path)}
     alone = {"processes": False, "n_workers": 1, "threads_per_worker": 1}
-    with distributed.LocalCluster(**here, **alone, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(**here, **alone, dashboard_address="127.0.0.1:0") as cluster:
         before = connections()
         with workers(tmp_path / "stop", cluster=cluster.scheduler_address) as crew:
             for _ in crew.run(abs, [-1, -2]):

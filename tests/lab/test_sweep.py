@@ -434,7 +434,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     words = ["sweep", "square", "--frequency", "1.5,2", "--periods", "3", "--settle", "1"]
     with distributed.LocalCluster(
-        1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+        1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address="127.0.0.1:0"
     ) as cluster:
         there = [*words, "--folder", str(tmp_path / "there")]
         done = fishctl(*there, "--cluster", cluster.scheduler_address)
