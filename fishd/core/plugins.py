@@ -161,7 +161,10 @@ def _mentioned(group: str) -> bool:
 
 
 def _mentions(path: str, group: bytes) -> bool:
-    """Does a package in this folder of sys.path? In an archive, one may."""
+    """Does a package in this folder of sys.path? In an archive, one may.
+
+    Without pathlib, which takes twice as long for hundreds of files.
+    """
     try:
         names = os.listdir(path or ".")  # noqa: PTH208
     except NotADirectoryError:
