@@ -60,8 +60,9 @@ def leave() -> None:
     up to a second, until the process, which it has preempted, has left /proc; and the processor
     with it.
     """
+    policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK  # without the flag, only root may
     with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setscheduler(0, policy, os.sched_param(0))
 
 
 def limit_for(priority: int) -> int:
