@@ -5,6 +5,7 @@ What is to swim a fish that nobody has measured should do well on all of them.
 
 import math
 import random
+from collections.abc import Callable
 from typing import NamedTuple
 
 from fishd.virtual.plant.parameters import PlantParameters
@@ -43,13 +44,7 @@ def harsh(seed: int) -> OtherFish:
     """A fish and a rig with all of it, in random sizes."""
     uniform = random.Random(seed).uniform
     plant = {
-        "omega0": uniform(8.0, 18.0),
-        "xi": uniform(0.6, 1.8),
-        "coupling": uniform(0.35, 0.6),
-        "servo_speed": uniform(4.0, 9.0),
-        "servo_lag": uniform(0.15, 0.4),
-        "thrust_coefficient": _MODEL.thrust_coefficient * uniform(0.6, 1.6),
-        "lateral_drag": _MODEL.lateral_drag * math.exp(uniform(math.log(0.5), math.log(3.0))),
+        **_random_fish(uniform),
         "backlash": uniform(0.0, 0.08),
         "servo_delay": uniform(0.0, 0.05),
         "servo_dead_zone": uniform(0.0, 0.03),
@@ -63,11 +58,40 @@ def harsh(seed: int) -> OtherFish:
         "offset_x": uniform(-0.02, 0.02),
         "seed": seed,
     }
-    keys = [f"plant.{name}={value!r}" for name, value in plant.items()]
-    keys += [f"simulation.{name}={value!r}" for name, value in rig.items()]
-    return OtherFish(f"harsh {seed}", tuple(keys))
+    return _other_fish(f"harsh {seed}", plant, rig)
+
+
+def mild(seed: int) -> OtherFish:
+    """Return a random fish on a clean rig: it differs from `harsh` in what the rig adds.
+
+    The fish have the ranges of `harsh`. The servo delay is 20 ms at most; there is no backlash, no
+    dead zone, no servo reaction, no offset, no drift and no rotation, and the noise is the default.
+    """
+    uniform = random.Random(seed).uniform
+    plant = {**_random_fish(uniform), "servo_delay": uniform(0.0, 0.02)}
+    return _other_fish(f"mild {seed}", plant, {"seed": seed})
 
 
 def harsh_fish() -> tuple[OtherFish, ...]:
     """The twenty that policies are judged by."""
     return tuple(harsh(FIRST_SEED + k) for k in range(HARSH_FISH))
+
+
+def _random_fish(uniform: Callable[[float, float], float]) -> dict[str, float]:
+    """Return the keys of section plant that make a random fish and servo."""
+    return {
+        "omega0": uniform(8.0, 18.0),
+        "xi": uniform(0.6, 1.8),
+        "coupling": uniform(0.35, 0.6),
+        "servo_speed": uniform(4.0, 9.0),
+        "servo_lag": uniform(0.15, 0.4),
+        "thrust_coefficient": _MODEL.thrust_coefficient * uniform(0.6, 1.6),
+        "lateral_drag": _MODEL.lateral_drag * math.exp(uniform(math.log(0.5), math.log(3.0))),
+    }
+
+
+def _other_fish(name: str, plant: dict[str, float], simulation: dict[str, float]) -> OtherFish:
+    """Return the fish with these keys in sections plant and simulation."""
+    keys = [f"plant.{key}={value!r}" for key, value in plant.items()]
+    keys += [f"simulation.{key}={value!r}" for key, value in simulation.items()]
+    return OtherFish(name, tuple(keys))

@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from rigs.policy_files import write
 from rigs.processes import fishctl
 
 from fishd.config import load
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.compare.survey import survey
-from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish
+from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
 from fishd.simulation import simulate
 
 BRIEF = ("--seconds", "8", "--settle", "3")
@@ -44,6 +45,18 @@ def test_the_harsh_fish_are_twenty_and_always_the_same() -> None:
     assert len({one.overrides for one in fish}) == 20
     assert fish == harsh_fish()
     assert 8.0 <= load(None, fish[3].overrides).plant.omega0 <= 18.0
+
+
+def test_mild_fish_are_as_random_as_harsh_ones_and_their_rigs_are_clean() -> None:
+    fish = [load(None, mild(seed).overrides) for seed in range(20)]
+    default = load(None)
+    for config in fish:
+        assert 8.0 <= config.plant.omega0 <= 18.0
+        assert 0.0 <= config.plant.servo_delay <= 0.02
+        assert config.plant.backlash == config.plant.servo_dead_zone == 0.0
+        assert replace(config.simulation, seed=0) == default.simulation
+    assert len({config.plant for config in fish}) == 20
+    assert mild(3) == mild(3)
 
 
 def test_the_verb_has_a_column_for_each_contestant() -> None:
