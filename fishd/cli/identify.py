@@ -1,6 +1,5 @@
 """The verb that identifies a fish from its forces."""
 
-import math
 import shlex
 from contextlib import ExitStack
 from datetime import datetime
@@ -22,23 +21,7 @@ from fishd.core.interruption import interrupted_once
 from fishd.recording.folder import find, named
 
 if TYPE_CHECKING:
-    from fishd.lab.identification import Estimate, Identification
-_SHOWN: dict[str, tuple[float, str]] = {
-    "N": (1e3, "mN"),
-    "s": (1e3, "ms"),
-    "N s^2/rad^2": (1e3, "mN s²/rad²"),
-    "N s/rad": (1e3, "mN s/rad"),
-    "1": (1.0, ""),
-}
-_SYMBOLS = {
-    "omega0": "ω₀",
-    "xi": "ξ",
-    "coupling": "λ",
-    "servo_speed": "Ω",
-    "servo_lag": "Δ",
-    "thrust_coefficient": "K",
-    "lateral_drag": "K_d",
-}
+    from fishd.lab.identification import Identification
 
 
 @click.command()
@@ -222,8 +205,10 @@ def _write(target: Path, text: str) -> None:
 
 
 def _print(found: "Identification") -> None:
+    from fishd.lab.identification.formatting import format_estimate
+
     rows = [("", "value", "95 % interval", "unit")]
-    rows += [_row(estimate) for estimate in found.estimates if estimate.fitted]
+    rows += [format_estimate(estimate) for estimate in found.estimates if estimate.fitted]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     for name, value, interval, unit in rows:
         line = f"{name:<{widths[0]}}  {value:>{widths[1]}}  {interval:<{widths[2]}}  {unit}"
@@ -234,17 +219,3 @@ def _print(found: "Identification") -> None:
         echo(f"{symbol}: {channel.explained:.3%} of it explained; {rest}")
     parts = "" if found.passages == 1 else f", in {found.passages} parts without a gap"
     echo(f"fitted to {found.seconds:.0f} s of swimming{parts}")
-
-
-def _row(estimate: "Estimate") -> tuple[str, str, str, str]:
-    """Name, value, interval and unit, in the unit that people read."""
-    factor, unit = _SHOWN.get(estimate.unit, (1.0, estimate.unit))
-    if estimate.name == "rotation":
-        factor, unit = math.degrees(1.0), "°"
-    symbol = _SYMBOLS.get(estimate.name)
-    value, low, high = (factor * x for x in (estimate.value, estimate.low, estimate.high))
-    # Two digits of what is not known.
-    digits = max(0, 1 - math.floor(math.log10(max(high - low, 1e-9)))) if high > low else 4
-    shown = [f"{x:.{min(digits, 6)}f}" for x in (value, low, high)]
-    name = f"{estimate.name} {symbol}" if symbol else estimate.name
-    return name, shown[0], f"{shown[1]} to {shown[2]}", unit

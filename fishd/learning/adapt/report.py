@@ -2,6 +2,7 @@
 
 import base64
 import csv
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
 from fishd.lab.identification.fit import LOGARITHMIC
-from fishd.lab.identification.result import UNITS
+from fishd.lab.identification.formatting import format_estimate
+from fishd.lab.identification.result import Estimate
 from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State
 from fishd.learning.adapt.verdict import NAMES, SQUARE, spelled
 from fishd.learning.run_folder.tables import EVALUATIONS
@@ -198,11 +200,16 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
-    return [
-        (name, f"{each['value']:.5g}", f"{each['low']:.5g} to {each['high']:.5g}", UNITS[name])
-        for name, each in fitted.found["estimates"].items()
-        if each.get("fitted", True)
-    ]
+    """Rows of the fitted numbers, as `fishctl identify` prints them."""
+    rows = []
+    for name, each in fitted.found["estimates"].items():
+        if each.get("fitted", True):
+            # JSON has no infinity: null stands for an end that the data do not tell.
+            low = -math.inf if each["low"] is None else each["low"]
+            high = math.inf if each["high"] is None else each["high"]
+            *row, unit = format_estimate(Estimate(name, each["value"], low, high))
+            rows.append((*row, unit or "–"))
+    return rows
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
