@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
+from msgspec import to_builtins
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
@@ -36,6 +37,7 @@ class _Outcome(NamedTuple):
     left_out: "list[tuple[Contestant, FishdError, int]]"  # why, and after how many runs
     amplitude: float  # rad
     unit: str = "N"
+    is_random: bool = True  # whether runs depend on the seed
     ended: str = ""  # why before everyone had swum, if so
     status: int = 0
 
@@ -114,6 +116,8 @@ def compare(
     rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
     simulated camera, on a robot by a running fishd-camera. ± is the 95 % interval of the mean
     thrust of all runs, from how they differ and, on a robot, from the error of each measurement.
+    The verdict names those that may be the best one, by intervals that hold together in 95 % of
+    cases, and chooses the simplest of them.
     |φ_c|/Φ is the mean size of the command, square its mean size over its rms: square wave 1, sine
     0.900, triangle 0.866.
     Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
@@ -166,7 +170,12 @@ def _in_simulation(
     swum = able or chosen
     with showing(len(swum) * runs * seconds, "s swum") as bar:
         found = comparison.compare(config, swum, seconds, settle, runs, bar.at, seen)
-    return _Outcome(*found, [(*each, 0) for each in left_out], config.amplitude_limit)
+    return _Outcome(
+        *found,
+        [(*each, 0) for each in left_out],
+        config.amplitude_limit,
+        is_random=config.simulation.is_random,
+    )
 
 
 def _on_robot(
@@ -201,7 +210,7 @@ def _on_robot(
             except FishdError as error:
                 ended, status = str(error), 1
     return _Outcome(
-        live.standings(), live.traces(), live.left_out, rig.amplitude, unit, ended, status
+        live.standings(), live.traces(), live.left_out, rig.amplitude, unit, True, ended, status
     )
 
 
@@ -235,15 +244,21 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
 
     runs: that each should have swum
     """
+    from fishd.lab.compare.comparison import judge_standings
+
     standings = outcome.standings
+    verdict = judge_standings(standings, outcome.is_random)
     if as_json:
-        print_json(standings)
+        best = verdict.best if verdict else ()
+        print_json([to_builtins(s) | {"verdict": _role(s.contestant, best)} for s in standings])
     elif standings:
         from rich.console import Console
 
         Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings, outcome.unit))
         if said := _of_simulated(standings):
             echo(said)
+        if verdict:
+            echo(f"Verdict: {verdict.sentence}.")
     for one, why, swum in outcome.left_out:
         when = f" after {swum} of {runs} runs, which stand in the table" if swum else ""
         echo(f"fishctl: {one.label}: left out{when}: {why}", err=True)
@@ -256,6 +271,20 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
     if outcome.ended:
         echo(f"fishctl: {outcome.ended}", err=True)
     return outcome.status or (1 if faults or outcome.left_out else 0)
+
+
+def _role(contestant: str, best: tuple[str, ...]) -> str | None:
+    """Return what the verdict says of one, for JSON; None without a verdict.
+
+    best: those that may be the best one, the chosen one first
+    """
+    if not best:
+        return None
+    if contestant not in best:
+        return "loses"
+    if len(best) == 1:
+        return "wins"
+    return "chosen" if contestant == best[0] else "undecided"
 
 
 def _table(standings: "list[Standing]", unit: str) -> "Table":

@@ -110,6 +110,11 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         MotorSettings()
     )
 
+    @property
+    def is_random(self) -> bool:
+        """Return True where forces depend on the seed."""
+        return any((self.noise, self.hum, self.spike_rate, self.drift, self.drift_walk))
+
 
 class Imperfections:
     """Turns true forces into measured ones."""

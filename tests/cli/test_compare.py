@@ -28,7 +28,9 @@ def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert "swing:C=0.5" in done.stdout
-    assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
+    *table, verdict = done.stdout.splitlines()
+    assert max(len(line.rstrip()) for line in table) <= 80
+    assert verdict == "Verdict: none: a single run with noise has no interval; use --runs 5."
 
 
 def test_the_command_prints_json_with_every_run() -> None:
@@ -36,6 +38,8 @@ def test_the_command_prints_json_with_every_run() -> None:
     first, second = json.loads(done.stdout)
     assert (first["contestant"], second["contestant"]) == ("swing", "square")
     assert len(first["runs"]) == 2
+    assert first["verdict"] == "wins"
+    assert second["verdict"] == "loses"
     assert {"efficiency", "thrust", "frequency", "fullness", "squareness"} <= set(first)
 
 
@@ -68,7 +72,9 @@ def test_of_one_that_gives_up_later_it_is_said_that_its_runs_before_stand_in_the
     assert done.stderr == (
         "fishctl: swing: left out after 1 of 2 runs, which stand in the table: swing gave up\n"
     )
-    assert (done.returncode, done.stdout.count("swing")) == (1, 1)
+    rows = [line for line in done.stdout.splitlines() if line.startswith("swing")]
+    assert (done.returncode, len(rows)) == (1, 1)
+    assert "Verdict: swing wins: it thrusts " in done.stdout
 
 
 def test_a_misspelt_path_of_a_policy_is_told_before_anything_swims() -> None:

@@ -1,6 +1,7 @@
 """Policies and controllers on the same fish: their figures, and a picture."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from rigs.policy_files import write
 from fishd.config import load
 from fishd.core.errors import FishdError, ParameterError, UnknownController
 from fishd.lab.compare import comparison
-from fishd.lab.compare.comparison import Trace, compare
+from fishd.lab.compare.comparison import Standing, Trace, compare, judge_standings
 from fishd.lab.compare.contestants import default_contestants, parse
 
 CONFIG = load(None, ["simulation.offset_y=0.005"])
@@ -46,6 +47,48 @@ def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Pa
     (policy, swing), _ = compare(load(None), [shaking, parse("swing")], 20.0, 5.0)
     assert "it wanted to reverse sooner than 0.2 s after its last reversal" in policy.fallbacks[0]
     assert (policy.faults, swing.fallbacks) == ([], [])
+
+
+def standing(contestant: str, controller: str, thrusts: list[float], **given: Any) -> Standing:
+    return Standing(
+        contestant=contestant, controller=controller, parameters={}, thrust=float(np.mean(thrusts)),
+        error=comparison.error_of_mean(thrusts), frequency=1.7, fullness=1.0, squareness=1.0,
+        thrusts=thrusts, **given,
+    )  # fmt: skip
+
+
+def test_a_verdict_names_a_winner_where_the_runs_tell_and_else_chooses_the_simplest() -> None:
+    swing = standing("swing", "swing", [20.0e-3, 20.2e-3, 20.1e-3])
+    square = standing("a wave", "square", [20.0e-3, 20.1e-3, 20.0e-3])
+    slow = standing("slow", "square", [15.0e-3, 15.1e-3, 15.0e-3])
+    undecided = judge_standings([swing, slow, square])
+    assert undecided
+    assert undecided.best == ("a wave", "swing")
+    assert undecided.sentence == (
+        "undecided between a wave and swing; a wave chosen because it is the simplest"
+    )
+    decided = judge_standings([slow, swing])
+    assert decided
+    assert decided.sentence.startswith("swing wins: it thrusts 133.")
+    assert decided.sentence.endswith(" of slow, the next one")
+    failed = standing("policy", "ppo", [30e-3] * 3, fallbacks=["swing took over"])
+    assert judge_standings([failed, slow, swing]) == decided
+    assert judge_standings([failed, swing]) is None
+
+
+def test_a_single_run_is_exact_without_noise_and_has_no_verdict_with_it() -> None:
+    swing, square = standing("swing", "swing", [21e-3]), standing("square", "square", [20e-3])
+    exact, noisy = (
+        judge_standings([swing, square], is_random=False),
+        judge_standings([swing, square]),
+    )
+    assert exact
+    assert noisy
+    assert "swing wins: it thrusts exactly 105.0 % of square" in exact.sentence
+    assert noisy == ("none: a single run with noise has no interval; use --runs 5", ())
+    waves = judge_standings([square, standing("sine", "sine", [17e-3])])
+    assert waves
+    assert waves.best == ("square",)
 
 
 def test_what_the_fish_starts_with_takes_no_part() -> None:

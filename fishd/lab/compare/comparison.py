@@ -14,7 +14,17 @@ from fishd.config import Config, Start
 from fishd.control.reporting import Publisher
 from fishd.core.signals import Tick
 from fishd.lab.compare.contestants import Contestant, build, parse, refusal
-from fishd.lab.compare.seeing import SeeingController
+from fishd.lab.compare.seeing import SeeingController, may_see_pictures
+from fishd.lab.ranking import (
+    Candidate,
+    complexity,
+    format_choice,
+    format_ratio,
+    half_width,
+    percent,
+    rank,
+    ratio,
+)
 from fishd.simulation import KeepingPublisher, Report, VirtualRun, judge
 
 TRACE = 3.0
@@ -163,6 +173,60 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         power=fmean(powers) if powers else None,
         thrust_per_watt=fmean(per_watt) if per_watt else None,
         thrust_per_watt_error=error_of_mean(per_watt),
+    )
+
+
+class Verdict(NamedTuple):
+    """Which contestant thrusts most, as far as that is known."""
+
+    sentence: str
+    best: tuple[str, ...]
+    """Those that may be the best one, the chosen one first; empty where no interval is known."""
+
+
+def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Verdict | None:
+    """Return the verdict on contestants; None where there are not two to compare.
+
+    One whose run ended in a fault, or that another controller took over from, is left out of it.
+
+    is_random: whether the forces of a simulated rig depend on the seed, as `is_random` of its
+        settings says; a single run without noise is exact
+    """
+    fair = [each for each in standings if not each.faults and not each.fallbacks]
+    if len(fair) < 2:
+        return None
+    if any(each.error is None and _depends_on_seed(each, is_random) for each in fair):
+        return Verdict("none: a single run with noise has no interval; use --runs 5", ())
+    found = [_candidate(each) for each in fair]
+    ranking = rank(found)
+    names = tuple(each.name for each in ranking.undecided)
+    if not ranking.is_decided:
+        return Verdict(format_choice(names, names[0], ranking.reason), names)
+    best, following = sorted(found, key=lambda each: -each.thrust)[:2]
+    pairs = len(found) * (len(found) - 1) // 2
+    widths = [half_width(each, pairs) for each in (best, following)]
+    share = ratio(best.thrust, widths[0], following.thrust, widths[1])
+    if share is None:
+        return Verdict(f"{names[0]} wins: no other one has a thrust above zero", names)
+    shown = format_ratio(share) if any(widths) else f"exactly {percent(share[0])}"
+    return Verdict(f"{names[0]} wins: it thrusts {shown} of {following.name}, the next one", names)
+
+
+def _depends_on_seed(standing: Standing, is_random: bool) -> bool:
+    """Return True where another run would differ: a given wave swims the same in any noise."""
+    sees = standing.controller == "ppo" and may_see_pictures(standing.parameters.get("policy"))
+    return sees or (is_random and complexity(standing.controller) > 0)
+
+
+def _candidate(standing: Standing) -> Candidate:
+    error = standing.error or 0.0
+    by_runs = error_of_mean(standing.thrusts)
+    return Candidate(
+        standing.contestant,
+        standing.thrust,
+        error,
+        complexity(standing.controller),
+        len(standing.thrusts) - 1 if by_runs is not None and error <= by_runs else math.inf,
     )
 
 
