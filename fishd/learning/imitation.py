@@ -32,6 +32,8 @@ AT_RANDOM = 3
 """At most one in so many ticks of a fish is swum by a wave of any frequency, at its beginning."""
 NEARER = 0.3
 """So many of the fish are from a part of the randomisation, the others from anywhere in it."""
+RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction")
+"""Ranges of a randomisation that a clean rig has little of."""
 LEAST_WEIGHT = 0.02
 """What a tick counts in which both sides are as good, in shares of the best thrust."""
 
@@ -47,10 +49,15 @@ class Labelled(NamedTuple):
     """What it would cost to choose the other side, shape (ticks,)."""
 
 
-def narrowed(spread: Randomisation, share: float) -> Randomisation:
-    """A randomisation of which each range is so much narrower; share: 0 to 1."""
+def narrowed(spread: Randomisation, share: float, rig_share: float = 1.0) -> Randomisation:
+    """Return a randomisation with narrower ranges.
+
+    share: factor on each range, from 0 to 1
+    rig_share: a further factor on the ranges of what the rig does to the command and to the force
+    """
     names = [name for name in Randomisation.__struct_fields__ if name != "fish"]
-    return replace(spread, **{name: share * getattr(spread, name) for name in names})
+    ranges = {name: share * getattr(spread, name) for name in names}
+    return replace(spread, **ranges | {name: rig_share * ranges[name] for name in RIG_RANGES})
 
 
 def half_beats(config: Config) -> NDArray[np.float64]:
@@ -97,7 +104,9 @@ class Imitation:
     def _swum(self) -> Labelled:
         """One fish: at first with random half beats, then as the learner wants, if it has begun."""
         config, draw, ticks = self._config, self._draw, self._settings.ticks
-        spread = narrowed(self._spread, min(1.0, float(draw.uniform()) / NEARER))
+        share = min(1.0, float(draw.uniform()) / NEARER)
+        is_clean = self._settings.clean_rigs > 0.0 and draw.uniform() < self._settings.clean_rigs
+        spread = narrowed(self._spread, share, float(draw.uniform()) if is_clean else 1.0)
         fish = drawn(config, spread, int(draw.integers(2**31)))
         env = SwimEnv(SimulatedLink(fish), config, self._environment)
         seen, _ = env.reset(seed=int(draw.integers(2**31)))

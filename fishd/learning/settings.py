@@ -169,6 +169,15 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         ),
     ] = 0
     fish: Annotated[int, note("Fish of a round.", ge=1, le=100_000)] = 500
+    clean_rigs: Annotated[
+        float,
+        note(
+            "Fraction of the fish whose rigs have a random fraction of the randomisation of delay, "
+            "dead zone, backlash and servo reaction; the other rigs have all of it.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
     ticks: Annotated[int, unit("ticks", "For which each is swum.", ge=8, le=100_000)] = 120
     epochs: Annotated[
         int, note("Passes, after each round, over the ticks of all rounds so far.", ge=1, le=1000)

@@ -42,8 +42,9 @@ from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.lab.compare.contestants import best_on_grid, parse
 from fishd.lab.compare.survey import survey
-from fishd.lab.other_fish import CHANGES, harsh_fish
-from fishd.learning.env.environment import SwimEnv
+from fishd.lab.other_fish import CHANGES, FIRST_SEED, HARSH_FISH, harsh_fish, mild
+from fishd.lab.other_fish import harsh as harsh_of_seed
+from fishd.learning.env.environment import SwimEnv, best_thrust
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import TrainingSettings
 from fishd.simulation import simulate
@@ -57,6 +58,8 @@ PAPER_STEPS, CHOICE_STEPS = 20_000, 3000
 CHOOSING = range(300, 310)
 """Seeds that settings were compared with."""
 SHIPPED, SWINGS = "default-fish", ("swing:C=0.6", "swing:C=auto")
+MANY_SEEDS = range(1000, 1100)
+"""Seeds of mild and harsh fish that no policy was trained or chosen with."""
 GOOD = 0.95
 """What a policy is to reach on each of sixteen fish."""
 SIMULATED = "`config/simulated.yaml`"
@@ -222,27 +225,59 @@ def transfer(options: Namespace) -> str:
 
 
 def harsh(options: Namespace) -> str:
-    """What `fishctl learn evaluate --fish harsh` shows, for three contestants."""
+    """What `fishctl learn evaluate --fish harsh` shows, and mild fish, for three contestants."""
     changes, random = list(CHANGES), list(harsh_fish())
-    configs = [(fish, load(None, fish.overrides)) for fish in (*changes, *random)]
+    clean = [mild(FIRST_SEED + number) for number in range(HARSH_FISH)]
+    configs = [(fish, load(None, fish.overrides)) for fish in (*changes, *random, *clean)]
     contestants = [parse(text) for text in (SHIPPED, *SWINGS)]
     found = survey(configs, contestants, SECONDS, SETTLE)
     rows = [
         [fish.name, *(f"{100 * one.fish[row].efficiency:.1f}" for one in found)]
         for row, fish in enumerate(changes)
     ]
-    others = [one.fish[len(changes) :] for one in found]
-    for name, pick in (("median", statistics.median), ("worst", min)):
-        figures = [pick(swum.efficiency for swum in row) for row in others]
-        rows.append(
-            [f"{len(random)} harsh fish, {name}", *(f"{100 * share:.1f}" for share in figures)]
-        )
+    first = len(changes)
+    for kind, group in (("harsh", random), ("mild", clean)):
+        groups = [one.fish[first : first + len(group)] for one in found]
+        for name, pick in (("median", statistics.median), ("worst", min)):
+            figures = [pick(swum.efficiency for swum in row) for row in groups]
+            rows.append(
+                [f"{len(group)} {kind} fish, {name}", *(f"{100 * share:.1f}" for share in figures)]
+            )
+        first += len(group)
     lost = [sum(swum.fallback is not None for swum in one.fish) for one in found]
     rows.append(["another took over, runs", *map(str, lost)])
     shaken = [max(swum.shaken for swum in one.fish) for one in found]
     rows.append(["reversals in consecutive ticks, at most, s", *(f"{s:.1f}" for s in shaken)])
     heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in found)])
-    return f"Efficiency in %, of a minute whose first 10 s do not count:\n\n{table(heads, rows)}"
+    return "\n\n".join(
+        (
+            "Efficiency in %, of a minute whose first 10 s do not count:",
+            table(heads, rows),
+            f"`{SHIPPED}` on {len(MANY_SEEDS)} more fish of each kind, seeds {MANY_SEEDS[0]} to "
+            f"{MANY_SEEDS[-1]}:",
+            on_many_fish(),
+        )
+    )
+
+
+def on_many_fish() -> str:
+    """Return the table of the shipped policy on many mild and harsh fish."""
+    rows = []
+    for kind, fish_of_seed in (("mild", mild), ("harsh", harsh_of_seed)):
+        fish = [fish_of_seed(seed) for seed in MANY_SEEDS]
+        configs = [load(None, each.overrides) for each in fish]
+        (found,) = survey(list(zip(fish, configs, strict=True)), [parse(SHIPPED)], SECONDS, SETTLE)
+        shares = [swum.efficiency for swum in found.fish]
+        grids = [best_on_grid(config).thrust / best_thrust(config) for config in configs]
+        limits = [statistics.median(shares), *np.quantile(shares, (0.1, 0.05)), min(shares)]
+        cells = [*limits, statistics.median(grids), min(grids)]
+        low = (f"{sum(share < limit for share in shares)}" for limit in (0.95, 0.9))
+        rows.append([kind, *(f"{100 * share:.1f}" for share in cells), *low])
+    heads = (
+        "fish | median | worst tenth below | worst twentieth below | worst | "
+        "best whole-tick wave: median | worst | below 95 % | below 90 %"
+    )
+    return table(heads, rows)
 
 
 def speed(options: Namespace) -> str:

@@ -226,7 +226,7 @@ def _train(job: "Job") -> int:
 
 def report(outcome: "Outcome", job: "Job") -> int:
     """Say how it ended; the exit status."""
-    from fishd.learning.train.progress import described, minutes
+    from fishd.learning.train.progress import NOT_COUNTED, described, minutes
 
     again = f"fishctl learn ppo --resume {outcome.folder}"
     for option, address in (
@@ -249,7 +249,8 @@ def report(outcome: "Outcome", job: "Job") -> int:
             f"fishctl: stopped after {outcome.steps} steps{lost}; to go on: {again}", err=True
         )
         return INTERRUPTED
-    click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time")
+    rest = NOT_COUNTED if job.on == "simulation" else ""
+    click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}")
     if found := outcome.best_evaluation:
         click.echo(f"best: {described(found).strip()}")
         off = found.error / found.thrust if found.error else 0.0

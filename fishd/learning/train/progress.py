@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from fishd.learning.env.evaluation import Evaluation
 
 
+NOT_COUNTED = " without evaluations"
+"""Addition to the tank time of a simulated training, whose evaluations swim a fish of their own."""
+
+
 class Display:
     """Is told how a training goes on; this one shows nothing."""
 
@@ -133,6 +137,8 @@ def imitation(number: int, rounds: int, right: float) -> str:
 def described(evaluation: "Evaluation") -> str:
     """An evaluation in one line."""
     when = f"{evaluation.steps:7d} steps, {minutes(evaluation.tank_time):>8} in the tank"
+    if evaluation.swam is None:
+        when += NOT_COUNTED
     if evaluation.swam is not None and evaluation.policy != evaluation.steps:
         when += f", policy of {evaluation.policy} steps"
     others = f", worst of other fish {evaluation.worst:.1%}" if evaluation.worst is not None else ""

@@ -40,7 +40,7 @@ from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.thrust_signal import ThrustSignal
 from fishd.learning.train.callbacks import RolloutCallback
 from fishd.learning.train.jobs import Ended, Job, Outcome
-from fishd.learning.train.progress import Display, minutes
+from fishd.learning.train.progress import NOT_COUNTED, Display, minutes
 from fishd.learning.train.recorder import RunRecorder
 from fishd.learning.train.tank import TankEvaluations
 
@@ -156,6 +156,8 @@ class Training:
         if job.resume:
             tank = minutes(self._env.tank_time)
             text += f", resumed from {recorder.checkpoint}, {tank} in the tank"
+        if job.on == "simulation" and job.settings.evaluation.every:
+            text += f"; tank times are{NOT_COUNTED}"
         self._display.begin(recorder.steps, last, text)
 
     def _reset(self) -> None:
