@@ -184,7 +184,8 @@ def _say(state: "State") -> None:
     for one in state.contenders:
         if one.true_thrust is not None:
             echo(
-                f"{one.name}: truly {1e3 * one.true_thrust:.2f} mN, {one.true_efficiency:.1%} of "
+                f"{one.name}: truly {1e3 * one.true_thrust:.2f} mN, "
+                f"{one.true_relative_thrust:.1%} of "
                 "the best of all square waves"
             )
     echo(f"{state.tank_time:.0f} s of tank time")

@@ -111,7 +111,7 @@ def compare(
     with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. Without any: the
     best square wave, swing, and the named policies that are made for this fish.
 
-    In simulation thrust is the true one, and efficiency that over the thrust of the best square
+    In simulation thrust is the true one, and relative thrust its share of that of the best square
     wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
     rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
     simulated camera, on a robot by a running fishd-camera. ± is the 95 % interval of the mean
@@ -294,16 +294,16 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
     several = simulated and len(standings[0].runs) > 1
     table = Table(box=None, pad_edge=False)
     table.add_column("contestant", overflow="fold")
-    heads = ["efficiency"] if simulated else []
+    heads = ["relative thrust"] if simulated else []
     heads += ["lowest – highest"] if several else []
     metered = all(standing.thrust_per_watt is not None for standing in standings)
     costs = ["W", f"m{unit}/W"] if metered else []
     for head in (*heads, f"m{unit}", *costs, "Hz", "|φ_c|/Φ", "square"):
         table.add_column(head, justify="right", no_wrap=True)
     for standing in standings:
-        cells = [f"{standing.efficiency:.1%}"] if simulated else []
+        cells = [f"{standing.relative_thrust:.1%}"] if simulated else []
         if several:
-            shares = [run.efficiency for run in standing.runs]
+            shares = [run.relative_thrust for run in standing.runs]
             cells.append(f"{min(shares):.1%} – {max(shares):.1%}")
         error = "" if standing.error is None else f" ± {standing.error * 1e3:.2f}"
         table.add_row(
@@ -326,7 +326,7 @@ def _costs(standing: "Standing") -> list[str]:
 
 
 def _of_simulated(standings: "list[Standing]") -> str | None:
-    """What efficiency is of, where it is the same for all; None on a robot."""
+    """Name the best square wave, where it is the same for all; None on a robot."""
     best = {
         (run.best_square_thrust, run.best_square_frequency)
         for standing in standings

@@ -176,7 +176,7 @@ def _optimise(
             optimum = optimum_of(name, measured, search, found, aim)
             if on == "simulation":
                 swum = simulate(load(file, overrides), name, {**parameters, **found.parameters})
-                truth = {"true_thrust": swum.mean_thrust, "efficiency": swum.efficiency}
+                truth = {"true_thrust": swum.mean_thrust, "relative_thrust": swum.relative_thrust}
                 optimum = replace(optimum, **truth, true_power=swum.mean_power)
                 warn_of_fin(swum.fin_amplitude)
             else:

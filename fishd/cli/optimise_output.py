@@ -50,7 +50,7 @@ class Optimum(Struct, frozen=True):
     """How long the fish of a robot waited besides while candidates were chosen, this time [s]."""
     true_thrust: float | None = None
     """There, of a simulated fish [N]."""
-    efficiency: float | None = None
+    relative_thrust: float | None = None
     """That over the thrust of the best square wave."""
     true_power: float | None = None
     """There, of a simulated servo [W]."""
@@ -136,7 +136,7 @@ def say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
         taking = "" if found.true_power is None else f" for {power_words(found.true_power)}"
         echo(
             f"true thrust there: {found.true_thrust * 1e3:.2f} mN{taking}, "
-            f"{found.efficiency:.1%} of the best square wave"
+            f"{found.relative_thrust:.1%} of the best square wave"
         )
     thinking = "" if found.thinking is None else f"; {found.thinking:.0f} s of thinking besides"
     echo(

@@ -16,7 +16,7 @@ from fishd.core.protocol import PolicyInfo
 from fishd.core.schema import names_file
 
 HEAD = (
-    *("name", "sees", "Φ [rad]", "tick", "trained in", "steps", "efficiency", "created"),
+    *("name", "sees", "Φ [rad]", "tick", "trained in", "steps", "relative thrust", "created"),
     "folder",
 )
 WIDEST = 40
@@ -31,7 +31,8 @@ def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
 
     One that sees forces swims with 'fishctl set-controller ppo --policy NAME', one that sees
     pictures with 'fishctl agent NAME'.
-    Efficiency is the thrust over that of the best square wave, as last evaluated in the training.
+    Relative thrust is the share of the best square wave's thrust, as last evaluated in the
+    training.
     """
     if ctx.invoked_subcommand:
         ctx.find_root().obj = endpoint
@@ -92,7 +93,7 @@ def _row(info: PolicyInfo) -> tuple[str, ...]:
         return (text.line(info.name, WIDEST), *["–"] * (len(HEAD) - 2), folder)
     card: dict[str, Any] = info.card
     past = card["provenance"]
-    efficiency = past["efficiency"]
+    relative_thrust = past.get("relative_thrust")
     cells = (
         info.name,
         info.sees or "–",
@@ -100,7 +101,7 @@ def _row(info: PolicyInfo) -> tuple[str, ...]:
         f"{card['tick'] * 1e3:g} ms",
         past["on"],
         str(past["steps"]),
-        "–" if efficiency is None else f"{efficiency:.1%}",
+        "–" if relative_thrust is None else f"{relative_thrust:.1%}",
         past["created"][:10],
         folder,
     )

@@ -138,8 +138,8 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
             f"squareness {report.squareness:.3f}",
         ),
         (
-            "efficiency",
-            f"{report.efficiency:.1%} of the best square wave at ±{report.amplitude:g} rad",
+            "relative thrust",
+            f"{report.relative_thrust:.1%} of the best square wave at ±{report.amplitude:g} rad",
         ),
         ("", f"({best}, where half beats need not be whole ticks)"),
         *([("", _ROUNDED)] if config.robot == "virtual-pi" else []),

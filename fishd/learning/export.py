@@ -204,7 +204,7 @@ def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
     """The card with the figures of an evaluation, and the note."""
     past = replace(
         card.provenance,
-        efficiency=evaluation.efficiency,
+        relative_thrust=evaluation.relative_thrust,
         frequency=evaluation.frequency,
         note="; ".join(part for part in (card.provenance.note, note) if part),
     )

@@ -111,15 +111,15 @@ class Imitation:
         env = SwimEnv(SimulatedLink(fish), config, self._environment)
         seen, _ = env.reset(seed=int(draw.integers(2**31)))
         learner = DeterministicPolicy(self._policy, env.perception, env.link.amplitude)
-        efficiency = half_beats(fish)
+        relative_thrust = half_beats(fish)
         at_random = int(draw.integers(ticks // AT_RANDOM + 1)) if self._rounds else ticks
-        longest = 2 * int(efficiency.argmax())
+        longest = 2 * int(relative_thrust.argmax())
         half = int(draw.integers(2, longest + 2))
         rows, sides, weights = [], [], []
         for tick in range(ticks):
             side = math.copysign(1.0, env.latest.side_time)
             elapsed = round(abs(env.latest.side_time) / config.tick)
-            right, weight = advice(efficiency, elapsed)
+            right, weight = advice(relative_thrust, elapsed)
             rows.append(seen)
             sides.append(right * side)
             weights.append(weight)
@@ -150,15 +150,15 @@ class Imitation:
         return float((weights * right).mean())
 
 
-def advice(efficiency: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
+def advice(relative_thrust: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
     """1 to stay or -1 to reverse, and what it would cost to do the other.
 
-    efficiency: as of `half_beats`
+    relative_thrust: as of `half_beats`
     elapsed: ticks since the last reversal
     """
-    now = min(elapsed, len(efficiency) - 2)
-    cost = abs(float(efficiency[now] - efficiency[now + 1])) + LEAST_WEIGHT
-    return (-1.0 if now >= efficiency.argmax() else 1.0), cost
+    now = min(elapsed, len(relative_thrust) - 2)
+    cost = abs(float(relative_thrust[now] - relative_thrust[now + 1])) + LEAST_WEIGHT
+    return (-1.0 if now >= relative_thrust.argmax() else 1.0), cost
 
 
 def _joined(parts: list[Labelled]) -> Labelled:

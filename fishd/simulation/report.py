@@ -45,7 +45,7 @@ class Report(Struct, frozen=True):
     """Mean |φ_c|/Φ: 1 where the command uses all of the amplitude all of the time."""
     squareness: float
     """Mean |φ_c| over the rms of φ_c: square wave 1, sine 0.900, triangle 0.866; 0 without any."""
-    efficiency: float
+    relative_thrust: float
     """`mean_thrust` over `best_square_thrust`; 0 where no square wave moves the fin at all."""
     best_square_thrust: float
     """What the best square wave at this amplitude gives [N]."""
@@ -119,7 +119,7 @@ def judge(
     Raises `ParameterError` where the lengths do not fit one another, and `ConfigError` where the
     fish swims freely.
     """
-    check_tethered(config.robot, "efficiency")
+    check_tethered(config.robot, "relative_thrust")
     ticks, first = count_ticks(seconds, settle, config.tick)
     beats = Beats()
     since = 0.0
@@ -156,7 +156,7 @@ def judge(
         fin_amplitude=means.fin_amplitude,
         fullness=means.mean_angle / amplitude,
         squareness=means.squareness,
-        efficiency=means.thrust / best.thrust if best.thrust > 0.0 else 0.0,
+        relative_thrust=means.thrust / best.thrust if best.thrust > 0.0 else 0.0,
         best_square_thrust=best.thrust,
         best_square_frequency=best.frequency,
         ticks=ticks,

@@ -40,7 +40,7 @@ def test_the_command_prints_json_with_every_run() -> None:
     assert len(first["runs"]) == 2
     assert first["verdict"] == "wins"
     assert second["verdict"] == "loses"
-    assert {"efficiency", "thrust", "frequency", "fullness", "squareness"} <= set(first)
+    assert {"relative_thrust", "thrust", "frequency", "fullness", "squareness"} <= set(first)
 
 
 def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:

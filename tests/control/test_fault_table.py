@@ -285,4 +285,4 @@ def test_an_emergency_stop_ends_the_pulses_within_one_frame(rig: LockstepRig) ->
 def test_swing_reaches_the_best_square_wave_through_the_whole_hardware_path(tmp_path: Path) -> None:
     with lockstep_rig(tmp_path, "simulation.noise=0.001", "force_sensor.full_scale=2.048") as rig:
         config = rig.config
-    assert simulate(config, "swing", {"C": 0.6}, seconds=25.0).efficiency >= 0.95
+    assert simulate(config, "swing", {"C": 0.6}, seconds=25.0).relative_thrust >= 0.95

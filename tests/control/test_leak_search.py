@@ -62,8 +62,8 @@ def test_swing_then_reaches_what_it_reaches_on_the_default_fish() -> None:
         leak: simulate(load(None, [f"estimator.leak={leak}", drag]), "swing", {}, 60.0, 30.0)
         for leak in ("0.3", "auto")
     }
-    assert share["0.3"].efficiency < 0.85
-    assert share["auto"].efficiency > 0.98
+    assert share["0.3"].relative_thrust < 0.85
+    assert share["auto"].relative_thrust > 0.98
 
 
 @pytest.mark.slow
@@ -71,7 +71,9 @@ def test_swing_then_reaches_what_it_reaches_on_the_default_fish() -> None:
 def test_on_the_default_fish_it_costs_no_thrust(amplitude: float) -> None:
     limit = f"amplitude_limit={amplitude}"
     shares = [
-        simulate(load(None, [f"estimator.leak={leak}", limit]), "swing", {}, 60.0, 10.0).efficiency
+        simulate(
+            load(None, [f"estimator.leak={leak}", limit]), "swing", {}, 60.0, 10.0
+        ).relative_thrust
         for leak in ("0.3", "auto")
     ]
     assert shares[1] > shares[0] - 0.01

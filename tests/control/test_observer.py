@@ -73,4 +73,4 @@ def test_swing_on_it_does_not_mind_a_slow_servo(kind: str, least: float, most: f
     from fishd.config import load
 
     config = load(None, [f"estimator.kind={kind}", "plant.servo_delay=0.1", *REAL])
-    assert least < simulate(config, "swing", {}, seconds=60).efficiency <= most
+    assert least < simulate(config, "swing", {}, seconds=60).relative_thrust <= most

@@ -12,15 +12,15 @@ from fishd.lab.other_fish import harsh
 from fishd.simulation import simulate
 
 
-def efficiency(
+def relative_thrust(
     C: float | str, *overrides: str, seconds: float = 90.0, settle: float = 60.0
 ) -> float:
-    return simulate(load(None, overrides), "swing", {"C": C}, seconds, settle).efficiency
+    return simulate(load(None, overrides), "swing", {"C": C}, seconds, settle).relative_thrust
 
 
 def fixed(*overrides: str) -> float:
     """Where nothing is searched for, it swims evenly within seconds."""
-    return efficiency(0.6, *overrides, seconds=30.0, settle=10.0)
+    return relative_thrust(0.6, *overrides, seconds=30.0, settle=10.0)
 
 
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def fixed(*overrides: str) -> float:
 )
 def test_after_a_minute_it_is_near_the_best_where_a_fixed_criterion_is_not(change: str) -> None:
     assert fixed(change) < 0.93
-    assert efficiency("auto", change) > 0.97
+    assert relative_thrust("auto", change) > 0.97
 
 
 @pytest.mark.slow
@@ -44,17 +44,17 @@ def test_after_a_minute_it_is_near_the_best_where_a_fixed_criterion_is_not(chang
 def test_it_is_near_the_best_whatever_the_servo_and_though_noise_is_as_large_as_its_trials(
     servo_speed: float,
 ) -> None:
-    assert efficiency("auto", f"plant.servo_speed={servo_speed}") > 0.97
+    assert relative_thrust("auto", f"plant.servo_speed={servo_speed}") > 0.97
 
 
 @pytest.mark.slow
 def test_where_the_best_half_beat_lies_between_two_numbers_of_ticks_the_sides_take_turns() -> None:
     config = load(None, harsh(318).overrides)
     squares = [simulate(config, "square", {"frequency": 10 / n}, 30.0) for n in (3, 4, 5, 6)]
-    whole = [square.efficiency for square in squares]
+    whole = [square.relative_thrust for square in squares]
     found = simulate(config, "swing", {"C": "auto"}, 90.0, 60.0)
     assert max(whole) < 0.91
-    assert found.efficiency > 0.95
+    assert found.relative_thrust > 0.95
     assert found.quantities["halfway"] == 1.0
     assert found.half_beats == (4, 5)
 
@@ -62,29 +62,31 @@ def test_where_the_best_half_beat_lies_between_two_numbers_of_ticks_the_sides_ta
 @pytest.mark.slow
 def test_a_gait_that_a_trial_has_lost_is_begun_again_and_that_trial_not_repeated() -> None:
     config = load(None, harsh(652).overrides)
-    assert simulate(config, "swing", {"C": 0.95, "lead": 0.05}, 30.0).efficiency < 0.1
-    assert efficiency("auto", *harsh(652).overrides) > 0.95
+    assert simulate(config, "swing", {"C": 0.95, "lead": 0.05}, 30.0).relative_thrust < 0.1
+    assert relative_thrust("auto", *harsh(652).overrides) > 0.95
 
 
 @pytest.mark.slow
 def test_a_fish_that_only_trembles_with_the_first_criterion_is_made_to_swim() -> None:
     assert fixed(*harsh(303).overrides) < 0.1
-    assert efficiency("auto", *harsh(303).overrides, seconds=120.0) > 0.92
+    assert relative_thrust("auto", *harsh(303).overrides, seconds=120.0) > 0.92
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_spikes_do_not_mislead_it(seed: int) -> None:
     rig = ("simulation.spike_rate=1", "simulation.spike_size=0.5", f"simulation.seed={seed}")
-    assert efficiency("auto", *rig) > 0.98
+    assert relative_thrust("auto", *rig) > 0.98
 
 
 def test_on_the_model_the_search_costs_a_few_percent_at_most() -> None:
-    assert efficiency("auto", seconds=60, settle=0) > 0.95 * efficiency(0.6, seconds=60, settle=0)
+    assert relative_thrust("auto", seconds=60, settle=0) > 0.95 * relative_thrust(
+        0.6, seconds=60, settle=0
+    )
 
 
 def test_neither_drift_nor_a_turned_sensor_misleads_it() -> None:
     rig = ("simulation.drift=0.02", "simulation.drift_period=20", "simulation.rotation=0.17")
-    assert efficiency("auto", "plant.servo_delay=0.04", *rig) > 0.97
+    assert relative_thrust("auto", "plant.servo_delay=0.04", *rig) > 0.97
 
 
 def test_it_shows_what_it_does_in_telemetry() -> None:

@@ -100,10 +100,10 @@ def test_it_swims_on_when_the_offset_jumps() -> None:
     assert rig.run(1)[-1].frequency == pytest.approx(1.67, abs=0.1)
 
 
-def efficiency(ratio: float, seed: int) -> float:
+def relative_thrust(ratio: float, seed: int) -> float:
     limit = f"amplitude_limit={ratio * SERVO_SPEED_OVER_OMEGA0}"
     config = load(None, [limit, *IMPERFECT, f"simulation.seed={seed}"])
-    return simulate(config, "swing", {"C": 0.6}, 25.0).efficiency
+    return simulate(config, "swing", {"C": 0.6}, 25.0).relative_thrust
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def efficiency(ratio: float, seed: int) -> float:
 )
 def test_on_an_imperfect_rig_it_gets_most_of_the_best_thrust(ratio: float, least: float) -> None:
     """ratio: ω₀Φ/Ω; the median over ten seeds of noise and drift."""
-    assert statistics.median(efficiency(ratio, seed) for seed in range(10)) >= least
+    assert statistics.median(relative_thrust(ratio, seed) for seed in range(10)) >= least
 
 
 @pytest.mark.slow
@@ -128,4 +128,4 @@ def test_on_an_imperfect_rig_it_gets_most_of_the_best_thrust(ratio: float, least
     "change", ["omega0=5", "omega0=25", "xi=2.4", "coupling=1", "servo_speed=20"]
 )
 def test_fishes_that_have_little_in_common_swim_with_the_same_settings(change: str) -> None:
-    assert simulate(load(None, [f"plant.{change}"]), "swing", {"C": 0.6}).efficiency > 0.9
+    assert simulate(load(None, [f"plant.{change}"]), "swing", {"C": 0.6}).relative_thrust > 0.9

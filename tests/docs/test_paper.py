@@ -32,7 +32,7 @@ def assert_same(report: Report, row: Mapping[str, Any]) -> None:
     if "thrust_mN" in row:
         assert 1e3 * report.mean_thrust == pytest.approx(row["thrust_mN"], rel=5e-3)
     else:
-        assert report.efficiency == pytest.approx(row["efficiency"], abs=5e-3)
+        assert report.relative_thrust == pytest.approx(row["relative_thrust"], abs=5e-3)
 
 
 @pytest.mark.parametrize("wave", figure_4.WAVES)

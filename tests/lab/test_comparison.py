@@ -23,8 +23,8 @@ def swum(*texts: str, runs: int = 1) -> list[comparison.Standing]:
 
 def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> None:
     standings = swum(*(f"{name}:frequency=1.7" for name in ("square", "sine", "triangle")))
-    efficiencies = [standing.efficiency for standing in standings]
-    assert efficiencies == sorted(efficiencies, reverse=True)
+    relative_thrusts = [standing.relative_thrust for standing in standings]
+    assert relative_thrusts == sorted(relative_thrusts, reverse=True)
     assert [standing.squareness for standing in standings] == pytest.approx(
         [1.0, 0.900, 0.866], abs=0.003
     )
@@ -94,7 +94,7 @@ def test_a_single_run_is_exact_without_noise_and_has_no_verdict_with_it() -> Non
 def test_what_the_fish_starts_with_takes_no_part() -> None:
     config = load(None, ["start.controller=hold"])
     (standing,), _ = compare(config, [parse("swing")], 20.0, 5.0)
-    assert standing.efficiency > 0.9
+    assert standing.relative_thrust > 0.9
 
 
 def test_without_names_the_best_square_wave_of_whole_ticks_meets_swing() -> None:
@@ -158,7 +158,7 @@ def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path:
             standings, traces = compare(CONFIG, contestants, 20.0, 5.0, runs)
             draw(tmp_path / f"{runs}.svg", standings, traces, 0.42)
     one, three = letters_of(tmp_path / "1.svg"), letters_of(tmp_path / "3.svg")
-    for name in ("command", "finangle", "asmeasured", "truemean", "efficiency", "Φ=0.42rad"):
+    for name in ("command", "finangle", "asmeasured", "truemean", "relativethrust", "Φ=0.42rad"):
         assert name in one
         assert name in three
     assert "lowesttohighestof3runs" in three

@@ -23,9 +23,9 @@ def test_a_policy_that_sees_is_a_contestant_like_any_other(eye: str) -> None:
     swing, seen = standings
     assert (seen.contestant, seen.controller) == (eye, "ppo")
     assert seen.parameters == {"policy": eye}
-    assert swing.efficiency
-    assert seen.efficiency
-    assert 0.4 < seen.efficiency < swing.efficiency
+    assert swing.relative_thrust
+    assert seen.relative_thrust
+    assert 0.4 < seen.relative_thrust < swing.relative_thrust
     assert not seen.fallbacks
     assert len(traces) == 2
 
@@ -66,5 +66,5 @@ def test_named_policies_that_see_swim_where_none_is_named(
 def test_it_swims_on_a_virtual_pi_in_virtual_time_too(tmp_path: Path, eye: str) -> None:
     config = load(None, ["robot=virtual-pi", f"state_folder={tmp_path}"])
     found = compare(config, [eye], seconds=10.0, settle=5.0)[0][0]
-    assert found.efficiency
-    assert found.efficiency > 0.3
+    assert found.relative_thrust
+    assert found.relative_thrust > 0.3

@@ -24,8 +24,8 @@ def test_each_fish_is_swum_as_by_itself() -> None:
     assert [swum.fish for swum in square.fish] == ["slow", "harsh 7"]
     for (_, config), swum in zip(configs, swing.fish, strict=True):
         alone = simulate(config, "swing", {"C": 0.5}, 8.0, 3.0)
-        assert (swum.efficiency, swum.thrust) == (alone.efficiency, alone.mean_thrust)
-    assert swing.worst.efficiency <= swing.median
+        assert (swum.relative_thrust, swum.thrust) == (alone.relative_thrust, alone.mean_thrust)
+    assert swing.worst.relative_thrust <= swing.median
 
 
 def test_it_tells_who_shook_the_servo_and_who_lost_command(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def contender(name: str, thrust: float, error: float, expected: float = 0.0) -> 
 def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
     told = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3, 1.0)])
     assert (told.winner, told.told) == ("swing", True)
-    assert told.efficiency == pytest.approx(1.05)
+    assert told.relative_thrust == pytest.approx(1.05)
     # √2 · 1 % of relative error, for a single comparison
     assert (told.low, told.high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
     assert "swing as --C auto has found it wins: it thrusts 105.0 %" in told.claim
@@ -85,7 +85,7 @@ def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
 
 def test_where_it_does_not_the_identified_fish_tells() -> None:
     near = judge([contender("policy", 20.1e-3, 0.2e-3, 0.8), contender("square", 20e-3, 2e-4, 0.9)])
-    assert (near.winner, near.told, near.efficiency) == ("square", False, 1.0)
+    assert (near.winner, near.told, near.relative_thrust) == ("square", False, 1.0)
     assert "the measurement does not tell it from the policy: on the" in near.claim
 
 

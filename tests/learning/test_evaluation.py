@@ -34,7 +34,7 @@ def square_of_six_ticks(observation: Observation, stack: Stack | None = None) ->
 def test_a_function_gets_the_report_that_a_controller_gets() -> None:
     found = judge(CONFIG, square_of_six_ticks, 30.0, 10.0)
     controller = simulate(CONFIG, "square", {"frequency": 1 / 0.6}, 30.0)
-    assert found.efficiency == pytest.approx(controller.efficiency, rel=1e-6)
+    assert found.relative_thrust == pytest.approx(controller.relative_thrust, rel=1e-6)
     assert found.frequency == pytest.approx(1 / 0.6)
     assert (found.fullness, found.squareness) == pytest.approx((1.0, 1.0))
     assert found.controller == "policy"
@@ -50,7 +50,7 @@ def test_it_sees_what_the_sensor_sees() -> None:
     report = judge(load(None, ["simulation.noise=0", "simulation.offset_y=0.02"]), rest, 3.0, 1.0)
     assert len(seen) == report.ticks
     assert seen[-1].fy == pytest.approx(0.02)
-    assert (report.efficiency, report.frequency, report.fullness) == (0.0, 0.0, 0.0)
+    assert (report.relative_thrust, report.frequency, report.fullness) == (0.0, 0.0, 0.0)
 
 
 def test_half_the_amplitude_is_half_full() -> None:
@@ -93,7 +93,7 @@ def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
     weak = Randomisation(coupling=0.5)
     settings = TrainingSettings(randomisation=weak, evaluation=EvaluationSettings(others=6))
     others = [at_edge(CONFIG, weak, seed) for seed in range(6)]
-    own = [judge(fish, square_of_six_ticks, 20.0, 5.0).efficiency for fish in others]
+    own = [judge(fish, square_of_six_ticks, 20.0, 5.0).relative_thrust for fish in others]
     worst = worst_of_others(CONFIG, square_of_six_ticks, settings)
     assert worst == pytest.approx(min(own), abs=1e-3)
 
@@ -105,7 +105,7 @@ def test_a_policy_that_stays_in_rapid_reversals_once_it_is_there_is_worth_nothin
         return -observation.instruction_angle if found[0] else square_of_six_ticks(observation)
 
     found: list[bool] = []
-    assert judge(CONFIG, stuck, 20.0, 5.0).efficiency > 0.95
+    assert judge(CONFIG, stuck, 20.0, 5.0).relative_thrust > 0.95
     found.clear()
     settings = TrainingSettings(evaluation=EvaluationSettings(others=1))
     assert worst_of_others(CONFIG, stuck, settings) < 0.05
@@ -133,7 +133,7 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     outcome = train(Job(config=CONFIG, settings=settings, folder=tmp_path / "run"))
     with (tmp_path / "run" / "evaluations.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert all(float(row["worst"]) <= float(row["efficiency"]) for row in rows)
+    assert all(float(row["worst"]) <= float(row["relative_thrust"]) for row in rows)
     assert outcome.best_evaluation
     assert outcome.best_evaluation.worst == max(
         float(row["worst"]) for row in rows if row["stalled"] == "0"

@@ -168,7 +168,7 @@ def test_a_policy_that_was_pushed_once_does_not_stay_the_best(
     (pushed,) = tank.evaluate(square(5), 8.0)
     link.push = 0.0
     assert tank.best == 1
-    assert pushed.efficiency > 1.02
+    assert pushed.relative_thrust > 1.02
     for _ in range(3):
         tank.evaluate(square(5))
     assert tank.best == 0
@@ -262,7 +262,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     assert outcome.best == job.folder / "best-000064"
     assert same(outcome.best, training.networks[64])
     past = checkpoints.read_card(outcome.best).provenance
-    assert (past.steps, past.efficiency, past.on) == (64, best.efficiency, "robot")
+    assert (past.steps, past.relative_thrust, past.on) == (64, best.relative_thrust, "robot")
     assert outcome.checkpoint
     assert same(outcome.checkpoint, training.networks[192])  # what learned on is the newest
     table = rows(job.folder / "evaluations.csv")
@@ -279,7 +279,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     monkeypatch.delattr(exporting, "in_simulation")  # its figures are those of the tank
     exported = exporting.export(outcome.best, tmp_path / "best.onnx")
     assert exported.evaluation == best
-    assert exported.card.provenance.efficiency == best.efficiency
+    assert exported.card.provenance.relative_thrust == best.relative_thrust
 
 
 def test_a_resumed_training_goes_on_with_the_best_and_the_swims_that_it_had(

@@ -65,7 +65,7 @@ def test_the_card_says_how_it_swims_and_carries_the_note(tmp_path: Path, by_forc
     assert by_force.best_evaluation
     past = export(by_force.best, tmp_path / "p.onnx", note="for the small tail").card.provenance
     assert past.note == "for the small tail"
-    assert past.efficiency == pytest.approx(by_force.best_evaluation.efficiency)
+    assert past.relative_thrust == pytest.approx(by_force.best_evaluation.relative_thrust)
     assert past.frequency == pytest.approx(by_force.best_evaluation.frequency)
 
 

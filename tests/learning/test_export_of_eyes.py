@@ -152,10 +152,10 @@ def test_what_was_learned_by_sight_swims_from_its_file(tmp_path: Path, by_sight:
     assert by_sight.best_evaluation
     found = export(by_sight.best, tmp_path / "eye.onnx")
     past = found.card.provenance
-    assert past.efficiency == pytest.approx(by_sight.best_evaluation.efficiency)
+    assert past.relative_thrust == pytest.approx(by_sight.best_evaluation.relative_thrust)
     assert file.read(found.path).card.pictures == StackSettings()
     standings, _ = compare(Config(), [str(found.path)], seconds=20.0, settle=5.0)
-    assert standings[0].efficiency == pytest.approx(past.efficiency, abs=0.05)
+    assert standings[0].relative_thrust == pytest.approx(past.relative_thrust, abs=0.05)
 
 
 @pytest.mark.slow

@@ -52,11 +52,11 @@ def imitated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, str]:
 
 def test_half_beats_are_compared_by_their_thrust() -> None:
     config = load(None, ["tick=0.02"])
-    efficiency = half_beats(config)
+    relative_thrust = half_beats(config)
     best = best_square_wave(config.plant, config.amplitude_limit)
-    assert efficiency[0] == 0.0
-    assert efficiency.max() == 1.0
-    assert efficiency.argmax() == round(0.5 / best.frequency / 0.02)
+    assert relative_thrust[0] == 0.0
+    assert relative_thrust.max() == 1.0
+    assert relative_thrust.argmax() == round(0.5 / best.frequency / 0.02)
 
 
 def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
@@ -68,8 +68,8 @@ def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
 
 
 def test_it_is_right_to_stay_until_the_best_half_beat_is_over() -> None:
-    efficiency = np.array([0.0, 0.5, 1.0, 0.9, 0.3])
-    sides, costs = zip(*(advice(efficiency, elapsed) for elapsed in range(6)), strict=True)
+    relative_thrust = np.array([0.0, 0.5, 1.0, 0.9, 0.3])
+    sides, costs = zip(*(advice(relative_thrust, elapsed) for elapsed in range(6)), strict=True)
     assert sides == (1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
     assert costs == pytest.approx((0.52, 0.52, 0.12, 0.62, 0.62, 0.62))
 
@@ -81,7 +81,7 @@ def test_a_policy_that_only_imitated_swims_and_says_how_it_learned(
     assert outcome.ended == "finished"
     assert outcome.steps == 0
     assert outcome.best_evaluation
-    assert outcome.best_evaluation.efficiency > 0.9
+    assert outcome.best_evaluation.relative_thrust > 0.9
     assert "imitation 2 of 2: 9" in said
     assert outcome.best
     past = read(export(outcome.best, tmp_path / "policy.onnx").path).card.provenance

@@ -313,20 +313,20 @@ def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
 
 
 @pytest.mark.parametrize(
-    ("efficiency", "error", "careful"),
+    ("relative_thrust", "error", "careful"),
     [(1.01, None, False), (1.1, None, True), (1.1, 0.001, True), (1.1, 0.003, False)],
 )
 def test_more_thrust_than_is_possible_is_said_to_be_so(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    efficiency: float,
+    relative_thrust: float,
     error: float | None,
     careful: bool,
 ) -> None:
     best = Evaluation(
         thrust=0.028,
         error=error,
-        efficiency=efficiency,
+        relative_thrust=relative_thrust,
         frequency=1.67,
         fullness=1.0,
         stalled=False,

@@ -64,7 +64,7 @@ def test_a_thousand_steps_teach_it_to_swim_by_sight(
     outcome = by_sight if rig == DEFAULT else train(job)
     assert (outcome.ended, outcome.steps) == ("finished", 1024)
     assert outcome.best_evaluation
-    assert outcome.best_evaluation.efficiency > 0.9
+    assert outcome.best_evaluation.relative_thrust > 0.9
 
 
 SMALLEST = [("cnn", 68), ("nature", 36)]
@@ -219,7 +219,7 @@ def test_another_camera_is_looked_at_anew_with_the_networks_of_the_first(
     again = job_of(tmp_path / "again", steps=512, rig=WEB)
     outcome = train(replace(again, parent=by_sight.best))
     assert outcome.best_evaluation
-    assert outcome.best_evaluation.efficiency > 0.9
+    assert outcome.best_evaluation.relative_thrust > 0.9
     assert by_sight.best
     assert outcome.best
     eyes = [checkpoints.load_policy(one)[1].eye for one in (by_sight.best, outcome.best)]

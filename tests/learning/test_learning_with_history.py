@@ -77,7 +77,7 @@ def test_a_file_with_a_history_swims_as_the_policy_that_was_trained(tmp_path: Pa
         chatter=replace(job.config.chatter, dwell=0.0),
     )
     report = simulate(free, "ppo", {"policy": str(found.path)}, 4.0, 2.0)
-    assert report.efficiency == pytest.approx(found.evaluation.efficiency, abs=1e-3)
+    assert report.relative_thrust == pytest.approx(found.evaluation.relative_thrust, abs=1e-3)
 
 
 def test_a_training_begins_only_with_a_policy_of_the_same_history(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_who_leans_on_the_shortest_dwell_is_worth_nothing_among_fish_of_the_rang
 
     chosen = EvaluationSettings(seconds=8.0, settle=3.0, others=3, others_from="range")
     settings = TrainingSettings(randomisation=Randomisation(backlash=0.1), evaluation=chosen)
-    assert in_simulation(CONFIG, six_ticks, chosen).efficiency > 0.9
+    assert in_simulation(CONFIG, six_ticks, chosen).relative_thrust > 0.9
     assert worst_of_others(CONFIG, six_ticks, settings) > 0.7
     assert worst_of_others(CONFIG, every_tick, settings) == 0.0
 
@@ -142,7 +142,7 @@ def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
     latest = train(job).latest_evaluation
     assert latest
     assert latest.worst is not None
-    assert latest.worst <= latest.efficiency
+    assert latest.worst <= latest.relative_thrust
 
 
 def test_a_fish_of_its_own_is_held_back_by_its_own_shortest_dwell() -> None:

@@ -113,7 +113,7 @@ def test_every_seed_has_a_folder_and_all_of_them_a_table(two: tuple[Path, Done])
     assert [row["steps"] for row in rows] == ["64", "128"]
     first, second = (read_evaluations(run / f"seed-{index}") for index in (0, 1))
     assert first != second
-    assert float(rows[-1]["lowest"]) == min(first[-1].efficiency, second[-1].efficiency)
+    assert float(rows[-1]["lowest"]) == min(first[-1].relative_thrust, second[-1].relative_thrust)
     assert float(rows[-1]["best_highest"]) == max(best_so_far(first)[-1], best_so_far(second)[-1])
 
 

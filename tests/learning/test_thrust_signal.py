@@ -123,4 +123,4 @@ def test_a_policy_learns_to_swim_a_rig_whose_sensor_is_turned_and_drifts(tmp_pat
     )
     best = train(job).best_evaluation
     assert best
-    assert best.efficiency > 0.95
+    assert best.relative_thrust > 0.95

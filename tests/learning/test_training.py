@@ -63,7 +63,7 @@ def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path, by_force: Outcome, dw
         outcome = train(Job(config=config, settings=free, folder=tmp_path / "run"))
     assert (outcome.ended, outcome.steps) == ("finished", 1024)
     assert outcome.best_evaluation
-    assert outcome.best_evaluation.efficiency > 0.9
+    assert outcome.best_evaluation.relative_thrust > 0.9
     untrained = rows(outcome.folder / "progress.csv")[0]
     # Who moves at random, but not too fast, swims not that badly.
     better = 1.2 if dwell else 3.0
@@ -123,7 +123,7 @@ def test_a_checkpoint_says_what_must_be_known_to_run_the_policy(brief: tuple[Job
     assert past.plant["omega0"] == 12.5
     assert past.settings["ppo"]["n_steps"] == 64
     assert outcome.latest_evaluation
-    assert past.efficiency == outcome.latest_evaluation.efficiency
+    assert past.relative_thrust == outcome.latest_evaluation.relative_thrust
     assert {"torch", "stable-baselines3", "gymnasium"} <= set(past.libraries)
 
 
@@ -143,10 +143,10 @@ def test_the_best_policy_is_kept_beside_the_newest(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=448)
     outcome = train(job, witness)
     swimming = [e for e in witness.evaluations if not e.stalled]
-    assert outcome.best_evaluation == max(swimming, key=lambda e: (e.efficiency, e.steps))
+    assert outcome.best_evaluation == max(swimming, key=lambda e: (e.relative_thrust, e.steps))
     assert outcome.best == job.folder / f"best-{outcome.best_evaluation.steps:06d}"
-    assert checkpoints.read_card(outcome.best).provenance.efficiency == (
-        outcome.best_evaluation.efficiency
+    assert checkpoints.read_card(outcome.best).provenance.relative_thrust == (
+        outcome.best_evaluation.relative_thrust
     )
     assert len(list(job.folder.glob("best-*"))) == 1
 

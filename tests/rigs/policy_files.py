@@ -34,7 +34,7 @@ PROVENANCE = Provenance(
     settings={"ppo": {"n_steps": 128}},
     plant={"omega0": 12.5},
     libraries={"numpy": np.__version__},
-    efficiency=0.987,
+    relative_thrust=0.987,
     frequency=1.67,
 )
 

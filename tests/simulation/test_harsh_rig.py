@@ -57,5 +57,5 @@ def test_a_square_wave_swims_on_it_as_well_as_its_frequency_permits(robot: str) 
     config = load(FILE, [f"robot={robot}"])
     best = simulate(config, "square", {"frequency": 1.6}, 7.0, 3.0)
     assert best.mode == "running"
-    assert 0.9 < best.efficiency < 1.03
+    assert 0.9 < best.relative_thrust < 1.03
     assert best.best_square_thrust < 0.5 * 0.0258  # of a fish without any of it

@@ -68,7 +68,7 @@ def test_figures_are_those_of_the_plant_and_not_of_the_sensor() -> None:
 
 def test_on_the_grid_the_best_square_wave_comes_close_to_the_optimum() -> None:
     report = simulate(load(), "square", {"frequency": 1.7089})
-    assert 0.98 <= report.efficiency <= 1.0
+    assert 0.98 <= report.relative_thrust <= 1.0
     assert report.best_square_frequency == pytest.approx(1.7089, abs=0.005)
     assert report.best_square_thrust == pytest.approx(25.78384e-3, rel=1e-4)
 
@@ -76,7 +76,7 @@ def test_on_the_grid_the_best_square_wave_comes_close_to_the_optimum() -> None:
 def test_the_comparison_is_with_the_amplitude_that_the_controller_uses() -> None:
     report = simulate(load(), "square", {"frequency": 1.7856, "amplitude": 0.2})
     assert report.best_square_thrust == pytest.approx(6.819563e-3, rel=1e-4)
-    assert report.efficiency > 0.95
+    assert report.relative_thrust > 0.95
 
 
 def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
@@ -106,7 +106,7 @@ def test_a_length_that_leaves_nothing_to_judge_is_refused(
 
 def test_slack_that_swallows_the_whole_amplitude_leaves_nothing_to_compare_with() -> None:
     report = simulate(load(None, ["plant.cable_slack=0.5"]), "square", {}, 20)
-    assert (report.mean_thrust, report.efficiency) == (0.0, 0.0)
+    assert (report.mean_thrust, report.relative_thrust) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("tick", [0.002, 0.01, 0.2])
@@ -170,10 +170,10 @@ run = partial(fishctl, "simulate")
 def test_the_command_prints_json_with_the_documented_keys() -> None:
     done = run("swing", "--C", "0.6", "--seconds", "20", "--json", "--set", "simulation.noise=1e-3")
     report = json.loads(done.stdout)
-    documented = "mean_thrust frequency fin_amplitude efficiency best_square_thrust ticks"
+    documented = "mean_thrust frequency fin_amplitude relative_thrust best_square_thrust ticks"
     assert {*documented.split(), "best_square_frequency", "real_time_factor"} <= set(report)
     assert report["ticks"] == 400
-    assert report["efficiency"] > 0.97
+    assert report["relative_thrust"] > 0.97
 
 
 @pytest.mark.parametrize(

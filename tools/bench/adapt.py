@@ -44,7 +44,7 @@ class Adapted(Struct, frozen=True):
     of_square: float
     """True thrust of the square wave found, over `best`."""
     claimed: tuple[float, float, float]
-    """Efficiency of the winner over the square wave found, and its interval."""
+    """Relative thrust of the winner over the square wave found, and its interval."""
     claims: dict[str, tuple[float, float, float, float]]
     """Of each but the square wave: the same, and the truth."""
     thrusts: dict[str, tuple[float, float, float]]
@@ -85,7 +85,7 @@ def adapted(task: tuple[int, int, float]) -> Adapted:
         winner=verdict.winner,
         share=truth(contenders[verdict.winner]) / best,
         of_square=truth(square) / best,
-        claimed=(verdict.efficiency, verdict.low, verdict.high),
+        claimed=(verdict.relative_thrust, verdict.low, verdict.high),
         claims={
             name: (*claim, truth(contenders[name]) / truth(square))
             for name, claim in verdict.others.items()
@@ -155,7 +155,7 @@ def summary(found: list[Adapted]) -> str:
         ["policy, of the best square wave, median", f"{percent(statistics.median(policies))} %"],
         ["policy, of the best square wave, worst", f"{percent(min(policies))} %"],
         ["policies that took part", f"{len(policies)} of {len(found)}"],
-        ["interval of the winner's efficiency covers the truth", _covered(claims)],
+        ["interval of the winner's relative thrust covers the truth", _covered(claims)],
         ["the same, of everyone but the square wave", _covered(every)],
         [
             "interval of the winner's thrust covers the truth",

@@ -51,7 +51,7 @@ FAST = 0.2
 class Swum(NamedTuple):
     """One run."""
 
-    efficiency: float
+    relative_thrust: float
     every_tick: float
     """Longest stretch of reversals in consecutive ticks [s]."""
     fast: float
@@ -65,7 +65,7 @@ def swim(config: Config, name: str, parameters: dict[str, str]) -> Swum:
     controller = registry.create(name, parameters, config.limits)
     report = judge(config, name, controller, SECONDS, SETTLE, reversals)
     return Swum(
-        report.efficiency,
+        report.relative_thrust,
         reversals.longest(1.5 * config.tick),
         reversals.longest(FAST - 0.5 * config.tick),
         report.fallback is not None,
@@ -110,14 +110,14 @@ def measure(options: Namespace) -> Report:
         rows.append(
             [
                 label,
-                efficiency(free),
+                relative_thrust(free),
                 f"{max(run.every_tick for run in free):.1f}",
                 f"{max(run.fast for run in free):.1f}",
-                efficiency(held),
+                relative_thrust(held),
                 f"{max(run.every_tick for run in held):.1f}",
                 f"{max(run.fast for run in held):.1f}",
                 f"{sum(run.fell_back for run in held)} of {seeds}",
-                efficiency(other),
+                relative_thrust(other),
             ]
         )
         progress(*rows[-1])
@@ -129,12 +129,12 @@ def measure(options: Namespace) -> Report:
     return Report({"bench chatter": text}, rows)
 
 
-def efficiency(runs: list[Swum]) -> str:
+def relative_thrust(runs: list[Swum]) -> str:
     """Median in %, for a cell."""
-    return f"{statistics.median(run.efficiency for run in runs) * 100:.1f}"
+    return f"{statistics.median(run.relative_thrust for run in runs) * 100:.1f}"
 
 
 def spread(runs: list[Swum]) -> str:
     """Median and lowest."""
-    lowest = min(run.efficiency for run in runs)
-    return f"{efficiency(runs)} % ({lowest * 100:.1f} %)"
+    lowest = min(run.relative_thrust for run in runs)
+    return f"{relative_thrust(runs)} % ({lowest * 100:.1f} %)"

@@ -72,7 +72,7 @@ def believed(plant: PlantParameters, estimator: str, seed: int) -> PlantParamete
     return msgspec.structs.replace(plant, **wrong)
 
 
-def efficiency(run: tuple[Rig, str, float, int]) -> float:
+def relative_thrust(run: tuple[Rig, str, float, int]) -> float:
     """Thrust over that of the best square wave of the same amplitude; zero after a fault."""
     rig, estimator, ratio, seed = run
     amplitude = ratio * PlantParameters().servo_speed / PlantParameters().omega0
@@ -114,7 +114,7 @@ def measure(options: Namespace) -> Report:
     """A table of medians; about a minute."""
     runs = list(itertools.product(RIGS, ESTIMATORS, RATIOS, range(options.seeds)))
     with ProcessPoolExecutor(options.jobs) as pool:
-        done = list(pool.map(efficiency, runs, chunksize=options.seeds))
+        done = list(pool.map(relative_thrust, runs, chunksize=options.seeds))
     shape = (len(RIGS), len(ESTIMATORS), len(RATIOS), options.seeds)
     found = np.median(np.array(done).reshape(shape), axis=3)
     rows = [

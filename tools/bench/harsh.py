@@ -1,8 +1,8 @@
 """What each imperfection of config/harsh.yaml does to `swing`, alone and with all the others.
 
 Each fish swims in virtual time with C = 0.6, a minute of which the first 10 s are not judged, and
-with C = auto, of which the second minute is. Efficiencies are shares of each fish's own best square
-wave, of its true thrust.
+with C = auto, of which the second minute is. Relative thrust is the true thrust over that of each
+fish's own best square wave.
 """
 
 import os

@@ -1,9 +1,9 @@
 """What learning comes to: learning curves, policies on fish they never met, and speed.
 
-Trainings are those of `fishctl learn ppo`, in a temporary folder. Efficiency is thrust over that of
-the best square wave of the same fish and amplitude.
+Trainings are those of `fishctl learn ppo`, in a temporary folder. Relative thrust is the share of
+the thrust of the best square wave of the same fish and amplitude.
 
-    efficiency   learning curves: several fish and settings; draws docs/learning-curves.png
+    relative_thrust  learning curves: several fish and settings; draws docs/learning-curves.png
     choices      what each of the default settings is worth
     transfer     policies for one fish on sixteen others
     tank         tank time of trainings on a robot, evaluations included
@@ -66,10 +66,10 @@ SIMULATED = "`config/simulated.yaml`"
 NEARLY, ENOUGH = 0.95, 0.97
 REACHED = f" | {100 * NEARLY:.0f} % | seeds | {100 * ENOUGH:.0f} % | seeds"
 STALLED = 0.5
-"""A policy of less efficiency than this counts as stalled."""
+"""A policy of less relative thrust than this counts as stalled."""
 
 
-def efficiency(options: Namespace) -> str:
+def relative_thrust(options: Namespace) -> str:
     """Learning curves of the default settings on several fish, and of two others; the figure."""
     plain, paper = settings_of(None), settings_of("learning-paper.yaml", PAPER_STEPS)
     blind = replace(plain, ppo=replace(plain.ppo, symmetric=False))
@@ -85,7 +85,7 @@ def efficiency(options: Namespace) -> str:
     found = several(rows, UNTOUCHED[: options.seeds], options.jobs)
     picture = {
         row.replace("`", ""): [
-            ([p.steps for p in one.points], [p.efficiency for p in one.points]) for one in runs
+            ([p.steps for p in one.points], [p.relative_thrust for p in one.points]) for one in runs
         ]
         for row, runs in found.items()
         if row != SIMULATED
@@ -96,13 +96,13 @@ def efficiency(options: Namespace) -> str:
     reached, learned, best, shape = [], [], [], []
     for row, runs in found.items():
         reached.append([row, *to_reach(runs, NEARLY), *to_reach(runs, ENOUGH)])
-        learned.append([row, *curve_of(runs, lambda one, k: one.points[k].efficiency)])
+        learned.append([row, *curve_of(runs, lambda one, k: one.points[k].relative_thrust)])
         best.append([row, *curve_of(runs, lambda one, k: one.best[k])])
         config = rows[row].config
         grid = best_on_grid(config)
         limit = grid.thrust / best_square_wave(config.plant, config.amplitude_limit).thrust
         ends = [one.points[-1] for one in runs]
-        stalled = sum(end.efficiency < STALLED for end in ends)
+        stalled = sum(end.relative_thrust < STALLED for end in ends)
         shape.append(
             [
                 row,
@@ -115,14 +115,14 @@ def efficiency(options: Namespace) -> str:
         )
     shape_heads = (
         "at the end | mean \\|φ_c\\|/Φ | frequency (Hz) | best on the grid (Hz) | "
-        "its efficiency (%) | stalled"
+        "its relative thrust (%) | stalled"
     )
     return "\n\n".join(
         (
-            f"Steps until the best policy so far has that efficiency, median [lowest – highest] of "
-            f"{options.seeds} seeds:",
+            f"Steps until the best policy so far has that relative thrust, median [lowest – "
+            f"highest] of {options.seeds} seeds:",
             table(REACHED, reached),
-            "Efficiency in % of the best policy that a seed has had until then, which is what is "
+            "Relative thrust (%) of the best policy that a seed has had until then, which is "
             "exported:",
             table(heads, best),
             "And of the policy as it stands after so many control steps:",
@@ -179,7 +179,7 @@ def choices(options: Namespace) -> str:
 
 
 def to_reach(runs: list[Trained], share: float) -> list[str]:
-    """The cells of a row: steps to that efficiency, and how many seeds reached it."""
+    """The cells of a row: steps to that relative thrust, and how many seeds reached it."""
     steps = [one.steps_to(share) for one in runs]
     reached = sum(map(math.isfinite, steps))
     return [spread(steps, 1.0, 0).replace("inf", "never"), f"{reached} of {len(runs)}"]
@@ -208,7 +208,7 @@ def transfer(options: Namespace) -> str:
         _, name, parameters = parse(text)
         fish = fish_that_are_off(rig())
         shares[f"`{text}`"] = [
-            [simulate(one, name, parameters, SECONDS, SETTLE).efficiency for one in fish]
+            [simulate(one, name, parameters, SECONDS, SETTLE).relative_thrust for one in fish]
         ]
     lines = [
         [
@@ -220,7 +220,9 @@ def transfer(options: Namespace) -> str:
         for row, runs in shares.items()
     ]
     heads = f"what swims | worst of 16 fish | median of 16 fish | all ≥ {100 * GOOD:.0f} %"
-    of_seeds = f"Efficiency in %, of policies median [lowest – highest] of {options.seeds} seeds:"
+    of_seeds = (
+        f"Relative thrust in %, of policies median [lowest – highest] of {options.seeds} seeds:"
+    )
     return f"{of_seeds}\n\n{table(heads, lines)}"
 
 
@@ -232,14 +234,14 @@ def harsh(options: Namespace) -> str:
     contestants = [parse(text) for text in (SHIPPED, *SWINGS)]
     found = survey(configs, contestants, SECONDS, SETTLE)
     rows = [
-        [fish.name, *(f"{100 * one.fish[row].efficiency:.1f}" for one in found)]
+        [fish.name, *(f"{100 * one.fish[row].relative_thrust:.1f}" for one in found)]
         for row, fish in enumerate(changes)
     ]
     first = len(changes)
     for kind, group in (("harsh", random), ("mild", clean)):
         groups = [one.fish[first : first + len(group)] for one in found]
         for name, pick in (("median", statistics.median), ("worst", min)):
-            figures = [pick(swum.efficiency for swum in row) for row in groups]
+            figures = [pick(swum.relative_thrust for swum in row) for row in groups]
             rows.append(
                 [f"{len(group)} {kind} fish, {name}", *(f"{100 * share:.1f}" for share in figures)]
             )
@@ -251,7 +253,7 @@ def harsh(options: Namespace) -> str:
     heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in found)])
     return "\n\n".join(
         (
-            "Efficiency in %, of a minute whose first 10 s do not count:",
+            "Relative thrust in %, of a minute whose first 10 s do not count:",
             table(heads, rows),
             f"`{SHIPPED}` on {len(MANY_SEEDS)} more fish of each kind, seeds {MANY_SEEDS[0]} to "
             f"{MANY_SEEDS[-1]}:",
@@ -267,7 +269,7 @@ def on_many_fish() -> str:
         fish = [fish_of_seed(seed) for seed in MANY_SEEDS]
         configs = [load(None, each.overrides) for each in fish]
         (found,) = survey(list(zip(fish, configs, strict=True)), [parse(SHIPPED)], SECONDS, SETTLE)
-        shares = [swum.efficiency for swum in found.fish]
+        shares = [swum.relative_thrust for swum in found.fish]
         grids = [best_on_grid(config).thrust / best_thrust(config) for config in configs]
         limits = [statistics.median(shares), *np.quantile(shares, (0.1, 0.05)), min(shares)]
         cells = [*limits, statistics.median(grids), min(grids)]
@@ -327,7 +329,7 @@ def inference(config: Config, policy: str) -> str:
 
 
 PARTS = {
-    "efficiency": efficiency,
+    "relative_thrust": relative_thrust,
     "choices": choices,
     "transfer": transfer,
     "tank": tank,

@@ -21,15 +21,15 @@ Later ones are thinner or have gaps, so that an earlier one with the same course
 _FIRST, _TICKS = 200, (200, 500, 1000, 2000, 5000, 10_000, 20_000)
 """Control steps."""
 _LOWEST = 60
-"""Efficiency at which the axis begins [%]."""
+"""Relative thrust at which the axis begins [%]."""
 
 
 def learning_curves(
     path: Path, curves: Mapping[str, Sequence[tuple[Sequence[int], Sequence[float]]]], goal: float
 ) -> None:
-    """Efficiency against steps: median and range of the seeds of each training.
+    """Relative thrust against steps: median and range of the seeds of each training.
 
-    curves: for each training its seeds, each as steps and efficiencies
+    curves: for each training its seeds, each as steps and relative thrusts
     goal: drawn as a line
     Raises `FishdError` where the file cannot be made, and `MissingPackage`.
     """
@@ -38,12 +38,12 @@ def learning_curves(
         axis = figure.subplots()
         for (color, style, width), (label, seeds) in zip(cycle(_CURVES), curves.items()):
             steps = np.array(seeds[0][0])
-            efficiency = 100.0 * np.array([efficiencies for _, efficiencies in seeds])
-            low, high = efficiency.min(0), efficiency.max(0)
+            relative_thrust = 100.0 * np.array([relative_thrusts for _, relative_thrusts in seeds])
+            low, high = relative_thrust.min(0), relative_thrust.max(0)
             axis.fill_between(steps, low, high, color=color, alpha=0.1, linewidth=0)
             for edge in (low, high):
                 axis.plot(steps, edge, color=color, linestyle=style, linewidth=0.5, alpha=0.6)
-            middle = np.median(efficiency, 0)
+            middle = np.median(relative_thrust, 0)
             axis.plot(steps, middle, color=color, linestyle=style, linewidth=width, label=label)
         axis.axhline(
             100.0 * goal,
@@ -59,5 +59,5 @@ def learning_curves(
         axis.minorticks_off()
         axis.set_ylim(_LOWEST, 101)
         axis.set_xlabel("control steps")
-        axis.set_ylabel(f"efficiency (%, from {_LOWEST} % up)")
+        axis.set_ylabel(f"relative thrust (%, from {_LOWEST} % up)")
         figure.legend(loc="outside lower center", ncols=3)

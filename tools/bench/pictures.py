@@ -1,7 +1,7 @@
 """What learning from pictures comes to: steps until it swims, for each eye; its optimum; speed.
 
 Trainings are those of `fishctl learn ppo --see camera`, in a temporary folder, with seeds that no
-setting was chosen with. Efficiency is thrust over that of the best square wave of the same fish.
+setting was chosen with. Relative thrust is the share of the best square wave's thrust.
 
     steps     control steps until 97 %, babble included; draws docs/camera-learning.png
     optimum   what was learned at four amplitudes, from pictures and from forces
@@ -74,7 +74,7 @@ def steps(options: Namespace) -> str:
 
 
 def curves(runs: list[Trained]) -> list[tuple[list[int], list[float]]]:
-    """Steps and best efficiency so far, of each seed."""
+    """Steps and best relative thrust so far, of each seed."""
     return [([point.steps for point in one.points], one.best) for one in runs]
 
 
@@ -119,14 +119,14 @@ def optimum(options: Namespace) -> str:
         for name in kinds:
             ends = [one.exported for one in found[f"{amplitude} {name}"]]
             frequency = statistics.median(end.frequency for end in ends)
-            share = statistics.median(100.0 * end.efficiency for end in ends)
+            share = statistics.median(100.0 * end.relative_thrust for end in ends)
             low, high = (pick(end.frequency for end in ends) for pick in (min, max))
             cells.append(f"{frequency:.2f} [{low:.2f} – {high:.2f}] / {share:.1f}")
         lines.append(cells)
     heads = " | ".join(("Φ (rad)", "best on the grid of ticks", *kinds))
     return (
-        f"Frequency (Hz), median [lowest – highest] of {len(seeds)} seeds, and efficiency (%), of "
-        f"the best policy of {longer} steps, `cnn` {LONGEST}:\n\n{table(heads, lines)}"
+        f"Frequency (Hz), median [lowest – highest] of {len(seeds)} seeds, and relative thrust "
+        f"(%), of the best policy of {longer} steps, `cnn` {LONGEST}:\n\n{table(heads, lines)}"
     )
 
 

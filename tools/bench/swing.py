@@ -1,7 +1,7 @@
 """`swing --C auto` on fish that differ from the model: beside C = 0.6, after a minute and before.
 
 The single changes are those of a real rig, one at a time. The harsh fish have all of them, in
-random sizes. Efficiencies are shares of each fish's own best square wave, of its true thrust.
+random sizes. Relative thrusts are shares of each fish's own best square wave, of its true thrust.
 """
 
 import os
@@ -51,7 +51,7 @@ def measured(case: OtherFish) -> Shares:
         report = simulate(config, "swing", {"C": C}, seconds, settle)
         if report.reason:
             raise BrokenPromise(f"{case.name}: {report.reason.message}")
-        return report.efficiency
+        return report.relative_thrust
 
     return Shares(
         share(0.6, LEARNT, 10.0), share("auto", LEARNT, 0.0), share("auto", SECONDS, LEARNT)

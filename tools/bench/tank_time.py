@@ -43,14 +43,14 @@ class Run(NamedTuple):
     """One training."""
 
     bests: list[tuple[float, float]]
-    """Tank time [s], and true efficiency of the policy that was called the best from then on."""
+    """Tank time [s], and true relative thrust of the policy called the best from then on."""
     highest: float
-    """True efficiency of the best candidate of all."""
+    """True relative thrust of the best candidate of all."""
     tank_time: float
     """[s]"""
 
     def at(self, seconds: float) -> float:
-        """Efficiency of what was called the best at that tank time; 0 before the first."""
+        """Relative thrust of what was called the best at that tank time; 0 before the first."""
         return next((share for time, share in reversed(self.bests) if time <= seconds), 0.0)
 
     @property
@@ -60,7 +60,7 @@ class Run(NamedTuple):
 
 
 class Comparing(Training):
-    """A training as it is, in which the true efficiency of each candidate is noted."""
+    """A training as it is, in which the true relative thrust of each candidate is noted."""
 
     truth: dict[int, float]
 
@@ -69,7 +69,7 @@ class Comparing(Training):
         return DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
 
     def _evaluate(self) -> None:
-        self.truth[self._recorder.steps] = true_efficiency(self._job.config, self._policy())
+        self.truth[self._recorder.steps] = true_relative_thrust(self._job.config, self._policy())
         super()._evaluate()
 
 
@@ -78,7 +78,7 @@ class OneByOne(Comparing):
 
     def _evaluate(self) -> None:
         env, decide, steps = self._env, self._policy(), self._recorder.steps
-        self.truth[steps] = true_efficiency(self._job.config, decide)
+        self.truth[steps] = true_relative_thrust(self._job.config, decide)
         env.resume()
         tick, samples = env.link.tick, []
         for swims, seconds in plan(BEFORE, {}):
@@ -102,7 +102,7 @@ class OneByOne(Comparing):
             tank_time=env.tank_time,
             thrust=found.thrust,
             error=found.error,
-            efficiency=found.thrust / env.best_thrust,
+            relative_thrust=found.thrust / env.best_thrust,
             frequency=frequency,
             fullness=fullness,
             stalled=is_stalled(frequency, fullness, tick),
@@ -110,7 +110,7 @@ class OneByOne(Comparing):
         self._recorder.add(row)
 
 
-def true_efficiency(config: Config, decide: DeterministicPolicy) -> float:
+def true_relative_thrust(config: Config, decide: DeterministicPolicy) -> float:
     """Without noise and drift, as `ppo` swims; 0 where another controller took over."""
     quiet = replace(config.simulation, noise=0.0, drift=0.0)
     limits = config.limits
@@ -120,7 +120,7 @@ def true_efficiency(config: Config, decide: DeterministicPolicy) -> float:
         return limit.apply(decide(seen, stack), seen.dt)
 
     report = judge(replace(config, simulation=quiet), limited, 30.0, 10.0)
-    return 0.0 if report.fallback else report.efficiency
+    return 0.0 if report.fallback else report.relative_thrust
 
 
 def trained(config: Config, seed: int, kind: type[Comparing]) -> Run:
@@ -170,7 +170,7 @@ def tank(options: Namespace) -> str:
         )
     )
     return (
-        "True efficiency in % of the policy that the training calls its best, median [lowest – "
+        "True relative thrust (%) of the policy that the training calls its best, median [lowest – "
         f"highest] of {len(seeds)} seeds:\n\n{table(heads, lines)}"
     )
 

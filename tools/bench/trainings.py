@@ -46,21 +46,21 @@ class Trained(NamedTuple):
 
     points: list[Evaluation]
     best: list[float]
-    """Efficiency of the best policy until each of them."""
+    """Relative thrust of the best policy until each of them."""
     others: list[float]
-    """Efficiencies of its best policy on fish that are off, if those were asked for."""
+    """Relative thrusts of its best policy on fish that are off, if those were asked for."""
     cost: float
     """Seconds of the processor for 1000 steps, evaluations included."""
 
-    def steps_to(self, efficiency: float) -> float:
-        """After which an evaluation found that efficiency for the first time; inf if none did."""
+    def steps_to(self, relative_thrust: float) -> float:
+        """Steps before the first evaluation with that relative thrust; inf if there is none."""
         reached = zip(self.points, self.best, strict=True)
-        return next((point.steps for point, best in reached if best >= efficiency), math.inf)
+        return next((point.steps for point, best in reached if best >= relative_thrust), math.inf)
 
     @property
     def exported(self) -> Evaluation:
         """The evaluation of its best policy."""
-        return max(self.points, key=lambda point: point.efficiency)
+        return max(self.points, key=lambda point: point.relative_thrust)
 
 
 def rig(amplitude: float = 0.42) -> Config:
@@ -98,11 +98,11 @@ def trained(row: Row, seed: int, others: bool) -> Trained:
 
 
 def swum(checkpoint: Path, config: Config) -> list[float]:
-    """Efficiency of a policy on each fish that is off, over that fish's own best square wave."""
+    """Relative thrust of a policy on each fish that is off."""
     found = []
     for off in fish_that_are_off(config):
         decide = DeterministicPolicy(*load_policy(checkpoint), config.amplitude_limit)
-        found.append(judge(off, decide, SECONDS, SETTLE).efficiency)
+        found.append(judge(off, decide, SECONDS, SETTLE).relative_thrust)
     return found
 
 
@@ -130,5 +130,5 @@ def several(
         for (row, seed), result in zip(tasks, work, strict=True):
             found[row].append(result)
             last = result.points[-1]
-            progress(f"{row}, seed {seed}: {last.efficiency:.1%}, best {result.best[-1]:.1%}")
+            progress(f"{row}, seed {seed}: {last.relative_thrust:.1%}, best {result.best[-1]:.1%}")
     return found

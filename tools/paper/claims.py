@@ -150,7 +150,7 @@ def waveforms() -> Iterator[Claim]:
         best["frequency_Hz"],
         1.8,
         f"ticks of 50 ms: {{:.3f}} Hz, {best['thrust_mN']:.2f} mN, "
-        f"{best['efficiency']:.1%} of the optimum",
+        f"{best['relative_thrust']:.1%} of the optimum",
     )
 
 
@@ -162,32 +162,32 @@ def swinging() -> Iterator[Claim]:
         (swing_map.CLAIMS[0], best, swing_map.NEARLY_BEST),
         (swing_map.CLAIMS[1], everything, swing_map.GOOD),
     ):
-        low = min(rows, key=lambda row: row["efficiency"])
-        missed = [row for row in rows if row["efficiency"] <= bound]
+        low = min(rows, key=lambda row: row["relative_thrust"])
+        missed = [row for row in rows if row["relative_thrust"] <= bound]
         yield Claim(
             claim,
-            f"from {low['efficiency']:.1%} up (C = {low['C']:g}, ω₀Φ/Ω = "
+            f"from {low['relative_thrust']:.1%} up (C = {low['C']:g}, ω₀Φ/Ω = "
             f"{low['w0Phi_over_Omega']:g}); less in {len(missed)} of {len(rows)} cases",
             not missed,
         )
     (weak,) = read(figure_5.INSET, xi=min(figure_5.DAMPINGS), C=0.0)
     yield Claim(
         "ξ → 0, fast servo, C = 0: close to 100 %",
-        f"{weak['efficiency']:.2%} at ξ = {weak['xi']:g}",
-        weak["efficiency"] > swing_map.NEARLY_BEST,
+        f"{weak['relative_thrust']:.2%} at ξ = {weak['xi']:g}",
+        weak["relative_thrust"] > swing_map.NEARLY_BEST,
     )
 
 
 def learning() -> Iterator[Claim]:
     """PPO, with ticks of 50 ms."""
     learned = read(figure_3.NAME, source=figure_3.LEARNT)
-    efficiencies = column(learned, "efficiency")
+    relative_thrusts = column(learned, "relative_thrust")
     full = column(learned, "mean_command_over_limit")
     yield Claim(
         "learning finds the square wave between ±Φ",
-        f"mean \\|φ_c\\|/Φ {min(full):.3f} to {max(full):.3f}, thrust {min(efficiencies):.1%} to "
-        f"{max(efficiencies):.1%} of the best square wave, over {len(learned)} amplitudes",
-        min(full) > 0.98 and min(efficiencies) > swing_map.NEARLY_BEST,
+        f"mean \\|φ_c\\|/Φ {min(full):.3f} to {max(full):.3f}, thrust {min(relative_thrusts):.1%} "
+        f"to {max(relative_thrusts):.1%} of the best square wave, over {len(learned)} amplitudes",
+        min(full) > 0.98 and min(relative_thrusts) > swing_map.NEARLY_BEST,
     )
     steps = [_steps(figure_3.policy(amplitude)) for amplitude in figure_3.LEARNED]
     yield Claim(

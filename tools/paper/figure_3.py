@@ -77,7 +77,7 @@ def _of(source: str, report: Report) -> Row:
         report.mean_thrust,
         report.frequency,
         report.fin_amplitude,
-        report.efficiency,
+        report.relative_thrust,
         report.fullness,
     )
 
@@ -85,14 +85,14 @@ def _of(source: str, report: Report) -> Row:
 def _row(
     source: str, amplitude: float, thrust: float, frequency: float, fin: float, *judged: float
 ) -> Row:
-    efficiency, fullness = judged or ("", "")
+    relative_thrust, fullness = judged or ("", "")
     return {
         "source": source,
         "amplitude_rad": amplitude,
         "thrust_mN": 1e3 * thrust,
         "frequency_Hz": frequency,
         "fin_amplitude_rad": fin,
-        "efficiency": efficiency,
+        "relative_thrust": relative_thrust,
         "mean_command_over_limit": fullness,
     }
 

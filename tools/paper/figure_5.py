@@ -1,4 +1,4 @@
-"""Figure 5: the efficiency of swinging control against ω₀Φ/Ω, and in an inset with a fast servo."""
+"""Figure 5: relative thrust of swinging control against ω₀Φ/Ω; inset: with a fast servo."""
 
 import numpy as np
 
@@ -61,14 +61,19 @@ def compute(jobs: int) -> None:
     write(
         NAME,
         [
-            {"C": c, "w0Phi_over_Omega": x, "efficiency": r.efficiency, "frequency_Hz": r.frequency}
+            {
+                "C": c,
+                "w0Phi_over_Omega": x,
+                "relative_thrust": r.relative_thrust,
+                "frequency_Hz": r.frequency,
+            }
             for (c, x), r in zip(cases, reports[: len(cases)], strict=True)
         ],
     )
     write(
         INSET,
         [
-            {"xi": xi, "C": c, "efficiency": r.efficiency, "frequency_Hz": r.frequency}
+            {"xi": xi, "C": c, "relative_thrust": r.relative_thrust, "frequency_Hz": r.frequency}
             for (xi, c), r in zip(fast, reports[len(cases) :], strict=True)
         ],
     )
@@ -87,7 +92,7 @@ def draw() -> None:
         axes = figure.subplots()
         for criterion, colour, line, marker in styles:
             rows = read(NAME, C=criterion)
-            x, y = column(rows, "w0Phi_over_Omega"), np.array(column(rows, "efficiency"))
+            x, y = column(rows, "w0Phi_over_Omega"), np.array(column(rows, "relative_thrust"))
             axes.plot(x, 100 * y, color=colour, ls=line)
             rows = read(swing_map.NAME, C=criterion)
             x, y = column(rows, "w0Phi_over_Omega"), np.array(column(rows, "median"))
@@ -109,7 +114,8 @@ def draw() -> None:
         for xi, line in zip(DAMPINGS, ("-", (0, (4, 2))), strict=True):
             rows = read(INSET, xi=xi)
             inset.plot(
-                column(rows, "C"), 100 * np.array(column(rows, "efficiency")), color=BLACK, ls=line,
+                column(rows, "C"), 100 * np.array(column(rows, "relative_thrust")), color=BLACK,
+                ls=line,
                 label=f"ξ = {xi:g}",
             )  # fmt: skip
         inset.set_xlim(0.0, 0.9)

@@ -55,7 +55,7 @@ def compute(jobs: int) -> None:
     rigs = [PERFECT, *(msgspec.structs.replace(REAL, seed=seed) for seed in range(SEEDS))]
     cells = list(itertools.product(CRITERIA, RATIOS))
     reports = swim_all((run(*cell, rig) for cell in cells for rig in rigs), jobs)
-    found = np.array([report.efficiency for report in reports]).reshape(len(cells), len(rigs))
+    found = np.array([report.relative_thrust for report in reports]).reshape(len(cells), len(rigs))
     exact = _continuous_time()
     write(
         NAME,

@@ -104,16 +104,17 @@ def _table(found: "list[Surveyed]", singles: int) -> "Table":
         table.add_column(one.contestant, justify="right", overflow="fold")
     for row in range(singles):
         swums = [one.fish[row] for one in found]
-        table.add_row(swums[0].fish, *(f"{swum.efficiency:.1%}" for swum in swums))
+        table.add_row(swums[0].fish, *(f"{swum.relative_thrust:.1%}" for swum in swums))
     others = [one.fish[singles:] for one in found]
     if others[0]:
         what = f"{len(others[0])} harsh fish"
         table.add_row(
             f"{what}, median",
-            *(f"{statistics.median(swum.efficiency for swum in row):.1%}" for row in others),
+            *(f"{statistics.median(swum.relative_thrust for swum in row):.1%}" for row in others),
         )
         table.add_row(
-            f"{what}, worst", *(f"{min(swum.efficiency for swum in row):.1%}" for row in others)
+            f"{what}, worst",
+            *(f"{min(swum.relative_thrust for swum in row):.1%}" for row in others),
         )
 
     def of_all(name: str, figure: "Callable[[list[Swum]], str]") -> None:

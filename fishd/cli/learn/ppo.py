@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fishd.learning.train.jobs import Job, Outcome
 
 IMPLAUSIBLE = 1.03
-"""Efficiencies surely above this are an error of measurement: the best square wave is optimal."""
+"""Largest relative thrust that can be true; above it the measurement is wrong."""
 AS_IT_BEGAN = "with --resume, which goes on as the run began"
 
 
@@ -182,8 +182,8 @@ def _job(
     # The inputs are scaled by the plant, and fishd's is most likely meant.
     if running and (other := other_plant(config, plant)):
         click.echo(
-            "fishctl: careful: scales and efficiency are made for another plant than that of the "
-            f"fishd that runs: {other}",
+            "fishctl: careful: scales and relative thrust are made for another plant than "
+            f"that of the fishd that runs: {other}",
             err=True,
         )
     return Job(
@@ -254,7 +254,7 @@ def report(outcome: "Outcome", job: "Job") -> int:
     if found := outcome.best_evaluation:
         click.echo(f"best: {described(found).strip()}")
         off = found.error / found.thrust if found.error else 0.0
-        if found.efficiency * (1.0 - off) > IMPLAUSIBLE:
+        if found.relative_thrust * (1.0 - off) > IMPLAUSIBLE:
             click.echo(
                 "careful: that is more than the best square wave of the configured plant; the fish "
                 "is another one, or F_x is not calibrated, or it drifts"
@@ -288,7 +288,7 @@ def _train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) 
         ("latest", [outcome.latest_evaluation for outcome in outcomes]),
         ("best", [outcome.best_evaluation for outcome in outcomes]),
     ):
-        shares = [evaluation.efficiency for evaluation in evaluations if evaluation]
+        shares = [evaluation.relative_thrust for evaluation in evaluations if evaluation]
         if shares:
             click.echo(
                 f"{name} policies of {len(shares)} seeds: median {statistics.median(shares):.1%} "

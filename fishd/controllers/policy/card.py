@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from fishd.core.errors import PolicyError
-from fishd.core.files import SETTINGS
+from fishd.core.files import SETTINGS, with_current_names
 from fishd.core.schema import Problem, convert, nested_too_deeply, note, spelled, unit
 from fishd.core.signals import Observation
 
@@ -178,8 +178,11 @@ class Provenance(Struct, frozen=True, kw_only=True):
     """The fish of the configuration: the one that swam, or that the scales are made for."""
     libraries: dict[str, str]
     """Versions of what trained it."""
-    efficiency: float | None = None
-    """Thrust in a deterministic evaluation, over that of the best square wave; None if unknown."""
+    relative_thrust: float | None = None
+    """Share of the best square wave's thrust in a deterministic evaluation; None if unknown.
+
+    A sealed file of an older version has it under the key `efficiency`.
+    """
     frequency: float | None = None
     """Tail-beat frequency in that evaluation [Hz]."""
     note: str = ""
@@ -259,6 +262,8 @@ def decode(text: str) -> Card:
         raise PolicyError(
             f"its card has format {spelled(found)[:60]}; this fishd reads format {FORMAT}{advice}"
         )
+    if "provenance" in data:
+        data["provenance"] = with_current_names(data["provenance"])
     try:
         card = convert(data, Card)
     except Problem as problem:

@@ -60,7 +60,7 @@ class Standing(Struct, frozen=True, kw_only=True):
     """Mean |φ_c| over the rms of φ_c: square 1, sine 0.900, triangle 0.866."""
     thrusts: list[float]
     """Of each run [N]."""
-    efficiency: float | None = None
+    relative_thrust: float | None = None
     """Thrust over that of the best square wave, which is known of a simulated fish only."""
     faults: list[str] = []
     """Why runs ended in mode fault, if any did."""
@@ -163,7 +163,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         thrust=fmean(thrusts),
         error=error_of_mean(thrusts),
         thrusts=thrusts,
-        efficiency=fmean(report.efficiency for report in reports),
+        relative_thrust=fmean(report.relative_thrust for report in reports),
         frequency=fmean(report.frequency for report in reports),
         fullness=fmean(report.fullness for report in reports),
         squareness=fmean(report.squareness for report in reports),

@@ -25,7 +25,7 @@ def draw(
 ) -> None:
     """Command, fin and force at the end of each contestant's run, and a bar of its result.
 
-    That is its efficiency, or, of a fish that could only be measured, its thrust.
+    That is its relative thrust, or, of a fish that could only be measured, its thrust.
     amplitude: Φ [rad]; unit: of the forces
     Raises `FishdError` where the file cannot be made, and `MissingPackage`.
     """
@@ -37,14 +37,14 @@ def draw(
         forces = [1e3 * force for trace in traces for force in trace.thrust]
         limits = min(0.0, *forces) - 4.0, 1.15 * max(0.0, *forces) + 1.0
         axes[0][1].set_title("force", fontweight="normal")
-        axes[0][2].set_title("efficiency" if simulated else "thrust", fontweight="normal")
+        axes[0][2].set_title("relative thrust" if simulated else "thrust", fontweight="normal")
         for (left, middle, right), standing, trace in zip(axes, standings, traces, strict=True):
             shown = _from_upward_reversal(trace)
             left.set_title(standing.contestant)
             _draw_angles(left, shown, amplitude)
             _draw_force(middle, standing, shown, limits, unit)
             if simulated:
-                _draw_efficiency(right, standing)
+                _draw_relative_thrust(right, standing)
             else:
                 _draw_thrust(right, standing, most)
             _describe(right, standing, unit)
@@ -98,10 +98,10 @@ def _draw_force(
     axis.set_ylabel(f"$F_x$ (m{unit})")
 
 
-def _draw_efficiency(axis: Any, standing: Standing) -> None:
-    shares = [100.0 * run.efficiency for run in standing.runs]
+def _draw_relative_thrust(axis: Any, standing: Standing) -> None:
+    shares = [100.0 * run.relative_thrust for run in standing.runs]
     value = sum(shares) / len(shares)
-    label = "efficiency" + _of_runs(", mean", standing)
+    label = "relative thrust" + _of_runs(", mean", standing)
     whisker = _of_runs("lowest to highest", standing)
     _draw_bar(axis, label, value, value - min(shares), max(shares) - value, whisker)
     axis.set_xlim(0.0, max(105.0, 1.02 * max(shares)))

@@ -21,7 +21,7 @@ class Swum(Struct, frozen=True, kw_only=True):
     fish: str
     overrides: tuple[str, ...]
     """The keys in which it differs."""
-    efficiency: float
+    relative_thrust: float
     """Thrust over that of this fish's own best square wave."""
     thrust: float
     """[N]"""
@@ -45,13 +45,13 @@ class Surveyed(Struct, frozen=True, kw_only=True):
 
     @property
     def median(self) -> float:
-        """Of the efficiencies."""
-        return median(swum.efficiency for swum in self.fish)
+        """Of the relative thrusts."""
+        return median(swum.relative_thrust for swum in self.fish)
 
     @property
     def worst(self) -> Swum:
         """On the fish that it is worst on."""
-        return min(self.fish, key=lambda swum: swum.efficiency)
+        return min(self.fish, key=lambda swum: swum.relative_thrust)
 
 
 class Reversals:
@@ -112,7 +112,7 @@ def survey(
                 Swum(
                     fish=fish.name,
                     overrides=fish.overrides,
-                    efficiency=report.efficiency,
+                    relative_thrust=report.relative_thrust,
                     thrust=report.mean_thrust,
                     frequency=report.frequency,
                     shaken=reversals.longest(1.5 * config.tick),

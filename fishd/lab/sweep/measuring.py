@@ -108,7 +108,7 @@ def swim(
         thrust=means.thrust,
         error=error,
         beat_frequency=means.frequency,
-        efficiency=means.thrust / best.thrust if best.thrust > 0.0 else None,
+        relative_thrust=means.thrust / best.thrust if best.thrust > 0.0 else None,
         fin_amplitude=means.fin_amplitude,
         power=means.power,
         thrust_per_watt=means.thrust / watts,

@@ -16,7 +16,7 @@ class Result(Struct, frozen=True):
     """Half of its 95 % interval [N]; None where it is not known."""
     beat_frequency: float = 0.0
     """Tail beats per second; 0 where the tail does not beat [Hz]."""
-    efficiency: float | None = None
+    relative_thrust: float | None = None
     """Thrust over that of the best square wave; of a simulated fish."""
     fin_amplitude: float | None = None
     """Largest fin angle of a half beat, mean [rad]; of a simulated fish."""

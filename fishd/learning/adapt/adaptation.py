@@ -157,7 +157,7 @@ class Adaptation:
             return
         worst = "" if found.worst is None else f", {found.worst:.1%} on the worst tried"
         cloud = f"{len(state.fitted.cloud)} fish of the fit's errors"
-        self._done(f"training on {cloud}: {found.efficiency:.1%} in simulation{worst}")
+        self._done(f"training on {cloud}: {found.relative_thrust:.1%} in simulation{worst}")
 
     def gaits(self, state: State) -> list[Gait]:
         """Who takes part."""
@@ -258,4 +258,4 @@ def _truth(config: Config, rig: Rig, gait: Gait) -> dict[str, float]:
     if rig.source != "simulation":
         return {}
     swum = simulate(config, gait.controller, gait.parameters)
-    return {"true_thrust": swum.mean_thrust, "true_efficiency": swum.efficiency}
+    return {"true_thrust": swum.mean_thrust, "true_relative_thrust": swum.relative_thrust}

@@ -93,7 +93,7 @@ def practise(
     return Trained(
         steps=display.steps,
         folder=best.folder.name,
-        efficiency=found.efficiency,
+        relative_thrust=found.relative_thrust,
         worst=found.worst,
     )
 

@@ -1,7 +1,6 @@
 """The report of an adaptation: one picture, and one page that needs no network."""
 
 import base64
-import csv
 import math
 from collections.abc import Sequence
 from html import escape
@@ -16,7 +15,7 @@ from fishd.lab.identification.formatting import format_estimate
 from fishd.lab.identification.result import Estimate
 from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State
 from fishd.learning.adapt.verdict import NAMES, SQUARE, spelled
-from fishd.learning.run_folder.tables import EVALUATIONS
+from fishd.learning.run_folder.tables import read_evaluations
 from fishd.virtual.plant.optimum import square_wave
 
 _COLOURS = {"policy": BLUE, "swing": GREEN, SQUARE: ORANGE}
@@ -34,20 +33,22 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     """
     picture = run.path / PICTURE
     trained = run.state.trained.folder if run.state.trained else ""
-    evaluations = run.path / (trained or TRAINING) / EVALUATIONS
-    draw(run.state, evaluations, amplitude, picture)
+    draw(run.state, run.path / (trained or TRAINING), amplitude, picture)
     run.write(PAGE, page(run.state, picture.read_bytes(), again))
     return picture, run.path / PAGE
 
 
-def draw(state: State, evaluations: Path, amplitude: float, path: Path) -> None:
-    """Fit, search, training and comparison, a panel each."""
+def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
+    """Draw fit, search, training and comparison, a panel each.
+
+    folder: that of the training
+    """
     assert state.fitted
     with drawn(path, (10.0, 7.0)) as figure:
         (fit, search), (training, contest) = figure.subplots(2, 2)
         _draw_fit(fit, state.fitted)
         _draw_search(search, state, amplitude)
-        _draw_training(training, evaluations)
+        _draw_training(training, folder)
         _draw_contest(contest, state)
 
 
@@ -89,32 +90,24 @@ def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     axis.legend(loc="lower right")
 
 
-def _draw_training(axis: Any, evaluations: Path) -> None:
+def _draw_training(axis: Any, folder: Path) -> None:
     """The policy on the identified fish, and on the worst of its cloud."""
     axis.set_title("training in simulation")
     axis.set_xlabel("steps")
     axis.set_ylabel("% of the best square wave")
-    rows = _rows(evaluations)
-    if not rows:
+    evaluations = read_evaluations(folder)
+    if not evaluations:
         axis.text(0.5, 0.5, "no evaluation", ha="center", transform=axis.transAxes)
         return
-    steps = [float(row["steps"]) for row in rows]
-    for column, label, colour in (
-        ("efficiency", "identified fish", BLUE),
-        ("worst", "worst fish tried", PURPLE),
+    steps = [evaluation.steps for evaluation in evaluations]
+    for shares, label, colour in (
+        ([evaluation.relative_thrust for evaluation in evaluations], "identified fish", BLUE),
+        ([evaluation.worst for evaluation in evaluations], "worst fish tried", PURPLE),
     ):
-        values = [100.0 * float(row[column] or "nan") for row in rows]
+        values = [100.0 * (math.nan if share is None else share) for share in shares]
         axis.plot(steps, values, color=colour, marker=".", label=label)
     axis.set_ylim(0.0, 105.0)
     axis.legend(loc="lower right")
-
-
-def _rows(evaluations: Path) -> list[dict[str, str]]:
-    try:
-        with evaluations.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
-    except OSError:
-        return []
 
 
 def _draw_contest(axis: Any, state: State) -> None:
@@ -157,8 +150,8 @@ def page(state: State, picture: bytes, again: str) -> str:
         f'<img alt="fit, search, training, comparison" src="data:image/png;base64,{image}">',
         "<h2>In the tank</h2>",
         _table(*_contenders(state)),
-        "<p>Efficiencies are over the best square wave that the search has found; their intervals "
-        "hold together in 95 % of cases.</p>",
+        "<p>Relative thrust is the share of that of the best square wave that the search has "
+        "found; the intervals hold together in 95 % of cases.</p>",
         "<h2>The fish</h2>",
         _table(("", "value", "95 % interval", "unit"), _estimates(state.fitted)),
         *([f"<h2>Careful</h2><ul>{''.join(map(_item, remarks))}</ul>"] if remarks else []),
@@ -179,18 +172,18 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Head and rows of the table of who was measured."""
     assert state.verdict
     known = any(one.true_thrust is not None for one in state.contenders)
-    head = ("gait", "thrust", "Hz", "efficiency", *(("true thrust",) if known else ()))
+    head = ("gait", "thrust", "Hz", "relative thrust", *(("true thrust",) if known else ()))
     rows = []
     for one in state.contenders:
         share = state.verdict.others.get(one.name)
-        efficiency = "1"
+        relative_thrust = "1"
         if share:
-            efficiency = spelled(share)
+            relative_thrust = spelled(share)
         row = [
             NAMES[one.name] + (", the winner" if one.name == state.verdict.winner else ""),
             f"{1e3 * one.thrust:.2f} ± {1e3 * one.error:.2f} mN",
             f"{one.frequency:.3f}",
-            efficiency,
+            relative_thrust,
         ]
         if known:
             true = one.true_thrust

@@ -75,7 +75,7 @@ class Trained(Struct, frozen=True, kw_only=True):
     """Of all trainings."""
     folder: str = ""
     """Of the one that it is from."""
-    efficiency: float | None = None
+    relative_thrust: float | None = None
     """Over the best square wave of the identified fish."""
     worst: float | None = None
     """The same, of the worst fish of the cloud that were tried."""
@@ -103,20 +103,20 @@ class Contender(Struct, frozen=True, kw_only=True):
     """On the identified fish, in simulation [N]."""
     true_thrust: float | None = None
     """Of a simulated fish [N]."""
-    true_efficiency: float | None = None
+    true_relative_thrust: float | None = None
     """That over the thrust of the best of all square waves."""
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
-    """Who has won, and by how much; efficiencies are over the best square wave found."""
+    """Who has won, and by how much; relative thrusts are over the best square wave found."""
 
     winner: str
-    efficiency: float
+    relative_thrust: float
     low: float
-    """The 95 % interval of the winner's efficiency holds whoever of them all has won."""
+    """The 95 % interval of the winner's relative thrust holds whoever of them all has won."""
     high: float
     others: dict[str, tuple[float, float, float]]
-    """Of each one but the square wave: efficiency, and its interval."""
+    """Of each one but the square wave: relative thrust, and its interval."""
     told: bool
     """Is it the winner by measurement alone? Else others did as well, as far as that tells."""
     claim: str
@@ -188,7 +188,8 @@ def _read(path: Path) -> State:
     if not path.exists():
         return State()
     try:
-        return msgspec.json.decode(files.read(path, files.SETTINGS, "an adaptation"), type=State)
+        data = msgspec.json.decode(files.read(path, files.SETTINGS, "an adaptation"))
+        return msgspec.convert(files.with_current_names(data), State)
     except (FileProblem, msgspec.MsgspecError) as error:
         raise ConfigError(
             f"{path}: not as this fishd ({__version__}) writes it: {error}; give another --folder"

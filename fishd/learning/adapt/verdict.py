@@ -1,4 +1,4 @@
-"""Who has won, and the interval of its efficiency."""
+"""Who has won, and the interval of its relative thrust."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
     Where the measurement does not tell others from it, that one of them wins which thrusts most on
     the identified fish.
 
-    Efficiencies are thrusts over that of the square wave. Their intervals are so wide that all of
+    Relative thrusts are shares of that of the square wave. Their intervals are so wide that all of
     them hold together in 95 % of cases (Bonferroni): that of the winner is as good for having been
     chosen. The square wave itself has 1, without an error.
 
@@ -41,10 +41,10 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
         if first.thrust - one.thrust <= wider * math.hypot(first.error, one.error)
     ]
     winner = max(level, key=lambda one: one.expected)
-    efficiency, low, high = shares.get(winner.name, (1.0, 1.0, 1.0))
+    relative_thrust, low, high = shares.get(winner.name, (1.0, 1.0, 1.0))
     return Verdict(
         winner=winner.name,
-        efficiency=efficiency,
+        relative_thrust=relative_thrust,
         low=low,
         high=high,
         others=shares,
@@ -55,7 +55,7 @@ def judge(contenders: Sequence[Contender]) -> Verdict:
 
 
 def _share(one: Contender, square: Contender, wider: float) -> tuple[float, float, float]:
-    """An efficiency with its interval, by Fieller's theorem for independent errors.
+    """A relative thrust with its interval, by Fieller's theorem for independent errors.
 
     (Fieller, "Some problems in interval estimation", J. R. Stat. Soc. B 16 (1954) 175.)
     """
@@ -64,7 +64,7 @@ def _share(one: Contender, square: Contender, wider: float) -> tuple[float, floa
     if not b > 0.0 or vb >= b * b:
         raise FishdError(
             f"the best square wave found thrusts {1e3 * b:.2f} ± {1e3 * square.error:.2f} mN: too "
-            "little to be told from nothing, so no efficiency is known"
+            "little to be told from nothing, so no relative thrust is known"
         )
     middle, scale = a * b, b * b - vb
     half = math.sqrt(max(0.0, middle**2 - (a * a - va) * scale))
@@ -89,7 +89,7 @@ def _untold(names: Sequence[str]) -> str:
 
 
 def spelled(share: tuple[float, float, float]) -> str:
-    """An efficiency with its interval."""
+    """A relative thrust with its interval."""
     value, low, high = share
     return f"{percent(value)} [{percent(low)}, {percent(high)}]"
 

@@ -54,7 +54,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     """
     error: float | None = None
     """Half of the 95 % interval of a measured thrust [N]; a true one needs none."""
-    efficiency: float
+    relative_thrust: float
     """Thrust over that of the configured fish's best square wave."""
     frequency: float
     """Tail beats per second; 0 where the tail does not beat [Hz]."""
@@ -63,14 +63,14 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     stalled: bool
     """It does not swim: it holds still, or nearly so, or reverses in nearly every tick."""
     worst: float | None = None
-    """Lowest efficiency on this and on other fish, where others were tried."""
+    """Lowest relative thrust on this and on other fish, where others were tried."""
     best: bool = False
     """It swims, and is the best so far."""
 
     @property
     def merit(self) -> float:
         """The figure that the best policy is chosen by."""
-        return self.efficiency if self.worst is None else self.worst
+        return self.relative_thrust if self.worst is None else self.worst
 
 
 def judge(
@@ -114,7 +114,7 @@ def in_simulation(
     )
     return Evaluation(
         thrust=float(found.mean_thrust),
-        efficiency=float(found.efficiency),
+        relative_thrust=float(found.relative_thrust),
         frequency=float(found.frequency),
         fullness=float(found.fullness),
         stalled=is_stalled(found.frequency, found.fullness, config.tick),
@@ -124,7 +124,7 @@ def in_simulation(
 def worst_of_others(
     config: Config, decide: Decide, settings: TrainingSettings, camera: Camera | None = None
 ) -> float:
-    """Lowest efficiency on fish of the randomisation, each over its own optimum.
+    """Lowest relative thrust on fish of the randomisation, each over its own optimum.
 
     At the edges each begins with rapid reversals, which some policies never leave. In the range
     they swim as `ppo` does, with the shortest dwell; who insists on less counts as worth nothing.
@@ -142,7 +142,7 @@ def _at_edge(
     seed: int,
 ) -> float:
     fish, found = at_edge(config, settings.randomisation, seed), settings.evaluation
-    return judge(fish, _shaken(decide, config), found.seconds, found.settle, camera).efficiency
+    return judge(fish, _shaken(decide, config), found.seconds, found.settle, camera).relative_thrust
 
 
 def _in_range(
@@ -160,7 +160,7 @@ def _in_range(
         return limit.apply(decide(observation, stack), observation.dt)
 
     report = judge(fish, limited, found.seconds, found.settle, camera)
-    return 0.0 if report.fallback else report.efficiency
+    return 0.0 if report.fallback else report.relative_thrust
 
 
 def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:

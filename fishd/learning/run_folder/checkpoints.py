@@ -191,7 +191,8 @@ def read_card(checkpoint: Path) -> Card:
 def read_state(checkpoint: Path) -> State:
     """Raises `CheckpointError`."""
     try:
-        return msgspec.json.decode(_text(checkpoint / STATE), type=State)
+        data = msgspec.json.decode(_text(checkpoint / STATE))
+        return msgspec.convert(files.with_current_names(data), State)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{checkpoint / STATE}: {_brief(error)}; {_ADVICE}") from None
 

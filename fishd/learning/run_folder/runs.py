@@ -148,7 +148,7 @@ def make_card(
             settings=msgspec.to_builtins(settings),
             plant=msgspec.to_builtins(config.plant),
             libraries={"python": platform.python_version(), **libraries},
-            efficiency=evaluation.efficiency if evaluation else None,
+            relative_thrust=evaluation.relative_thrust if evaluation else None,
             frequency=evaluation.frequency if evaluation else None,
             note=note,
         ),

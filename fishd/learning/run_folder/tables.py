@@ -9,7 +9,13 @@ from typing import Any
 import msgspec
 
 from fishd.core.errors import ConfigError
-from fishd.core.files import FileProblem, NoFile, write_atomically
+from fishd.core.files import (
+    FORMER_NAMES,
+    FileProblem,
+    NoFile,
+    with_current_names,
+    write_atomically,
+)
 from fishd.lab import tables
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder.checkpoints import CheckpointError
@@ -19,7 +25,7 @@ PROGRESS = {
     "tank_time": "tank/time",
     "reward": "rollout/reward",
     "thrust": "rollout/thrust",
-    "efficiency": "rollout/efficiency",
+    "relative_thrust": "rollout/relative_thrust",
     "frequency": "rollout/frequency",
     "fullness": "rollout/fullness",
     "lost": "tank/lost",
@@ -47,7 +53,7 @@ SUMMARY = (
     "best_lowest",
     "best_highest",
 )
-"""Columns of seeds.csv: efficiencies of the current policies, and of each seed's best so far."""
+"""Columns of seeds.csv: relative thrust of the current policies, and of each seed's best so far."""
 
 
 class Table(tables.Table):
@@ -61,6 +67,7 @@ class Table(tables.Table):
         """
         try:
             head, *rows = tables.read(self.path)
+            head = [FORMER_NAMES.get(name, name) for name in head]
             at = head.index("steps")
             complete = [row for row in rows if len(row) == len(head)]
             kept = [dict(zip(head, row, strict=True)) for row in complete if int(row[at]) <= steps]
@@ -80,7 +87,10 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     path = folder / EVALUATIONS
     try:
         head, *rows = tables.read(path)
-        given = [{key: text for key, text in zip(head, row, strict=True) if text} for row in rows]
+        given = [
+            with_current_names({key: text for key, text in zip(head, row, strict=True) if text})
+            for row in rows
+        ]
         return msgspec.convert(given, list[Evaluation], strict=False)
     except NoFile:
         return []
@@ -91,9 +101,9 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
 
 
 def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
-    """Efficiency of the best policy until each evaluation; one that stalls does not count."""
+    """Relative thrust of the best policy until each evaluation; one that stalls does not count."""
     best = 0.0
-    return [best := one.efficiency if one.best else best for one in evaluations]
+    return [best := one.relative_thrust if one.best else best for one in evaluations]
 
 
 def write_summary(path: Path, folders: Sequence[Path]) -> None:
@@ -102,7 +112,7 @@ def write_summary(path: Path, folders: Sequence[Path]) -> None:
     for folder in folders:
         evaluations = read_evaluations(folder)
         for one, best in zip(evaluations, best_so_far(evaluations), strict=True):
-            at[one.steps].append((one.efficiency, best))
+            at[one.steps].append((one.relative_thrust, best))
     lines: list[Sequence[Any]] = [SUMMARY]
     for steps, pairs in sorted(at.items()):
         columns = list(zip(*pairs, strict=True))

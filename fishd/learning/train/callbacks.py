@@ -66,7 +66,7 @@ class RolloutCallback(BaseCallback):
                 "run it on a faster or less busy machine, nearer to fishd"
             )
         actions, thrust = np.array(self._actions), float(np.mean(self._thrusts))
-        efficiency = thrust / self._env.best_thrust
+        relative_thrust = thrust / self._env.best_thrust
         frequency = beat_frequency(actions, self._env.link.tick)
         for name, value in (
             ("tank/lost", lost),
@@ -74,13 +74,13 @@ class RolloutCallback(BaseCallback):
             ("tank/paused", self._paused),
             ("rollout/reward", float(np.mean(self._rewards))),
             ("rollout/thrust", thrust),
-            ("rollout/efficiency", efficiency),
+            ("rollout/relative_thrust", relative_thrust),
             ("rollout/frequency", frequency),
             ("rollout/fullness", float(np.mean(np.abs(actions)))),
         ):
             self.logger.record(name, value)
         self._lost, self._blind = self._env.lost, self._env.blind
-        self._display.explored(thrust, efficiency, frequency)
+        self._display.explored(thrust, relative_thrust, frequency)
 
     @property
     def _buffer(self) -> Rollout:

@@ -29,7 +29,7 @@ class Display:
     def step(self, tank_time: float) -> None:
         """One more control step is done; tank_time: [s]."""
 
-    def explored(self, thrust: float, efficiency: float, frequency: float) -> None:
+    def explored(self, thrust: float, relative_thrust: float, frequency: float) -> None:
         """A rollout is done, with these means [N], [Hz]."""
 
     def evaluated(self, evaluation: "Evaluation") -> None:
@@ -62,7 +62,7 @@ class LineDisplay(Display):
 
 
 class BarDisplay(Display):
-    """A progress bar with thrust, efficiency, frequency, tank time and time left."""
+    """A progress bar with thrust, relative thrust, frequency, tank time and time left."""
 
     def __init__(self) -> None:
         from rich.progress import (
@@ -101,10 +101,10 @@ class BarDisplay(Display):
         """Advance by one."""
         self._progress.update(self._task, advance=1, tank=minutes(tank_time))
 
-    def explored(self, thrust: float, efficiency: float, frequency: float) -> None:
+    def explored(self, thrust: float, relative_thrust: float, frequency: float) -> None:
         """Show how the fish swam with exploration, until the first evaluation."""
         if not self._was_evaluated:
-            self._progress.update(self._task, figures=figures(thrust, efficiency, frequency))
+            self._progress.update(self._task, figures=figures(thrust, relative_thrust, frequency))
 
     def evaluated(self, evaluation: "Evaluation") -> None:
         """Show how it swims without exploration."""
@@ -150,13 +150,15 @@ def summary(evaluation: "Evaluation") -> str:
     if evaluation.stalled:
         return "stalled: it does not swim"
     error = evaluation.error
-    return figures(evaluation.thrust, evaluation.efficiency, evaluation.frequency, error)
+    return figures(evaluation.thrust, evaluation.relative_thrust, evaluation.frequency, error)
 
 
-def figures(thrust: float, efficiency: float, frequency: float, error: float | None = None) -> str:
+def figures(
+    thrust: float, relative_thrust: float, frequency: float, error: float | None = None
+) -> str:
     """`25.1 mN  97.8%  1.67 Hz`, or `25.1 ± 0.3 mN  97.8%  1.67 Hz`."""
     known = "" if error is None else f" ± {error * 1e3:.1f}"
-    return f"{thrust * 1e3:.1f}{known} mN  {efficiency:.1%}  {frequency:.2f} Hz"
+    return f"{thrust * 1e3:.1f}{known} mN  {relative_thrust:.1%}  {frequency:.2f} Hz"
 
 
 def minutes(seconds: float) -> str:

@@ -88,7 +88,7 @@ class RunRecorder:
         logger.record("tank/steps", self.steps)
         logger.record("tank/time", self._env.tank_time)
         if self._job.settings.evaluation.every and self.latest:
-            for name in ("thrust", "efficiency", "frequency", "fullness", "stalled"):
+            for name in ("thrust", "relative_thrust", "frequency", "fullness", "stalled"):
                 logger.record(f"evaluation/{name}", float(getattr(self.latest, name)))
         logger.dump(self.steps)
 

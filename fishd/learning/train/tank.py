@@ -93,7 +93,7 @@ class TankEvaluations:
             swam=one.swam,
             thrust=thrust,
             error=None if one.stalled else self._candidates.error(one),
-            efficiency=thrust / self._env.best_thrust,
+            relative_thrust=thrust / self._env.best_thrust,
             frequency=one.frequency,
             fullness=one.fullness,
             stalled=one.stalled,

@@ -259,7 +259,7 @@ class Training:
         found = evaluation.in_simulation(job.config, policy, job.settings.evaluation, camera)
         if job.settings.evaluation.others:
             others = evaluation.worst_of_others(job.config, policy, job.settings, camera)
-            found = replace(found, worst=min(others, found.efficiency))
+            found = replace(found, worst=min(others, found.relative_thrust))
         return replace(found, steps=steps, policy=steps, tank_time=env.tank_time)
 
 

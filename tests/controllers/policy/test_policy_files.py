@@ -48,6 +48,14 @@ class Trap:
         return os.mkdir, (str(self.trace),)
 
 
+def test_a_sealed_file_of_an_older_fishd_still_tells_its_relative_thrust() -> None:
+    older = Path(__file__).parents[3] / "docs/figures/policies/amplitude-0.42.onnx"
+    assert b'"efficiency":' in older.read_bytes()
+    share = file.read(older).card.provenance.relative_thrust
+    assert share is not None
+    assert 0.9 < share < 1.0
+
+
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) -> None:
     path = write(tmp_path, pickle.dumps(Trap(tmp_path / "trace"), protocol))

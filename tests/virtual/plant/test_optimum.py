@@ -179,5 +179,5 @@ def test_swinging_control_has_the_reference_efficiency_at_every_threshold(
         amplitude, threshold = float(row["Phi_rad"]), float(row["C"])
         if amplitude not in best:
             best[amplitude] = best_square_wave(p, amplitude).thrust
-        efficiency = swing_thrust(p, amplitude, threshold) / best[amplitude]
-        assert efficiency == pytest.approx(float(row["efficiency"]), abs=0.002), row
+        relative_thrust = swing_thrust(p, amplitude, threshold) / best[amplitude]
+        assert relative_thrust == pytest.approx(float(row["efficiency"]), abs=0.002), row

@@ -164,4 +164,4 @@ def test_its_best_square_wave_is_what_it_swims() -> None:
     config = load(None, ["plant.model=good"])
     report = simulate(config, "square", {"frequency": 1.0}, 5.0, 1.0)
     assert report.best_square_thrust == 0.01
-    assert report.efficiency == pytest.approx(1.0)
+    assert report.relative_thrust == pytest.approx(1.0)
