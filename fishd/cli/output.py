@@ -1,7 +1,7 @@
 """How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, TypeVar
 
@@ -21,9 +21,10 @@ def echo(message: Any = "", *, err: bool = False, nl: bool = True) -> None:
     click.echo(text.block(str(message), _MOST), err=err, nl=nl)
 
 
-def echo_rows(rows: Iterable[tuple[str, str]]) -> None:
+def echo_rows(rows: Sequence[tuple[str, str]]) -> None:
     """Print what each thing is called, and what it is, in two columns."""
-    echo("\n".join(f"{name:<12}{what}" for name, what in rows))
+    width = max(12, *(len(name) + 1 for name, _ in rows))
+    echo("\n".join(f"{name:<{width}}{what}" for name, what in rows))
 
 
 def print_json(value: Any) -> None:
