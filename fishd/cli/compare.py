@@ -115,7 +115,8 @@ def compare(
     wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
     rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
     simulated camera, on a robot by a running fishd-camera. ± is the 95 % interval of the mean
-    thrust of all runs, from how they differ and, on a robot, from the error of each measurement.
+    thrust of all runs, from how they differ and, on a robot, from the error of each measurement
+    and of the sensor's calibration, which is the same fraction of all thrusts.
     The verdict names those that may be the best one, by intervals that hold together in 95 % of
     cases, and chooses the simplest of them.
     |φ_c|/Φ is the mean size of the command, square its mean size over its rms: square wave 1, sine
@@ -259,6 +260,12 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
             echo(said)
         if verdict:
             echo(f"Verdict: {verdict.sentence}.")
+    measured = [standing for standing in standings if not standing.runs]
+    if measured:
+        from fishd.lab.error_budget import unknown_calibration
+
+        if line := unknown_calibration(measured[0].calibration_ci95, outcome.unit):
+            echo(f"fishctl: {line}", err=True)
     for one, why, swum in outcome.left_out:
         when = f" after {swum} of {runs} runs, which stand in the table" if swum else ""
         echo(f"fishctl: {one.label}: left out{when}: {why}", err=True)
@@ -298,18 +305,20 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
     heads += ["lowest – highest"] if several else []
     metered = all(standing.thrust_per_watt is not None for standing in standings)
     costs = ["W", f"m{unit}/W"] if metered else []
-    for head in (*heads, f"m{unit}", *costs, "Hz", "|φ_c|/Φ", "square"):
+    parts = [] if simulated else ["statistical", "calibration"]
+    for head in (*heads, f"m{unit}", *parts, *costs, "Hz", "|φ_c|/Φ", "square"):
         table.add_column(head, justify="right", no_wrap=True)
     for standing in standings:
         cells = [f"{standing.relative_thrust:.1%}"] if simulated else []
         if several:
             shares = [run.relative_thrust for run in standing.runs]
             cells.append(f"{min(shares):.1%} – {max(shares):.1%}")
-        error = "" if standing.error is None else f" ± {standing.error * 1e3:.2f}"
+        error = _interval(standing.error, standing.total_ci95)
         table.add_row(
             standing.contestant,
             *cells,
             f"{standing.thrust * 1e3:.2f}{error}",
+            *([] if simulated else _parts(standing)),
             *(_costs(standing) if metered else []),
             f"{standing.frequency:.3f}",
             f"{standing.fullness:.3f}",
@@ -320,9 +329,22 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
 
 def _costs(standing: "Standing") -> list[str]:
     """Power, and what each watt gave."""
-    gave, error = standing.thrust_per_watt or 0.0, standing.thrust_per_watt_error
-    interval = "" if error is None else f" ± {error * 1e3:.2f}"
+    gave = standing.thrust_per_watt or 0.0
+    interval = _interval(standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95)
     return [f"{standing.power or 0.0:.3f}", f"{gave * 1e3:.2f}{interval}"]
+
+
+def _interval(statistical_ci95: float | None, total_ci95: float | None) -> str:
+    """The error of a mean, with that of the calibration where it is known, in thousandths."""
+    whole = statistical_ci95 if total_ci95 is None else total_ci95
+    return "" if whole is None else f" ± {whole * 1e3:.2f}"
+
+
+def _parts(standing: "Standing") -> list[str]:
+    """What the interval of a measured thrust is made of."""
+    part = standing.calibration_ci95
+    calibration = "unknown" if part is None else f"± {part * 1e3:.2f}" if part else "exact"
+    return [f"± {(standing.error or 0.0) * 1e3:.2f}", calibration]
 
 
 def _of_simulated(standings: "list[Standing]") -> str | None:

@@ -1,5 +1,7 @@
 """The verb that finds a controller's thrust with its interval, on a live or a simulated fish."""
 
+import math
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +14,6 @@ from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, jso
 from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
 from fishd.config import load
-from fishd.core import text
 from fishd.core.console import INTERRUPTED, power_words
 from fishd.core.interruption import interrupted_once
 
@@ -115,6 +116,8 @@ def _measure(
         print_json(summary(found, rig.tick))
     else:
         echo(_line(found))
+    for line in _careful(found):
+        echo(f"fishctl: {line}", err=True)
     if found.remark:
         echo(f"fishctl: {found.remark}; measure again with a longer --settle", err=True)
     if picture:
@@ -125,18 +128,39 @@ def _measure(
 
 
 def _line(found: "Measured") -> str:
+    from fishd.lab import error_budget
+
     what = f"{found.controller} {spelled(dict(found.parameters))}".rstrip()
-    thrust = f"{found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} m{text.quoted(found.unit)}"
+    thrust = error_budget.spelled(
+        found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
+    )
     line = f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"
     return line + _power(found)
 
 
+def _careful(found: "Measured") -> "Iterator[str]":
+    """Yield what the interval does not cover, or covers only by a guess."""
+    from fishd.lab.error_budget import unknown_calibration
+
+    if line := unknown_calibration(found.calibration_ci95, found.unit):
+        yield line
+    if found.rotation:
+        hidden = 1.0 - math.cos(found.rotation)
+        yield (
+            f"F_x follows F_y as if the sensor were turned by {math.degrees(found.rotation):+.1f}° "
+            f"against the fish: that hides {hidden:.2%} of the thrust, which the interval covers"
+        )
+
+
 def _power(found: "Measured") -> str:
     """What the servo took, where that is known, and what a watt of it gave."""
+    from fishd.lab import error_budget
     from fishd.lab.objective import per_watt
 
     gave, error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
     if gave is None or error is None or not found.watts:
         return ""
-    unit = f"m{text.quoted(found.unit)}"
-    return f"; {power_words(found.watts)}, {gave * 1e3:.2f} ± {error * 1e3:.2f} {unit} per W"
+    _, total = per_watt(found.thrust, found.total_ci95, found.watts, found.watts_error)
+    part = None if found.calibration_ci95 is None else found.calibration_ci95 / found.watts
+    budget = error_budget.spelled(gave, error, part, total, f"{found.unit} per W")
+    return f"; {power_words(found.watts)}, {budget}"

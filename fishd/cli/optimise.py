@@ -173,7 +173,7 @@ def _optimise(
     try:
         with interrupted_once():
             found = search.proposal()
-            optimum = optimum_of(name, measured, search, found, aim)
+            optimum = optimum_of(name, measured, search, found, aim, rig.calibration)
             if on == "simulation":
                 swum = simulate(load(file, overrides), name, {**parameters, **found.parameters})
                 truth = {"true_thrust": swum.mean_thrust, "relative_thrust": swum.relative_thrust}

@@ -11,6 +11,7 @@ from fishd.cli.output import counted, echo
 from fishd.core.console import power_words
 
 if TYPE_CHECKING:
+    from fishd.core.calibration import ForceCalibration
     from fishd.lab.optimise.aim import Aim
     from fishd.lab.optimise.least_power import LeastPower
     from fishd.lab.optimise.search import Proposal, Search
@@ -46,6 +47,17 @@ class Optimum(Struct, frozen=True):
     """[N/W]"""
     thrust_per_watt_error: float | None = None
     """Half of its 95 % interval [N/W]."""
+    calibration_ci95: float | None = None
+    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+
+    null where its uncertainty is unknown.
+    """
+    total_ci95: float | None = None
+    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    thrust_per_watt_calibration_ci95: float | None = None
+    """As `calibration_ci95`, of the thrust for each watt [N/W]."""
+    thrust_per_watt_total_ci95: float | None = None
+    """As `total_ci95`, of the thrust for each watt [N/W]."""
     thinking: float | None = None
     """How long the fish of a robot waited besides while candidates were chosen, this time [s]."""
     true_thrust: float | None = None
@@ -83,8 +95,10 @@ def optimum_of(
     search: "Search | LeastPower",
     found: "Proposal",
     aim: "Aim",
+    calibration: "ForceCalibration",
 ) -> Optimum:
-    """What a search found; measured: all that it knows of"""
+    """What a search found; measured: all that it knows of; calibration: of the force sensor"""
+    from fishd.lab.error_budget import budget
     from fishd.lab.objective import per_watt
 
     last = measured[-1]
@@ -97,6 +111,8 @@ def optimum_of(
     gives, gives_error = per_watt(thrust, error, power, power_error)
     if aim.objective == "thrust-per-watt" and aim.target is None:
         gives, gives_error = found.value, found.error
+    whole = budget(calibration, thrust, error)
+    whole_per_watt = None if gives is None else budget(calibration, gives, gives_error)
     return Optimum(
         controller=name,
         parameters=found.parameters,
@@ -112,6 +128,10 @@ def optimum_of(
         power_error=power_error,
         thrust_per_watt=gives,
         thrust_per_watt_error=gives_error,
+        calibration_ci95=whole.calibration_ci95,
+        total_ci95=whole.total_ci95,
+        thrust_per_watt_calibration_ci95=whole_per_watt and whole_per_watt.calibration_ci95,
+        thrust_per_watt_total_ci95=whole_per_watt and whole_per_watt.total_ci95,
         ticks_swum=last.swum,
         seconds=last.passed,
     )
@@ -119,17 +139,27 @@ def optimum_of(
 
 def say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
     """Show what was found; units: of the parameters, unit: of the force."""
+    from fishd.lab import error_budget
+
     for name, value in found.parameters.items():
         symbol = "" if units[name] in ("", "1") else f" {units[name]}"
         interval = f"[{found.low[name]:.4g}, {found.high[name]:.4g}]"
         echo(f"best {name} of {found.controller}: {value:.4g}{symbol} {interval}")
-    echo(f"thrust there: {found.thrust * 1e3:.2f} ± {found.error * 1e3:.2f} m{unit}")
+    thrust = error_budget.spelled(
+        found.thrust, found.error, found.calibration_ci95, found.total_ci95, unit
+    )
+    echo(f"thrust there: {thrust}")
     if found.power is not None and found.power_error is not None:
-        gives, error = found.thrust_per_watt or 0.0, found.thrust_per_watt_error or 0.0
-        echo(
-            f"power there: {found.power * 1e3:.0f} ± {found.power_error * 1e3:.0f} mW, "
-            f"{gives * 1e3:.2f} ± {error * 1e3:.2f} m{unit} per W"
+        gives = error_budget.spelled(
+            found.thrust_per_watt or 0.0,
+            found.thrust_per_watt_error or 0.0,
+            found.thrust_per_watt_calibration_ci95,
+            found.thrust_per_watt_total_ci95,
+            f"{unit} per W",
         )
+        echo(f"power there: {found.power * 1e3:.0f} ± {found.power_error * 1e3:.0f} mW, {gives}")
+    if line := error_budget.unknown_calibration(found.calibration_ci95, unit):
+        echo(f"fishctl: {line}", err=True)
     if found.target is not None and found.thrust < found.target:
         echo(f"fishctl: no parameters are known that give {found.target * 1e3:g} m{unit}", err=True)
     if found.true_thrust is not None:

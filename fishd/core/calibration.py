@@ -15,6 +15,9 @@ Scale = Annotated[float, unit("us/rad", "Change of the pulse per angle.", ge=10,
 Lowest = Annotated[float, unit("rad", "Soft limit: no angle below.", ge=-math.pi, le=0)]
 Highest = Annotated[float, unit("rad", "Soft limit: no angle above.", ge=0, le=math.pi)]
 
+Covariance = tuple[float, float, float]
+"""Variance of a row's first gain, covariance of both, and variance of the second [N²/V²]."""
+
 WORST_CONDITION = 1e5
 """A matrix of a larger condition number says the same of both forces; that of a fit is less."""
 
@@ -38,6 +41,16 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Root mean square of what the fit leaves over [N]."""
     condition: float = 0.0
     """Condition number of the fit."""
+    covariance_x: Covariance | None = None
+    """Covariance of xx and xy; null where the uncertainty of this calibration is unknown.
+
+    1.96 times the root of a variance is the half-width of a 95 % confidence interval.
+    """
+    covariance_y: Covariance | None = None
+    """Covariance of yx and yy, in the same way."""
+    load_error: float | None = None
+    """Half-width of the 95 % interval of the error that all loads share, as a fraction of a load;
+    part of both covariances, null where they are null."""
     tared: str = ""
     """When x0 and y0 were last set by a tare, ISO 8601; empty for never."""
 
@@ -47,6 +60,21 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             self.xx * vx + self.xy * vy + self.x0,
             self.yx * vx + self.yy * vy + self.y0,
         )
+
+    def thrust_ci95(self, fx: float, fy: float = 0.0) -> float | None:
+        """Return the half-width of the 95 % interval that the gains leave to a force fx [N].
+
+        The force is a difference, such as that of swimming to rest, so that no zero is in it.
+        fy: the difference of F_y at the same time [N]
+        None where the uncertainty of this calibration is unknown.
+        """
+        if self.covariance_x is None:
+            return None
+        determinant = self.xx * self.yy - self.xy * self.yx
+        vx = (self.yy * fx - self.xy * fy) / determinant
+        vy = (self.xx * fy - self.yx * fx) / determinant
+        first, both, second = self.covariance_x
+        return 1.96 * math.sqrt(max(0.0, first * vx**2 + 2.0 * both * vx * vy + second * vy**2))
 
     @property
     def untouched(self) -> bool:
@@ -65,6 +93,10 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         squares = xx * xx + xy * xy + yx * yx + yy * yy
         determinant = abs(xx * yy - xy * yx)
         return squares > determinant * (WORST_CONDITION + 1.0 / WORST_CONDITION)
+
+
+EXACT = ForceCalibration(covariance_x=(0.0, 0.0, 0.0), covariance_y=(0.0, 0.0, 0.0), load_error=0.0)
+"""Calibration of a simulated sensor, whose forces are exact but for its simulated errors."""
 
 
 class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

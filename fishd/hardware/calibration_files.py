@@ -108,9 +108,29 @@ def check(calibration: C) -> C:
             raise Problem((key,), f"{value} is not a finite number")
         if key in ("date", "tared") and value and not _is_date(value):
             raise Problem((key,), f"'{value}' is no date: one in ISO 8601 is needed")
-    if isinstance(calibration, ForceCalibration) and calibration.singular:
-        raise Problem((), "the matrix xx xy, yx yy says the same of both forces")
+    if isinstance(calibration, ForceCalibration):
+        if calibration.singular:
+            raise Problem((), "the matrix xx xy, yx yy says the same of both forces")
+        _check_uncertainty(calibration)
     return calibration
+
+
+def _check_uncertainty(calibration: ForceCalibration) -> None:
+    """Raise `Problem` where a number is not a possible uncertainty."""
+    for key in ("covariance_x", "covariance_y"):
+        covariance = getattr(calibration, key)
+        if covariance is None:
+            continue
+        first, both, second = covariance
+        possible = min(first, second) >= 0.0 and both * both <= first * second * (1.0 + 1e-9)
+        if not (possible and all(map(math.isfinite, covariance))):
+            raise Problem(
+                (key,),
+                f"{list(covariance)} is not a covariance: variance, covariance and variance of "
+                "two gains are needed",
+            )
+    if calibration.load_error is not None and calibration.load_error < 0.0:
+        raise Problem(("load_error",), f"{calibration.load_error:g} is negative")
 
 
 def _is_dated(name: str) -> bool:

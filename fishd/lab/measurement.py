@@ -11,6 +11,7 @@ from msgspec import UNSET, Struct
 from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
+from fishd.lab import error_budget
 from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
 from fishd.lab.objective import per_watt
 from fishd.lab.rig import Rig, refuse_lost
@@ -76,6 +77,17 @@ class Measured(NamedTuple):
     """Half of its 95 % interval, by how beats differ [W]."""
     steps: Sequence["Step"] = ()
     """How each beat differed from the one before it."""
+    calibration_ci95: float | None = 0.0
+    """Half-width of the 95 % interval that the calibration of the sensor leaves to the thrust [N].
+
+    None where its uncertainty is unknown.
+    """
+    total_ci95: float | None = None
+    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    rotation: float = 0.0
+    """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
+    lateral: float = 0.0
+    """Mean F_y that swimming adds [N]."""
 
 
 class Step(NamedTuple):
@@ -117,8 +129,17 @@ def measure(
     found = evaluate(samples, rig.tick, settle, _still(settle))
     if not found.frequency and len({each.phi_c for each in samples if each.swims}) > 1:
         raise ParameterError("no whole beat is left of a swim; a longer --settle lengthens swims")
+    rotation = error_budget.visible_rotation(ticks)
+    lateral = error_budget.lateral_force(ticks)
+    budget = error_budget.budget(rig.calibration, found.thrust, found.error, lateral, rotation)
     return found._replace(
-        controller=controller, parameters=dict(parameters), ticks=ticks, unit=rig.unit
+        controller=controller,
+        parameters=dict(parameters),
+        ticks=ticks,
+        unit=rig.unit,
+        rotation=rotation,
+        lateral=lateral,
+        **budget._asdict(),
     )
 
 
@@ -167,6 +188,17 @@ class Summary(Struct, frozen=True):
     """[N/W]"""
     thrust_per_watt_error: float | None = None
     """Half of its 95 % interval [N/W]."""
+    calibration_ci95: float | None = None
+    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+
+    null where its uncertainty is unknown.
+    """
+    total_ci95: float | None = None
+    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    rotation: float = 0.0
+    """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
+    thrust_per_watt_total_ci95: float | None = None
+    """As `total_ci95`, of the thrust for each watt [N/W]."""
 
 
 def summary(found: Measured, tick: float) -> Summary:
@@ -187,6 +219,10 @@ def summary(found: Measured, tick: float) -> Summary:
         found.watts_error,
         ratio,
         ratio_error,
+        found.calibration_ci95,
+        found.total_ci95,
+        found.rotation,
+        per_watt(found.thrust, found.total_ci95, found.watts, found.watts_error)[1],
     )
 
 

@@ -38,7 +38,8 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
         room = 0.35 * (outer.max() - outer.min()) + 1.0
         above.set_ylim(outer.min() - room, outer.max() + room)
         above.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.2))
-        level, error = 1e3 * found.thrust, 1e3 * found.error
+        whole = found.error if found.total_ci95 is None else found.total_ci95
+        level, error = 1e3 * found.thrust, 1e3 * whole
         below.axhspan(level - error, level + error, color=BLUE, alpha=0.2, linewidth=0)
         below.axhline(level, color=BLUE, linewidth=0.8)
         below.axhline(0.0, color=GREY, linewidth=0.6)

@@ -8,6 +8,7 @@ from fishd.client import Fish
 from fishd.config import Config, check_tethered
 from fishd.control.reporting import Publisher
 from fishd.core import text
+from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.core.errors import (
     FishdError,
     FishError,
@@ -76,6 +77,8 @@ class Rig(Protocol):
     """Φ [rad]"""
     unit: str
     """Of its forces: `N`, or that of its sensor until that is calibrated."""
+    calibration: ForceCalibration
+    """Calibration of its force sensor, for how well the gains are known."""
     source: "Source"
     """What a recording says of where its ticks are from."""
     listener: Publisher | None
@@ -106,7 +109,8 @@ class Rig(Protocol):
 class VirtualRig:
     """A simulated fish in virtual time."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, calibration: ForceCalibration | None = None) -> None:
+        """calibration: that of its force sensor; by default what was saved, else an exact one"""
         check_tethered(config.robot, "a measurement of thrust")
         self.name = "simulation"
         self.tick = config.tick
@@ -115,7 +119,12 @@ class VirtualRig:
         self.listener: Publisher | None = None
         self._heard = _Heard()
         self._run = VirtualRun(config, self._heard)
-        self.unit = self._run.loop.robot.force_unit
+        robot = self._run.loop.robot
+        if calibration and robot.tared:
+            robot.tared.recalibrate(calibration)
+        saved = robot.calibrated.sensor.calibration if robot.calibrated else EXACT
+        self.calibration = calibration or saved
+        self.unit = robot.force_unit
 
     def describe(self, writer: "RunWriter") -> None:
         """As `Rig.describe`."""
@@ -162,6 +171,8 @@ class LiveRig:
         check_tethered(status.robot, "a measurement of thrust")
         self.name = status.robot
         self.unit = status.force_unit
+        simulated = status.robot == "simulated"
+        self.calibration = EXACT if simulated else fish.calibrations().force
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self.source: Source = "fishd"

@@ -43,7 +43,13 @@ def measure(dialogue: Dialogue, rig: Bench, fx: float, fy: float, size: str | No
     dialogue.answer("r to measure it again:")
 
 
-def test_five_guided_loads_make_true_forces_of_voltages(
+def measure_again(dialogue: Dialogue, rig: Bench, x: float, y: float, size: str = "") -> None:
+    """Hang the second load along each axis, to either side."""
+    for load in ((x, 0.0), (-x, 0.0), (0.0, y), (0.0, -y)):
+        measure(dialogue, rig, *load, size)
+
+
+def test_guided_loads_make_true_forces_of_voltages_and_say_how_well_they_are_known(
     talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
     record = tmp_path / "loads.csv"
@@ -57,19 +63,27 @@ def test_five_guided_loads_make_true_forces_of_voltages(
     measure(dialogue, rig, -20 * GRAM, 0.0, "")  # as before
     measure(dialogue, rig, 0.0, +30 * GRAM, "30")
     measure(dialogue, rig, 0.0, -30 * GRAM, "30")
+    measure_again(dialogue, rig, 25 * GRAM, 25 * GRAM, "25")
     dialogue.answer("Another load", "10 10")
     measure(dialogue, rig, 10 * GRAM, 10 * GRAM)
     dialogue.answer("Another load", "")
     fit = dialogue.answer("save it?", "y")
     assert dialogue.finish() == 0
-    assert "over 6 loads" in fit
+    assert "over 10 loads" in fit
     assert float(re.search(r"residual ([\d.]+) mN", fit)[1]) < 2.0  # type: ignore[index]
     assert float(re.search(r"condition number ([\d.]+)", fit)[1]) < 3.0  # type: ignore[index]
+    known = re.search(r"known to ± ([\d.]+)%: scatter .* ± ([\d.]+)%, .* ± 1.00%", fit)
+    assert known
+    total, scatter = map(float, known.groups())
+    assert total == pytest.approx((scatter**2 + 1.0) ** 0.5, abs=0.02)
+    used = calibrations(daemon).force
+    assert used.thrust_ci95(1.0) == pytest.approx(total / 100.0, abs=1e-4)
+    assert "covariance_x" in rig.files("force")[-1].read_text()
     assert dialogue.text.endswith(f"saved in {rig.files('force')[-1]}\n")
     for load in ((0.1, -0.2), (-0.05, 0.05), (0.0, 0.0)):
         rig.pi.load(*load)
         assert forces(daemon) == pytest.approx(load, abs=3e-3)
-    assert len(record.read_text().splitlines()) == 7
+    assert len(record.read_text().splitlines()) == 11
 
 
 def test_a_doubtful_load_is_pointed_out_and_measured_again_and_none_is_lost(
@@ -117,20 +131,22 @@ def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
     measure(dialogue, rig, -0.2, 0.0, "")
     measure(dialogue, rig, 0.0, 0.2, "")
     measure(dialogue, rig, 0.0, -0.2, "")
+    measure_again(dialogue, rig, 0.2, 0.2)
     dialogue.answer("Another load", "7 7")
     measure(dialogue, rig, 0.0, 0.0)
     dialogue.answer("Another load", "")
     dialogue.expect("do not follow the loads")
     assert rig.files("force") == []
     dialogue.answer("Another load", "+z")
-    dialogue.expect("or one of zero, +x, -x, +y, -y, (7, 7) N is needed")
+    dialogue.expect("or one of zero, +x, -x, +y, -y, +x again")
+    dialogue.expect("(7, 7) N is needed")
     dialogue.answer("Another load", "drop (7, 7) N")
     dialogue.answer("Another load", "+x")
     measure(dialogue, rig, 0.2, 0.0, "")
     dialogue.answer("Another load", "")
-    dialogue.expect("over 5 loads")
+    dialogue.expect("over 9 loads")
     assert dialogue.finish() == 0
-    assert len(record.read_text().splitlines()) == 6
+    assert len(record.read_text().splitlines()) == 10
     rig.pi.load(0.1, -0.1)
     assert forces(daemon) == pytest.approx((0.1, -0.1), abs=3e-3)
 
@@ -142,7 +158,7 @@ def test_a_load_beyond_what_the_sensor_is_believed_is_refused_where_it_is_typed(
     measure(dialogue, rig, 0.0, 0.0)
     dialogue.answer("load [N]", "20")
     dialogue.expect("20 N is beyond force_sensor.force_limit, 10 N; did you mean --unit g?")
-    for _ in range(4):
+    for _ in range(8):
         measure(dialogue, rig, 0.0, 0.0, "0.2")
     dialogue.answer("Another load", "5 -15")
     dialogue.expect("-15 N is beyond force_sensor.force_limit, 10 N; did you mean --unit g?")
@@ -208,6 +224,7 @@ def test_loads_outlive_a_fishd_that_does_not_answer_or_refuses_what_they_make(
     measure(dialogue, rig, -0.2, 0.0, "")
     measure(dialogue, rig, 0.0, 0.2, "")
     measure(dialogue, rig, 0.0, -0.2, "")
+    measure_again(dialogue, rig, 0.2, 0.2)
     rig.pi.load(0.0, 0.0)
     assert daemon.fishctl("set-controller", "swing").returncode == 0
     dialogue.answer("Another load")

@@ -121,6 +121,11 @@ def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str, wo
         (ForceCalibration, FORCE, {"xx": 0.0, "yy": 0.0}, "says the same of both forces"),
         (ForceCalibration, FORCE, {"xy": 2.0, "yx": 0.5}, "says the same of both forces"),
         (ForceCalibration, FORCE, {"xy": 1e-9, "xx": 1e-9}, "says the same of both forces"),
+        (ForceCalibration, FORCE, {"covariance_x": [-1.0, 0.0, 1.0]}, "is not a covariance"),
+        (ForceCalibration, FORCE, {"covariance_y": [1.0, 2.0, 1.0]}, "is not a covariance"),
+        (ForceCalibration, FORCE, {"covariance_x": [1.0, 0.0, float("inf")]}, "is not a covar"),
+        (ForceCalibration, FORCE, {"covariance_x": [1.0, 0.0]}, "covariance_x: [1.0, 0.0] is not"),
+        (ForceCalibration, FORCE, {"load_error": -0.1}, "load_error: -0.1 is negative"),
         (ServoCalibration, SERVO, {"trim": float("nan")}, "trim: nan is not"),
         (ServoCalibration, SERVO, {"highest": 3.15}, "highest: 3.15 is not valid"),
         (ServoCalibration, SERVO, {"scale": 0.0}, "scale: 0.0 is not valid"),
@@ -148,6 +153,25 @@ def bounds(struct: type[Struct], name: str) -> object:
 @pytest.mark.parametrize("key", list(SERVO))
 def test_a_servo_calibration_has_the_bounds_of_the_same_keys_of_the_configuration(key: str) -> None:
     assert bounds(ServoCalibration, key) == bounds(ServoSettings, key)
+
+
+def test_a_file_of_before_uncertainties_were_kept_is_used_and_its_own_is_unknown(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "force-2026-11-21T120000.000000Z.yaml").write_text(yaml.safe_dump(FORCE))
+    found = CalibrationFolder(tmp_path).newest(ForceCalibration)
+    assert found is not None
+    assert found[0].thrust_ci95(0.025) is None
+
+
+def test_an_uncertainty_is_kept_with_its_calibration(tmp_path: Path) -> None:
+    folder = CalibrationFolder(tmp_path)
+    known = ForceCalibration(covariance_x=(1e-4, -1e-5, 2e-4), covariance_y=(1e-4, 0.0, 1e-4))
+    folder.save(known, NOON)
+    found = folder.newest(ForceCalibration)
+    assert found is not None
+    assert found[0].covariance_x == known.covariance_x
+    assert found[0].thrust_ci95(0.025) == pytest.approx(1.96e-2 * 0.025)
 
 
 def test_a_folder_that_cannot_be_read_is_an_error_and_not_no_calibration(tmp_path: Path) -> None:

@@ -29,6 +29,8 @@ from fishd.hardware.force_sensor.calibration_fit import (
 
 T = TypeVar("T")
 
+LOAD_ERROR = 0.01
+"""Default of `--load-error`: kitchen scales, weights of a school set, a pulley with friction."""
 _POOR_FIT = 0.02
 """A residual beyond this share of the largest load is worth a warning."""
 
@@ -47,6 +49,14 @@ _POOR_FIT = 0.02
     default=5.0,
     show_default=True,
     help="How long to measure each load.",
+)
+@click.option(
+    "--load-error",
+    type=FiniteRange(0.0, 0.5),
+    default=LOAD_ERROR,
+    show_default=True,
+    help="Largest error that all loads have in common, as a fraction of a load, such as that of "
+    "the scale. No fit can see it; it becomes part of the calibration's uncertainty.",
 )
 @click.option(
     "--loads",
@@ -68,6 +78,7 @@ _POOR_FIT = 0.02
 def force(
     unit: str,
     seconds: float,
+    load_error: float,
     plan: Path | None,
     record: Path | None,
     replace: bool,
@@ -76,9 +87,9 @@ def force(
 ) -> int:
     """Calibrate the force sensor with known loads.
 
-    You hang them: none at first, then one each along +x, -x, +y and -y. F_x is positive forward,
-    F_y to the fish's left. The daemon measures. Nothing changes before you have seen the fit and
-    said yes.
+    You hang them: none at first, then one each along +x, -x, +y and -y, and these four again: how
+    the two differ says how well the gains are known. F_x is positive forward, F_y to the fish's
+    left. The daemon measures. Nothing changes before you have seen the fit and said yes.
     """
     steps = load_files.read(plan, unit) if plan else []
     if steps and (missing := missing_loads([(step.fx, step.fy) for step in steps])):
@@ -97,11 +108,12 @@ def force(
         load_files.check_limit(steps, limit)
         try:
             if measured:
-                fitted = _fitted([f"load {n}" for n in range(1, len(steps) + 1)], measured)
+                names = [f"load {n}" for n in range(1, len(steps) + 1)]
+                fitted = _fitted(names, measured, load_error)
             else:
                 dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
-                fitted = _fitted_with_help(dialogue)
+                fitted = _fitted_with_help(dialogue, load_error)
             seen = _answered(fish.status, plan if measured else None).fy_reversed
             if doubt := _doubtful_sign(seen, present.force, fitted.calibration):
                 echo(f"warning: {doubt}", err=True)
@@ -157,9 +169,9 @@ def _doubtful_sign(
     )
 
 
-def _fitted(names: list[str], loads: list[Load]) -> Fit:
+def _fitted(names: list[str], loads: list[Load], load_error: float) -> Fit:
     """Fit the loads and show how well that went; raises `PoorLoads`."""
-    fitted = fit(loads)
+    fitted = fit(loads, load_error)
     _show(names, loads, fitted)
     check(fitted, loads, names)
     largest = max(math.hypot(load.fx, load.fy) for load in loads)
@@ -173,12 +185,12 @@ def _fitted(names: list[str], loads: list[Load]) -> Fit:
     return fitted
 
 
-def _fitted_with_help(dialogue: Dialogue) -> Fit:
+def _fitted_with_help(dialogue: Dialogue, load_error: float) -> Fit:
     """Fit what was measured. While the fit is refused, ask for more loads; none is lost."""
     while True:
         dialogue.amend()
         try:
-            return _fitted(*dialogue.result())
+            return _fitted(*dialogue.result(), load_error)
         except PoorLoads as error:
             echo(f"\n{error}", err=True)
 
@@ -197,4 +209,23 @@ def _show(names: list[str], loads: list[Load], fitted: Fit) -> None:
     echo(
         f"residual {found.residual * 1e3:.3f} mN rms over {found.loads} loads, "
         f"condition number {found.condition:.3g}"
+    )
+    for row, covariance in (
+        (("xx", "xy"), found.covariance_x),
+        (("yx", "yy"), found.covariance_y),
+    ):
+        assert covariance is not None  # of a fit
+        first, both, second = covariance
+        correlation = both / math.sqrt(first * second) if first * second > 0.0 else 0.0
+        echo(
+            f"{row[0]} ± {1.96 * math.sqrt(first):.2g}, {row[1]} ± {1.96 * math.sqrt(second):.2g} "
+            f"N/V (95 %), correlation {correlation:+.2f}"
+        )
+    share, load_error = found.thrust_ci95(1.0), found.load_error
+    assert share is not None
+    assert load_error is not None
+    scatter = math.sqrt(max(0.0, share**2 - load_error**2))
+    echo(
+        f"a thrust is known to ± {share:.2%}: scatter of the loads ± {scatter:.2%}, "
+        f"--load-error ± {load_error:.2%}"
     )

@@ -18,14 +18,21 @@ from fishd.core.calibration import ForceSample
 from fishd.core.errors import FishError
 from fishd.hardware.force_sensor.calibration_fit import Load
 
-PLAN = (
-    ("zero", 0, 0, "nothing pulls at the fish"),
+_AXES = (
     ("+x", 1, 0, "pull the fish forward, as its own thrust does"),
     ("-x", -1, 0, "pull the fish backward"),
     ("+y", 0, 1, "pull the fish to its left"),
     ("-y", 0, -1, "pull the fish to its right"),
 )
-"""Name, direction and what to do, of the loads that suffice."""
+PLAN = (
+    ("zero", 0, 0, "nothing pulls at the fish"),
+    *_AXES,
+    *(
+        (f"{name} again", x, y, "hang it again, best with another weight")
+        for name, x, y, _ in _AXES
+    ),
+)
+"""Name, direction and what to do, of each load; five suffice, the others show how well they fit."""
 RESTLESS = 3.0
 """So many times the quietest load's standard deviation is not still."""
 _QUIET = 5e-5
@@ -70,7 +77,7 @@ class Dialogue:
         ]
         echo(f"The loads, each measured for {self._seconds:g} s:")
         for n, (name, what, _) in enumerate(asks, 1):
-            echo(f"  {n}  {name:<5} {what}")
+            echo(f"  {n}  {name:<8} {what}")
         for each in asks:
             self._add(*each)
 

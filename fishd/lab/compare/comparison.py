@@ -74,6 +74,15 @@ class Standing(Struct, frozen=True, kw_only=True):
     """[N/W]"""
     thrust_per_watt_error: float | None = None
     """Half of its 95 % interval [N/W]; None for one run in simulation."""
+    calibration_ci95: float | None = None
+    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+
+    None in simulation, where the thrust is the true one, and where it is unknown.
+    """
+    total_ci95: float | None = None
+    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    thrust_per_watt_total_ci95: float | None = None
+    """As `total_ci95`, of the thrust for each watt [N/W]."""
 
 
 def compare(

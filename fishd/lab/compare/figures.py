@@ -109,7 +109,7 @@ def _draw_relative_thrust(axis: Any, standing: Standing) -> None:
 
 def _draw_thrust(axis: Any, standing: Standing, most: float) -> None:
     value, error = 1e3 * standing.thrust, 1e3 * (standing.error or 0.0)
-    _draw_bar(axis, "thrust", value, error, error, "95 % interval")
+    _draw_bar(axis, "thrust", value, error, error, "95 %, statistical")
     low = min(0.0, 1.05 * (value - error))
     axis.set_xlim(low, 1.05e3 * max(most, 1e-9))
 
@@ -129,7 +129,8 @@ def _draw_bar(
 
 
 def _describe(axis: Any, standing: Standing, unit: str) -> None:
-    error = "" if standing.error is None else f" ± {1e3 * standing.error:.2f}"
+    whole = standing.error if standing.total_ci95 is None else standing.total_ci95
+    error = "" if whole is None else f" ± {1e3 * whole:.2f}"
     text = (
         f"{1e3 * standing.thrust:.2f}{error} m{unit}, {standing.frequency:.2f} Hz\n"
         f"$|φ_c|/Φ$ {standing.fullness:.2f}, square {standing.squareness:.2f}"

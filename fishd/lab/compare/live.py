@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from msgspec.structs import replace
 
+from fishd.core.calibration import ForceCalibration
 from fishd.core.errors import FishdError
 from fishd.core.signals import Tick
 from fishd.lab.compare.comparison import Standing, Trace, error_of_mean, trace
 from fishd.lab.compare.contestants import Contestant, parse
+from fishd.lab.error_budget import budget
 from fishd.lab.measurement import Measured, measure, plan
 from fishd.lab.objective import per_watt
 from fishd.lab.rig import Rig, is_of_one
@@ -98,7 +100,8 @@ def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
         fullness=mean / rig.amplitude,
         squareness=mean / rms if rms else 0.0,
     )
-    return replace(standing, **_power(runs))
+    standing = replace(standing, **_power(runs))
+    return replace(standing, **_budget(runs, weights, standing, rig.calibration))
 
 
 def _power(runs: list[Measured]) -> dict[str, float]:
@@ -117,6 +120,29 @@ def _power(runs: list[Measured]) -> dict[str, float]:
         "thrust_per_watt": sum(w * each for w, each in zip(weights, gave, strict=True)) / total,
         "thrust_per_watt_error": max(1.0 / math.sqrt(total), error_of_mean(gave) or 0.0),
     }
+
+
+def _budget(
+    runs: list[Measured], weights: list[float], standing: Standing, calibration: ForceCalibration
+) -> dict[str, float | None]:
+    """The part of the calibration: the same error in all runs, so that more of them do not help.
+
+    weights: by which the runs count
+    """
+    rotation, lateral = np.average(
+        [(run.rotation, run.lateral) for run in runs], axis=0, weights=weights
+    ).tolist()
+    whole = budget(calibration, standing.thrust, standing.error, lateral, rotation)
+    found = whole._asdict()
+    if standing.power and standing.thrust_per_watt is not None:
+        found["thrust_per_watt_total_ci95"] = budget(
+            calibration,
+            standing.thrust_per_watt,
+            standing.thrust_per_watt_error,
+            lateral / standing.power,
+            rotation,
+        ).total_ci95
+    return found
 
 
 def _trace(run: Measured) -> Trace:

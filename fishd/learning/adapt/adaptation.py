@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 from fishd.config import Config
 from fishd.core.errors import FishdError
+from fishd.lab import error_budget
 from fishd.lab.identification import experiment
 from fishd.lab.measurement import REST, measure
 from fishd.lab.rig import Rig, is_of_one
@@ -211,6 +212,8 @@ class Adaptation:
                 parameters=gait.parameters,
                 thrust=found.thrust,
                 error=found.error,
+                calibration_ci95=found.calibration_ci95,
+                total_ci95=found.total_ci95,
                 frequency=found.frequency,
                 seconds=seconds,
                 remark=found.remark,
@@ -218,7 +221,9 @@ class Adaptation:
                 **_truth(self._config, self._rig, gait),
             )
         )
-        measured = f"{1e3 * found.thrust:.2f} ± {1e3 * found.error:.2f} mN"
+        measured = error_budget.spelled(
+            found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
+        )
         self._done(f"{gait.name}: {measured} at {found.frequency:.3f} Hz")
         if found.remark:
             self._show.warn(f"fishctl: {gait.name}: {found.remark}")

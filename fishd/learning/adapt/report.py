@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fishd.lab import error_budget
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
 from fishd.lab.identification.fit import LOGARITHMIC
 from fishd.lab.identification.formatting import format_estimate
@@ -135,6 +136,8 @@ def page(state: State, picture: bytes, again: str) -> str:
     image = base64.b64encode(picture).decode()
     remarks = [*state.fitted.found["remarks"]]
     remarks += [f"{NAMES[name]} was left out: {why}" for name, why in state.left_out.items()]
+    if line := error_budget.unknown_calibration(state.contenders[0].calibration_ci95, "N"):
+        remarks.append(line)
     remarks += [f"{NAMES[one.name]}: {one.remark}" for one in state.contenders if one.remark]
     if state.trained and state.trained.refused:
         remarks.append(f"no policy took part: {state.trained.refused}")
@@ -151,7 +154,8 @@ def page(state: State, picture: bytes, again: str) -> str:
         "<h2>In the tank</h2>",
         _table(*_contenders(state)),
         "<p>Relative thrust is the share of that of the best square wave that the search has "
-        "found; the intervals hold together in 95 % of cases.</p>",
+        "found; the intervals hold together in 95 % of cases. The error of the force sensor's "
+        "calibration is the same fraction of all thrusts, so it is no part of a share.</p>",
         "<h2>The fish</h2>",
         _table(("", "value", "95 % interval", "unit"), _estimates(state.fitted)),
         *([f"<h2>Careful</h2><ul>{''.join(map(_item, remarks))}</ul>"] if remarks else []),
@@ -181,7 +185,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             relative_thrust = spelled(share)
         row = [
             NAMES[one.name] + (", the winner" if one.name == state.verdict.winner else ""),
-            f"{1e3 * one.thrust:.2f} ± {1e3 * one.error:.2f} mN",
+            error_budget.spelled(one.thrust, one.error, one.calibration_ci95, one.total_ci95, "N"),
             f"{one.frequency:.3f}",
             relative_thrust,
         ]

@@ -94,6 +94,13 @@ class Contender(Struct, frozen=True, kw_only=True):
     """[N]"""
     error: float
     """Half of its 95 % interval [N]."""
+    calibration_ci95: float | None = None
+    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+
+    The same fraction of all thrusts, so no part of a relative thrust; None where it is unknown.
+    """
+    total_ci95: float | None = None
+    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
     frequency: float
     """[Hz]"""
     seconds: float

@@ -20,7 +20,7 @@ class Tank:
         progress: called with the time that is used, tick by tick [s]
         """
         self.name, self.tick, self.amplitude = rig.name, rig.tick, rig.amplitude
-        self.unit, self.source = rig.unit, rig.source
+        self.unit, self.source, self.calibration = rig.unit, rig.source, rig.calibration
         self.listener: Publisher | None = None
         self.used = used
         """Time in the tank so far, also of a swim that was broken off [s]."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from fishd.hardware.force_sensor.calibration_fit import (
     WORST_CONDITION,
@@ -70,6 +71,45 @@ def test_with_noise_it_is_recovered_as_well_as_that_permits(
     assert 0.2 * noise < found.calibration.residual < 5 * noise
     errors = np.array(found.errors)
     assert found.calibration.residual == pytest.approx(np.sqrt(np.mean(errors**2)))
+
+
+@pytest.mark.parametrize(
+    ("weight", "thread", "noise"),
+    [(0.02, 0.0, 0.0), (0.0, 0.03, 0.0), (0.02, 0.03, 0.0), (0.0, 0.0, 2e-3), (0.01, 0.0, 1e-3)],
+)
+@pytest.mark.parametrize("plan", [PLAN, [*PLAN, *PLAN[1:]]])
+def test_the_covariance_holds_the_true_gains_whatever_is_wrong_with_the_loads(
+    plan: list[tuple[float, float]], weight: float, thread: float, noise: float
+) -> None:
+    """weight: relative error of each load; thread: its direction [rad]; noise: [N]; all rms."""
+    random = np.random.default_rng(7)
+    true = sensor(2.0, 1.5, 0.1, 0.1)
+    missed = np.zeros(3)
+    for _ in range(300):
+        planned = np.array(plan)
+        scale, turn = random.standard_normal((2, len(plan), 1)) * [[[weight]], [[thread]]]
+        hung = planned * (1.0 + scale) + turn * planned[:, ::-1] * [-1.0, 1.0]
+        volts = (hung + noise * random.standard_normal(hung.shape)) @ true.T + [0.3, -0.2]
+        found = fit([Load(*f, *v) for f, v in zip(plan, volts.tolist(), strict=True)]).calibration
+        for index, (fx, fy) in enumerate(((1.0, 0.0), (0.0, 1.0), (1.0, 0.3))):
+            vx, vy = true @ (fx, fy)
+            known = found.thrust_ci95(fx, fy)
+            assert known is not None
+            missed[index] += abs(found.xx * vx + found.xy * vy - fx) > known
+    assert (missed <= 0.08 * 300).all()  # where 5 % is meant
+
+
+def test_an_error_that_all_loads_share_is_in_the_covariance_as_it_is_told() -> None:
+    loads = [Load(1.02 * f.fx, 1.02 * f.fy, f.vx, f.vy) for f in measured(PLAN, sensor(2, 1, 0.1))]
+    told = fit(loads, 0.03).calibration
+    assert told.thrust_ci95(1.0) == pytest.approx(0.03)
+    assert told.thrust_ci95(0.5, 0.2) == pytest.approx(0.015)  # it shares the factor, not the axis
+    assert fit(loads).calibration.thrust_ci95(1.0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_tare_keeps_the_uncertainty_of_the_gains() -> None:
+    known = fit(measured(PLAN, sensor(1, 1), noise=1e-3)).calibration
+    assert known.thrust_ci95(1.0) == replace(known, x0=0.5).thrust_ci95(1.0)
 
 
 def test_the_error_of_each_load_points_at_the_one_that_was_entered_wrongly() -> None:

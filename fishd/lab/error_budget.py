@@ -1,0 +1,142 @@
+"""Error budget of a measured thrust: statistics, gains of the calibration, rotation of the sensor.
+
+The statistical error is that of one measurement. The error of the gains is the same fraction of
+all thrusts measured with one calibration, so it counts for newtons and newtons per watt, and
+cancels in the ratio of two thrusts.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from itertools import groupby, pairwise
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import UNSET
+
+from fishd.control.estimators.live_thrust import SWIM_SETTLES
+from fishd.core import text
+from fishd.core.calibration import ForceCalibration
+from fishd.core.signals import Tick
+
+MIN_ROTATION_RAD = 0.01
+"""A smaller rotation hides less than 0.005 % of a thrust and is not counted."""
+MIN_ELONGATION = 4.0
+"""Ratio of the variances along the axes of the force, below which its direction is not known."""
+
+
+class Budget(NamedTuple):
+    """Half-widths of 95 % intervals of a thrust, in its unit."""
+
+    calibration_ci95: float | None
+    """What the calibration leaves: gains and rotation; None where its uncertainty is unknown."""
+    total_ci95: float | None
+    """Statistics and calibration together; None where one of them is unknown."""
+
+
+def budget(
+    calibration: ForceCalibration,
+    thrust: float,
+    statistical_ci95: float | None,
+    lateral: float = 0.0,
+    rotation: float = 0.0,
+) -> Budget:
+    """Return the error budget of a thrust [N].
+
+    Random errors are added as squares. What a rotation hides is not random: it is added whole.
+
+    statistical_ci95: None where it is unknown [N]
+    lateral: the mean F_y that swimming adds [N]
+    rotation: of the sensor's axes, as `visible_rotation` finds it [rad]
+    """
+    gain = calibration.thrust_ci95(thrust, lateral)
+    if gain is None:
+        return Budget(None, None)
+    hidden = abs((math.cos(rotation) - 1.0) * thrust + math.sin(rotation) * lateral)
+    whole = None if statistical_ci95 is None else math.hypot(statistical_ci95, gain) + hidden
+    return Budget(gain + hidden, whole)
+
+
+def spelled(
+    value: float,
+    statistical_ci95: float,
+    calibration_ci95: float | None,
+    total_ci95: float | None,
+    unit: str,
+) -> str:
+    """Return a force, or a force for each watt, with its error budget, in thousandths of its unit.
+
+    Where the calibration's part is unknown, the statistical error stands alone, and that is said.
+    """
+    if calibration_ci95 is None or total_ci95 is None:
+        total_ci95 = statistical_ci95
+        part = "unknown" if unit.startswith("N") else "none"
+    else:
+        part = f"± {1e3 * calibration_ci95:.2f}" if calibration_ci95 else "exact"
+    return (
+        f"{1e3 * value:.2f} ± {1e3 * total_ci95:.2f} m{text.quoted(unit)} "
+        f"(statistical ± {1e3 * statistical_ci95:.2f}, calibration {part})"
+    )
+
+
+def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
+    """Return a line on a calibration whose uncertainty is unknown; empty where it is known."""
+    if calibration_ci95 is not None:
+        return ""
+    if unit != "N":
+        return (
+            f"the force sensor is not calibrated: forces are in {text.quoted(unit)}, and no "
+            "interval covers its gain: fishctl calibrate force"
+        )
+    return (
+        "the calibration file does not say how well the gains are known, so the interval is "
+        "statistical only: fishctl calibrate force"
+    )
+
+
+def visible_rotation(ticks: Iterable[Tick]) -> float:
+    """Return by what angle F_x and F_y are turned into each other while the fish swims [rad].
+
+    Over whole beats of a symmetric gait the true F_x, at even harmonics, and the true F_y, at odd
+    ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD` or not known.
+    """
+    swims = [np.array([(tick.fx, tick.fy) for tick in swim]) for swim in _steady_swims(ticks)]
+    apart = [swim - swim.mean(axis=0) for swim in swims]
+    if not apart:
+        return 0.0
+    forces = np.concatenate(apart)
+    (xx, xy), (_, yy) = forces.T @ forces
+    least, most = np.linalg.eigvalsh(forces.T @ forces)
+    if most < MIN_ELONGATION * least:
+        return 0.0
+    angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
+    return angle if abs(angle) >= MIN_ROTATION_RAD else 0.0
+
+
+def lateral_force(ticks: Iterable[Tick]) -> float:
+    """Return what swimming adds to the mean of F_y [N]; 0 where there is no whole beat or rest."""
+    ticks = list(ticks)
+    swimming = [tick.fy for swim in _steady_swims(ticks) for tick in swim]
+    resting = [tick.fy for rest in _settled(ticks, swims=False) for tick in rest]
+    if not swimming or not resting:
+        return 0.0
+    return sum(swimming) / len(swimming) - sum(resting) / len(resting)
+
+
+def _steady_swims(ticks: Iterable[Tick]) -> list[list[Tick]]:
+    """Return the whole beats of each swim once it is steady."""
+    beats = []
+    for swim in _settled(ticks, swims=True):
+        ups = [i for i, (a, b) in enumerate(pairwise(swim), 1) if a.phi_c <= 0.0 < b.phi_c]
+        if len(ups) > 1:
+            # A force is that of the window before its tick, an angle that of the one after it.
+            beats.append(swim[ups[0] + 1 : ups[-1] + 1])
+    return beats
+
+
+def _settled(ticks: Iterable[Tick], *, swims: bool) -> Iterator[list[Tick]]:
+    """Yield each swim, or each rest, once it has settled, without forces not to be trusted."""
+    for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
+        phase = list(group)
+        start = phase[0].t + SWIM_SETTLES
+        if running is swims:
+            yield [tick for tick in phase if tick.t >= start and tick.suspect is UNSET]

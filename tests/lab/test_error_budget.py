@@ -1,0 +1,92 @@
+"""Gains and rotation of the force sensor are part of a thrust's interval, or named beside it."""
+
+import math
+
+import pytest
+from msgspec.structs import replace
+
+from fishd.config import load
+from fishd.core.calibration import EXACT, ForceCalibration
+from fishd.lab.compare import LiveComparison
+from fishd.lab.error_budget import budget, spelled, unknown_calibration
+from fishd.lab.measurement import Measured, measure, summary
+from fishd.lab.rig import VirtualRig
+from fishd.simulation import simulate
+
+GAIN_ERROR = 0.02
+KNOWN = ForceCalibration(
+    xx=1.0 + GAIN_ERROR,
+    covariance_x=((1.5 * GAIN_ERROR / 1.96) ** 2, 0.0, 0.0),
+    covariance_y=(0.0, 0.0, 0.0),
+    loads=9,
+)
+"""Of a sensor of 1 N/V, whose gain is off by 2 % and said to be known to 3 %."""
+
+
+def measured(*overrides: str, calibration: ForceCalibration | None = None) -> Measured:
+    with VirtualRig(load(None, overrides), calibration) as rig:
+        return measure(rig, "swing", {}, 30.0)
+
+
+def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> None:
+    found, truth = measured(calibration=KNOWN), simulate(load(), "swing", {}).mean_thrust
+    assert found.calibration_ci95 == pytest.approx(0.03 * found.thrust / (1.0 + GAIN_ERROR))
+    assert found.total_ci95 == pytest.approx(math.hypot(found.error, found.calibration_ci95))
+    assert found.error < abs(found.thrust - truth) < found.total_ci95
+    told = summary(found, 0.05)
+    assert told.power is not None
+    assert told.thrust_per_watt_total_ci95 == pytest.approx(found.total_ci95 / told.power, rel=1e-3)
+
+
+def test_the_sensor_of_a_simulated_fish_is_exact() -> None:
+    found = measured()
+    assert (found.calibration_ci95, found.total_ci95, found.rotation) == (0.0, found.error, 0.0)
+
+
+@pytest.mark.parametrize("angle", [0.05, -0.17])
+def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle: float) -> None:
+    quiet = ("simulation.noise=1e-5", f"simulation.rotation={angle}")
+    found, truth = measured(*quiet), simulate(load(), "swing", {}).mean_thrust
+    assert found.rotation == pytest.approx(angle, abs=0.003)
+    assert found.total_ci95
+    assert truth - found.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
+    assert found.error < truth - found.thrust < found.total_ci95 < 0.02 * truth
+
+
+def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
+    assert measured("simulation.noise=0.02", "simulation.drift=5e-3").rotation == 0.0
+    with VirtualRig(load()) as rig:
+        assert measure(rig, "hold", {}, 30.0).rotation == 0.0
+
+
+def test_without_a_known_calibration_no_total_is_claimed() -> None:
+    old = replace(KNOWN, covariance_x=None)
+    assert budget(old, 0.025, 1e-4) == (None, None)
+    assert spelled(0.025, 1e-4, None, None, "N").endswith(
+        "± 0.10 mN (statistical ± 0.10, calibration unknown)"
+    )
+    assert spelled(0.025, 1e-4, None, None, "V").endswith(
+        "mV (statistical ± 0.10, calibration none)"
+    )
+    assert "does not say how well" in unknown_calibration(None, "N")
+    assert "not calibrated: forces are in V" in unknown_calibration(None, "V")
+    assert not unknown_calibration(0.0, "N")
+
+
+def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
+    with VirtualRig(load(), KNOWN) as rig:
+        live = LiveComparison(rig, ["swing"])
+        live.swim(21.0, runs=3)
+    (found,) = live.standings()
+    assert found.calibration_ci95 == pytest.approx(0.03 / 1.02 * found.thrust, rel=1e-3)
+    assert found.error is not None
+    assert found.total_ci95 == pytest.approx(math.hypot(found.error, found.calibration_ci95))
+
+
+def test_a_tail_beat_to_one_side_counts_with_the_cross_term() -> None:
+    turned = replace(EXACT, covariance_x=(0.0, 0.0, (0.02 / 1.96) ** 2))
+    assert budget(turned, 0.025, 0.0).total_ci95 == 0.0
+    assert budget(turned, 0.025, 0.0, lateral=0.01).total_ci95 == pytest.approx(0.02 * 0.01)
+    assert budget(EXACT, 0.025, 0.0, 0.01, 0.1).total_ci95 == pytest.approx(
+        abs((math.cos(0.1) - 1.0) * 0.025 + math.sin(0.1) * 0.01)
+    )
