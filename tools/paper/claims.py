@@ -4,18 +4,26 @@ The tables are those that the figures are drawn from; `docs/paper.md` holds what
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from typing import Any, NamedTuple
+
+from msgspec.structs import replace
+from scipy.optimize import brentq
 
 from common.report import table
 from fishd.config import Config
 from fishd.controllers.policy import file, library
 from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
 from fishd.virtual.plant.optimum import square_wave
+from fishd.virtual.plant.parameters import PlantParameters
 from paper import figure_2b, figure_3, figure_4, figure_5, figure_6, swing_map
 from paper.runs import PLANT, column, read
 
 DOCUMENT = "paper.md"
+HARD_SERVO_LAG = 1e-4
+"""Δ that stands for a servo without a lag, which turns at Ω until it is there [rad]."""
+PLATEAU = 0.99
+"""Share of the best thrust from which on a frequency counts as good as the best."""
 SOON, SLOW = 0.02, 100.0
 """Amplitudes that stand for a small and a large Φ, in units of Φ_s."""
 NEAR = 0.05
@@ -95,17 +103,35 @@ def equations() -> Iterator[Claim]:
     best = best_square_waves(p, [0.42])
     thrust, frequency = float(best.thrust[0]), float(best.frequency[0])
     kept = square_wave(p, 0.42, 1.8).thrust / thrust
+    low, high = _plateau(p, 0.42, frequency)
     yield _near(
         "optimum at Φ = 0.42 rad: about 1.8 Hz",
         frequency,
         1.8,
-        f"{{:.3f}} Hz, {1e3 * thrust:.2f} mN; 1.8 Hz gives {kept:.1%} of that",
+        f"{{:.3f}} Hz, {1e3 * thrust:.2f} mN; 1.8 Hz gives {kept:.1%} of that; "
+        f"{PLATEAU:.0%} begins {frequency - low:.3f} Hz below the best and "
+        f"{high - frequency:.3f} Hz above, at {low:.3f} and {high:.3f} Hz",
+    )
+    hard = best_square_waves(replace(p, servo_lag=HARD_SERVO_LAG), [0.42])
+    yield _near(
+        "… of a hard servo, which turns at Ω until it is there (Δ → 0)",
+        float(hard.frequency[0]),
+        1.8,
+        f"{{:.3f}} Hz, {1e3 * float(hard.thrust[0]):.2f} mN",
     )
     ends = best_square_waves(p, [SOON * saturation_amplitude(p), 1.57]).frequency
     yield Claim(
         "best frequency falls from 2.5 to 1 Hz over the range of Φ",
         f"from {ends[0]:.2f} Hz (Φ → 0) to {ends[1]:.2f} Hz (Φ = 1.57 rad)",
         _close(float(ends[0]), 2.5) and _close(float(ends[1]), 1.0),
+    )
+    slow_start, at_once = float(ends[0]), float(fast_servo(p, [1.0]).frequency[0])
+    yield Claim(
+        "… 2.5 Hz at small Φ",
+        f"{slow_start:.3f} Hz; without the servo's lag {at_once:.3f} Hz: the lag is "
+        f"{at_once - slow_start:.2f} of the {2.5 - slow_start:.2f} Hz that are missing, "
+        f"{2.5 - at_once:.2f} Hz are not explained",
+        _close(slow_start, 2.5),
     )
 
 
@@ -164,10 +190,14 @@ def swinging() -> Iterator[Claim]:
     ):
         low = min(rows, key=lambda row: row["relative_thrust"])
         missed = [row for row in rows if row["relative_thrust"] <= bound]
+        thresholds = {row["C"] for row in rows}
+        lacking = _listed({row["C"] for row in missed}, thresholds)
         yield Claim(
             claim,
             f"from {low['relative_thrust']:.1%} up (C = {low['C']:g}, ω₀Φ/Ω = "
-            f"{low['w0Phi_over_Omega']:g}); less in {len(missed)} of {len(rows)} cases",
+            f"{low['w0Phi_over_Omega']:g}); less in {len(missed)} of {len(rows)} cases"
+            f"{f', all with {lacking}' if lacking else ''}; "
+            f"in continuous time {_in_continuous_time(thresholds, bound)}",
             not missed,
         )
     (weak,) = read(figure_5.INSET, xi=min(figure_5.DAMPINGS), C=0.0)
@@ -176,6 +206,24 @@ def swinging() -> Iterator[Claim]:
         f"{weak['relative_thrust']:.2%} at ξ = {weak['xi']:g}",
         weak["relative_thrust"] > swing_map.NEARLY_BEST,
     )
+
+
+def _listed(thresholds: Set[float], choices: Set[float]) -> str:
+    """Return some C of several choices, as a list in words; empty where there is no choice."""
+    return ", ".join(f"C = {c:g}" for c in sorted(thresholds)) if len(choices) > 1 else ""
+
+
+def _in_continuous_time(thresholds: Set[float], bound: float) -> str:
+    """Return what the reference has for these C, and which of them miss the bound by how much."""
+    shares = {case: s for case, s in swing_map.continuous_time().items() if case[0] in thresholds}
+    low = min(shares, key=shares.__getitem__)
+    found = f"from {shares[low]:.1%} up (C = {low[0]:g}, ω₀Φ/Ω = {low[1]:g})"
+    missed = {c for (c, _), share in shares.items() if share <= bound}
+    if not missed:
+        return found
+    lacking = _listed(missed, thresholds)
+    alone = f"only {lacking} misses it, by" if lacking else "less by"
+    return f"{found}; {alone} {100 * (bound - shares[low]):.1f} points"
 
 
 def learning() -> Iterator[Claim]:
@@ -285,6 +333,16 @@ def _swum(controller: str) -> list[dict[str, Any]]:
 def _steps(policy: str) -> int:
     """How long a policy has learned [control steps]."""
     return file.read(library.find(policy)).card.provenance.steps
+
+
+def _plateau(p: PlantParameters, amplitude: float, best: float) -> list[float]:
+    """Return the two frequencies at which a square wave has `PLATEAU` of the best thrust [Hz]."""
+    wanted = PLATEAU * square_wave(p, amplitude, best).thrust
+
+    def excess(frequency: float) -> float:
+        return square_wave(p, amplitude, frequency).thrust - wanted
+
+    return [float(brentq(excess, best, share * best)) for share in (0.5, 1.5)]
 
 
 def _near(paper: str, value: float, stated: float, text: str) -> Claim:

@@ -56,7 +56,7 @@ def compute(jobs: int) -> None:
     cells = list(itertools.product(CRITERIA, RATIOS))
     reports = swim_all((run(*cell, rig) for cell in cells for rig in rigs), jobs)
     found = np.array([report.relative_thrust for report in reports]).reshape(len(cells), len(rigs))
-    exact = _continuous_time()
+    exact = continuous_time()
     write(
         NAME,
         [
@@ -76,8 +76,8 @@ def compute(jobs: int) -> None:
     )
 
 
-def _continuous_time() -> dict[tuple[float, float], float]:
-    """The same with the true fin velocity and no tick, where it was computed."""
+def continuous_time() -> dict[tuple[float, float], float]:
+    """Return the relative thrust with the true fin velocity and no tick, by C and ω₀Φ/Ω."""
     with REFERENCE.open(newline="", encoding="utf-8") as file:
         return {
             (float(row["C"]), float(row["w0Phi_over_Omega"])): float(row["efficiency"])
