@@ -2,7 +2,7 @@
 
 import contextlib
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -58,7 +58,7 @@ STEPS = 6400
 @click.option(
     "--no-command",
     is_flag=True,
-    help="On a robot: leave the fish at rest; without it, the winner swims on.",
+    help="On a robot: leave the fish at rest; without it, the chosen gait swims on.",
 )
 @click.option(
     "--config",
@@ -85,7 +85,8 @@ def adapt(
 
     It swims excitation, and a fish is fitted to its forces. swing --C auto finds its C, and a
     search the best square wave. A policy is trained on the cloud of fish that the fit leaves
-    possible. All three are measured on the fish, and the winner swims it from then on. Nothing is
+    possible. All three are measured on the fish, and the best one swims it from then on;
+    where the measurement leaves that undecided, the simplest of those that may be it. Nothing is
     assumed of plant and rig, even if the configuration describes them.
 
     Ctrl-C lets the fish rest; the same command with the --folder goes on, and measures nothing
@@ -117,7 +118,7 @@ def adapt(
                     showing(tank_time, "s of tank time", err=as_json) as show,
                 ):
                     state = Adaptation(rig, config, run, tank_time, steps, seed, show).run()
-                    words = command_of(_winner(state), on)
+                    words = command_of(_chosen(state), on, file, overrides, endpoint)
                     files = report.write(run, rig.amplitude, words)
             except KeyboardInterrupt:
                 kept = f"{run.state.tank_time:.0f} s of tank time are kept"
@@ -131,10 +132,10 @@ def adapt(
         else:
             _say(state)
             echo(f"report: {files[1]}, picture: {files[0]}")
-        winner = _winner(state)
+        chosen = _chosen(state)
         if fish and not no_command:
-            fish.set_controller(winner.controller, **winner.parameters)
-            echo(f"{winner.name} swims the fish now; to have it again: {words}", err=as_json)
+            fish.set_controller(chosen.controller, **chosen.parameters)
+            echo(f"{chosen.name} swims the fish now; to have it again: {words}", err=as_json)
         else:
             echo(f"to have it again: {words}", err=as_json)
     return 0
@@ -158,9 +159,9 @@ def _fish(
         yield rig, adopt(fish.config()), data, fish
 
 
-def _winner(state: "State") -> "Contender":
+def _chosen(state: "State") -> "Contender":
     assert state.verdict
-    return next(one for one in state.contenders if one.name == state.verdict.winner)
+    return next(one for one in state.contenders if one.name == state.verdict.chosen)
 
 
 def _kept(run: "AdaptFolder") -> str:
@@ -169,12 +170,24 @@ def _kept(run: "AdaptFolder") -> str:
     return f"{used:.0f} s of tank time are kept; to go on: " if used else "to begin again: "
 
 
-def command_of(one: "Contender", on: str) -> str:
-    """The command line that lets a gait swim."""
+def command_of(
+    one: "Contender",
+    on: str,
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+    endpoint: str | None = None,
+) -> str:
+    """Return the command line that lets a gait swim the same fish.
+
+    file, overrides: configuration of a simulated one; endpoint: of the fishd of another one
+    """
     words = ["fishctl", "set-controller" if on == "robot" else "simulate", one.controller]
     for name, value in one.parameters.items():
         shown = f"{value:.6g}" if isinstance(value, float) else str(value)
         words += [f"--{name.replace('_', '-')}", shown]
+    words += ["--config", str(file)] if file else []
+    words += [word for text in overrides for word in ("--set", text)]
+    words += ["--endpoint", endpoint] if endpoint else []
     return shlex.join(words)
 
 

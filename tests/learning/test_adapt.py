@@ -18,7 +18,17 @@ from fishd.lab.rig import LiveRig, VirtualRig
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.cloud import WIDER, cloud
-from fishd.learning.adapt.state import AdaptFolder, Begun, Contender, Fitted, State, Trained, Tried
+from fishd.learning.adapt.prior import MODEL_ERROR, model_error
+from fishd.learning.adapt.state import (
+    AdaptFolder,
+    Begun,
+    Contender,
+    Fitted,
+    Model,
+    State,
+    Trained,
+    Tried,
+)
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import judge
 from fishd.learning.env.simulated_link import at_edge, drawn
@@ -67,59 +77,135 @@ def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
     assert [at_edge(Config(), spread, seed).plant for seed in range(5)] == list(fish)
 
 
-def contender(name: str, thrust: float, error: float, expected: float = 0.0) -> Contender:
+CONTROLLERS = {"policy": "ppo", "swing": "swing", "square": "square"}
+GOOD = Model(explained=0.995, error=MODEL_ERROR)
+USELESS = Model(explained=0.61, error=None)
+
+
+def contender(name: str, thrust: float, error: float, *expected: float) -> Contender:
     return Contender(
-        name=name, controller="swing", parameters={}, thrust=thrust, error=error, frequency=1.7,
-        seconds=46.0, expected=expected,
+        name=name, controller=CONTROLLERS[name], parameters={}, thrust=thrust, error=error,
+        frequency=1.7, seconds=46.0, expected=list(expected),
     )  # fmt: skip
 
 
 def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
-    told = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3, 1.0)])
-    assert (told.winner, told.told) == ("swing", True)
-    assert told.relative_thrust == pytest.approx(1.05)
+    won = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3)], GOOD)
+    assert (won.chosen, won.decided, won.undecided) == ("swing", True, ["swing"])
+    assert won.relative_thrust == pytest.approx(1.05)
     # √2 · 1 % of relative error, for a single comparison
-    assert (told.low, told.high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
-    assert "swing as --C auto has found it wins: it thrusts 105.0 %" in told.claim
+    assert (won.low, won.high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
+    assert "swing as --C auto has found it wins: it thrusts 105.0 %" in won.claim
 
 
-def test_where_it_does_not_the_identified_fish_tells() -> None:
-    near = judge([contender("policy", 20.1e-3, 0.2e-3, 0.8), contender("square", 20e-3, 2e-4, 0.9)])
-    assert (near.winner, near.told, near.relative_thrust) == ("square", False, 1.0)
-    assert "the measurement does not tell it from the policy: on the" in near.claim
+def test_where_it_does_not_the_simplest_is_chosen_and_nothing_wins() -> None:
+    near = [contender("policy", 20.2e-3, 2e-4), contender("square", 20e-3, 2e-4)]
+    swing = contender("swing", 20.1e-3, 2e-4)
+    two, three = judge(near, GOOD), judge([swing, *near], USELESS)
+    assert (two.chosen, two.decided, two.relative_thrust) == ("square", False, 1.0)
+    assert three.undecided == ["square", "swing", "policy"]
+    assert three.claim.startswith(
+        "undecided between the best square wave found, swing as --C auto has found it and the "
+        "policy; the best square wave found chosen because it is the simplest; of the thrust "
+    )
+    assert three.claim.endswith(
+        "the identified fish explains 61% of its forces only, so it is not used"
+    )
+    assert not any("wins" in verdict.claim for verdict in (two, three))
+
+
+@pytest.mark.parametrize(
+    ("model", "chosen"),
+    [
+        (GOOD, "policy"),
+        (Model(explained=0.9, error=0.3), "square"),  # as good as no model
+        (USELESS, "square"),
+        (Model(explained=0.995, error=MODEL_ERROR, is_rejected=True), "square"),
+    ],
+)
+def test_the_identified_fish_counts_by_how_well_it_explains(model: Model, chosen: str) -> None:
+    # Measured to 7 %; on the fish of the cloud the policy has 15 % more.
+    vague = [
+        contender("policy", 20.5e-3, 1.4e-3, 23e-3, 24e-3),
+        contender("square", 20e-3, 1.4e-3, 20e-3, 21e-3),
+    ]
+    verdict = judge(vague, model)
+    assert (verdict.chosen, verdict.decided) == (chosen, False)
+    reason = "because the identified fish, which explains 99.5% of its forces, thrusts most with it"
+    assert (reason in verdict.claim) == (chosen == "policy")
+
+
+def test_thrusts_that_contradict_the_identified_fish_are_believed_instead_of_it() -> None:
+    measured = [
+        contender("policy", 19.9e-3, 2e-4, 30e-3, 30e-3),
+        contender("square", 20e-3, 2e-4, 20e-3, 20e-3),
+    ]
+    assert judge(measured, GOOD).chosen == "square"
 
 
 def test_intervals_of_two_are_wider_than_that_of_one() -> None:
     square, swing = contender("square", 20e-3, 0.2e-3), contender("swing", 21e-3, 0.2e-3)
-    one, two = judge([swing, square]), judge([contender("policy", 1e-3, 0.2e-3), swing, square])
+    policy = contender("policy", 1e-3, 0.2e-3)
+    one, two = judge([swing, square], GOOD), judge([policy, swing, square], GOOD)
     assert two.high - two.low == pytest.approx(2.2414 / 1.96 * (one.high - one.low), rel=2e-3)
 
 
 def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
     with pytest.raises(FishdError, match="too little to be told from nothing"):
-        judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)])
+        judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)], GOOD)
 
 
-FITTED = Fitted(
-    plant=PlantParameters(), rig=SimulationSettings(), offset=0.0, cloud=(PlantParameters(),),
-    found={},
-)  # fmt: skip
+def test_the_weight_of_a_fit_follows_what_it_explains() -> None:
+    def channels(white: bool, *explained: float) -> list[Channel]:
+        return [Channel("fx", share, 1e-3, 0.0, white) for share in explained]
+
+    assert model_error(channels(True, 0.4, 0.99)) == MODEL_ERROR  # what is left is noise
+    assert model_error(channels(False, 0.99, 0.999)) == pytest.approx(0.1, rel=0.01)
+    assert model_error(channels(False, 0.999, 0.61)) is None
 
 
-@pytest.mark.parametrize(("scale", "agrees"), [(lambda f: 0.9, True), (lambda f: f, False)])
-def test_the_fit_says_which_square_wave_is_best_unless_the_tank_disagrees(
-    scale: Any, agrees: bool
+def fitted(model: Model) -> Fitted:
+    return Fitted(
+        plant=PlantParameters(), rig=SimulationSettings(), offset=0.0, cloud=(PlantParameters(),),
+        model=model, found={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("model", "scale", "used"),
+    [
+        (GOOD, lambda f: 0.9, True),
+        (GOOD, lambda f: f, False),  # the tank disagrees
+        (Model(explained=0.8, error=0.45), lambda f: f, True),  # so vague that the tank tells
+        (USELESS, lambda f: f, False),
+    ],
+)
+def test_the_fit_says_which_square_wave_is_best_by_how_well_it_explains(
+    model: Model, scale: Any, used: bool
 ) -> None:
     with VirtualRig(Config()) as rig:
-        search = steps.square_waves(FITTED, Tank(rig, 0.0, lambda used: None), 0)
+        search = steps.square_waves(fitted(model), Tank(rig, 0.0, lambda used: None), 0)
     tried = []
     for frequency in search.ranges[0].values:
         thrust = scale(frequency) * square_wave(PlantParameters(), PHI, frequency).thrust
         tried.append(Tried(frequency, thrust, 0.2e-3, 0, 0.0))
         search.observe({"frequency": frequency}, thrust, 0.2e-3)
-    frequency, told = steps.best_of(search, tried, FITTED, PHI)
-    assert told == agrees
-    assert frequency == pytest.approx(10 / 6 if agrees else 2.0)
+    true = max(tried, key=lambda each: each.thrust).frequency
+    frequency, is_used = steps.best_of(search, tried, fitted(model), PHI)
+    assert is_used == used
+    assert frequency == pytest.approx(true)
+    fastest = max(search.ranges[0].values)
+    assert (fastest > 4.0) == (model.error is None)  # all frequencies are searched without a fit
+
+
+def test_few_waves_with_noise_leave_the_maximum_where_a_good_fit_has_it() -> None:
+    with VirtualRig(Config()) as rig:
+        search = steps.square_waves(fitted(GOOD), Tank(rig, 0.0, lambda used: None), 0)
+    for frequency, luck in ((10 / 8, 1.04), (10 / 6, 0.96), (2.0, 1.0)):
+        thrust = luck * square_wave(PlantParameters(), PHI, frequency).thrust
+        search.observe({"frequency": frequency}, thrust, 2e-3)
+    tried = [Tried(*each, 0, 0.0) for each in zip(*search.measured("frequency"), strict=True)]
+    assert steps.best_of(search, tried, fitted(GOOD), PHI) == (pytest.approx(10 / 6), True)
 
 
 class Quiet:
@@ -183,6 +269,9 @@ def test_what_was_measured_is_not_measured_again(
     assert sum(line.startswith("excitation") for line in show.lines) == 1
     assert any("nobody trains" in line for line in show.lines)
     assert {one.name for one in state.contenders} == {"swing", "square"}
+    assert state.verdict.chosen == "square"
+    assert state.verdict.undecided == ["square", "swing"]
+    assert all(len(one.expected) == 8 for one in state.contenders)
     for name, (value, low, high) in state.verdict.others.items():
         assert 0.95 < value < 1.05, name
         assert low < 1.0 < high
@@ -191,7 +280,10 @@ def test_what_was_measured_is_not_measured_again(
     assert picture.stat().st_size > 10_000
     text = page.read_text(encoding="utf-8")
     assert "fishctl set-controller &lt;swing&gt;" in text
-    assert state.verdict.winner in text
+    assert "the best square wave found, chosen" in text
+    assert "<td>rad/s</td>" in text
+    assert "<td>–</td>" in text
+    assert "e-" not in text.partition("<h2>The fish</h2>")[2]
     with pytest.raises(ConfigError, match="begun with seed = 0, now it is 1"):
         folder(path, seed=1)
 
@@ -234,4 +326,9 @@ def test_the_last_line_says_what_to_type() -> None:
         contender("square", 1.0, 0.1), controller="square", parameters={"frequency": 5.0 / 3.0}
     )
     assert command_of(one, "robot") == "fishctl set-controller square --frequency 1.66667"
-    assert command_of(one, "simulation").startswith("fishctl simulate square")
+    assert command_of(one, "robot", endpoint="ipc:///run/a").endswith(" --endpoint ipc:///run/a")
+    fish = command_of(one, "simulation", Path("a fish.yaml"), ("plant.xi=0.9", "tick=0.05"))
+    assert fish == (
+        "fishctl simulate square --frequency 1.66667 --config 'a fish.yaml' --set plant.xi=0.9 "
+        "--set tick=0.05"
+    )

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
+from msgspec.structs import replace
+
 from fishd.config import Config
 from fishd.core.errors import FishdError
 from fishd.lab import error_budget
@@ -12,7 +14,16 @@ from fishd.lab.measurement import REST, measure
 from fishd.lab.rig import Rig, is_of_one
 from fishd.learning.adapt import steps as do
 from fishd.learning.adapt.practice import TRIES, practise, simulated
-from fishd.learning.adapt.state import FISH, POLICY, AdaptFolder, Contender, State, Tried
+from fishd.learning.adapt.state import (
+    FISH,
+    POLICY,
+    AdaptFolder,
+    Contender,
+    Model,
+    State,
+    Trained,
+    Tried,
+)
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import SQUARE, judge
 from fishd.simulation import simulate
@@ -88,7 +99,7 @@ class Adaptation:
             self._practise(state)
         if state.verdict is None:
             self._contest(state)
-            state.verdict = judge(state.contenders)
+            state.verdict = judge(state.contenders, self._model(state))
             self._keep()
         return state
 
@@ -107,7 +118,8 @@ class Adaptation:
         found, state.fitted = do.fit(path, self._tank.amplitude, self._seed)
         self._run.write(FISH, found.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in found.channels)
-        self._done(f"fit: it explains {explained} of F_x and F_y")
+        unused = "" if state.fitted.model.error is not None else ": too little to be used"
+        self._done(f"fit: it explains {explained} of F_x and F_y{unused}")
         for remark in found.remarks:
             self._show.warn(f"fishctl: careful: {remark}")
 
@@ -134,14 +146,24 @@ class Adaptation:
         path = self._run.recording("search")
         with self._in_tank("search", "searching square waves"), self._tank.recorded(path, _NOTE):
             do.search_square_waves(self._tank, search, budget, tuple(state.trials), keep)
-        state.square, told = do.best_of(search, state.trials, state.fitted, self._tank.amplitude)
+        state.square, used = do.best_of(search, state.trials, state.fitted, self._tank.amplitude)
+        state.disagrees = not used and state.fitted.model.error is not None
         tried = f"{len(state.trials)} square waves tried"
-        agree = "they agree with" if told else "whatever"
-        does = "" if told else " says"
-        self._done(f"search: {tried}; best at {state.square:.4g} Hz, {agree} the fit{does}")
+        by = "they agree with the fit" if used else "by these alone"
+        by = "they disagree with the fit, which is not used" if state.disagrees else by
+        self._done(f"search: {tried}; best at {state.square:.4g} Hz, {by}")
+
+    def _model(self, state: State) -> Model:
+        """How far the identified fish is used."""
+        assert state.fitted
+        return replace(state.fitted.model, is_rejected=state.disagrees)
 
     def _practise(self, state: State) -> None:
         assert state.fitted
+        if state.fitted.model.error is None:
+            state.trained = Trained(steps=0, refused="the fit explains too little to train on it")
+            self._done("no policy is trained: the fit explains too little")
+            return
 
         def progress(done: int) -> None:
             again, step = divmod(done - 1, self._steps)
@@ -228,11 +250,16 @@ class Adaptation:
         if found.remark:
             self._show.warn(f"fishctl: {gait.name}: {found.remark}")
 
-    def _expected(self, state: State, gait: Gait) -> float:
-        """The thrust of a gait on the identified fish [N]."""
+    def _expected(self, state: State, gait: Gait) -> list[float]:
+        """Thrusts of a gait on the first fish of the cloud [N]; empty where these are not used."""
         assert state.fitted
-        config = simulated(self._config, state.fitted)
-        return simulate(config, gait.controller, gait.parameters).mean_thrust
+        if state.fitted.model.error is None:
+            return []
+        identified = simulated(self._config, state.fitted)
+        return [
+            simulate(replace(identified, plant=plant), gait.controller, gait.parameters).mean_thrust
+            for plant in state.fitted.cloud[:_CLOUD]
+        ]
 
     @contextmanager
     def _in_tank(self, step: str, doing: str) -> Iterator[None]:
@@ -256,6 +283,8 @@ class Adaptation:
 
 
 _NOTE = "fishctl adapt"
+_CLOUD = 8
+"""Fish of the cloud on which a gait is simulated."""
 
 
 def _truth(config: Config, rig: Rig, gait: Gait) -> dict[str, float]:

@@ -14,8 +14,9 @@ from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
 from fishd.lab.identification.fit import LOGARITHMIC
 from fishd.lab.identification.formatting import format_estimate
 from fishd.lab.identification.result import Estimate
-from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State
-from fishd.learning.adapt.verdict import NAMES, SQUARE, spelled
+from fishd.lab.ranking import format_ratio
+from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State, Verdict
+from fishd.learning.adapt.verdict import NAMES, SQUARE
 from fishd.learning.run_folder.tables import read_evaluations
 from fishd.virtual.plant.optimum import square_wave
 
@@ -29,7 +30,7 @@ img { max-width: 100%; } .claim { font-size: 1.3em; } code { background: #f3f3f3
 def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     """Draw the picture and write the page; the paths of both.
 
-    amplitude: Φ [rad]; again: the command line that lets the winner swim
+    amplitude: Φ [rad]; again: the command line that lets the chosen gait swim
     Raises `FishdError` where one cannot be written.
     """
     picture = run.path / PICTURE
@@ -182,9 +183,9 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         share = state.verdict.others.get(one.name)
         relative_thrust = "1"
         if share:
-            relative_thrust = spelled(share)
+            efficiency = format_ratio(share)
         row = [
-            NAMES[one.name] + (", the winner" if one.name == state.verdict.winner else ""),
+            NAMES[one.name] + _role(one.name, state.verdict),
             error_budget.spelled(one.thrust, one.error, one.calibration_ci95, one.total_ci95, "N"),
             f"{one.frequency:.3f}",
             relative_thrust,
@@ -194,6 +195,15 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             row.append("" if true is None else f"{1e3 * true:.2f} mN")
         rows.append(tuple(row))
     return head, rows
+
+
+def _role(name: str, verdict: Verdict) -> str:
+    """Return what the verdict says of a gait, to stand behind its name."""
+    if name not in verdict.undecided:
+        return ""
+    if verdict.decided:
+        return ", wins"
+    return ", chosen" if name == verdict.chosen else ", undecided"
 
 
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:

@@ -31,6 +31,17 @@ class Begun(Struct, frozen=True):
     version: str = __version__
 
 
+class Model(Struct, frozen=True, kw_only=True):
+    """How far the identified fish can be used to choose among gaits."""
+
+    explained: float
+    """Share of the variance of a force that it explains; the smaller one of both forces."""
+    error: float | None
+    """Standard error of a thrust of it, as a fraction; None where it explains too little."""
+    is_rejected: bool = False
+    """Whether the square waves tried disagree with it."""
+
+
 class Fitted(Struct, frozen=True, kw_only=True):
     """The fish that explains the forces best, and those that do nearly as well."""
 
@@ -39,6 +50,7 @@ class Fitted(Struct, frozen=True, kw_only=True):
     offset: float
     """Half of the range in which the offset of F_y may be while the fish swims [N]."""
     cloud: tuple[PlantParameters, ...]
+    model: Model
     found: dict[str, Any]
     """The estimates with their intervals, and remarks, as `fishctl identify --json` gives them."""
 
@@ -106,8 +118,9 @@ class Contender(Struct, frozen=True, kw_only=True):
     seconds: float
     """How long it was measured, rests included [s]."""
     remark: str = ""
-    expected: float
-    """On the identified fish, in simulation [N]."""
+    expected: list[float] = []
+    """Thrust on fish of the cloud, the identified one first, in simulation [N]; empty where that
+    is not used."""
     true_thrust: float | None = None
     """Of a simulated fish [N]."""
     true_relative_thrust: float | None = None
@@ -115,17 +128,21 @@ class Contender(Struct, frozen=True, kw_only=True):
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
-    """Who has won, and by how much; relative thrusts are over the best square wave found."""
+    """Which gait is chosen, and why; relative thrusts are over the best square wave found."""
 
-    winner: str
+    chosen: str
+    """The winner, or the one chosen from those between which it is undecided."""
+    decided: bool
+    """Whether the measurement alone says that it is the best one."""
+    undecided: list[str]
+    """Those that may be the best one, as far as the measurement tells, simplest first."""
     relative_thrust: float
+    """Of the chosen one."""
     low: float
-    """The 95 % interval of the winner's relative thrust holds whoever of them all has won."""
+    """Lower end of its 95 % interval, which holds whichever gait is chosen."""
     high: float
     others: dict[str, tuple[float, float, float]]
     """Of each one but the square wave: relative thrust, and its interval."""
-    told: bool
-    """Is it the winner by measurement alone? Else others did as well, as far as that tells."""
     claim: str
     """The same in a sentence."""
 
@@ -145,6 +162,8 @@ class State(Struct, kw_only=True):
     """Square waves, as they were tried."""
     square: float | None = None
     """The frequency of the best of them [Hz]."""
+    disagrees: bool = False
+    """Whether the square waves tried disagree with the identified fish."""
     trained: Trained | None = None
     contenders: list[Contender] = []
     left_out: dict[str, str] = {}

@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.stats import chi2
 
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.measurement import REST, SWIM
@@ -16,21 +15,26 @@ from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import Trial, lengths, trials, whole_ticks
 from fishd.learning.adapt.cloud import cloud, identified
-from fishd.learning.adapt.state import Fitted, Rung, Tried
+from fishd.learning.adapt.prior import (
+    combine,
+    correlation_of_waves,
+    deviations,
+    is_rejected,
+    model_error,
+)
+from fishd.learning.adapt.state import Fitted, Model, Rung, Tried
 from fishd.learning.adapt.tank import Tank
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
 FITTED = (*DEFAULT, "servo_dead_zone", "servo_reaction")
 """What is fitted: all of a fish that a fit can find, but slack, which backlash stands for."""
-LEAST_EXPLAINED = 0.5
-"""A fish of which the fit explains less, of either force, is not the one that it describes."""
+LEAST_EXPLAINED = 0.1
+"""Where the fit explains a smaller share of a force, that is mostly noise, and no fish is known."""
 AROUND = 2.0
 """Square waves are searched from so many times below to above the best of the identified fish."""
 SLOWEST, FASTEST = 0.3, 8.0
 """They are searched between these, whatever the fit says [Hz]."""
-DISAGREES = 0.01
-"""Square waves disagree with the identified fish where so few as good as it would miss so much."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
 """Shares of the tank time; the comparison has the rest."""
 LEAST = 150.0
@@ -41,25 +45,29 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     """The fish of a recorded excitation, of which nothing is known before, and its cloud.
 
     amplitude: Φ [rad]
-    Raises `Unidentifiable`, also where the best fit leaves half of a force unexplained.
+    Raises `Unidentifiable`, also where the best fit explains next to nothing of a force.
     """
     found = identify([recording], fit=FITTED)
     for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
         if not channel.explained >= LEAST_EXPLAINED:
             raise Unidentifiable(
-                f"the best fit explains {max(0.0, channel.explained):.0%} of {symbol} only: this "
-                "fish moves otherwise than the model of a tethered fish, or its forces are mostly "
-                "noise; see fishctl plot and fishctl identify with --plot"
+                f"the best fit explains {max(0.0, channel.explained):.0%} of {symbol} only: its "
+                "forces are mostly noise, or have nothing to do with what it is told to do; see "
+                "fishctl plot and fishctl identify with --plot"
             )
     plant = identified(found)
-    if not best_square_wave(plant, amplitude).thrust > 0.0:
-        raise Unidentifiable("the identified fish has no thrust")
+    thrusts = best_square_wave(plant, amplitude).thrust > 0.0
+    model = Model(
+        explained=min(channel.explained for channel in found.channels),
+        error=model_error(found.channels) if thrusts else None,
+    )
     offset, drift = found["offset_y"], found.channels[1].drift
     fitted = Fitted(
         plant=plant,
         rig=msgspec.convert(found.simulation, SimulationSettings),
         offset=max(offset.high - offset.value, 0.5 * drift),
         cloud=cloud(found, seed),
+        model=model,
         found=found.to_builtins(),
     )
     return found, fitted
@@ -79,10 +87,16 @@ def settle_swing(rig: Tank, seconds: float) -> Rung:
 
 
 def square_waves(fitted: Fitted, rig: Tank, seed: int) -> Search:
-    """A search over the square waves of whole ticks around the best of the identified fish."""
-    best = best_square_wave(fitted.plant, rig.amplitude).frequency
-    best = min(FASTEST / AROUND, max(SLOWEST * AROUND, best))
-    low, high = best / AROUND, min(best * AROUND, 0.5 / rig.tick)
+    """Return a search over square waves of whole ticks around the best of the identified fish.
+
+    Where that explains too little, all frequencies are searched.
+    """
+    low, high = SLOWEST, FASTEST
+    if fitted.model.error is not None:
+        best = best_square_wave(fitted.plant, rig.amplitude).frequency
+        best = min(FASTEST / AROUND, max(SLOWEST * AROUND, best))
+        low, high = best / AROUND, best * AROUND
+    high = min(high, 0.5 / rig.tick)
     return Search([whole_ticks(Range("frequency", low, high), rig.tick)], seed)
 
 
@@ -112,24 +126,27 @@ def search_square_waves(
 def best_of(
     search: Search, tried: Sequence[Tried], fitted: Fitted, amplitude: float
 ) -> tuple[float, bool]:
-    """The frequency of the best square wave [Hz], and whether the identified fish has told it.
+    """Return the frequency of the best square wave [Hz], and whether the identified fish is used.
 
-    Where what was tried agrees with that fish, up to a factor, its curve says where the maximum is:
-    it stands on a whole excitation, and a few trials with noise tell less. Where it does not, the
-    search alone says so.
+    Its curve stands on a whole excitation, and a few trials with noise tell less. It counts by how
+    well it explains the forces. Where it explains too little, or what was tried disagrees with it,
+    the search alone tells.
     """
-    curve = {
-        frequency: square_wave(fitted.plant, amplitude, frequency).thrust
-        for frequency in search.ranges[0].values
-    }
-    expected = np.array([curve[each.frequency] for each in tried])
-    measured = np.array([each.thrust for each in tried])
-    weights = np.array([(1.96 / each.error) ** 2 for each in tried])
-    factor = (weights @ (expected * measured)) / (weights @ expected**2)
-    missed = weights @ (measured - factor * expected) ** 2
-    agrees = factor > 0.0 and chi2.sf(missed, max(1, len(tried) - 1)) > DISAGREES
-    if agrees:
-        return max(curve, key=lambda frequency: curve[frequency]), True
+    frequencies = search.ranges[0].values
+    if fitted.model.error is not None:
+        curves = np.array(
+            [
+                [square_wave(plant, amplitude, f).thrust for f in frequencies]
+                for plant in fitted.cloud
+            ]
+        )
+        spread = deviations(curves, fitted.model.error, correlation_of_waves(frequencies))
+        places = [int(np.argmin(np.abs(np.subtract(frequencies, t.frequency)))) for t in tried]
+        measured = np.array([each.thrust for each in tried])
+        ci95 = np.array([each.error for each in tried])
+        if not is_rejected(curves[0], spread, places, measured, ci95):
+            thrusts, _ = combine(curves[0], spread, places, measured, ci95)
+            return frequencies[int(np.argmax(thrusts))], True
     return search.proposal().parameters["frequency"], False
 
 

@@ -1,11 +1,24 @@
-"""Who has won, and the interval of its relative thrust."""
+"""Which gait is the best one, as far as the measurement tells, and its relative thrust."""
 
-import math
 from collections.abc import Sequence
-from statistics import NormalDist
+
+import numpy as np
 
 from fishd.core.errors import FishdError
-from fishd.learning.adapt.state import Contender, Verdict
+from fishd.lab.ranking import (
+    Candidate,
+    complexity,
+    format_choice,
+    format_ratio,
+    half_width,
+    join,
+    not_excluded,
+    rank,
+    ratio,
+    widening,
+)
+from fishd.learning.adapt.prior import combine, deviations, is_rejected
+from fishd.learning.adapt.state import Contender, Model, Verdict
 
 SQUARE = "square"
 NAMES = {
@@ -13,87 +26,121 @@ NAMES = {
     "swing": "swing as --C auto has found it",
     SQUARE: "the best square wave found",
 }
-_LEVEL = 0.05
 
 
-def judge(contenders: Sequence[Contender]) -> Verdict:
-    """The one with the largest measured thrust wins.
+def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
+    """Return which gait is the best one, or between which the measurement leaves it undecided.
 
-    Where the measurement does not tell others from it, that one of them wins which thrusts most on
-    the identified fish.
+    The one that thrusts more than all others by more than the intervals of the differences wins
+    (`fishd.lab.ranking`). Where several are left, those are dropped that the measurement and the
+    identified fish together exclude, and the simplest of the rest is chosen.
 
-    Relative thrusts are shares of that of the square wave. Their intervals are so wide that all of
-    them hold together in 95 % of cases (Bonferroni): that of the winner is as good for having been
-    chosen. The square wave itself has 1, without an error.
+    Relative thrusts are shares of that of the square wave. Their intervals hold together in 95 %
+    of cases (Bonferroni). The square wave itself has 1, without an error.
 
     contenders: the one named `square` among them
     Raises `FishdError` where that hardly thrusts, so that it is no measure.
     """
     square = next(one for one in contenders if one.name == SQUARE)
     others = [one for one in contenders if one is not square]
-    normal = NormalDist()
-    wider = normal.inv_cdf(1.0 - 0.5 * _LEVEL / max(1, len(others))) / normal.inv_cdf(0.975)
-    shares = {one.name: _share(one, square, wider) for one in others}
-    first = max(contenders, key=lambda one: one.thrust)
-    level = [
-        one
-        for one in contenders
-        if first.thrust - one.thrust <= wider * math.hypot(first.error, one.error)
-    ]
-    winner = max(level, key=lambda one: one.expected)
-    relative_thrust, low, high = shares.get(winner.name, (1.0, 1.0, 1.0))
+    shares = {one.name: _share(one, square, len(others)) for one in others}
+    ranking = rank([_candidate(one) for one in contenders])
+    names = [each.name for each in ranking.undecided]
+    if ranking.is_decided:
+        chosen, claim = names[0], _win(names[0], shares)
+    else:
+        left = _likely(contenders, names, model)
+        chosen = left[0]
+        reason = _reason(ranking.reason, chosen == names[0], len(left), model)
+        claim = format_choice([NAMES[name] for name in names], NAMES[chosen], reason)
+        if shares:
+            claim += f"; of the thrust of {NAMES[SQUARE]} has {_list(shares)}"
+        if unused := _unused(model):
+            claim += f"; {unused}"
+    relative_thrust, low, high = shares.get(chosen, (1.0, 1.0, 1.0))
     return Verdict(
-        winner=winner.name,
+        chosen=chosen,
+        decided=ranking.is_decided,
+        undecided=names,
         relative_thrust=relative_thrust,
         low=low,
         high=high,
         others=shares,
-        told=len(level) == 1,
-        claim=_claim(winner.name, shares)
-        + _untold([one.name for one in level if one is not winner]),
+        claim=claim,
     )
 
 
-def _share(one: Contender, square: Contender, wider: float) -> tuple[float, float, float]:
-    """A relative thrust with its interval, by Fieller's theorem for independent errors.
+def _candidate(one: Contender) -> Candidate:
+    return Candidate(one.name, one.thrust, one.error, complexity(one.controller))
 
-    (Fieller, "Some problems in interval estimation", J. R. Stat. Soc. B 16 (1954) 175.)
-    """
-    a, b = one.thrust, square.thrust
-    va, vb = (wider * one.error) ** 2, (wider * square.error) ** 2
-    if not b > 0.0 or vb >= b * b:
+
+def _share(one: Contender, square: Contender, comparisons: int) -> tuple[float, float, float]:
+    """Return a relative thrust with its interval; raises `FishdError`."""
+    widths = [half_width(_candidate(each), comparisons) for each in (one, square)]
+    share = ratio(one.thrust, widths[0], square.thrust, widths[1])
+    if share is None:
         raise FishdError(
-            f"the best square wave found thrusts {1e3 * b:.2f} ± {1e3 * square.error:.2f} mN: too "
-            "little to be told from nothing, so no relative thrust is known"
+            f"the best square wave found thrusts {1e3 * square.thrust:.2f} ± "
+            f"{1e3 * square.error:.2f} mN: too little to be told from nothing, so no relative "
+            "thrust is known"
         )
-    middle, scale = a * b, b * b - vb
-    half = math.sqrt(max(0.0, middle**2 - (a * a - va) * scale))
-    return a / b, (middle - half) / scale, (middle + half) / scale
+    return share
 
 
-def _claim(winner: str, shares: dict[str, tuple[float, float, float]]) -> str:
-    if winner in shares:
-        return f"{NAMES[winner]} wins: it thrusts {spelled(shares[winner])} of {NAMES[SQUARE]}"
+def _likely(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
+    """Return the undecided gaits that the identified fish leaves possible, too, in their order."""
+    expected = np.array([one.expected for one in contenders]).T
+    if model.error is None or model.is_rejected or not expected.size or expected[0].min() <= 0.0:
+        return names
+    places = range(len(contenders))
+    measured = np.array([one.thrust for one in contenders])
+    ci95 = np.array([one.error for one in contenders])
+    spread = deviations(expected, model.error)
+    if is_rejected(expected[0], spread, places, measured, ci95):
+        return names
+    thrusts, covariance = combine(expected[0], spread, places, measured, ci95)
+    width = 1.96 * widening(len(contenders) * (len(contenders) - 1) // 2)
+
+    def apart(i: int, j: int) -> float:
+        variance = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
+        return width * float(np.sqrt(max(0.0, variance)))
+
+    left = {contenders[k].name for k in not_excluded(thrusts.tolist(), apart)}
+    return [name for name in names if name in left] or names
+
+
+def _reason(simplest: str, is_simplest: bool, left: int, model: Model) -> str:
+    """Return why a gait is chosen among those that the measurement leaves undecided.
+
+    simplest: the reason for the simplest one; left: how many the identified fish leaves
+    """
+    if is_simplest:
+        return simplest
+    fish = f"the identified fish, which explains {model.explained:.1%} of its forces"
+    if left == 1:
+        return f"{fish}, thrusts most with it"
+    return f"it is the simplest that {fish}, leaves possible"
+
+
+def _unused(model: Model) -> str:
+    """Return why the identified fish has no part in a choice; empty where it has."""
+    if model.error is None:
+        return (
+            f"the identified fish explains {max(0.0, model.explained):.0%} of its forces only, so "
+            "it is not used"
+        )
+    if model.is_rejected:
+        return "the square waves tried disagree with the identified fish, so it is not used"
+    return ""
+
+
+def _win(name: str, shares: dict[str, tuple[float, float, float]]) -> str:
+    if name in shares:
+        return f"{NAMES[name]} wins: it thrusts {format_ratio(shares[name])} of {NAMES[SQUARE]}"
     if not shares:
         return f"{NAMES[SQUARE]} wins: it is the only one that could be measured"
-    others = " and ".join(f"{NAMES[name]} {spelled(share)}" for name, share in shares.items())
-    return f"{NAMES[SQUARE]} wins: of its thrust has {others}"
+    return f"{NAMES[SQUARE]} wins: of its thrust has {_list(shares)}"
 
 
-def _untold(names: Sequence[str]) -> str:
-    """From whom the measurement does not tell the winner, if from anyone."""
-    if not names:
-        return ""
-    others = " or from ".join(NAMES[name] for name in names)
-    return f"; the measurement does not tell it from {others}: on the identified fish it is best"
-
-
-def spelled(share: tuple[float, float, float]) -> str:
-    """A relative thrust with its interval."""
-    value, low, high = share
-    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
-
-
-def percent(share: float) -> str:
-    """With one decimal."""
-    return f"{round(100.0 * share, 1) + 0.0:.1f} %"  # no negative zero
+def _list(shares: dict[str, tuple[float, float, float]]) -> str:
+    return join([f"{NAMES[name]} {format_ratio(share)}" for name, share in shares.items()])

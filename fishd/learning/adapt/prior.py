@@ -1,0 +1,102 @@
+"""What the identified fish says of thrusts, with a weight that follows how well it explains.
+
+A thrust is taken to be that of the identified fish, times a factor which all gaits have in common,
+times a deviation of each gait. The factor is unknown. The deviations are as large as the fish of
+the cloud differ, and as the share of the forces that the fit does not explain. So a fish that
+explains all of them says how gaits compare, and one that explains little says nothing beside a
+measurement.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from fishd.lab.identification import Channel
+
+Array = NDArray[np.float64]
+
+MIN_EXPLAINED = 0.7
+"""Smallest share of the variance of both forces that a fit must explain to be used at all."""
+MODEL_ERROR = 0.01
+"""Standard error of a thrust of an identified fish that leaves nothing but noise, as a fraction."""
+REJECTED = 0.01
+"""Probability, under the identified fish, of a misfit at least as large; below it, the measured
+thrusts reject it."""
+_UNKNOWN_FACTOR = 10.0
+"""Standard deviation of the common factor."""
+_CORRELATED = 0.3
+"""Distance at which deviations of square waves are still alike, as a logarithm of frequency."""
+
+
+def model_error(channels: Sequence[Channel]) -> float | None:
+    """Return the standard error of a thrust of the identified fish, as a fraction of it.
+
+    Where more than noise is left over, it is as large as the rms that is left over, as a fraction
+    of that of the force. None where the fit explains too little to be used.
+    """
+    if all(channel.white for channel in channels):
+        return MODEL_ERROR
+    explained = min(channel.explained for channel in channels)
+    if not explained >= MIN_EXPLAINED:
+        return None
+    return math.hypot(MODEL_ERROR, math.sqrt(max(0.0, 1.0 - explained)))
+
+
+def deviations(curves: Array, error: float, correlation: Array | None = None) -> Array:
+    """Return the covariance of the deviations of gaits, as fractions of their thrusts.
+
+    curves: thrusts of the gaits on each fish of the cloud, the identified one first, (fish, gaits)
+    error: as `model_error` returns
+    correlation: of what the fit does not explain, between gaits; by default there is none
+    """
+    gaits = curves.shape[1]
+    ratios = curves[1:] / curves[0]
+    if len(ratios):
+        ratios = ratios / ratios.mean(axis=1, keepdims=True)  # without the common factor
+    spread = (ratios - 1.0).T @ (ratios - 1.0) / max(1, len(ratios))
+    own = np.eye(gaits) if correlation is None else correlation
+    covariance: Array = spread + error**2 * own
+    return covariance
+
+
+def correlation_of_waves(frequencies: Sequence[float]) -> Array:
+    """Return how alike the deviations of square waves of these frequencies are [Hz]."""
+    logs = np.log(frequencies)
+    apart = (logs[:, None] - logs[None, :]) / _CORRELATED
+    correlation: Array = np.exp(-0.5 * apart**2)
+    return correlation
+
+
+def combine(
+    expected: Array, covariance: Array, places: Sequence[int], measured: Array, ci95: Array
+) -> tuple[Array, Array]:
+    """Return thrusts and their covariance, from the identified fish and from measurements.
+
+    expected: thrusts of the gaits on the identified fish, all above zero [N]
+    covariance: as `deviations` returns
+    places: which gait each measurement is of
+    measured, ci95: thrusts, and half-widths of their 95 % confidence intervals [N]
+    """
+    at = list(places)
+    prior = covariance + _UNKNOWN_FACTOR**2
+    noise = np.diag((ci95 / 1.96 / expected[at]) ** 2)
+    gain = np.linalg.solve(prior[np.ix_(at, at)] + noise, prior[at]).T
+    ratios = 1.0 + gain @ (measured / expected[at] - 1.0)
+    left = prior - gain @ prior[at]
+    return expected * ratios, left * np.outer(expected, expected)
+
+
+def is_rejected(
+    expected: Array, covariance: Array, places: Sequence[int], measured: Array, ci95: Array
+) -> bool:
+    """Return True where measurements disagree with the identified fish; arguments as `combine`."""
+    at = list(places)
+    ratios = measured / expected[at]
+    noise = np.diag((ci95 / 1.96 / expected[at]) ** 2)
+    inverse = np.linalg.inv(covariance[np.ix_(at, at)] + noise)
+    factor = float(inverse.sum(axis=0) @ ratios / inverse.sum())
+    missed = float((ratios - factor) @ inverse @ (ratios - factor))
+    return factor <= 0.0 or bool(chi2.sf(missed, max(1, len(at) - 1)) < REJECTED)
