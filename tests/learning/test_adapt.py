@@ -14,6 +14,7 @@ from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError, Refused
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
+from fishd.lab.ranking import format_ratio
 from fishd.lab.rig import LiveRig, VirtualRig
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
@@ -281,6 +282,7 @@ def test_what_was_measured_is_not_measured_again(
     text = page.read_text(encoding="utf-8")
     assert "fishctl set-controller &lt;swing&gt;" in text
     assert "the best square wave found, chosen" in text
+    assert format_ratio(state.verdict.others["swing"]) in text.partition("<h2>In the tank</h2>")[2]
     assert "<td>rad/s</td>" in text
     assert "<td>–</td>" in text
     assert "e-" not in text.partition("<h2>The fish</h2>")[2]

@@ -183,7 +183,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         share = state.verdict.others.get(one.name)
         relative_thrust = "1"
         if share:
-            efficiency = format_ratio(share)
+            relative_thrust = format_ratio(share)
         row = [
             NAMES[one.name] + _role(one.name, state.verdict),
             error_budget.spelled(one.thrust, one.error, one.calibration_ci95, one.total_ci95, "N"),
