@@ -16,6 +16,7 @@ from fishd.cli.output import echo, print_json
 from fishd.cli.sweep import ON, refuse_other
 from fishd.client import Fish
 from fishd.config import Config, adopt, check_tethered, load
+from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
 from fishd.core.interruption import interrupted_once
@@ -313,14 +314,13 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
         if several:
             shares = [run.relative_thrust for run in standing.runs]
             cells.append(f"{min(shares):.1%} – {max(shares):.1%}")
-        error = _interval(standing.error, standing.total_ci95)
         table.add_row(
             standing.contestant,
             *cells,
-            f"{standing.thrust * 1e3:.2f}{error}",
+            text.measured(standing.thrust, _whole(standing.error, standing.total_ci95)),
             *([] if simulated else _parts(standing)),
             *(_costs(standing) if metered else []),
-            f"{standing.frequency:.3f}",
+            f"{standing.frequency:.3f}" if standing.frequency else "–",
             f"{standing.fullness:.3f}",
             f"{standing.squareness:.3f}",
         )
@@ -329,22 +329,23 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
 
 def _costs(standing: "Standing") -> list[str]:
     """Power, and what each watt gave."""
-    gave = standing.thrust_per_watt or 0.0
-    interval = _interval(standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95)
-    return [f"{standing.power or 0.0:.3f}", f"{gave * 1e3:.2f}{interval}"]
+    whole = _whole(standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95)
+    return [
+        f"{standing.power or 0.0:.3f}",
+        text.measured(standing.thrust_per_watt or 0.0, whole),
+    ]
 
 
-def _interval(statistical_ci95: float | None, total_ci95: float | None) -> str:
-    """The error of a mean, with that of the calibration where it is known, in thousandths."""
-    whole = statistical_ci95 if total_ci95 is None else total_ci95
-    return "" if whole is None else f" ± {whole * 1e3:.2f}"
+def _whole(statistical_ci95: float | None, total_ci95: float | None) -> float | None:
+    """Return the error of a mean, with that of the calibration where it is known."""
+    return statistical_ci95 if total_ci95 is None else total_ci95
 
 
 def _parts(standing: "Standing") -> list[str]:
     """What the interval of a measured thrust is made of."""
     part = standing.calibration_ci95
-    calibration = "unknown" if part is None else f"± {part * 1e3:.2f}" if part else "exact"
-    return [f"± {(standing.error or 0.0) * 1e3:.2f}", calibration]
+    calibration = "unknown" if part is None else text.half_width(part)
+    return [text.half_width(standing.error or 0.0), calibration]
 
 
 def _of_simulated(standings: "list[Standing]") -> str | None:

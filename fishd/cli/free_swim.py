@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fishd.cli.free_swim_options import SwimmerOptions
 from fishd.cli.lab_progress import showing
 from fishd.cli.output import echo, echo_rows, print_json, spelled
+from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, MissingPackage
 from fishd.core.interruption import on_signal
@@ -123,13 +124,12 @@ def _kept(swum: "Swum", options: SwimmerOptions) -> str:
 def _rows(report: "SwimReport") -> list[tuple[str, str]]:
     plural = "" if report.beats == 1 else "s"
     beats = f"over {report.beats} whole beat{plural}" if report.beats else "no whole beat"
-    error = f" ± {report.speed_error * 1e3:.2f}" if report.speed_error is not None else ""
     anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
     return [
         ("controller", f"{report.controller} {spelled(report.parameters)}{anew}"),
-        ("speed", f"{report.speed * 1e3:.2f}{error} mm/s, {beats}"),
+        ("speed", f"{text.measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
         *_trend(report),
-        ("frequency", f"{report.frequency:.3f} Hz"),
+        ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),
         ("heading", f"{report.heading:+.3f} rad"),
         ("tail", f"{report.tail_width:.3f} lengths from side to side"),
         (

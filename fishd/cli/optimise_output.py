@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from msgspec import Struct
 
 from fishd.cli.output import counted, echo
+from fishd.core import text
 from fishd.core.console import power_words
 
 if TYPE_CHECKING:
@@ -74,8 +75,7 @@ def told(number: int, trial: "Trial", best: "Proposal | None", unit: str) -> str
     best: what seems so, once there is enough to say it
     """
     measured = (
-        f"{number}: {_spelled(trial.parameters)}: {trial.thrust * 1e3:.2f} ± "
-        f"{trial.error * 1e3:.2f} m{unit}"
+        f"{number}: {_spelled(trial.parameters)}: {text.measured(trial.thrust, trial.error, unit)}"
     )
     if math.isfinite(trial.power):
         measured += f" for {power_words(trial.power)}"

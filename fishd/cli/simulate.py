@@ -69,6 +69,7 @@ def _simulate(
     **swimmers: Any,
 ) -> int:
     of_swimmer = SwimmerOptions(**swimmers)
+    from fishd.simulation import check_whole_beat
     from fishd.simulation import simulate as run
 
     config = load(file, overrides)
@@ -88,6 +89,7 @@ def _simulate(
             asked = (config, name, parameters, seconds, settle, writer, begun)
             return swim(asked, of_swimmer, as_json)
         report = run(config, name, parameters, seconds, settle, writer, begun)
+    check_whole_beat(report, seconds, settle)
     if as_json:
         print_json(report)
     else:
@@ -130,7 +132,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
         *_chosen(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
         *_power(report),
-        ("frequency", f"{report.frequency:.3f} Hz{_half_beats(report, config.tick)}"),
+        ("frequency", _frequency(report, config.tick)),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
         (
             "command",
@@ -177,12 +179,12 @@ def _chosen(report: "Report") -> list[tuple[str, str]]:
     return [("", f"C = {found['criterion']:g} at the end{ahead}{turns}")]
 
 
-def _half_beats(report: "Report", tick: float) -> str:
-    """The half beats that were swum: a reversal waits for a tick."""
+def _frequency(report: "Report", tick: float) -> str:
+    """Return the tail-beat frequency and the half beats swum: a reversal waits for a tick."""
     lengths = sorted(set(report.half_beats) - {0})
     if not lengths:
-        return ""
+        return "–, as nothing was reversed"
     ticks = " to ".join(map(str, lengths))
     alone = " to ".join(f"{0.5 / (length * tick):.3f}" for length in lengths)
     each = f" ({alone} Hz)" if len(lengths) > 1 else ""
-    return f", in half beats of {ticks} ticks{each}"
+    return f"{report.frequency:.3f} Hz, in half beats of {ticks} ticks{each}"

@@ -11,6 +11,7 @@ import msgspec
 
 from fishd.cli.lab_progress import Lines, showing
 from fishd.cli.output import counted, echo, print_json, warn_of_fin
+from fishd.core import text
 from fishd.core.console import INTERRUPTED
 
 if TYPE_CHECKING:
@@ -57,10 +58,9 @@ def telling(
 def _figures(result: "Found", quantity: "Quantity") -> str:
     if result.value is None:
         return f"no {quantity.name}: {result.trouble}"
-    error = "" if result.error is None else f" ± {result.error * 1e3:.2f}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
     steady = "" if getattr(result, "settled", 0.0) is not None else ", not yet steady"
-    return f"{result.value * 1e3:.2f}{error} m{quantity.unit}{beats}{steady}"
+    return f"{text.measured(result.value, result.error, quantity.unit)}{beats}{steady}"
 
 
 def conclude(
@@ -117,8 +117,7 @@ def conclude(
 
 def _proposal(best: "Best", unit: str, of: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
-    error = "" if best.error is None else f" ± {best.error * 1e3:.2f}"
-    value = f"{best.value * 1e3:.2f}{error} m{of}"
+    value = text.measured(best.value, best.error, of)
     if best.x is None:
         return value
     if best.at_edge:
@@ -133,11 +132,11 @@ def _proposal(best: "Best", unit: str, of: str) -> str:
 
 
 def _measured(found: "WholeTicks", force_unit: str) -> str:
-    error = "" if found.error is None else f" ± {found.error * 1e3:.2f}"
-    thrust = f"best measured at {found.frequency:.4g} Hz: {found.thrust * 1e3:.2f}{error}"
+    thrust = text.measured(found.thrust, found.error, force_unit)
+    best = f"best measured at {found.frequency:.4g} Hz: {thrust}"
     if found.nearer is None:
-        return f"{thrust} m{force_unit}"
-    return f"{thrust} m{force_unit}; {found.nearer:.6g} Hz is nearer the best, and not in the grid"
+        return best
+    return f"{best}; {found.nearer:.6g} Hz is nearer the best, and not in the grid"
 
 
 def again(folder: Path) -> str:

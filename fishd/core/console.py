@@ -42,8 +42,9 @@ def thrust_words(status: Status) -> str:
     unit = f"m{text.quoted(status.force_unit)}"
     if status.sensor_lost:
         return f"– {unit}"
-    thrust, error = status.thrust * 1e3, status.thrust_error
-    return f"{thrust:.2f} ± {'?' if error is None else f'{error * 1e3:.2f}'} {unit}"
+    if status.thrust_error is None:
+        return f"{1e3 * status.thrust:.2f} ± ? {unit}"
+    return text.measured(status.thrust, status.thrust_error, status.force_unit)
 
 
 def power_words(power: float) -> str:

@@ -6,6 +6,8 @@ LONGEST = 1000
 """Longer texts are cut, in the middle [characters]."""
 LONGEST_WORD = 60
 """Of a word that is quoted in a message [characters]."""
+EXACT_CI95 = 1e-9
+"""Half-width of a 95 % interval below which a value is called exact [N, or another unit]."""
 
 
 def line(text: str, longest: int = LONGEST) -> str:
@@ -32,6 +34,28 @@ def block(text: str, longest: int = LONGEST) -> str:
 def quoted(word: str) -> str:
     """A word from outside, cut to fit in a message."""
     return line(word, LONGEST_WORD)
+
+
+def half_width(ci95: float) -> str:
+    """Return the half-width of a 95 % interval in thousandths: `± 0.12`, or `exact`."""
+    if ci95 < EXACT_CI95:
+        return "exact"
+    return f"± {1e3 * ci95:.2f}" if ci95 >= 5e-6 else f"± {1e3 * ci95:.1g}"
+
+
+def measured(value: float, ci95: float | None, unit: str = "") -> str:
+    """Return a value in thousandths, with its interval: `25.74 ± 0.12 mN` or `25.74 mN (exact)`.
+
+    ci95: half-width of the 95 % interval; None where it is not known
+    unit: such as N; `m` goes before it
+    """
+    unit = f" m{quoted(unit)}" if unit else ""
+    if ci95 is None:
+        return f"{1e3 * value:.2f}{unit}"
+    interval = half_width(ci95)
+    if interval == "exact":
+        return f"{1e3 * value:.2f}{unit} (exact)"
+    return f"{1e3 * value:.2f} {interval}{unit}"
 
 
 def said(error: BaseException) -> str:

@@ -71,10 +71,10 @@ def spelled(
         total_ci95 = statistical_ci95
         part = "unknown" if unit.startswith("N") else "none"
     else:
-        part = f"± {1e3 * calibration_ci95:.2f}" if calibration_ci95 else "exact"
+        part = text.half_width(calibration_ci95)
     return (
-        f"{1e3 * value:.2f} ± {1e3 * total_ci95:.2f} m{text.quoted(unit)} "
-        f"(statistical ± {1e3 * statistical_ci95:.2f}, calibration {part})"
+        f"{text.measured(value, total_ci95, unit)} "
+        f"(statistical {text.half_width(statistical_ci95)}, calibration {part})"
     )
 
 

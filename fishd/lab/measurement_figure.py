@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 
+from fishd.core import text
 from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, drawn
 from fishd.lab.measurement import Measured
 
@@ -45,4 +46,4 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
         below.axhline(0.0, color=GREY, linewidth=0.6)
         below.set_ylabel(f"without drift [m{found.unit}]")
         below.set_xlabel("time [s]")
-        below.set_title(f"{found.controller}: {level:.2f} ± {error:.2f} m{found.unit}")
+        below.set_title(f"{found.controller}: {text.measured(found.thrust, whole, found.unit)}")

@@ -1,7 +1,7 @@
 """A run in virtual time: the robot's own loop on a simulated fish, its ticks or a report."""
 
 from fishd.simulation.beats import Beats
-from fishd.simulation.report import Report, judge, simulate
+from fishd.simulation.report import Report, check_whole_beat, judge, simulate
 from fishd.simulation.table import run
 from fishd.simulation.virtual_run import EncodingPublisher, KeepingPublisher, VirtualRun
 
@@ -11,6 +11,7 @@ __all__ = [
     "KeepingPublisher",
     "Report",
     "VirtualRun",
+    "check_whole_beat",
     "judge",
     "run",
     "simulate",

@@ -17,6 +17,9 @@ class Beats:
     def __init__(self) -> None:
         self._whole = _Sums()
         self._open = _Sums()
+        self._before = _Sums()
+        """The time before the first beat."""
+        self.reversals = 0
         self._began = False
         self._side = 0.0
         self._each: list[tuple[float, float]] = []  # impulse N s, duration s
@@ -31,10 +34,13 @@ class Beats:
         side = math.copysign(1.0, angle) if angle else self._side
         if side != self._side and self._side:
             self._open.close_half()
+            self.reversals += 1
             if side > 0.0:
                 if self._began:
                     self._whole += self._open
                     self._each.append((self._open.impulse, self._open.duration))
+                else:
+                    self._before = self._open
                 self._began = True
                 self._open = _Sums()
         self._side = side
@@ -45,8 +51,9 @@ class Beats:
         sums = self._whole
         frequency = 0.5 * sums.halves / sums.duration if sums.halves else 0.0
         if not sums.halves:
-            sums = self._open
-            sums.close_half()
+            self._open.close_half()
+            sums = self._before
+            sums += self._open
         mean = sums.angle / sums.duration
         rms = math.sqrt(sums.angle_squared / sums.duration)
         return BeatMeans(

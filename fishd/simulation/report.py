@@ -39,6 +39,8 @@ class Report(Struct, frozen=True):
     """Tail beats per second; 0 when the tail does not beat [Hz]."""
     half_beats: tuple[int, int]
     """The shortest and the longest half beat, in ticks; 0 when the tail does not beat."""
+    reversals: int
+    """Changes of the command's side in the time that is judged."""
     fin_amplitude: float
     """Largest fin angle of each half beat, mean over half beats [rad]."""
     fullness: float
@@ -104,6 +106,18 @@ def count_ticks(seconds: float, settle: float, tick: float) -> tuple[int, int]:
     return ticks, first
 
 
+def check_whole_beat(report: Report, seconds: float, settle: float) -> None:
+    """Raise `ParameterError` where the tail was reversed, but for less than a whole beat.
+
+    The mean thrust over a part of a beat is that of no gait.
+    """
+    if report.reversals and not report.frequency:
+        raise ParameterError(
+            f"{report.controller}: no whole tail beat in the {seconds - settle:g} s after the "
+            f"{settle:g} s of --settle, so there is no mean thrust; give more --seconds"
+        )
+
+
 def judge(
     config: Config,
     name: str,
@@ -153,6 +167,7 @@ def judge(
         mean_power=means.power,
         frequency=means.frequency,
         half_beats=means.half_beats,
+        reversals=beats.reversals,
         fin_amplitude=means.fin_amplitude,
         fullness=means.mean_angle / amplitude,
         squareness=means.squareness,

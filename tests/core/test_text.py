@@ -66,3 +66,19 @@ class Mute(Exception):
 )
 def test_an_exception_is_named_whatever_it_is(error: BaseException, line: str) -> None:
     assert text.named(error) == line
+
+
+@pytest.mark.parametrize(
+    ("ci95", "said"),
+    [
+        (0.12e-3, "25.74 ± 0.12 mN"),
+        (4e-6, "25.74 ± 0.004 mN"),
+        (1.7e-18, "25.74 mN (exact)"),
+        (0.0, "25.74 mN (exact)"),
+        (None, "25.74 mN"),
+    ],
+)
+def test_an_interval_of_zero_is_called_exact_and_never_shown_as_zero(
+    ci95: float | None, said: str
+) -> None:
+    assert text.measured(25.74e-3, ci95, "N") == said

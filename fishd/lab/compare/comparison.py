@@ -25,7 +25,7 @@ from fishd.lab.ranking import (
     rank,
     ratio,
 )
-from fishd.simulation import KeepingPublisher, Report, VirtualRun, judge
+from fishd.simulation import KeepingPublisher, Report, VirtualRun, check_whole_beat, judge
 
 TRACE = 3.0
 """How much of the end of a run a picture shows [s]."""
@@ -102,7 +102,7 @@ def compare(
     camera: what shows the fish to policies that see it; by default a good one
 
     Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
-    `UnknownController`, before anything swims.
+    `UnknownController`, before anything swims; `ParameterError` also where a run has no whole beat.
     """
     chosen = [parse(one) if isinstance(one, str) else one for one in contestants]
     for contestant in chosen:
@@ -117,7 +117,9 @@ def compare(
             fish = replace(config, simulation=noise)
             light = replace(seen, seed=seen.seed + run)
             end = _End(config.tick)
-            reports.append(swim(fish, contestant, seconds, settle, end, light))
+            report = swim(fish, contestant, seconds, settle, end, light)
+            check_whole_beat(report, seconds, settle)
+            reports.append(report)
             progress(next(swum) * seconds)
         standings.append(_standing(contestant.label, reports))
         traces.append(trace(end.ticks))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fishd.core import text
 from fishd.lab.compare.comparison import TRACE, Standing, Trace
 from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn
 
@@ -130,13 +131,12 @@ def _draw_bar(
 
 def _describe(axis: Any, standing: Standing, unit: str) -> None:
     whole = standing.error if standing.total_ci95 is None else standing.total_ci95
-    error = "" if whole is None else f" ± {1e3 * whole:.2f}"
-    text = (
-        f"{1e3 * standing.thrust:.2f}{error} m{unit}, {standing.frequency:.2f} Hz\n"
+    words = (
+        f"{text.measured(standing.thrust, whole, unit)}, {standing.frequency:.2f} Hz\n"
         f"$|φ_c|/Φ$ {standing.fullness:.2f}, square {standing.squareness:.2f}"
     )
     style = {"va": "top", "fontsize": 6, "color": "0.35", "transform": _across(axis)}
-    axis.text(0.0, -0.34, text, **style)
+    axis.text(0.0, -0.34, words, **style)
 
 
 def _across(axis: Any) -> Any:
