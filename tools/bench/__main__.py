@@ -16,6 +16,7 @@ NAMES = (
     "pictures",
     "chatter",
     "measurement",
+    "calibration",
     "sweep",
     "identification",
     "estimators",

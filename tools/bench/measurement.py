@@ -37,17 +37,18 @@ OPTIONS: Options = {
 
 
 def run(drift: str, seconds: float, seed: int) -> tuple[float, float, float]:
-    """Thrust, half of its interval, and the plain mean of F_x while it swims [N]."""
+    """Thrust, half-width of its total interval, plain mean of F_x while it swims [N]."""
     config = Config(simulation=replace(RIG, seed=seed, **DRIFTS[drift]))
     with VirtualRig(config) as rig:
         found = measured(rig, "swing", {}, seconds)
     plain = float(np.mean([tick.fx for tick in found.ticks if tick.mode == "running"]))
-    return found.thrust, found.error, plain
+    assert found.total_ci95 is not None
+    return found.thrust, found.total_ci95, plain
 
 
 def measure(options: Namespace) -> Report:
     """Measure each kind of drift, for each length."""
-    truth = simulate(Config(), "swing", {}).mean_thrust * np.cos(RIG.rotation)
+    truth = simulate(Config(), "swing", {}).mean_thrust
     rows, figures = [], []
     with joblib.Parallel(options.jobs) as pool:
         for seconds in LENGTHS:
