@@ -7,7 +7,7 @@ tip's share s of the inertia:
     α̈ = −ξω₀ α̇ − ω₀² (α − λφ) + s/(1 − s) ω_t² (β − α)
     β̈ = −ζω_t β̇ − ω_t² (β − α)
     F_x = −K ((1 − s) α α̈ + s β β̈)
-    F_y = −K ((1 − s) α̈ + s β̈) − K_d ((1 − s) α̇ + s β̇)
+    F_y = −K_y ((1 − s) α̈ + s β̈) − K_d ((1 − s) α̇ + s β̇)
 """
 
 import math
@@ -108,7 +108,7 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
         a += s / (1.0 - s) * pull
         b = -p.tip_xi * p.tip_omega0 * beta_rate - pull
         fx = -p.thrust_coefficient * ((1.0 - s) * alpha * a + s * beta * b)
-        fy = -p.thrust_coefficient * ((1.0 - s) * a + s * b)
+        fy = -p.lateral_inertia * ((1.0 - s) * a + s * b)
         fy -= p.lateral_drag * ((1.0 - s) * alpha_rate + s * beta_rate)
         return turning, alpha_rate, a, beta_rate, b, fx, fy
 

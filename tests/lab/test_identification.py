@@ -236,6 +236,8 @@ def test_a_name_that_cannot_be_fitted_is_refused(table: pd.DataFrame) -> None:
         PlantParameters(servo_delay=0.05, backlash=0.03),
         PlantParameters(cable_slack=0.03, servo_dead_zone=0.02),
         PlantParameters(servo_delay=0.03, servo_reaction=5e-3),
+        PlantParameters(quadratic_drag=2.0, lateral_quadratic_drag=0.01, lateral_inertia_ratio=0.7),
+        PlantParameters(quadratic_drag=20.0, xi=0.2, backlash=0.02),
     ],
 )
 def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> None:
@@ -244,11 +246,13 @@ def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> N
     commands[:20] = 0.0
     fish = TetheredFish(plant)
     windows = [fish.advance(angle, TICK, 10) for angle in commands]
-    drive = Drive(**{name: getattr(plant, name) for name in Drive.__dataclass_fields__})
-    a, b, c, d = response(drive, commands, np.arange(len(commands) + 1), TICK, 10)
-    inertia, drag, scale = plant.thrust_coefficient, plant.lateral_drag, plant.coupling
-    fx = inertia * scale * scale * a
-    fy = inertia * scale * b + drag * scale * c + plant.servo_reaction * d
+    known = {name: getattr(plant, name) for name in Drive.__dataclass_fields__}
+    known["quadratic_drag"] *= plant.coupling
+    a, b, c, d, e = response(Drive(**known), commands, np.arange(len(commands) + 1), TICK, 10)
+    drag, scale = plant.lateral_drag, plant.coupling
+    fx = plant.thrust_coefficient * scale * scale * a
+    fy = plant.lateral_inertia * scale * b + drag * scale * c + plant.servo_reaction * d
+    fy = fy + plant.lateral_quadratic_drag * scale * scale * e
     # Far below the noise of 1 mN; play is lost and found between two points of the grid.
     assert fx == pytest.approx([w.sampled_thrust for w in windows], abs=2e-5)
     assert fy == pytest.approx([w.sampled_lateral_force for w in windows], abs=1e-4)

@@ -111,8 +111,8 @@ class Observer(Estimator):
         motion, spread = _motion(plant, dt)
         spread = settings.disturbance**2 * spread
         wander = settings.offset_drift**2 * dt
-        # F_y = −K α̈ − K_d α̇, so its mean is a difference between the ends of the window.
-        ends = np.array([-plant.lateral_drag, -plant.thrust_coefficient]) / dt
+        # F_y = −K_y α̈ − K_d α̇, so its mean is a difference between the ends of the window.
+        ends = np.array([-plant.lateral_drag, -plant.lateral_inertia]) / dt
         grow, noise = np.eye(3), np.zeros((3, 3))
         grow[:2, :2] = motion
         noise[:2, :2], noise[2, 2] = spread, wander

@@ -1,24 +1,33 @@
-"""From ticks to a fish: starts, fits, intervals, and what is to be said about them."""
+"""From ticks to a fish: starts, fits, intervals, and what is to be said about them.
 
+K, λ, K_y and K_d cannot be told apart by forces: F_x is K λ² times what the wheel does, F_y is
+K_y λ and K_d λ times it. K and λ are told apart by K_y = K. How far that may be wrong is part of
+their intervals, unless `lateral_inertia_ratio` is left out of `fit`.
+"""
+
+import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, t
 
 from fishd.core import text
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
-from fishd.lab.identification.fit import BOUNDS, DRIVE, FORCES, LOGARITHMIC, Problem, solve
+from fishd.lab.identification import misfit
+from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC, Problem, solve
 from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
 from fishd.lab.identification.response import Array
 from fishd.lab.identification.result import (
+    PRODUCT_UNITS,
     UNITS,
-    UNKNOWN_TO_FITS,
     Channel,
     Estimate,
     Fit,
@@ -30,11 +39,42 @@ from fishd.virtual.plant.parameters import PlantParameters
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-DEFAULT = tuple(name for name in (*DRIVE, *FORCES) if name != "servo_reaction")
-"""What is fitted unless something else is asked for."""
+DEFAULT = (
+    *("omega0", "xi", "quadratic_drag", "coupling", "servo_speed", "servo_lag"),
+    *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag", "lateral_quadratic_drag"),
+    *("servo_delay", "backlash", "rotation"),
+)
+"""What is fitted by default; what is left over may then demand some of `FURTHER`, too."""
+FURTHER = ("servo_reaction", "cable_slack", "servo_dead_zone")
+"""What is fitted where what is left over looks like it."""
 POSSIBLE = tuple(BOUNDS)
 
 _Z = 1.96
+LATERAL_INERTIA_FACTOR = 2.0
+"""K_y/K is within this factor of the configured one, in 95 % of cases, where no data tell it."""
+SCALED = {
+    "coupling": 1.0,
+    "thrust_coefficient": -2.0,
+    "lateral_inertia_ratio": 1.0,
+    "lateral_drag": -1.0,
+    "quadratic_drag": -1.0,
+    "lateral_quadratic_drag": -2.0,
+}
+"""Exponents of K_y/K: all of these may change with it in this way, and no force changes."""
+MISFIT_FACTOR = 2.0
+"""By how much the disagreement between groups of data is multiplied: there are few groups, and what
+all of them have in common does not show."""
+MIN_EXPLAINED = 0.9
+"""Smallest share of each force, out of sample, with which intervals are shown after a misfit."""
+_WORSE = 1.1
+"""Largest ratio of squares of what is left over, out of sample to in sample."""
+_CLEAR = 25.0
+"""Smallest fall of the sum of squares, in units of noise², that names what the model lacks."""
+_DEMANDED = 0.05
+"""Smallest share of what is left over that something further must explain to be fitted."""
+_QUADRATIC = ("quadratic_drag", "lateral_quadratic_drag")
+_PROBED = 0.01
+"""Size of slack and dead zone whose effect is compared with what is left over [rad]."""
 _SETTLE = 2.0
 """How long the beginning of a passage is not judged, since nobody knows what was before [s]."""
 _LONGEST_SETTLE = 20.0
@@ -50,6 +90,9 @@ _SMOOTH = 5.0
 """For the drift that is shown [s]."""
 _SINGULAR = 1e-10
 """Information below this share of the largest is none."""
+_SYMBOLS = {"fx": "F_x", "fy": "F_y"}
+_SMALLEST = {"servo_delay": 2e-3, "backlash": 2e-3}
+"""Width of an interval that is narrow enough, however small the value is [s], [rad]."""
 SIGNED = ("servo_reaction", "rotation")
 """These may be negative."""
 OFFSETS = ("offset_x", "offset_y")
@@ -64,33 +107,44 @@ def identify(
     *,
     start: PlantParameters | None = None,
     rig: SimulationSettings | None = None,
-    fit: Sequence[str] = DEFAULT,
+    fit: Sequence[str] | None = None,
 ) -> Identification:
     """Fit a fish and its rig to what some runs of it have measured.
 
     runs: tables of ticks (`fishd.recording.read`, `experiment`), or paths of recordings
     start: where to begin, and the value of what is not fitted; by default the fish of Fu et al.
     rig: the same for `rotation`; by default the sensor is not turned
-    fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`
+    fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`; by default `DEFAULT`
+        and what of `FURTHER` the data demand. Without `lateral_inertia_ratio`, K_y/K is as in
+        `start`, and K, λ and K_d are known so much better
 
     Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
     that is not possible, and what `fishd.recording.read` raises.
     """
-    names = check(fit)
+    names = check(DEFAULT if fit is None else fit)
     parts = passages([_table(run) for run in _several(runs)])
     if not any(one.commands.any() for one in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
     known = msgspec.structs.asdict(start or PlantParameters())
     known["rotation"] = (rig or SimulationSettings()).rotation
     values = {name: float(known[name]) for name in POSSIBLE}
-    problem, values = _solved(parts, names, values)
+    scale_is_free = _scale_is_free(names, values)
+    if scale_is_free:
+        names = tuple(name for name in names if name != "lateral_inertia_ratio")
+    problem, values = _solved(parts, names, values, FURTHER if fit is None else ())
     settle = _settling(values)
     if settle > _SETTLE:
         longer = [one for one in parts if one.duration > settle + SHORTEST]
         parts, settle = (longer, settle) if longer else (parts, _SETTLE)
-        problem = Problem(parts, names, settle)
+        problem = Problem(parts, problem.names, settle)
         values = solve(problem, values)
-    return _summary(parts, problem, values, known)
+    return _summary(parts, problem, values, known, scale_is_free)
+
+
+def _scale_is_free(names: Sequence[str], values: dict[str, float]) -> bool:
+    """Return whether K_y/K changes no force: all that goes with it is fitted, or zero."""
+    needed = [name for name in SCALED if name in LOGARITHMIC or values[name]]
+    return all(name in names for name in needed)
 
 
 def _several(runs: object) -> list[object]:
@@ -125,24 +179,86 @@ def check(fit: Sequence[str]) -> tuple[str, ...]:
 
 
 def _solved(
-    parts: Sequence[Passage], names: tuple[str, ...], first: dict[str, float]
+    parts: Sequence[Passage],
+    names: tuple[str, ...],
+    first: dict[str, float],
+    further: Sequence[str],
 ) -> tuple[Problem, dict[str, float]]:
-    """The best fit of several starts; of one, where it leaves no more than noise.
+    """Return the best fit of several starts; of one, where it leaves no more than noise.
 
-    The others are fitted roughly, and the best of them to its end.
+    The others are fitted roughly, without quadratic drag, and the best of them to its end.
+
+    further: what is fitted, too, where what is left over looks like it
     """
     starts = [_begun(first, names, *start) for start in _STARTS]
     problem = Problem(parts, names, _SETTLE)
     values = solve(problem, starts[0])
-    if all(map(_is_white, problem.whitened(problem.residuals(values)))):
+    problem, values = _extended(parts, problem, values, further)
+    if _all_white(problem, values):
         return problem, values
     rough = []
+    few = tuple(name for name in names if name not in _QUADRATIC) or names
     for start in starts[1:]:
-        other = Problem(parts, names, _SETTLE)
+        other = Problem(parts, few, _SETTLE)
         rough.append((solve(other, start, rounds=1, steps=_ROUGH), other))
-    best, other = min(rough, key=lambda each: each[1].unexplained)
+    best, _ = min(rough, key=lambda each: each[1].unexplained)
+    other = Problem(parts, names, _SETTLE)
     best = solve(other, best)
+    other, best = _extended(parts, other, best, further)
     return (other, best) if other.unexplained < problem.unexplained else (problem, values)
+
+
+def _all_white(problem: Problem, values: dict[str, float]) -> bool:
+    return all(map(_is_white, problem.whitened(problem.residuals(values))))
+
+
+def _extended(
+    parts: Sequence[Passage],
+    problem: Problem,
+    values: dict[str, float],
+    further: Sequence[str],
+) -> tuple[Problem, dict[str, float]]:
+    """Return the fit with what of `further` the data demand, one after the other."""
+    while not _all_white(problem, values):
+        looks_like = _likenesses(problem, values, further)
+        if not looks_like or looks_like[0][1] < _CLEAR:
+            break
+        name, _, size = looks_like[0]
+        wider = Problem(parts, check((*problem.names, name)), _SETTLE)
+        begun = {**values, name: float(np.clip(size, *BOUNDS[name]))}
+        begun = solve(wider, begun)
+        if wider.unexplained > problem.unexplained - 0.5 * _DEMANDED:
+            break
+        problem, values = wider, begun
+    return problem, values
+
+
+def _likenesses(
+    problem: Problem, values: dict[str, float], names: Sequence[str]
+) -> list[tuple[str, float, float]]:
+    """Return what is not fitted and looks like what is left over, the most alike first.
+
+    Each is a name, the fall of the sum of squares in units of noise², and the likely value.
+    """
+    innovations = problem.whitened(problem.residuals(values))
+    jacobian = problem.jacobian(values)[:, :, _inside(problem.names, values)]
+    found = []
+    for name in names:
+        if name in problem.names or values[name]:
+            continue
+        step = None if name in SIGNED else _PROBED
+        fall, size = misfit.likeness(problem.column(values, name, step), jacobian, innovations)
+        if name in SIGNED or size > 0.0:
+            found.append((name, fall, size))
+    return sorted(found, key=lambda each: -each[1])
+
+
+def _inside(names: Sequence[str], values: dict[str, float]) -> NDArray[np.bool_]:
+    """Return which of what is fitted is not at an end of where a fit looks."""
+    lows = [values[name] <= BOUNDS[name][0] + 1e-7 * BOUNDS[name][1] for name in names]
+    ends = [_at_end(name, values[name]) for name in names]
+    inside: NDArray[np.bool_] = ~(np.array(lows) | np.array(ends))
+    return inside
 
 
 def _begun(
@@ -172,16 +288,49 @@ def _summary(
     problem: Problem,
     values: dict[str, float],
     known: dict[str, float],
+    scale_is_free: bool,
 ) -> Identification:
-    """What is found; `known` holds what the model does not use, too."""
+    """Return what is found; `known` holds what the model does not use, too."""
     all_values = {**known, **values}
     residuals = problem.residuals(values)
     innovations = problem.whitened(residuals)
     jacobian = problem.jacobian(values)
-    covariance, untold = _covariance(jacobian, innovations)
+    statistical, untold = _covariance(jacobian, innovations)
+    labels = misfit.groups(parts, problem.skips)
+    inside = _inside(problem.names, values)
+    predicted = misfit.predicted(jacobian[:, :, inside], innovations, labels)
+    measured = problem.whitened(problem.measured)
+    drifts = [_smoothed(each, parts[0].tick) for each in residuals]
+    channels = tuple(
+        Channel(
+            name,
+            explained=_share(left, whole),
+            explained_out_of_sample=_share(unseen, whole),
+            noise=noise.white,
+            drift=float(max(d[k].max() for d in drifts) - min(d[k].min() for d in drifts)),
+            white=_is_white(left),
+        )
+        for k, (name, left, unseen, whole, noise) in enumerate(
+            zip(("fx", "fy"), innovations, predicted, measured, problem.noise, strict=True)
+        )
+    )
+    failed = _failed(channels, innovations, predicted)
+    covariance, inflation = statistical, 1.0
+    if failed:
+        further = misfit.disagreement(jacobian, innovations, labels)
+        covariance = statistical + MISFIT_FACTOR**2 * further
+        inflation = float(np.median(np.sqrt(np.diag(covariance) / np.diag(statistical))))
+        rest = [name for name in (*FURTHER, *_QUADRATIC, "rotation") if name not in problem.names]
+        alike = _likenesses(problem, values, rest)
+        failed = [*(f"{name} = 0" for name, fall, _ in alike[:1] if fall > _CLEAR), *failed]
+    identified = not failed or all(c.explained_out_of_sample >= MIN_EXPLAINED for c in channels)
     deviations = np.sqrt(np.diag(covariance))
     spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
+    if not identified:
+        spread = dict.fromkeys(spread, np.inf)
     estimates = [_estimate(name, all_values[name], spread) for name in UNITS if name in all_values]
+    if scale_is_free:
+        estimates = [_with_free_scale(each) for each in estimates]
     left = np.concatenate(residuals, axis=1)
     slopes = problem.slopes_of_means(values)
     for name, of, slope, noise in zip(OFFSETS, left, slopes, problem.noise, strict=True):
@@ -189,29 +338,110 @@ def _summary(
         error = float(np.hypot(told, _wandering(of)))
         mean = float(of.mean())
         estimates.append(Estimate(name, mean, mean - error, mean + error))
-    drifts = [_smoothed(each, parts[0].tick) for each in residuals]
-    channels = tuple(
-        Channel(
-            name,
-            explained=share,
-            noise=noise.white,
-            drift=float(max(d[k].max() for d in drifts) - min(d[k].min() for d in drifts)),
-            white=_is_white(innovations[k]),
-        )
-        for k, (name, share, noise) in enumerate(
-            zip(("fx", "fy"), _explained(problem, residuals), problem.noise, strict=True)
-        )
-    )
     return Identification(
+        headline=_headline(channels, failed, identified, inflation),
+        identified=identified,
         estimates=tuple(estimates),
+        products=_products(problem.names, all_values, covariance, identified),
         channels=(channels[0], channels[1]),
         seconds=sum(one.duration for one in parts),
         passages=len(parts),
-        remarks=_remarks(problem.names, estimates, channels, untold),
+        remarks=_remarks(problem.names, estimates, untold),
         names=problem.names,
-        correlation=covariance / np.outer(deviations, deviations),
+        covariance=covariance,
+        inflation=inflation,
+        failed_assumptions=tuple(failed),
         fit=_series(problem, values, drifts),
     )
+
+
+def _failed(channels: Sequence[Channel], innovations: Array, predicted: Array) -> list[str]:
+    """Return the assumptions about what is left over that do not hold."""
+    failed = [f"white residual of {channel.name}" for channel in channels if not channel.white]
+    for channel, fitted, unseen in zip(channels, innovations, predicted, strict=True):
+        if unseen @ unseen > _WORSE * (fitted @ fitted):
+            failed.append(f"prediction of {channel.name}")
+    return failed
+
+
+def _share(left: Array, whole: Array) -> float:
+    """Return the share of the variance that is explained."""
+    return float(1.0 - (left @ left) / (whole @ whole))
+
+
+def _with_free_scale(estimate: Estimate) -> Estimate:
+    """Return the estimate with an interval for any K_y/K that is within reason."""
+    if estimate.name not in SCALED:
+        return estimate
+    factor = LATERAL_INERTIA_FACTOR ** abs(SCALED[estimate.name])
+    low, high = estimate.low / factor, estimate.high * factor
+    if estimate.name == "lateral_inertia_ratio":
+        return replace(estimate, low=low, high=high, fitted=True)
+    if not estimate.fitted:
+        return estimate
+    return replace(estimate, low=low, high=high, if_ratio_holds=(estimate.low, estimate.high))
+
+
+def _products(
+    names: Sequence[str], values: dict[str, float], covariance: Array, identified: bool
+) -> tuple[Estimate, ...]:
+    """Return K λ², K_y λ and K_d λ with their intervals."""
+    scale, inertia = values["coupling"], values["thrust_coefficient"]
+    ratio, drag = values["lateral_inertia_ratio"], values["lateral_drag"]
+    found = []
+    for name, value, exponents in zip(
+        PRODUCT_UNITS,
+        (inertia * scale * scale, ratio * inertia * scale, drag * scale),
+        (
+            {"coupling": 2.0, "thrust_coefficient": 1.0},
+            {"coupling": 1.0, "thrust_coefficient": 1.0, "lateral_inertia_ratio": 1.0},
+            {"coupling": 1.0, "lateral_drag": 1.0},
+        ),
+        strict=True,
+    ):
+        slope = np.array([exponents.get(each, 0.0) * value for each in names])
+        if "lateral_drag" in exponents and "lateral_drag" in names:  # not fitted as a logarithm
+            slope[list(names).index("lateral_drag")] = scale
+        error = _Z * float(np.sqrt(slope @ covariance @ slope)) if identified else np.inf
+        found.append(Estimate(name, value, max(0.0, value - error), value + error))
+    return tuple(found)
+
+
+def _headline(
+    channels: Sequence[Channel], failed: Sequence[str], identified: bool, inflation: float
+) -> str:
+    """Return the first line of what is shown."""
+    explains = " and ".join(
+        f"{_percent(channel.explained_out_of_sample)} of {_SYMBOLS[channel.name]}"
+        for channel in channels
+    )
+    if not failed:
+        return f"identified: the model explains {explains}"
+    causes = [each for each in failed if each.endswith(" = 0")]
+    signs = [_in_words(each) for each in failed if each not in causes]
+    why = "; ".join(signs)
+    if causes:
+        why += f"; it looks as if {causes[0].replace(' = 0', ' is not 0')}"
+    if not identified:
+        return f"not identified: the model explains {explains}: {why}"
+    wider = f"intervals are {inflation:.2g} times as wide as noise alone makes them"
+    return f"careful: the model lacks something and explains {explains}: {why}; {wider}"
+
+
+def _in_words(failed: str) -> str:
+    """Return an assumption that fails as a clause of a sentence."""
+    what, _, channel = failed.rpartition(" of ")
+    symbol = _SYMBOLS[channel]
+    if what == "prediction":
+        return f"data left out of the fit are predicted worse in {symbol}"
+    return f"what is left of {symbol} is more than noise"
+
+
+def _percent(share: float) -> str:
+    """Return a share with as many digits as tell it from all: 71 %, 99.6 %, 99.995 %."""
+    rest = max(1.0 - share, 1e-6)
+    digits = min(4, max(0, -math.floor(math.log10(rest)) - 2)) if share < 1.0 else 4
+    return f"{100.0 * max(share, 0.0):.{digits}f} %"
 
 
 def _covariance(jacobian: Array, innovations: Array) -> tuple[Array, Array | None]:
@@ -258,16 +488,10 @@ def _estimate(name: str, value: float, spread: dict[str, float]) -> Estimate:
     if error is None:
         return Estimate(name, value, value, value, fitted=False)
     if name in LOGARITHMIC:  # a share, and so the interval is not symmetric
-        error = min(error, _UNKNOWN)
-        return Estimate(name, value, value * float(np.exp(-error)), value * float(np.exp(error)))
+        high = value * float(np.exp(min(error, _UNKNOWN))) if np.isfinite(error) else np.inf
+        return Estimate(name, value, value * float(np.exp(-error)), high)
     low = value - error if name in SIGNED else max(0.0, value - error)
     return Estimate(name, value, low, value + error)
-
-
-def _explained(problem: Problem, residuals: Sequence[Array]) -> list[float]:
-    """Share of the variance of each force that a model explains, drift left out."""
-    measured, left = problem.whitened(problem.measured), problem.whitened(residuals)
-    return [float(1.0 - np.sum(b * b) / np.sum(a * a)) for a, b in zip(measured, left, strict=True)]
 
 
 def _is_white(innovations: Array) -> bool:
@@ -300,15 +524,9 @@ def _series(problem: Problem, values: dict[str, float], drifts: Sequence[Array])
 
 
 def _remarks(
-    names: Sequence[str],
-    estimates: Sequence[Estimate],
-    channels: Sequence[Channel],
-    untold: Array | None,
+    names: Sequence[str], estimates: Sequence[Estimate], untold: Array | None
 ) -> tuple[str, ...]:
     remarks = []
-    unfitted = [e.name for e in estimates if e.name in UNKNOWN_TO_FITS and e.value]
-    for name in unfitted:
-        remarks.append(f"{name} is as in the configuration, but no fit takes it into account")
     if untold is not None:
         involved = [name for name, part in zip(names, untold, strict=True) if abs(part) > 0.3]
         remarks.append(
@@ -316,9 +534,7 @@ def _remarks(
             + (" apart" if len(involved) > 1 else "")
             + "; fix one, or run fishctl identify --experiment"
         )
-    wide = [
-        e.name for e in estimates if e.fitted and e.name in LOGARITHMIC and e.high > 1.2 * e.low
-    ]
+    wide = [e.name for e in estimates if e.name in names and _is_wide(e)]
     if wide:
         remarks.append(f"known to 10 % at best: {', '.join(wide)}")
     ends = [
@@ -328,14 +544,18 @@ def _remarks(
     ]
     if ends:
         remarks.append(f"at the end of where a fit looks: {', '.join(ends)}")
-    symbols = {"fx": "F_x", "fy": "F_y"}
-    coloured = [symbols[channel.name] for channel in channels if not channel.white]
-    if coloured:
-        remarks.append(
-            f"what is left of {' and '.join(coloured)} is more than noise: the model lacks "
-            "something of this fish, and intervals may be too narrow"
-        )
     return tuple(remarks)
+
+
+def _is_wide(estimate: Estimate) -> bool:
+    """Return whether the interval is wider than ±10 % of the value, and ±1 ms or ±1 mrad."""
+    low, high = estimate.known
+    if not estimate.fitted or not math.isfinite(high):
+        return False
+    if estimate.name in LOGARITHMIC:
+        return high > 1.2 * low
+    smallest = _SMALLEST.get(estimate.name)
+    return smallest is not None and high - low > max(0.2 * estimate.value, smallest)
 
 
 def _at_end(name: str, value: float) -> bool:

@@ -15,15 +15,22 @@ from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
 from fishd.lab.identification.passages import Passage
-from fishd.lab.identification.response import Array, Drive, response
+from fishd.lab.identification.response import Array, Drive, Motion, respond
 
-DRIVE = ("omega0", "xi", "servo_speed", "servo_lag", "servo_delay", "backlash")
+DRIVE = (
+    *("omega0", "xi", "quadratic_drag", "servo_speed", "servo_lag"),
+    *("servo_delay", "backlash", "cable_slack", "servo_dead_zone"),
+)
 """What shapes the motion of the fin: the response is simulated for each."""
-FORCES = ("coupling", "thrust_coefficient", "lateral_drag", "servo_reaction", "rotation")
+FORCES = (
+    *("coupling", "thrust_coefficient", "lateral_inertia_ratio", "lateral_drag"),
+    *("lateral_quadratic_drag", "servo_reaction", "rotation"),
+)
 """What scales and turns the forces of a motion."""
 BOUNDS = {
     "omega0": (0.5, 200.0),
     "xi": (1e-3, 10.0),
+    "quadratic_drag": (0.0, 100.0),
     "servo_speed": (0.05, 1e3),
     "servo_lag": (5e-3, 10.0),
     "servo_delay": (0.0, 0.5),
@@ -32,16 +39,27 @@ BOUNDS = {
     "servo_dead_zone": (0.0, 0.5),
     "coupling": (1e-3, 10.0),
     "thrust_coefficient": (1e-8, 10.0),
+    "lateral_inertia_ratio": (0.01, 100.0),
     "lateral_drag": (0.0, 10.0),
+    "lateral_quadratic_drag": (0.0, 10.0),
     "servo_reaction": (-0.1, 0.1),
     "rotation": (-1.5, 1.5),
 }
 """Where a fit looks, in the units of the configuration."""
 LOGARITHMIC = frozenset(
-    ("omega0", "xi", "servo_speed", "servo_lag", "coupling", "thrust_coefficient")
+    (
+        *("omega0", "xi", "servo_speed", "servo_lag"),
+        *("coupling", "thrust_coefficient", "lateral_inertia_ratio"),
+    )
 )
 """Fitted as logarithms: they are positive, and errors of them are shares."""
-_STEPS = {"servo_delay": 1e-4, "backlash": 2e-4, "cable_slack": 2e-4, "servo_dead_zone": 2e-4}
+_STEPS = {
+    "servo_delay": 1e-4,
+    "backlash": 2e-4,
+    "cable_slack": 2e-4,
+    "servo_dead_zone": 2e-4,
+    "quadratic_drag": 1e-3,
+}
 """For differences; 1e-4 elsewhere."""
 
 
@@ -78,6 +96,7 @@ class Problem:
             (one, int(np.searchsorted(one.ends[1:] * one.tick, settle))) for one in passages
         ]
         self._cached: tuple[dict[str, float], list[Array]] | None = None
+        self._near: list[Motion | None] = [None for _ in passages]
 
     def to_z(self, values: dict[str, float]) -> Array:
         """The vector of what is fitted, within bounds."""
@@ -95,6 +114,11 @@ class Problem:
         """Of z."""
         lowest, highest = ({name: BOUNDS[name][end] for name in self.names} for end in (0, 1))
         return self.to_z(lowest), self.to_z(highest)
+
+    @property
+    def skips(self) -> list[int]:
+        """How many windows at the start of each passage are not judged."""
+        return [skip for _, skip in self._passages]
 
     @property
     def unexplained(self) -> float:
@@ -137,6 +161,13 @@ class Problem:
         columns = [self.whitened(self._slope(values, name)) for name in self.names]
         return np.stack(columns, axis=2)
 
+    def column(self, values: dict[str, float], name: str, step: float | None) -> Array:
+        """Derivative of `whitened(residuals(…))` by what need not be fitted, shape (2, n).
+
+        step: of the difference; by default as for a fit
+        """
+        return self.whitened(self._slope(values, name, step))
+
     def slopes_of_means(self, values: dict[str, float]) -> Array:
         """Derivatives of the mean residual of both channels by z, shape (2, names)."""
         slopes = [np.concatenate(self._slope(values, name), axis=1) for name in self.names]
@@ -147,11 +178,11 @@ class Problem:
         found = [likeliest([each[channel] for each in residuals]) for channel in range(2)]
         self.noise = (found[0], found[1])
 
-    def _slope(self, values: dict[str, float], name: str) -> list[Array]:
+    def _slope(self, values: dict[str, float], name: str, step: float | None = None) -> list[Array]:
         """Derivative of the residuals by one element of z, by passage."""
         value = values[name]
-        step = _STEPS.get(name, 1e-4) * (value if name in LOGARITHMIC else 1.0)
-        if name in FORCES:
+        step = step or _STEPS.get(name, 1e-4) * (value if name in LOGARITHMIC else 1.0)
+        if name in FORCES and not (name == "coupling" and values["quadratic_drag"]):
             step = 1e-6 * max(1e-3, abs(value))
         later = {**values, name: value + step}
         moved, moved_later = self._moved(values), self._moved(later, keep=False)
@@ -163,16 +194,18 @@ class Problem:
 
     def _moved(self, values: dict[str, float], *, keep: bool = True) -> list[Array]:
         """The response of the fin for λ = 1, by passage; the latest one is kept."""
-        drive = {name: value for name, value in values.items() if name not in FORCES}
+        drive = {name: values[name] for name in DRIVE}
+        drive["quadratic_drag"] *= values["coupling"]
         if self._cached and self._cached[0] == drive:
             return self._cached[1]
         model = Drive(**drive)
-        moved = [
-            response(model, one.commands, one.ends, one.tick, one.samples)
-            for one, _ in self._passages
+        responses = [
+            respond(model, one.commands, one.ends, one.tick, one.samples, near)
+            for (one, _), near in zip(self._passages, self._near, strict=True)
         ]
+        moved = [forces for forces, _ in responses]
         if keep:
-            self._cached = (drive, moved)
+            self._cached, self._near = (drive, moved), [motion for _, motion in responses]
         return moved
 
 
@@ -222,7 +255,8 @@ def _seen(values: dict[str, float], moved: Array) -> Array:
     """The forces of a response, as a sensor that is turned shows them; shape (2, windows)."""
     scale, inertia, drag = (values[n] for n in ("coupling", "thrust_coefficient", "lateral_drag"))
     fx = inertia * scale * scale * moved[0]
-    fy = inertia * scale * moved[1] + drag * scale * moved[2]
+    fy = scale * (values["lateral_inertia_ratio"] * inertia * moved[1] + drag * moved[2])
+    fy = fy + values["lateral_quadratic_drag"] * scale * scale * moved[4]
     fy = fy + values["servo_reaction"] * moved[3]
     cos, sin = np.cos(values["rotation"]), np.sin(values["rotation"])
     return np.stack((cos * fx - sin * fy, sin * fx + cos * fy))

@@ -22,6 +22,10 @@ _FINEST = 0.0025
 """Steps of the grid are at most this long [s]."""
 _MOST_SAMPLES = 40
 """More samples in a period than this are as good as the continuous force."""
+_MAX_ITERATIONS = 100
+"""Iterations of quadratic drag, at most."""
+_CLOSE = 1e-7
+"""Largest change of the fin's speed in the last iteration, as a share of its largest speed."""
 _EARLIER = 2
 """Slots before the first command, in which the servo already holds it."""
 
@@ -46,20 +50,52 @@ class Drive:
     """[rad]"""
     servo_dead_zone: float = 0.0
     """[rad]"""
+    quadratic_drag: float = 0.0
+    """That of the fin times its coupling, cλ, as the fin here has λ = 1 [1/rad]."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of the wheel and of a fin with λ = 1, at the points of a grid."""
+
+    servo: tuple[float, ...]
+    """What of the drive the wheel depends on."""
+    pull: Array
+    """Wheel angle that drives the fin, also half way between the points [rad]."""
+    turned: Array
+    """Angle of the wheel itself at the same instants [rad]."""
+    rate: Array
+    """Speed of the fin [rad/s]."""
 
 
 def response(
     drive: Drive, commands: Array, ends: NDArray[np.int_], tick: float, samples: int
 ) -> Array:
-    """Window means of [−α α̈, −α̈, −α̇, −φ̈] for λ = 1, of shape (4, len(ends) − 1).
+    """Return the forces of `respond`."""
+    return respond(drive, commands, ends, tick, samples)[0]
 
-    With coupling λ, F_x = K λ² · the first, and F_y = K λ · the second + K_d λ · the third +
-    J · the fourth, which is smoothed as the mount of the servo does.
+
+def respond(
+    drive: Drive,
+    commands: Array,
+    ends: NDArray[np.int_],
+    tick: float,
+    samples: int,
+    near: Motion | None = None,
+) -> tuple[Array, Motion]:
+    """Return what the sensor feels, and the motion.
+
+    The first are window means of [−α α̈, −α̈, −α̇, −φ̈, −|α̇| α̇] for λ = 1, of shape
+    (5, len(ends) − 1).
+
+    With coupling λ, F_x = K λ² · the first, and F_y = K_y λ · the second + K_d λ · the third +
+    J · the fourth, which is smoothed as the mount of the servo does, + K_q λ² · the fifth.
 
     commands: φ_c in each slot of one period [rad], from the start on
     ends: slots at whose starts windows end; the first one begins where the first window does
     tick: one period [s]
     samples: how many samples, spread evenly over each period, the means are taken over
+    near: the motion for the same commands and a similar drive, which saves time
     """
     samples = min(samples, _MOST_SAMPLES)
     stride = math.ceil(tick / (samples * _FINEST))
@@ -67,8 +103,16 @@ def response(
     h = tick / steps
     before = _EARLIER + math.ceil(drive.servo_delay / tick - 1e-9)
     held = np.concatenate((np.full(before, commands[0]), commands))
-    pull, turned = _pull(drive, held, steps, tick)
-    alpha, rate = _fin(drive, pull, h)
+    servo = (
+        *(drive.servo_speed, drive.servo_lag, drive.backlash, drive.cable_slack),
+        *(drive.servo_dead_zone, float(before)),
+    )
+    if near and near.servo == servo:
+        pull, turned = near.pull, near.turned
+    else:
+        pull, turned = _pull(drive, held, steps, tick)
+    similar = near.rate if near and near.pull.size == pull.size else None
+    alpha, rate = _fin(drive, pull, h, similar)
     # Slot k of the commands begins at k·tick; its command acts from grid point (k + before)·steps
     # on, which is servo_delay later. So its first sample is at this grid point:
     position = before * steps - drive.servo_delay / h + 0.5 * stride
@@ -79,18 +123,21 @@ def response(
     def taken(values: Array, later: int = 0, each: int = 1) -> Array:
         return values[each * first + later :: each * stride][: slots * samples]
 
-    acceleration = -drive.xi * drive.omega0 * rate - drive.omega0**2 * (alpha - pull[::2])
+    acceleration = _acceleration(drive, alpha, rate, pull[::2])
     here, there = taken(rate), taken(rate, 1)
     a = _hermite(taken(alpha), taken(alpha, 1), here, there, part, h)
     v = _hermite(here, there, taken(acceleration), taken(acceleration, 1), part, h)
     pulls = taken(pull, 0, 2), taken(pull, 1, 2), taken(pull, 2, 2)
-    pulled = sum(w * u for w, u in zip(_parabola(part), pulls, strict=True))
-    minus = drive.xi * drive.omega0 * v + drive.omega0**2 * (a - pulled)
-    sums = np.stack((a * minus, minus, -v)).reshape(3, slots, samples).sum(axis=2)
+    pulled = np.tensordot(_parabola(part), np.stack(pulls), 1)
+    minus = -_acceleration(drive, a, v, pulled)
+    sums = np.stack((a * minus, minus, -v, -np.abs(v) * v))
+    sums = sums.reshape(4, slots, samples).sum(axis=2)
     means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
     edges = 2.0 * (before * steps - drive.servo_delay / h + ends * steps)
     passed_on = np.interp(edges, np.arange(turned.size), _passed_on(turned, 0.5 * h))
-    return np.vstack((means, -np.diff(passed_on) / (tick * np.diff(ends))))
+    reaction = -np.diff(passed_on) / (tick * np.diff(ends))
+    forces = np.vstack((means[:3], reaction, means[3]))
+    return forces, Motion(servo, pull, turned, rate)
 
 
 def _passed_on(angles: Array, step: float) -> Array:
@@ -135,9 +182,49 @@ def _pull(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Ar
     return pull, turned
 
 
-def _fin(drive: Drive, pull: Array, h: float) -> tuple[Array, Array]:
-    """α and α̇ at the grid points for λ = 1, from rest at the first pull."""
-    free, push = _discrete(drive.omega0, drive.xi, h)
+def _acceleration(drive: Drive, angle: Array, rate: Array, pull: Array) -> Array:
+    """Return α̈ of the fin for λ = 1."""
+    acceleration = -drive.xi * drive.omega0 * rate - drive.omega0**2 * (angle - pull)
+    if drive.quadratic_drag:
+        acceleration -= drive.quadratic_drag * np.abs(rate) * rate
+    return acceleration
+
+
+def _fin(drive: Drive, pull: Array, h: float, similar: Array | None) -> tuple[Array, Array]:
+    """Return α and α̇ at the grid points for λ = 1, from rest at the first pull.
+
+    Quadratic drag is found by iteration: the fin is a linear filter of the pull and of the drag of
+    the motion found before. A linear drag of about its size, c·m, is part of the filter, so that
+    only the rest, c (|α̇| − m) α̇, is iterated.
+
+    similar: a speed to begin with [rad/s]
+    """
+    drag = drive.quadratic_drag
+    if not drag:
+        return _linear_fin(drive.omega0, drive.xi, pull, h)
+    rate = _linear_fin(drive.omega0, drive.xi, pull, h)[1] if similar is None else similar
+    mean = 2.0 * float(np.abs(rate).mean())
+    xi = drive.xi + drag * mean / drive.omega0
+    share = drag / drive.omega0**2
+    shrinks = min(1.0, 2.0 * drag * mean / (xi * drive.omega0))
+    for _ in range(_MAX_ITERATIONS):
+        rates = np.empty_like(pull)
+        rates[::2] = rate
+        # A cubic through four points; the ends are at rest and at the end of what is used.
+        rates[1::2] = 0.5 * (rate[1:] + rate[:-1])
+        bend = rate[3:] - rate[2:-1] - rate[1:-2] + rate[:-3]
+        rates[3:-3:2] -= 0.0625 * bend
+        driven = pull - share * (np.abs(rates) - mean) * rates
+        before = rate
+        alpha, rate = _linear_fin(drive.omega0, xi, driven, h)
+        if shrinks * np.abs(rate - before).max() <= _CLOSE * np.abs(rate).max():
+            break
+    return alpha, rate
+
+
+def _linear_fin(omega0: float, xi: float, pull: Array, h: float) -> tuple[Array, Array]:
+    """Return α and α̇ at the grid points of a fin without quadratic drag, from rest."""
+    free, push = _discrete(omega0, xi, h)
     relative = pull - pull[0]
     cells = np.stack((relative[:-2:2], relative[1:-1:2], relative[2::2]))
     kick_a, kick_v = push @ cells

@@ -46,8 +46,18 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     ] = 12.9e-3
     lateral_drag: Annotated[
         float,
-        unit("N s/rad", "Lateral drag coefficient K_d, in F_y = −K α̈ − K_d α̇.", ge=0.0, le=10.0),
+        unit("N s/rad", "Lateral drag coefficient K_d, in F_y = −K_y α̈ − K_d α̇.", ge=0.0, le=10.0),
     ] = 39.9e-3
+    lateral_inertia_ratio: Annotated[
+        float,
+        unit(
+            "1",
+            "Ratio K_y/K of the lateral inertia coefficient K_y, in F_y = −K_y α̈ − K_d α̇, to the "
+            "thrust coefficient.",
+            gt=0.0,
+            le=100.0,
+        ),
+    ] = 1.0
     quadratic_drag: Annotated[
         float,
         unit(
@@ -107,6 +117,11 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=0.1,
         ),
     ] = 0.0
+
+    @property
+    def lateral_inertia(self) -> float:
+        """Lateral inertia coefficient K_y [N s²/rad²]."""
+        return self.lateral_inertia_ratio * self.thrust_coefficient
 
 
 def of_the_paper(parameters: PlantParameters) -> PlantParameters:

@@ -29,6 +29,7 @@ FISHES = {
     "quadratic lateral drag": Fish(lateral_quadratic_drag=0.02, xi=0.3),
     "quadratic drag, slack cables": Fish(quadratic_drag=0.5, backlash=0.1, cable_slack=0.05),
     "quadratic drag, servo that pushes back": Fish(quadratic_drag=2.0, servo_reaction=0.004),
+    "more lateral inertia": Fish(lateral_inertia_ratio=1.5),
     "no damping": Fish(xi=0.0),
     "little damping": Fish(xi=0.02),
     "heavy damping": Fish(xi=15.0),
@@ -70,7 +71,7 @@ def integrate(
         return -p.xi * p.omega0 * rate - braking - p.omega0**2 * (alpha - drive)
 
     def forces(alpha: float, rate: float, a: float) -> tuple[float, float]:
-        side = p.thrust_coefficient * a + p.lateral_drag * rate
+        side = p.lateral_inertia_ratio * p.thrust_coefficient * a + p.lateral_drag * rate
         side += p.lateral_quadratic_drag * abs(rate) * rate
         return -p.thrust_coefficient * alpha * a, -side
 
