@@ -57,9 +57,16 @@ if TYPE_CHECKING:
 @click.option(
     "--fit",
     metavar="NAME,...",
-    help="What to fit; the rest is as in the configuration. [default: omega0, xi, "
-    "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_drag, servo_delay, backlash, "
-    "rotation; also: cable_slack, servo_dead_zone, servo_reaction]",
+    help="What to fit; the rest is as in the configuration. [default: omega0, xi, quadratic_drag, "
+    "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_inertia_ratio, lateral_drag, "
+    "lateral_quadratic_drag, servo_delay, backlash, rotation; and where the forces show it "
+    "cable_slack, servo_dead_zone, servo_reaction]",
+)
+@click.option(
+    "--fix",
+    metavar="NAME,...",
+    help="What not to fit, as it is known: lateral_inertia_ratio where K_y = K, or coupling where "
+    "λ was measured.",
 )
 @click.option(
     "--to",
@@ -86,6 +93,7 @@ def identify(
     file: Path | None,
     overrides: tuple[str, ...],
     fit: str | None,
+    fix: str | None,
     target: Path | None,
     force: bool,
     plot: Path | None,
@@ -116,8 +124,9 @@ def identify(
 
     from fishd.lab import identification as lab
 
-    names = lab.DEFAULT if fit is None else tuple(filter(None, fit.replace(" ", "").split(",")))
-    lab.check(names)  # before minutes of swimming
+    names = None if fit is None else _names(fit)
+    known = _names(fix or "")
+    lab.check(lab.DEFAULT if names is None else names, known)  # before minutes of swimming
     if experiment:
         config, fish = _config(on, file, overrides, endpoint)
         try:
@@ -131,7 +140,7 @@ def identify(
         config, tables = load(file, overrides), [find(run, folder) for run in runs]
         check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
-    found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names)
+    found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names, fix=known)
     if as_json:
         print_json(found.to_builtins() | {"origin": origin})
     else:
@@ -147,6 +156,10 @@ def identify(
 
         draw(found, plot)
     return 0
+
+
+def _names(listed: str) -> tuple[str, ...]:
+    return tuple(filter(None, listed.replace(" ", "").split(",")))
 
 
 def _swimmer(on: str | None, file: Path | None, overrides: tuple[str, ...]) -> str:
@@ -205,15 +218,23 @@ def _write(target: Path, text: str) -> None:
 
 
 def _print(found: "Identification") -> None:
-    from fishd.lab.identification.formatting import format_estimate
+    from fishd.lab.identification.formatting import format_estimate, format_if_ratio_holds
 
-    rows = [("", "value", "95 % interval", "unit")]
-    rows += [format_estimate(estimate) for estimate in found.estimates if estimate.fitted]
-    widths = [max(len(row[column]) for row in rows) for column in range(3)]
-    for name, value, interval, unit in rows:
-        line = f"{name:<{widths[0]}}  {value:>{widths[1]}}  {interval:<{widths[2]}}  {unit}"
+    echo(found.headline)
+    echo()
+    ratio = found["lateral_inertia_ratio"].value
+    shown = [each for each in (*found.estimates, *found.products) if each.fitted]
+    rows = [("", "value", "95 % interval", "unit", f"if K_y/K = {ratio:g}")]
+    rows += [(*format_estimate(each), format_if_ratio_holds(each)) for each in shown]
+    columns = 5 if any(row[4] for row in rows[1:]) else 4
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    for name, value, interval, unit, narrow in rows:
+        line = f"{name:<{widths[0]}}  {value:>{widths[1]}}  {interval:<{widths[2]}}"
+        line += f"  {unit:<{widths[3]}}" + (f"  {narrow}" if columns == 5 else "")
         echo(line.rstrip())
     echo()
+    if columns == 5:
+        echo("forces do not tell K_y/K: --fix lateral_inertia_ratio takes it as known")
     for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
         rest = f"noise {channel.noise * 1e3:.2f} mN, drift ±{0.5 * channel.drift * 1e3:.1f} mN"
         echo(f"{symbol}: {channel.explained:.3%} of it explained; {rest}")

@@ -22,12 +22,23 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     swim = ("--experiment", "--for", "40", "--record", str(record), "--plot", str(picture))
     done = invoke(*swim, "--set", "plant.omega0=11", "--to", str(fish))
     assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("identified: the model explains 9")
     assert "omega0 ω₀" in done.stdout
+    assert "if K_y/K = 1" in done.stdout
     assert f"{fish}: written; to swim it: fishctl simulate swing --config {fish}" in done.stdout
     assert load(fish).plant.omega0 == pytest.approx(11.0, rel=0.01)
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
-    again = invoke(str(record), "--fit", "omega0, xi", "--set", "plant.omega0=11", "--json")
+    again = invoke(
+        str(record),
+        "--fit",
+        "omega0, xi, coupling",
+        "--fix",
+        "coupling",
+        "--set",
+        "plant.omega0=11",
+        "--json",
+    )
     assert again.exit_code == 0
     told = json.loads(again.stdout)
     assert told["origin"] == "run.mcap"

@@ -10,14 +10,16 @@ from argparse import Namespace
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from math import radians
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from common.report import Options, Report, table
-from fishd.config import Config
+from fishd.config import Config, load
 from fishd.lab.identification import experiment, identify
+from fishd.lab.identification.estimation import FURTHER
+from fishd.lab.other_fish import harsh
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -32,74 +34,170 @@ VARIED = (
 )  # fmt: skip
 LONGEST_DELAY, MOST_BACKLASH = 0.1, 0.05
 """[s], [rad]"""
+MOST_DRAG, MOST_LATERAL_DRAG = 2.0, 0.01
+"""Quadratic drag of the fin [1/rad], and in F_y [N s²/rad²]."""
+RATIOS = (0.6, 0.85, 1.15, 1.6)
+"""K_y/K is between the first two or between the last two of these."""
+FIRST_SEED = 26000
+"""Seed of the first fish of each kind, and of its sensor."""
+FIRST_HARSH_SEED = 700
 SECONDS = 180.0
-ABSOLUTE = {"servo_delay": (1e3, "ms"), "backlash": (1e3, "mrad")}
+ABSOLUTE = {
+    "servo_delay": (1e3, "ms"),
+    "backlash": (1e3, "mrad"),
+    "quadratic_drag": (1.0, "1/rad"),
+    "lateral_quadratic_drag": (1e3, "mN s²/rad²"),
+}
 """Judged by their errors; all others by their share of the truth."""
 
 
-def fish(kind: str, seed: int) -> PlantParameters:
-    """A fish that is known: `default`, `driven` (the same with delay and backlash), or `other`."""
+KINDS = {
+    "default": "the default fish",
+    "driven": "with delay and backlash",
+    "other": "other fish, with delay and backlash",
+    "outside": "the same with quadratic drag and K_y ≠ K",
+    "harsh": "harsh fish: dead zone and reaction, too",
+    "lacking": "harsh fish, both left out of the fit",
+}
+"""What is identified, with the words of the table; the first three have K_y = K."""
+
+
+class Interval(NamedTuple):
+    """An estimate of a fish that is known."""
+
+    truth: float
+    value: float
+    low: float
+    high: float
+    known_low: float
+    """Lower end of the interval for a known K_y/K."""
+    known_high: float
+
+
+class Outcome(NamedTuple):
+    """What came of one experiment."""
+
+    intervals: dict[str, Interval]
+    trusted: bool
+    """Whether the first line of the output has no warning."""
+
+
+def fish(kind: str, seed: int) -> Config:
+    """A fish that is known, of one of `KINDS`, and its rig."""
+    if kind in ("harsh", "lacking"):
+        return load(None, harsh(FIRST_HARSH_SEED + seed).overrides)
+    rig = msgspec.structs.replace(RIG, seed=FIRST_SEED + seed)
     if kind == "default":
-        return PlantParameters()
+        return Config(simulation=rig)
     if kind == "driven":
-        return PlantParameters(servo_delay=0.03, backlash=0.02)
-    chance = random.Random(1000 + seed)
+        return Config(plant=PlantParameters(servo_delay=0.03, backlash=0.02), simulation=rig)
+    chance = random.Random(FIRST_SEED + seed)
     plain = msgspec.structs.asdict(PlantParameters())
     varied = {name: plain[name] * chance.uniform(1 - SPREAD, 1 + SPREAD) for name in VARIED}
-    return PlantParameters(
-        **varied,
-        servo_delay=chance.uniform(0.0, LONGEST_DELAY),
-        backlash=chance.uniform(0.0, MOST_BACKLASH),
-    )
+    varied["servo_delay"] = chance.uniform(0.0, LONGEST_DELAY)
+    varied["backlash"] = chance.uniform(0.0, MOST_BACKLASH)
+    if kind == "outside":
+        varied["quadratic_drag"] = chance.uniform(0.0, MOST_DRAG)
+        varied["lateral_quadratic_drag"] = chance.uniform(0.0, MOST_LATERAL_DRAG)
+        side = chance.choice((RATIOS[:2], RATIOS[2:]))
+        varied["lateral_inertia_ratio"] = chance.uniform(*side)
+    return Config(plant=PlantParameters(**varied), simulation=rig)
 
 
-def one(run: tuple[str, int]) -> dict[str, tuple[float, float, float, float]]:
-    """Truth, value, low and high of everything, of one experiment."""
+def one(run: tuple[str, int]) -> Outcome:
+    """Let one fish swim, and identify it."""
     kind, seed = run
-    plant, rig = fish(kind, seed), msgspec.structs.replace(RIG, seed=seed)
-    with VirtualRig(Config(plant=plant, simulation=rig)) as swum:
-        found = identify(experiment(swum, SECONDS))
-    truth: dict[str, Any] = msgspec.structs.asdict(plant) | msgspec.structs.asdict(rig)
+    config = fish(kind, seed)
+    with VirtualRig(config) as swum:
+        found = identify(experiment(swum, SECONDS), fix=FURTHER if kind == "lacking" else ())
+    truth: dict[str, Any] = msgspec.structs.asdict(config.plant)
+    truth |= msgspec.structs.asdict(config.simulation)
     # Nearly three whole periods of the drift: its mean is as good as zero.
-    return {
-        each.name: (truth[each.name], each.value, each.low, each.high)
+    intervals = {
+        each.name: Interval(truth[each.name], each.value, each.low, each.high, *each.known)
         for each in found.estimates
         if each.fitted
     }
+    return Outcome(intervals, found.headline.startswith("identified"))
 
 
-def rows(runs: Sequence[dict[str, tuple[float, float, float, float]]]) -> list[list[str]]:
-    """One for each quantity: errors, width, coverage."""
+def rows(outcomes: Sequence[Outcome], *, known: bool) -> list[list[str]]:
+    """One for each quantity: errors, width, coverage.
+
+    known: K_y/K is, so that intervals for it are meant
+    """
     found = []
-    for name in runs[0]:
+    for name in outcomes[0].intervals:
+        intervals = [o.intervals[name] for o in outcomes]
+        truth, value, low, high, known_low, known_high = np.array(intervals).T
+        if known:
+            low, high = known_low, known_high
+        is_absolute = name in ABSOLUTE
         factor, unit = ABSOLUTE.get(name, (100.0, "%"))
-        truth, value, low, high = np.array([run[name] for run in runs]).T
-        scale = factor if name in ABSOLUTE else factor / np.abs(truth)
+        scale = factor if is_absolute else factor / np.abs(truth)
         error, width = np.abs(value - truth) * scale, 0.5 * (high - low) * scale
         covered = int(np.sum((low <= truth) & (truth <= high)))
         found.append(
             [
                 f"`{name}`",
                 *(f"{x:.2g} {unit}" for x in (np.median(error), error.max(), np.median(width))),
-                f"{covered} of {len(runs)}",
+                f"{covered} of {len(outcomes)}",
             ]
         )
     return found
 
 
+def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
+    """The row of one kind of fish."""
+    known = kind in ("default", "driven", "other")
+    held = narrow = count = astray = withheld = 0
+    errors, worst = [], 0.0
+    for outcome in outcomes:
+        for name, each in outcome.intervals.items():
+            if not np.isfinite(each.high):
+                withheld += 1
+                continue
+            count += 1
+            held += each.low <= each.truth <= each.high
+            narrow += each.known_low <= each.truth <= each.known_high
+            off = abs(each.truth - 0.5 * (each.low + each.high)) / (0.5 * (each.high - each.low))
+            worst = max(worst, off)
+            astray += outcome.trusted and off > 2.0
+            if known and name in VARIED:
+                errors.append(100.0 * abs(each.value / each.truth - 1.0))
+    return [
+        KINDS[kind],
+        f"{held} of {count} ({held / max(1, count):.0%})",
+        str(withheld),
+        f"{narrow} of {count}" if known else "–",
+        f"{np.median(errors):.2g} %" if known else "–",
+        f"{sum(not outcome.trusted for outcome in outcomes)} of {len(outcomes)}",
+        f"{worst:.2g}",
+        str(astray),
+    ]
+
+
+SUMMARY = (
+    "fish | intervals that hold | withheld | with K_y/K known | error, median | "
+    "warned in the first line | furthest off, in half-widths | more than 2 off and not warned"
+)
 HEAD = "quantity | error, median | error, largest | half of the 95 % interval | it covers the truth"
 OPTIONS: Options = {
-    "--seeds": {"type": int, "default": 20, "help": "experiments of each kind; default 20"},
+    "--seeds": {"type": int, "default": 10, "help": "experiments of each kind; default 10"},
     "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
 }
 
 
 def measure(options: Namespace) -> Report:
-    """The three tables; each experiment takes some seconds."""
-    sections, figures = {}, {}
+    """The tables; each experiment takes some seconds."""
+    sections, figures, whole = {}, {}, []
     with ProcessPoolExecutor(options.jobs) as pool:
-        for kind in ("default", "driven", "other"):
-            runs = list(pool.map(one, [(kind, seed) for seed in range(options.seeds)]))
-            sections[f"bench identification {kind}"] = table(HEAD, rows(runs))
-            figures[kind] = runs
+        for kind in KINDS:
+            outcomes = list(pool.map(one, [(kind, seed) for seed in range(options.seeds)]))
+            whole.append(summary(kind, outcomes))
+            figures[kind] = [outcome._asdict() for outcome in outcomes]
+            if kind not in ("harsh", "lacking"):  # not all of them fit the same
+                lines = rows(outcomes, known=kind != "outside")
+                sections[f"bench identification {kind}"] = table(HEAD, lines)
+    sections["bench identification summary"] = table(SUMMARY, whole)
     return Report(sections, figures)

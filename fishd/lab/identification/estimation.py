@@ -91,6 +91,11 @@ _SMOOTH = 5.0
 _SINGULAR = 1e-10
 """Information below this share of the largest is none."""
 _SYMBOLS = {"fx": "F_x", "fy": "F_y"}
+_SIGNS = {
+    "white residual": "what is left of {} is more than noise",
+    "prediction": "data left out of the fit are predicted worse in {}",
+}
+"""Failed assumptions, as a clause of a sentence about forces."""
 _SMALLEST = {"servo_delay": 2e-3, "backlash": 2e-3}
 """Width of an interval that is narrow enough, however small the value is [s], [rad]."""
 SIGNED = ("servo_reaction", "rotation")
@@ -108,6 +113,7 @@ def identify(
     start: PlantParameters | None = None,
     rig: SimulationSettings | None = None,
     fit: Sequence[str] | None = None,
+    fix: Sequence[str] = (),
 ) -> Identification:
     """Fit a fish and its rig to what some runs of it have measured.
 
@@ -115,13 +121,14 @@ def identify(
     start: where to begin, and the value of what is not fitted; by default the fish of Fu et al.
     rig: the same for `rotation`; by default the sensor is not turned
     fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`; by default `DEFAULT`
-        and what of `FURTHER` the data demand. Without `lateral_inertia_ratio`, K_y/K is as in
-        `start`, and K, λ and K_d are known so much better
+        and what of `FURTHER` the data demand
+    fix: what of that is not fitted. With `lateral_inertia_ratio`, K_y/K is as in `start`, and K, λ
+        and K_d are known so much better; so they are with `coupling`, if λ was measured
 
     Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
     that is not possible, and what `fishd.recording.read` raises.
     """
-    names = check(DEFAULT if fit is None else fit)
+    names = check(DEFAULT if fit is None else fit, fix)
     parts = passages([_table(run) for run in _several(runs)])
     if not any(one.commands.any() for one in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
@@ -131,7 +138,9 @@ def identify(
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
-    problem, values = _solved(parts, names, values, FURTHER if fit is None else ())
+    problem, values = _solved(
+        parts, names, values, tuple(name for name in FURTHER if fit is None and name not in fix)
+    )
     settle = _settling(values)
     if settle > _SETTLE:
         longer = [one for one in parts if one.duration > settle + SHORTEST]
@@ -168,14 +177,18 @@ def _table(run: object) -> "DataFrame":
     return run  # type: ignore[return-value]
 
 
-def check(fit: Sequence[str]) -> tuple[str, ...]:
-    """Names of what to fit, in order; raises ParameterError for one that is not possible."""
-    for name in fit:
+def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the names of what to fit, in order, without those of `fix`.
+
+    Raises `ParameterError` for one that is not possible, and where nothing is left.
+    """
+    for name in (*fit, *fix):
         if name not in POSSIBLE:
             raise ParameterError(f"'{name}' cannot be fitted; {nearest(name, list(POSSIBLE))}")
-    if not fit:
+    names = tuple(name for name in POSSIBLE if name in fit and name not in fix)
+    if not names:
         raise ParameterError(f"nothing to fit; possible: {', '.join(POSSIBLE)}")
-    return tuple(name for name in POSSIBLE if name in fit)
+    return names
 
 
 def _solved(
@@ -333,11 +346,17 @@ def _summary(
         estimates = [_with_free_scale(each) for each in estimates]
     left = np.concatenate(residuals, axis=1)
     slopes = problem.slopes_of_means(values)
-    for name, of, slope, noise in zip(OFFSETS, left, slopes, problem.noise, strict=True):
+    means = np.concatenate(problem.forces(values), axis=1).mean(axis=1)
+    for name, of, slope, noise, mean, channel in zip(
+        OFFSETS, left, slopes, problem.noise, means, channels, strict=True
+    ):
         told = _Z * np.sqrt(slope @ covariance @ slope + noise.white**2 / of.size)
+        if failed:  # a mean force may be as wrong as the rest of it, and no drift shows that
+            lost = max(0.0, 1.0 - channel.explained_out_of_sample)
+            told = np.hypot(told, _Z * np.sqrt(lost) * mean)
         error = float(np.hypot(told, _wandering(of)))
-        mean = float(of.mean())
-        estimates.append(Estimate(name, mean, mean - error, mean + error))
+        value = float(of.mean())
+        estimates.append(Estimate(name, value, value - error, value + error))
     return Identification(
         headline=_headline(channels, failed, identified, inflation),
         identified=identified,
@@ -418,8 +437,11 @@ def _headline(
     if not failed:
         return f"identified: the model explains {explains}"
     causes = [each for each in failed if each.endswith(" = 0")]
-    signs = [_in_words(each) for each in failed if each not in causes]
-    why = "; ".join(signs)
+    why = "; ".join(
+        words.format(" and ".join(symbols))
+        for sign, words in _SIGNS.items()
+        if (symbols := [s for name, s in _SYMBOLS.items() if f"{sign} of {name}" in failed])
+    )
     if causes:
         why += f"; it looks as if {causes[0].replace(' = 0', ' is not 0')}"
     if not identified:
@@ -428,19 +450,10 @@ def _headline(
     return f"careful: the model lacks something and explains {explains}: {why}; {wider}"
 
 
-def _in_words(failed: str) -> str:
-    """Return an assumption that fails as a clause of a sentence."""
-    what, _, channel = failed.rpartition(" of ")
-    symbol = _SYMBOLS[channel]
-    if what == "prediction":
-        return f"data left out of the fit are predicted worse in {symbol}"
-    return f"what is left of {symbol} is more than noise"
-
-
 def _percent(share: float) -> str:
-    """Return a share with as many digits as tell it from all: 71 %, 99.6 %, 99.995 %."""
+    """Return a share with as many digits as tell it from all: 71 %, 99.63 %, 99.9950 %."""
     rest = max(1.0 - share, 1e-6)
-    digits = min(4, max(0, -math.floor(math.log10(rest)) - 2)) if share < 1.0 else 4
+    digits = min(4, max(0, -math.floor(math.log10(rest)) - 1))
     return f"{100.0 * max(share, 0.0):.{digits}f} %"
 
 

@@ -2,12 +2,13 @@
 
 import math
 
-from fishd.lab.identification.result import Estimate
+from fishd.lab.identification.result import PRODUCT_UNITS, Estimate
 
 _SHOWN: dict[str, tuple[float, str]] = {
     "N": (1e3, "mN"),
     "s": (1e3, "ms"),
     "N s^2/rad^2": (1e3, "mN s²/rad²"),
+    "N s^2/rad": (1e3, "mN s²/rad"),
     "N s/rad": (1e3, "mN s/rad"),
     "1": (1.0, ""),
 }
@@ -20,20 +21,49 @@ _SYMBOLS = {
     "servo_lag": "Δ",
     "thrust_coefficient": "K",
     "lateral_drag": "K_d",
+    "lateral_inertia_ratio": "K_y/K",
+    "quadratic_drag": "c",
+    "lateral_quadratic_drag": "K_q",
 }
+_PRODUCTS = dict(zip(PRODUCT_UNITS, ("K λ²", "K_y λ", "K_d λ"), strict=True))
 
 
 def format_estimate(estimate: Estimate) -> tuple[str, str, str, str]:
-    """Return name, value, 95 % interval and unit; the unit of a pure number is empty."""
-    factor, unit = _SHOWN.get(estimate.unit, (1.0, estimate.unit))
-    if estimate.name == "rotation":
-        factor, unit = math.degrees(1.0), "°"
+    """Return name, value, 95 % interval and unit; the unit of a pure number is empty.
+
+    Where K_y/K makes the interval wide, the value has the digits that a known ratio would justify.
+    """
+    factor, unit = _unit(estimate)
     symbol = _SYMBOLS.get(estimate.name)
-    value, low, high = (factor * x for x in (estimate.value, estimate.low, estimate.high))
-    # Two digits of what is not known.
-    width = high - low
-    known = 0.0 < width < math.inf
-    digits = max(0, 1 - math.floor(math.log10(max(width, 1e-9)))) if known else 4
-    shown = [f"{x:.{min(digits, 6)}f}" for x in (value, low, high)]
-    name = f"{estimate.name} {symbol}" if symbol else estimate.name
-    return name, shown[0], f"{shown[1]} to {shown[2]}", unit
+    name = f"{estimate.name} {symbol}" if symbol else _PRODUCTS.get(estimate.name, estimate.name)
+    value = f"{factor * estimate.value:.{_digits(estimate.known, factor)}f}"
+    if not math.isfinite(estimate.high):
+        return name, value, "not identified", unit
+    return name, value, _interval((estimate.low, estimate.high), factor), unit
+
+
+def format_if_ratio_holds(estimate: Estimate) -> str:
+    """Return the 95 % interval for a known K_y/K, or nothing where that makes no difference."""
+    if not estimate.if_ratio_holds or not math.isfinite(estimate.high):
+        return ""
+    return _interval(estimate.if_ratio_holds, _unit(estimate)[0])
+
+
+def _unit(estimate: Estimate) -> tuple[float, str]:
+    """Return the unit that people read, and how many of it are one of the configuration."""
+    if estimate.name == "rotation":
+        return math.degrees(1.0), "°"
+    return _SHOWN.get(estimate.unit, (1.0, estimate.unit))
+
+
+def _interval(ends: tuple[float, float], factor: float) -> str:
+    digits = _digits(ends, factor)
+    return f"{factor * ends[0]:.{digits}f} to {factor * ends[1]:.{digits}f}"
+
+
+def _digits(ends: tuple[float, float], factor: float) -> int:
+    """Return how many decimals show two digits of the width of an interval."""
+    width = factor * (ends[1] - ends[0])
+    if not 0.0 < width < math.inf:
+        return 4
+    return min(6, max(0, 1 - math.floor(math.log10(max(width, 1e-9)))))

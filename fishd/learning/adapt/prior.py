@@ -34,12 +34,12 @@ _CORRELATED = 0.3
 def model_error(channels: Sequence[Channel]) -> float | None:
     """Return the standard error of a thrust of the identified fish, as a fraction of it.
 
-    Where more than noise is left over, it is as large as the rms that is left over, as a fraction
-    of that of the force. None where the fit explains too little to be used.
+    Where more than noise is left over, it is as large as the rms that is left over of data that
+    were not fitted, as a fraction of that of the force. None where the fit explains too little.
     """
     if all(channel.white for channel in channels):
         return MODEL_ERROR
-    explained = min(channel.explained for channel in channels)
+    explained = min(channel.explained_out_of_sample for channel in channels)
     if not explained >= MIN_EXPLAINED:
         return None
     return math.hypot(MODEL_ERROR, math.sqrt(max(0.0, 1.0 - explained)))

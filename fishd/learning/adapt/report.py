@@ -55,12 +55,16 @@ def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
 
 
 def _draw_fit(axis: Any, fitted: Fitted) -> None:
-    """How well those are known whose errors are shares; the others may be as good as zero."""
-    shown = [
-        (name, 50.0 * (each["high"] - each["low"]) / abs(each["value"]))
-        for name, each in fitted.found["estimates"].items()
-        if each.get("fitted", True) and name in LOGARITHMIC
-    ]
+    """How well those are known whose errors are shares; the others may be as good as zero.
+
+    Intervals are those for a known K_y/K; one that is withheld has no bar.
+    """
+    shown = []
+    for name, each in fitted.found["estimates"].items():
+        low, high = each.get("if_ratio_holds") or (each["low"], each["high"])
+        if each.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
+            width = math.nan if low is None or high is None else high - low
+            shown.append((name, 50.0 * width / abs(each["value"])))
     places = np.arange(len(shown))[::-1]
     axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
     axis.set_yticks(places, [name for name, _ in shown])
@@ -214,7 +218,10 @@ def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
             # JSON has no infinity: null stands for an end that the data do not tell.
             low = -math.inf if each["low"] is None else each["low"]
             high = math.inf if each["high"] is None else each["high"]
-            *row, unit = format_estimate(Estimate(name, each["value"], low, high))
+            narrow = each.get("if_ratio_holds")
+            narrow = (narrow[0], narrow[1]) if narrow else None
+            estimate = Estimate(name, each["value"], low, high, if_ratio_holds=narrow)
+            *row, unit = format_estimate(estimate)
             rows.append((*row, unit or "–"))
     return rows
 

@@ -174,21 +174,21 @@ class TetheredFish(Plant[PlantParameters]):
             self._motor.end(lag if motor else 0.0)
             power = self._motor.idle + energy / duration
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
-        inertia, lateral_inertia, drag = p.thrust_coefficient, p.lateral_inertia, p.lateral_drag
+        inertia, side_inertia, drag = p.thrust_coefficient, p.lateral_inertia, p.lateral_drag
         reaction = self._momentum - momentum
         braking, sampled_braking = self._side_drag * braking, self._side_drag * sampled_braking
         return FinWindow(
             duration,
             inertia * thrust / duration,
             -(
-                lateral_inertia * (rate - start.alpha_rate)
+                side_inertia * (rate - start.alpha_rate)
                 + drag * (alpha - start.alpha)
                 + braking
                 - reaction
             )
             / duration,
             inertia * sampled_thrust / samples,
-            -(lateral_inertia * sampled_acceleration + drag * sampled_rate + sampled_braking) / samples
+            -(side_inertia * sampled_acceleration + drag * sampled_rate + sampled_braking) / samples
             + reaction / whole,
             course,
             power,
