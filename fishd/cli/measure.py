@@ -1,6 +1,5 @@
 """The verb that finds a controller's thrust with its interval, on a live or a simulated fish."""
 
-import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -140,16 +139,12 @@ def _line(found: "Measured") -> str:
 
 def _careful(found: "Measured") -> "Iterator[str]":
     """Yield what the interval does not cover, or covers only by a guess."""
-    from fishd.lab.error_budget import unknown_calibration
+    from fishd.lab.error_budget import rotation_remark, unknown_calibration
 
     if line := unknown_calibration(found.calibration_ci95, found.unit):
         yield line
-    if found.rotation:
-        hidden = 1.0 - math.cos(found.rotation)
-        yield (
-            f"F_x follows F_y as if the sensor were turned by {math.degrees(found.rotation):+.1f}° "
-            f"against the fish: that hides {hidden:.2%} of the thrust, which the interval covers"
-        )
+    if line := rotation_remark(found.rotation):
+        yield line
 
 
 def _power(found: "Measured") -> str:

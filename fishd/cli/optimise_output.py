@@ -59,6 +59,8 @@ class Optimum(Struct, frozen=True):
     """As `calibration_ci95`, of the thrust for each watt [N/W]."""
     thrust_per_watt_total_ci95: float | None = None
     """As `total_ci95`, of the thrust for each watt [N/W]."""
+    rotation: float = 0.0
+    """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
     thinking: float | None = None
     """How long the fish of a robot waited besides while candidates were chosen, this time [s]."""
     true_thrust: float | None = None
@@ -111,8 +113,12 @@ def optimum_of(
     gives, gives_error = per_watt(thrust, error, power, power_error)
     if aim.objective == "thrust-per-watt" and aim.target is None:
         gives, gives_error = found.value, found.error
-    whole = budget(calibration, thrust, error)
-    whole_per_watt = None if gives is None else budget(calibration, gives, gives_error)
+    rotations = [each.rotation for each in measured if each.rotation]
+    rotation = sum(rotations) / len(rotations) if rotations else 0.0
+    whole = budget(calibration, thrust, error, rotation=rotation)
+    whole_per_watt = (
+        None if gives is None else budget(calibration, gives, gives_error, rotation=rotation)
+    )
     return Optimum(
         controller=name,
         parameters=found.parameters,
@@ -130,6 +136,7 @@ def optimum_of(
         thrust_per_watt_error=gives_error,
         calibration_ci95=whole.calibration_ci95,
         total_ci95=whole.total_ci95,
+        rotation=rotation,
         thrust_per_watt_calibration_ci95=whole_per_watt and whole_per_watt.calibration_ci95,
         thrust_per_watt_total_ci95=whole_per_watt and whole_per_watt.total_ci95,
         ticks_swum=last.swum,
@@ -158,7 +165,8 @@ def say(found: Optimum, unit: str, units: dict[str, str], path: Path) -> None:
             f"{unit} per W",
         )
         echo(f"power there: {found.power * 1e3:.0f} ± {found.power_error * 1e3:.0f} mW, {gives}")
-    if line := error_budget.unknown_calibration(found.calibration_ci95, unit):
+    unknown = error_budget.unknown_calibration(found.calibration_ci95, unit)
+    for line in filter(None, (unknown, error_budget.rotation_remark(found.rotation))):
         echo(f"fishctl: {line}", err=True)
     if found.target is not None and found.thrust < found.target:
         echo(f"fishctl: no parameters are known that give {found.target * 1e3:g} m{unit}", err=True)

@@ -51,7 +51,9 @@ def budget(
     gain = calibration.thrust_ci95(thrust, lateral)
     if gain is None:
         return Budget(None, None)
-    hidden = abs((math.cos(rotation) - 1.0) * thrust + math.sin(rotation) * lateral)
+    lost = (math.cos(rotation) - 1.0) * thrust
+    # A drift of F_y is in `lateral`: it must not make up for what the rotation hides.
+    hidden = max(abs(lost), abs(lost + math.sin(rotation) * lateral))
     whole = None if statistical_ci95 is None else math.hypot(statistical_ci95, gain) + hidden
     return Budget(gain + hidden, whole)
 
@@ -93,13 +95,27 @@ def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
     )
 
 
-def visible_rotation(ticks: Iterable[Tick]) -> float:
+def rotation_remark(rotation: float) -> str:
+    """Return a line on a rotation that no load has shown; empty where none is seen."""
+    if not rotation:
+        return ""
+    hidden = 1.0 - math.cos(rotation)
+    return (
+        f"F_x follows F_y as if the sensor were turned by {math.degrees(rotation):+.1f}° against "
+        f"the fish: that hides {hidden:.2%} of the thrust, which the interval covers"
+    )
+
+
+def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> float:
     """Return by what angle F_x and F_y are turned into each other while the fish swims [rad].
 
     Over whole beats of a symmetric gait the true F_x, at even harmonics, and the true F_y, at odd
     ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD` or not known.
+
+    settles: time until a swim is steady [s]
     """
-    swims = [np.array([(tick.fx, tick.fy) for tick in swim]) for swim in _steady_swims(ticks)]
+    steady = _steady_swims(ticks, settles)
+    swims = [np.array([(tick.fx, tick.fy) for tick in swim]) for swim in steady]
     apart = [swim - swim.mean(axis=0) for swim in swims]
     if not apart:
         return 0.0
@@ -115,17 +131,18 @@ def visible_rotation(ticks: Iterable[Tick]) -> float:
 def lateral_force(ticks: Iterable[Tick]) -> float:
     """Return what swimming adds to the mean of F_y [N]; 0 where there is no whole beat or rest."""
     ticks = list(ticks)
-    swimming = [tick.fy for swim in _steady_swims(ticks) for tick in swim]
-    resting = [tick.fy for rest in _settled(ticks, swims=False) for tick in rest]
+    swimming = [tick.fy for swim in _steady_swims(ticks, SWIM_SETTLES) for tick in swim]
+    rests = _settled(ticks, SWIM_SETTLES, swims=False)
+    resting = [tick.fy for rest in rests for tick in rest]
     if not swimming or not resting:
         return 0.0
     return sum(swimming) / len(swimming) - sum(resting) / len(resting)
 
 
-def _steady_swims(ticks: Iterable[Tick]) -> list[list[Tick]]:
+def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
     """Return the whole beats of each swim once it is steady."""
     beats = []
-    for swim in _settled(ticks, swims=True):
+    for swim in _settled(ticks, settles, swims=True):
         ups = [i for i, (a, b) in enumerate(pairwise(swim), 1) if a.phi_c <= 0.0 < b.phi_c]
         if len(ups) > 1:
             # A force is that of the window before its tick, an angle that of the one after it.
@@ -133,10 +150,10 @@ def _steady_swims(ticks: Iterable[Tick]) -> list[list[Tick]]:
     return beats
 
 
-def _settled(ticks: Iterable[Tick], *, swims: bool) -> Iterator[list[Tick]]:
+def _settled(ticks: Iterable[Tick], settles: float, *, swims: bool) -> Iterator[list[Tick]]:
     """Yield each swim, or each rest, once it has settled, without forces not to be trusted."""
     for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
         phase = list(group)
-        start = phase[0].t + SWIM_SETTLES
+        start = phase[0].t + settles
         if running is swims:
             yield [tick for tick in phase if tick.t >= start and tick.suspect is UNSET]

@@ -8,6 +8,7 @@ from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core.errors import ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
+from fishd.lab.error_budget import visible_rotation
 from fishd.lab.measurement import REST, Step, evaluate, samples_of
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
@@ -46,6 +47,8 @@ class Trial(NamedTuple):
     """Ticks of swimming so far."""
     passed: float
     """Time since the beginning, rest included [s]."""
+    rotation: float = 0.0
+    """Rotation of the sensor as this swim shows it; 0 for one that was read from a table [rad]."""
 
 
 def trials(
@@ -91,7 +94,10 @@ def trials(
         power, power_error = (
             math.nan if each is None else each for each in (found.watts, found.watts_error)
         )
-        trial = Trial(candidate, found.thrust, found.error, power, power_error, swum, passed)
+        rotation = visible_rotation(swim, settles)
+        trial = Trial(
+            candidate, found.thrust, found.error, power, power_error, swum, passed, rotation
+        )
         if observe:
             observe(trial)
         else:
