@@ -1,4 +1,4 @@
-"""How often the interval of `fishctl measure` holds the thrust when the sensor's calibration is off.
+"""How often the interval of `fishctl measure` holds the thrust of a wrongly calibrated sensor.
 
 Each run calibrates the sensor of the default fish, turned by 0.05 rad, with loads that are not what
 they are said to be, and measures `swing` with its defaults. The truth is the fish's own thrust.
