@@ -21,6 +21,7 @@ from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.cloud import cloud
 from fishd.learning.adapt.prior import MODEL_ERROR, model_error
 from fishd.learning.adapt.state import (
+    TRAINING,
     AdaptFolder,
     Begun,
     Contender,
@@ -119,7 +120,7 @@ def test_where_it_does_not_the_simplest_is_chosen_and_nothing_wins() -> None:
     assert three.undecided == ["square", "swing", "policy"]
     assert three.claim.startswith(
         "undecided between the best square wave found, swing as --C auto has found it and the "
-        "policy; the best square wave found chosen because it is the simplest; of the thrust "
+        "policy; the best square wave found chosen because it is the simplest; thrust relative "
     )
     assert three.claim.endswith(
         "the identified fish explains 61% of its forces only, so it is not used"
@@ -300,6 +301,19 @@ def test_what_was_measured_is_not_measured_again(
     assert "e-" not in text.partition("<h2>The fish</h2>")[2]
     with pytest.raises(ConfigError, match="begun with seed = 0, now it is 1"):
         folder(path, seed=1)
+
+
+def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path) -> None:
+    run, show = folder(tmp_path / "run"), Quiet()
+    run.state.fitted = fitted(USELESS)
+    with VirtualRig(Config()) as rig:
+        made = Adaptation(rig, Config(), run, 150.0, 640, 0, show)
+        made._practise(run.state)
+    assert show.lines == ["no policy is trained: the fit explains too little"]
+    kept = folder(run.path).state
+    assert kept.trained
+    assert kept.trained.refused
+    assert not (run.path / TRAINING).exists()
 
 
 def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> None:

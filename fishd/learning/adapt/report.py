@@ -185,7 +185,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     rows = []
     for one in state.contenders:
         share = state.verdict.others.get(one.name)
-        relative_thrust = "1"
+        relative_thrust = "100 %"
         if share:
             relative_thrust = format_ratio(share)
         row = [

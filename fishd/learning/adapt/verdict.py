@@ -54,7 +54,7 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
         reason = _reason(ranking.reason, chosen == names[0], len(left), model)
         claim = format_choice([NAMES[name] for name in names], NAMES[chosen], reason)
         if shares:
-            claim += f"; of the thrust of {NAMES[SQUARE]} has {_list(shares)}"
+            claim += f"; thrust relative to {NAMES[SQUARE]}: {_list(shares)}"
         if unused := _unused(model):
             claim += f"; {unused}"
     relative_thrust, low, high = shares.get(chosen, (1.0, 1.0, 1.0))
@@ -139,7 +139,7 @@ def _win(name: str, shares: dict[str, tuple[float, float, float]]) -> str:
         return f"{NAMES[name]} wins: it thrusts {format_ratio(shares[name])} of {NAMES[SQUARE]}"
     if not shares:
         return f"{NAMES[SQUARE]} wins: it is the only one that could be measured"
-    return f"{NAMES[SQUARE]} wins: of its thrust has {_list(shares)}"
+    return f"{NAMES[SQUARE]} wins; thrust relative to it: {_list(shares)}"
 
 
 def _list(shares: dict[str, tuple[float, float, float]]) -> str:
