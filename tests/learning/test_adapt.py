@@ -1,5 +1,6 @@
 """`fishctl adapt`: what it draws, whom it lets win, and that nothing is measured twice."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ from fishd.lab.rig import LiveRig, VirtualRig
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.cloud import cloud
-from fishd.learning.adapt.prior import MODEL_ERROR, model_error
+from fishd.learning.adapt.prior import MODEL_ERROR, model_of
 from fishd.learning.adapt.state import (
     TRAINING,
     AdaptFolder,
@@ -169,13 +170,23 @@ def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
         judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)], GOOD)
 
 
-def test_the_weight_of_a_fit_follows_what_it_explains() -> None:
-    def channels(white: bool, *explained: float) -> list[Channel]:
-        return [Channel("fx", 1.0, share, 1e-3, 0.0, white) for share in explained]
-
-    assert model_error(channels(True, 0.4, 0.99)) == MODEL_ERROR  # what is left is noise
-    assert model_error(channels(False, 0.99, 0.999)) == pytest.approx(0.1, rel=0.01)
-    assert model_error(channels(False, 0.999, 0.61)) is None
+@pytest.mark.parametrize(
+    ("failed", "explained", "error"),
+    [
+        ((), 0.4, MODEL_ERROR),  # what is left is noise
+        (("white residual of fx",), 0.99, 0.1005),
+        (("white residual of fx",), 0.61, None),
+    ],
+)
+def test_the_weight_of_a_fit_follows_what_it_explains_out_of_sample(
+    failed: tuple[str, ...], explained: float, error: float | None
+) -> None:
+    fit = found()
+    vague = dataclasses.replace(fit.channels[0], explained_out_of_sample=explained)
+    fit = dataclasses.replace(fit, channels=(fit.channels[0], vague), failed_assumptions=failed)
+    model = model_of(fit)
+    assert model.explained == explained
+    assert model.error == (error and pytest.approx(error, rel=1e-3))
 
 
 def fitted(model: Model) -> Fitted:

@@ -14,14 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fishd.lab.identification import Channel
+from fishd.lab.identification import Identification
+from fishd.learning.adapt.state import Model
 
 Array = NDArray[np.float64]
 
 MIN_EXPLAINED = 0.7
-"""Smallest share of the variance of both forces that a fit must explain to be used at all."""
+"""Smallest share of the variance of each force, out of sample, that a fit must explain to be used,
+if it lacks something."""
 MODEL_ERROR = 0.01
-"""Standard error of a thrust of an identified fish that leaves nothing but noise, as a fraction."""
+"""Standard error of a thrust of an identified fish that lacks nothing, as a fraction."""
 REJECTED = 0.01
 """Probability, under the identified fish, of a misfit at least as large; below it, the measured
 thrusts reject it."""
@@ -31,25 +33,26 @@ _CORRELATED = 0.3
 """Distance at which deviations of square waves are still alike, as a logarithm of frequency."""
 
 
-def model_error(channels: Sequence[Channel]) -> float | None:
-    """Return the standard error of a thrust of the identified fish, as a fraction of it.
+def model_of(found: Identification) -> Model:
+    """Return how far the identified fish can be used to choose among gaits.
 
-    Where more than noise is left over, it is as large as the rms that is left over of data that
-    were not fitted, as a fraction of that of the force. None where the fit explains too little.
+    Where it lacks something, the standard error of a thrust is as large as the rms of the force
+    that it does not predict, as a fraction of that of the force.
     """
-    if all(channel.white for channel in channels):
-        return MODEL_ERROR
-    explained = min(channel.explained_out_of_sample for channel in channels)
+    explained = min(channel.explained_out_of_sample for channel in found.channels)
+    if not found.failed_assumptions:
+        return Model(explained=explained, error=MODEL_ERROR)
     if not explained >= MIN_EXPLAINED:
-        return None
-    return math.hypot(MODEL_ERROR, math.sqrt(max(0.0, 1.0 - explained)))
+        return Model(explained=explained, error=None)
+    error = math.hypot(MODEL_ERROR, math.sqrt(max(0.0, 1.0 - explained)))
+    return Model(explained=explained, error=error)
 
 
 def deviations(curves: Array, error: float, correlation: Array | None = None) -> Array:
     """Return the covariance of the deviations of gaits, as fractions of their thrusts.
 
     curves: thrusts of the gaits on each fish of the cloud, the identified one first, (fish, gaits)
-    error: as `model_error` returns
+    error: as `Model.error`
     correlation: of what the fit does not explain, between gaits; by default there is none
     """
     gaits = curves.shape[1]

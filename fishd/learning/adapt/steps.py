@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.measurement import REST, SWIM
@@ -20,9 +21,9 @@ from fishd.learning.adapt.prior import (
     correlation_of_waves,
     deviations,
     is_rejected,
-    model_error,
+    model_of,
 )
-from fishd.learning.adapt.state import Fitted, Model, Rung, Tried
+from fishd.learning.adapt.state import Fitted, Rung, Tried
 from fishd.learning.adapt.tank import Tank
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
@@ -56,11 +57,9 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
                 "fishctl plot and fishctl identify with --plot"
             )
     plant = identified(found)
-    thrusts = best_square_wave(plant, amplitude).thrust > 0.0
-    model = Model(
-        explained=min(channel.explained for channel in found.channels),
-        error=model_error(found.channels) if thrusts else None,
-    )
+    model = model_of(found)
+    if not best_square_wave(plant, amplitude).thrust > 0.0:
+        model = replace(model, error=None)
     offset, drift = found["offset_y"], found.channels[1].drift
     fitted = Fitted(
         plant=plant,
