@@ -90,7 +90,7 @@ def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
             "interval covers its gain: fishctl calibrate force"
         )
     return (
-        "the calibration file does not say how well the gains are known, so the interval is "
+        "nothing says how well the gains of the force sensor are known, so the interval is "
         "statistical only: fishctl calibrate force"
     )
 

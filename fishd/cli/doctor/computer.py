@@ -179,12 +179,14 @@ def _in_force(force: ForceCalibration, servo: str) -> Result:
     if force.untouched:
         tared = f"tared {force.tared}, but never calibrated" if force.tared else "not calibrated"
         return warning(f"the force sensor is {tared}: forces are volts", "fishctl calibrate force")
+    share = force.thrust_ci95(1.0)
+    known = "its uncertainty is unknown" if share is None else f"a thrust is known to ± {share:.2%}"
     if not servo:
         return warning(
-            f"force of {force.date}; the servo has no calibration but the configuration's",
+            f"force of {force.date} ({known}); the servo has no calibration but the configuration's",
             "fishctl calibrate servo",
         )
-    return ok(f"force of {force.date}, servo of {servo}")
+    return ok(f"force of {force.date} ({known}), servo of {servo}")
 
 
 def _unreadable(context: Context, folder: Path, complaint: str) -> Result:
