@@ -18,7 +18,7 @@ import numpy as np
 from common.report import Options, Report, table
 from fishd.config import Config, load
 from fishd.lab.identification import experiment, identify
-from fishd.lab.identification.estimation import FURTHER
+from fishd.lab.identification.estimation import FURTHER, SCALED
 from fishd.lab.other_fish import harsh
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.imperfections import SimulationSettings
@@ -150,7 +150,7 @@ def rows(outcomes: Sequence[Outcome], *, known: bool) -> list[list[str]]:
 def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
     """The row of one kind of fish."""
     known = kind in ("default", "driven", "other")
-    held = narrow = count = astray = withheld = 0
+    held = narrow = count = astray = withheld = own = own_held = 0
     errors, worst = [], 0.0
     for outcome in outcomes:
         for name, each in outcome.intervals.items():
@@ -158,7 +158,10 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
                 withheld += 1
                 continue
             count += 1
-            held += each.low <= each.truth <= each.high
+            holds = each.low <= each.truth <= each.high
+            held += holds
+            if name not in SCALED:
+                own, own_held = own + 1, own_held + holds
             narrow += each.known_low <= each.truth <= each.known_high
             off = abs(each.truth - 0.5 * (each.low + each.high)) / (0.5 * (each.high - each.low))
             worst = max(worst, off)
@@ -168,6 +171,7 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
     return [
         KINDS[kind],
         f"{held} of {count} ({held / max(1, count):.0%})",
+        f"{own_held} of {own}",
         str(withheld),
         f"{narrow} of {count}" if known else "–",
         f"{np.median(errors):.2g} %" if known else "–",
@@ -178,8 +182,8 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
 
 
 SUMMARY = (
-    "fish | intervals that hold | withheld | with K_y/K known | error, median | "
-    "warned in the first line | furthest off, in half-widths | more than 2 off and not warned"
+    "fish | intervals that hold | those that K_y/K does not scale | withheld | with K_y/K known | "
+    "error, median | warned in the first line | furthest off, in half-widths | more than 2 off and not warned"
 )
 HEAD = "quantity | error, median | error, largest | half of the 95 % interval | it covers the truth"
 OPTIONS: Options = {
