@@ -96,7 +96,7 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 EXACT = ForceCalibration(covariance_x=(0.0, 0.0, 0.0), covariance_y=(0.0, 0.0, 0.0), load_error=0.0)
-"""Calibration of a simulated sensor, whose forces are exact but for its simulated errors."""
+"""Calibration of a simulated sensor: its gains are exact."""
 
 
 class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

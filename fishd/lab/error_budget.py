@@ -28,7 +28,7 @@ class Budget(NamedTuple):
     """Half-widths of 95 % intervals of a thrust, in its unit."""
 
     calibration_ci95: float | None
-    """What the calibration leaves: gains and rotation; None where its uncertainty is unknown."""
+    """Part of the calibration, gains and rotation; None where its uncertainty is unknown."""
     total_ci95: float | None
     """Statistics and calibration together; None where one of them is unknown."""
 
@@ -129,10 +129,10 @@ def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> fl
 
 
 def lateral_force(ticks: Iterable[Tick]) -> float:
-    """Return what swimming adds to the mean of F_y [N]; 0 where there is no whole beat or rest."""
+    """Return what swimming adds to the mean of F_y [N]; 0 without a whole beat and a rest."""
     ticks = list(ticks)
     swimming = [tick.fy for swim in _steady_swims(ticks, SWIM_SETTLES) for tick in swim]
-    rests = _settled(ticks, SWIM_SETTLES, swims=False)
+    rests = _settled_phases(ticks, SWIM_SETTLES, swims=False)
     resting = [tick.fy for rest in rests for tick in rest]
     if not swimming or not resting:
         return 0.0
@@ -142,7 +142,7 @@ def lateral_force(ticks: Iterable[Tick]) -> float:
 def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
     """Return the whole beats of each swim once it is steady."""
     beats = []
-    for swim in _settled(ticks, settles, swims=True):
+    for swim in _settled_phases(ticks, settles, swims=True):
         ups = [i for i, (a, b) in enumerate(pairwise(swim), 1) if a.phi_c <= 0.0 < b.phi_c]
         if len(ups) > 1:
             # A force is that of the window before its tick, an angle that of the one after it.
@@ -150,7 +150,7 @@ def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
     return beats
 
 
-def _settled(ticks: Iterable[Tick], settles: float, *, swims: bool) -> Iterator[list[Tick]]:
+def _settled_phases(ticks: Iterable[Tick], settles: float, *, swims: bool) -> Iterator[list[Tick]]:
     """Yield each swim, or each rest, once it has settled, without forces not to be trusted."""
     for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
         phase = list(group)

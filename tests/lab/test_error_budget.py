@@ -20,7 +20,7 @@ KNOWN = ForceCalibration(
     covariance_y=(0.0, 0.0, 0.0),
     loads=9,
 )
-"""Of a sensor of 1 N/V, whose gain is off by 2 % and said to be known to 3 %."""
+"""Calibration of a sensor of 1 N/V: its gain is off by 2 %, with an interval of ± 3 %."""
 
 
 def measured(*overrides: str, calibration: ForceCalibration | None = None) -> Measured:
@@ -29,28 +29,38 @@ def measured(*overrides: str, calibration: ForceCalibration | None = None) -> Me
 
 
 def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> None:
-    found, truth = measured(calibration=KNOWN), simulate(load(), "swing", {}).mean_thrust
-    assert found.calibration_ci95 == pytest.approx(0.03 * found.thrust / (1.0 + GAIN_ERROR))
-    assert found.total_ci95 == pytest.approx(math.hypot(found.error, found.calibration_ci95))
-    assert found.error < abs(found.thrust - truth) < found.total_ci95
-    told = summary(found, 0.05)
-    assert told.power is not None
-    assert told.thrust_per_watt_total_ci95 == pytest.approx(found.total_ci95 / told.power, rel=1e-3)
+    measurement, truth = measured(calibration=KNOWN), simulate(load(), "swing", {}).mean_thrust
+    assert measurement.calibration_ci95 == pytest.approx(
+        0.03 * measurement.thrust / (1.0 + GAIN_ERROR)
+    )
+    assert measurement.total_ci95 == pytest.approx(
+        math.hypot(measurement.error, measurement.calibration_ci95)
+    )
+    assert measurement.error < abs(measurement.thrust - truth) < measurement.total_ci95
+    report = summary(measurement, 0.05)
+    assert report.power is not None
+    assert report.thrust_per_watt_total_ci95 == pytest.approx(
+        measurement.total_ci95 / report.power, rel=1e-3
+    )
 
 
 def test_the_sensor_of_a_simulated_fish_is_exact() -> None:
-    found = measured()
-    assert (found.calibration_ci95, found.total_ci95, found.rotation) == (0.0, found.error, 0.0)
+    measurement = measured()
+    assert (measurement.calibration_ci95, measurement.total_ci95, measurement.rotation) == (
+        0.0,
+        measurement.error,
+        0.0,
+    )
 
 
 @pytest.mark.parametrize("angle", [0.05, -0.17])
 def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle: float) -> None:
     quiet = ("simulation.noise=1e-5", f"simulation.rotation={angle}")
-    found, truth = measured(*quiet), simulate(load(), "swing", {}).mean_thrust
-    assert found.rotation == pytest.approx(angle, abs=0.003)
-    assert found.total_ci95
-    assert truth - found.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
-    assert found.error < truth - found.thrust < found.total_ci95 < 0.02 * truth
+    measurement, truth = measured(*quiet), simulate(load(), "swing", {}).mean_thrust
+    assert measurement.rotation == pytest.approx(angle, abs=0.003)
+    assert measurement.total_ci95
+    assert truth - measurement.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
+    assert measurement.error < truth - measurement.thrust < measurement.total_ci95 < 0.02 * truth
 
 
 def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
@@ -77,10 +87,12 @@ def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
     with VirtualRig(load(), KNOWN) as rig:
         live = LiveComparison(rig, ["swing"])
         live.swim(21.0, runs=3)
-    (found,) = live.standings()
-    assert found.calibration_ci95 == pytest.approx(0.03 / 1.02 * found.thrust, rel=1e-3)
-    assert found.error is not None
-    assert found.total_ci95 == pytest.approx(math.hypot(found.error, found.calibration_ci95))
+    (standing,) = live.standings()
+    assert standing.calibration_ci95 == pytest.approx(0.03 / 1.02 * standing.thrust, rel=1e-3)
+    assert standing.error is not None
+    assert standing.total_ci95 == pytest.approx(
+        math.hypot(standing.error, standing.calibration_ci95)
+    )
 
 
 def test_a_tail_beat_to_one_side_counts_with_the_cross_term() -> None:

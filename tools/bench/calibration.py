@@ -31,7 +31,7 @@ FIRST_SEED = 1000
 
 
 class Case(NamedTuple):
-    """What is wrong with the loads, rms, and what fishd is told of it."""
+    """Errors of the loads, rms, and the `--load-error` that is given for them."""
 
     weight: float = 0.0
     """Error of each load, as a fraction."""
@@ -40,7 +40,7 @@ class Case(NamedTuple):
     thread: float = 0.0
     """Direction of each load [rad]."""
     load_error: float = 0.01
-    """As `--load-error`."""
+    """Value of `--load-error`."""
     loads: int = len(PLAN)
 
 
@@ -81,10 +81,11 @@ def run(case: Case, seed: int) -> tuple[float, float, float, float]:
     """Return the thrust, and its statistical error, that of the calibration, and of both [N]."""
     config = Config(simulation=replace(RIG, seed=FIRST_SEED + seed))
     with VirtualRig(config, calibrated(case, seed)) as rig:
-        found = measured(rig, "swing", {}, RUN_SECONDS)
-    assert found.calibration_ci95 is not None
-    assert found.total_ci95 is not None
-    return found.thrust, found.error, found.calibration_ci95, found.total_ci95
+        measurement = measured(rig, "swing", {}, RUN_SECONDS)
+    assert measurement.calibration_ci95 is not None
+    assert measurement.total_ci95 is not None
+    m = measurement
+    return m.thrust, m.error, m.calibration_ci95, m.total_ci95
 
 
 def measure(options: Namespace) -> Report:
@@ -96,7 +97,7 @@ def measure(options: Namespace) -> Report:
             runs = pool(joblib.delayed(run)(case, i) for i in range(options.runs))
             thrust, statistical, calibration, total = 1e3 * np.array(runs).T
             off = np.abs(thrust - truth)
-            found = {
+            figure = {
                 "loads": name,
                 "runs": options.runs,
                 "rms": float(np.sqrt(np.mean(off**2))),
@@ -105,15 +106,15 @@ def measure(options: Namespace) -> Report:
                 "statistical_holds": float(np.mean(off < statistical)),
                 "total_holds": float(np.mean(off < total)),
             }
-            figures.append(found)
+            figures.append(figure)
             rows.append(
                 (
                     name,
-                    f"{found['rms']:.2f} mN",
-                    f"± {found['statistical']:.2f} mN",
-                    f"± {found['calibration']:.2f} mN",
-                    f"{found['statistical_holds']:.0%}",
-                    f"{found['total_holds']:.0%}",
+                    f"{figure['rms']:.2f} mN",
+                    f"± {figure['statistical']:.2f} mN",
+                    f"± {figure['calibration']:.2f} mN",
+                    f"{figure['statistical_holds']:.0%}",
+                    f"{figure['total_holds']:.0%}",
                 )
             )
     head = (

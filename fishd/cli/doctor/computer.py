@@ -183,7 +183,8 @@ def _in_force(force: ForceCalibration, servo: str) -> Result:
     known = "its uncertainty is unknown" if share is None else f"a thrust is known to ± {share:.2%}"
     if not servo:
         return warning(
-            f"force of {force.date} ({known}); the servo has no calibration but the configuration's",
+            f"force of {force.date} ({known}); the servo has no calibration but that of the "
+            "configuration",
             "fishctl calibrate servo",
         )
     return ok(f"force of {force.date} ({known}), servo of {servo}")
