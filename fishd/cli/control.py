@@ -10,13 +10,14 @@ import click
 from fishd.cli.completion import active_parameters, complete_pair
 from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
 from fishd.cli.output import echo, echo_rows, made_printable, measured, print_json, spelled
+from fishd.cli.plausibility import warn_of_values
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core.addresses import ENDPOINT_VARIABLE
 from fishd.core.console import power_words, thrust_words
 from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
-from fishd.core.schema import Field, nearest
+from fishd.core.schema import Field, echoed, nearest
 from fishd.core.signals import Percentiles, Reason, Status
 
 T = TypeVar("T")
@@ -107,12 +108,16 @@ def set_parameter(words: tuple[str, ...], endpoint: str | None, as_json: bool) -
     pairs = list(_pairs(words))
 
     def change(fish: Fish) -> State:
+        from fishd.config import adopt
+
         known = active_parameters(fish)
         # The daemon refuses a name that the controller does not have, and says which it has.
         values = {
             name: _converted(known[name], text) if name in known else text for name, text in pairs
         }
-        return fish.set_parameters(**values)
+        state = fish.set_parameters(**values)
+        warn_of_values(known.values(), values, lambda: adopt(fish.config()))
+        return state
 
     _change(endpoint, as_json, change)
 
@@ -184,7 +189,7 @@ def _change(endpoint: str | None, as_json: bool, change: Callable[[Fish], State]
         return
     state = made_printable(state)
     why = f" ({_why(state.reason)})" if state.reason else ""
-    echo(f"{state.mode}{why}: {state.controller} {spelled(state.parameters)}".rstrip())
+    echo(f"{state.mode}{why}: {spelled(state.controller, state.parameters)}")
 
 
 def _status_rows(status: Status) -> list[tuple[str, str]]:
@@ -202,7 +207,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
     return [
         ("fish", f"{status.name}, {status.robot}"),
         *mode,
-        ("controller", f"{status.controller} {spelled(status.parameters)}"),
+        ("controller", spelled(status.controller, status.parameters)),
         *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
         *_swum(status),
@@ -210,7 +215,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
-        *([("survived", spelled(survived))] if survived else []),
+        *([("survived", echoed(survived, {}))] if survived else []),
         *([("late", missed)] if status.missed or status.overruns else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),

@@ -126,7 +126,7 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
     beats = f"over {report.beats} whole beat{plural}" if report.beats else "no whole beat"
     anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
     return [
-        ("controller", f"{report.controller} {spelled(report.parameters)}{anew}"),
+        ("controller", f"{spelled(report.controller, report.parameters)}{anew}"),
         ("speed", f"{text.measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
         *_trend(report),
         ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),

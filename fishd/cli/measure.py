@@ -129,7 +129,7 @@ def _measure(
 def _line(found: "Measured") -> str:
     from fishd.lab import error_budget
 
-    what = f"{found.controller} {spelled(dict(found.parameters))}".rstrip()
+    what = spelled(found.controller, dict(found.parameters))
     thrust = error_budget.spelled(
         found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
     )

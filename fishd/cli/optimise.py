@@ -32,7 +32,7 @@ from fishd.controllers.base import Limits
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, NoDaemon, ParameterError
 from fishd.core.interruption import interrupted_once
-from fishd.core.schema import Field, nearest
+from fishd.core.schema import Field, nearest, units_of
 from fishd.simulation import simulate
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def _optimise(
                 warn_of_fin(swum.fin_amplitude)
             else:
                 optimum = replace(optimum, thinking=thinking)
-            units = {each: field.unit for each, field in _fields().items()}
+            units = units_of(_fields().values())
     except KeyboardInterrupt:
         echo(f"fishctl: stopped before the best was told; to go on: {again(path)}", err=True)
         return INTERRUPTED
@@ -247,6 +247,7 @@ def _measured(
     for each in run.done:
         task.aim.observe(search, each)
     measured = list(run.done)
+    units = units_of(_fields().values())
     last = measured[-1] if measured else None
     observe = partial(task.aim.observe, search)
     before = last.passed if last else 0.0
@@ -271,7 +272,7 @@ def _measured(
                 measured.append(each)
                 found = search.proposal()
                 shown = found if search.is_warm else None
-                show.done(told(search.trials, each, shown, unit), each.passed)
+                show.done(told(search.trials, each, shown, unit, units), each.passed)
                 if task.is_done(found):
                     break
     except KeyboardInterrupt:

@@ -10,6 +10,7 @@ from msgspec import Struct
 from fishd.cli.output import counted, echo
 from fishd.core import text
 from fishd.core.console import power_words
+from fishd.core.schema import echoed
 
 if TYPE_CHECKING:
     from fishd.core.calibration import ForceCalibration
@@ -71,24 +72,26 @@ class Optimum(Struct, frozen=True):
     """There, of a simulated servo [W]."""
 
 
-def told(number: int, trial: "Trial", best: "Proposal | None", unit: str) -> str:
+def told(
+    number: int, trial: "Trial", best: "Proposal | None", unit: str, units: dict[str, str]
+) -> str:
     """A line on a trial.
 
     best: what seems so, once there is enough to say it
+    unit: of the force; units: of the parameters
     """
-    measured = (
-        f"{number}: {_spelled(trial.parameters)}: {text.measured(trial.thrust, trial.error, unit)}"
-    )
+    thrust = text.measured(trial.thrust, trial.error, unit)
+    measured = f"{number}: {_spelled(trial.parameters, units)}: {thrust}"
     if math.isfinite(trial.power):
         measured += f" for {power_words(trial.power)}"
     if best is None:
         return measured
     more = f"another may give {best.improvement:.1%} more"
-    return f"{measured}; best so far {_spelled(best.parameters)}, {more}"
+    return f"{measured}; best so far {_spelled(best.parameters, units)}, {more}"
 
 
-def _spelled(parameters: dict[str, float]) -> str:
-    return " ".join(f"{name}={value:.4g}" for name, value in parameters.items())
+def _spelled(parameters: dict[str, float], units: dict[str, str]) -> str:
+    return echoed({name: float(f"{value:.4g}") for name, value in parameters.items()}, units)
 
 
 def optimum_of(

@@ -2,19 +2,24 @@
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar, cast
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.shell_completion import CompletionItem
 
 from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
+from fishd.cli.plausibility import warn_of_values
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core import files
 from fishd.core.errors import FishError, ParameterError, UnknownController
 from fishd.core.schema import Field, names_file, spelled, wanted
 from fishd.core.signals import ControllerInfo
+
+if TYPE_CHECKING:
+    from fishd.config import Config
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -149,6 +154,19 @@ def describe(field: Field) -> str:
     return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
 
 
+def _fish_of(values: dict[str, Any]) -> "Config":
+    """Return the configuration of the fish that the options of a verb are about.
+
+    Raises `FishdError`.
+    """
+    from fishd.config import adopt, load
+
+    if "endpoint" in values and not values.get("file") and not values.get("overrides"):
+        with Fish(values["endpoint"]) as fish:
+            return adopt(fish.config())
+    return load(values.get("file"), values.get("overrides", ()))
+
+
 class _ControllerCommand(click.Command):
     """Takes a parameter as `NAME=VALUE`, too."""
 
@@ -211,6 +229,7 @@ class ControllerGroup(click.Group):
         @click.pass_context
         def callback(ctx: click.Context, /, **values: Any) -> Any:
             parameters = given_parameters(ctx, values)
+            warn_of_values(fields.values(), parameters, partial(_fish_of, values))
             return self._action(infos if self._several else cmd_name, parameters, **values)
 
         decorated = self._options(cast(Any, callback))

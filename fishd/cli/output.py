@@ -8,7 +8,9 @@ from typing import Any, TypeVar
 import click
 import msgspec
 
+from fishd.controllers import registry
 from fishd.core import text
+from fishd.core.schema import echoed
 
 T = TypeVar("T")
 
@@ -42,10 +44,9 @@ def made_printable(value: T) -> T:
     return msgspec.convert(_printable(msgspec.to_builtins(value)), type(value))
 
 
-def spelled(parameters: dict[str, Any]) -> str:
-    """Parameters as `C=0.6 amplitude=default`."""
-    words = (f"{k}={'default' if v is None else v}" for k, v in parameters.items())
-    return text.line(" ".join(words))
+def spelled(controller: str, parameters: dict[str, Any]) -> str:
+    """Return a controller with its parameters, as `square frequency=1.7 Hz amplitude=default`."""
+    return text.line(f"{controller} {echoed(parameters, registry.units(controller))}".rstrip())
 
 
 def measured(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[str, str]]:

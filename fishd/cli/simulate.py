@@ -127,7 +127,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
     return [
         (
             "controller",
-            f"{report.controller} {spelled(report.parameters)} {_until(report, settle)}".rstrip(),
+            f"{spelled(report.controller, report.parameters)} {_until(report, settle)}".rstrip(),
         ),
         *_chosen(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),

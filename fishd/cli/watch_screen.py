@@ -109,7 +109,7 @@ class View:
             f"{text.quoted(self.status.name)} " if self.status.name else "",
             (f" {text.quoted(tick.mode).upper()} ", f"bold reverse {MODES.get(tick.mode, 'none')}"),
             (f" {text.quoted(tick.controller)} ", "bold"),
-            spelled(self.status.parameters),
+            spelled(self.status.controller, self.status.parameters).partition(" ")[2],
             "" if tick.servo_on else ("  no pulses", "dim"),
             ("  servo not reached", "red") if self.status.servo_lost else "",
         )

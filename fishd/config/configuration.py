@@ -3,6 +3,7 @@
 Each section is a struct of the part that it configures; this module only puts them together.
 """
 
+import logging
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -19,7 +20,16 @@ from fishd.control.estimators.base import EstimatorSettings
 from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
-from fishd.core.schema import Problem, convert, leaves, note, unit, without_empty_sections
+from fishd.core.schema import (
+    Problem,
+    convert,
+    doubts,
+    fields_of,
+    leaves,
+    note,
+    unit,
+    without_empty_sections,
+)
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 from fishd.hardware.servo.pigpio import PigpioSettings
 from fishd.hardware.settings import (
@@ -33,6 +43,8 @@ from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.dwell import shortest_dwell
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.swimmer.settings import SwimmerSettings
+
+log = logging.getLogger(__name__)
 
 SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
 """What the service runs with, as installed by 'make install-pi'."""
@@ -61,6 +73,7 @@ class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             "How long the fish rests before: 3 s are enough to find the zero of the force sensor.",
             ge=0,
             le=3600,
+            usual=600,
         ),
     ] = 0.0
 
@@ -261,7 +274,22 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = 
         _check(config)
     except Problem as problem:
         raise ConfigError(problem.located(sources)) from None
+    _warn_of_values(config, sources)
     return config
+
+
+def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> None:
+    """Log a warning for each value that was given and is far beyond what makes sense."""
+    for path, place in sources.items():
+        section: Any = config
+        for key in path[:-1]:
+            section = getattr(section, key, None)
+        if not path or not isinstance(section, Struct):
+            continue
+        (name,) = path[-1:]
+        fields = [field for field in fields_of(type(section)) if field.name == name]
+        for doubt in doubts({name: getattr(section, name, None)}, fields):
+            log.warning("careful: %s: %s", place, ".".join((*path[:-1], doubt)))
 
 
 def check_tethered(robot: str, what: str) -> None:

@@ -13,6 +13,7 @@ from fishd.controllers.quantities import quantities_of, values_of
 from fishd.core import text
 from fishd.core.errors import ControllerFault
 from fishd.core.foreign_code import contained
+from fishd.core.schema import fields_of, units_of
 from fishd.core.signals import Observation, Reason
 
 Successor = tuple[str, Controller[Any]]
@@ -28,6 +29,7 @@ class ActiveController:
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
         self.parameters = _plain(self.controller)
         """Its parameters, as JSON has them."""
+        self.parameter_units = _parameter_units(self.controller)
         self.wave = _wave(self.name, self.controller, self.parameters)
         """Which kind of wave it makes, as another object after each change."""
         self.quantities: dict[str, float] = {}
@@ -42,6 +44,7 @@ class ActiveController:
         """Make a ready-made controller the active one; raises what its parameters raise."""
         units = _units(type(controller))
         former, self.parameters = self.controller, _plain(controller)
+        self.parameter_units = _parameter_units(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
         self.wave = _wave(name, controller, self.parameters)
         self.quantities, self.quantity_units = {}, units
@@ -63,7 +66,9 @@ class ActiveController:
         before = self.name
         self.replace(*successor)
         self.fallback = Reason(code, text.line(f"{before} gave up: {text.said(error)}"))
-        self._reporter.fallback(before, self.name, self.parameters, self.fallback)
+        self._reporter.fallback(
+            before, self.name, self.parameters, self.parameter_units, self.fallback
+        )
 
     def update(self, observation: Observation) -> Any:
         """What it commands, unchecked; raises what it raises."""
@@ -80,7 +85,7 @@ class ActiveController:
         contained(self.controller.retune, parameters)
         self.parameters = _plain(self.controller)
         self.wave = _wave(self.name, self.controller, self.parameters)
-        self._reporter.controller("parameters", self.name, self.parameters)
+        self._reporter.controller("parameters", self.name, self.parameters, self.parameter_units)
 
     def warm_up(self) -> None:
         """Let it warm up for the next update, which is imminent; raises what it raises."""
@@ -91,6 +96,12 @@ class ActiveController:
 def _units(controller: type[Controller[Any]]) -> dict[str, str]:
     """The units of its quantities, by name; of a class, which does not change."""
     return {each.name: each.unit for each in quantities_of(controller)}
+
+
+def _parameter_units(controller: Controller[Any]) -> dict[str, str]:
+    """Return the units of its parameters, by name."""
+    kind: type[Struct] = type(controller.parameters)
+    return units_of(fields_of(kind))
 
 
 def told(error: ControllerFault) -> tuple[str, Successor | None]:

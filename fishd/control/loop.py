@@ -158,7 +158,8 @@ class ControlLoop:
         self.supervisor.check_startable()
         self._await_nobody()
         self.active.replace(name, controller)
-        self.reporter.controller("controller", name, self.active.parameters)
+        active = self.active
+        self.reporter.controller("controller", name, active.parameters, active.parameter_units)
         self.supervisor.start()
 
     def set_controller_after(self, seconds: float, name: str, controller: Controller[Any]) -> None:

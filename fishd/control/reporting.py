@@ -10,6 +10,7 @@ from fishd.control.supervisor import Mode
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.errors import FishdError
+from fishd.core.schema import echoed
 from fishd.core.signals import Event, EventKind, Level, Reason, Tick
 
 if TYPE_CHECKING:
@@ -45,17 +46,33 @@ class Reporter:
         except Exception:
             log.exception("the event could not be published")
 
-    def controller(self, kind: EventKind, name: str, parameters: Mapping[str, Any]) -> None:
-        """Tell that a controller is active now, or has new parameters: kind is `parameters`."""
+    def controller(
+        self,
+        kind: EventKind,
+        name: str,
+        parameters: Mapping[str, Any],
+        units: Mapping[str, str],
+    ) -> None:
+        """Tell that a controller is active now, or has new parameters: kind is `parameters`.
+
+        units: those of its parameters, by their names
+        """
         does = "goes on with" if kind == "parameters" else "takes over with"
-        message = f"{name} {does} {_spelled(parameters)}"
+        message = f"{name} {does} {_spelled(parameters, units)}"
         self.event(kind, message, controller=name, parameters=parameters)
 
-    def fallback(self, before: str, name: str, parameters: Mapping[str, Any], why: Reason) -> None:
+    def fallback(
+        self,
+        before: str,
+        name: str,
+        parameters: Mapping[str, Any],
+        units: Mapping[str, str],
+        why: Reason,
+    ) -> None:
         """Tell that a controller gave up and another one is active now."""
         self.event(
             "fallback",
-            f"{name} takes over with {_spelled(parameters)}: {why.message}",
+            f"{name} takes over with {_spelled(parameters, units)}: {why.message}",
             "warning",
             controller=name,
             parameters=parameters,
@@ -138,6 +155,5 @@ class Reporter:
         )
 
 
-def _spelled(parameters: Mapping[str, Any]) -> str:
-    texts = (f"{k}={'default' if v is None else v}" for k, v in parameters.items())
-    return ", ".join(texts) or "no parameters"
+def _spelled(parameters: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    return echoed(parameters, units, ", ") or "no parameters"

@@ -28,7 +28,14 @@ class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         ),
     ] = "auto"
     patience: Annotated[
-        float, unit("s", "Who insists on such reversals for so long loses command.", ge=0.2, le=600)
+        float,
+        unit(
+            "s",
+            "Who insists on such reversals for so long loses command.",
+            ge=0.2,
+            le=600,
+            usual=60,
+        ),
     ] = 2.0
     fallback: Annotated[
         Literal["swing", "fault"], note("What comes then: swing takes over, or mode fault.")

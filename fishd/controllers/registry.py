@@ -14,7 +14,7 @@ from fishd.core import text
 from fishd.core.errors import ParameterError, UnknownController
 from fishd.core.foreign_code import Attempt, contained
 from fishd.core.plugins import Plugins
-from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest
+from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest, units_of
 from fishd.core.signals import ControllerInfo
 
 LONGEST_IMPORT = 10.0
@@ -53,6 +53,14 @@ def describe(name: str) -> ControllerInfo:
         parameters=fields_of(found.Parameters),
         quantities=quantities_of(found),
     )
+
+
+def units(name: str) -> dict[str, str]:
+    """Return the units of a controller's parameters; none of one that is not installed here."""
+    try:
+        return units_of(fields_of(find(name).Parameters))
+    except UnknownController:
+        return {}
 
 
 def describe_all() -> list[ControllerInfo]:

@@ -41,6 +41,7 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             "Reverse after this time even if the fin shows no sign of slowing down.",
             gt=0,
             le=10,
+            usual=5,
         ),
     ] = 1.0
     lead: Annotated[

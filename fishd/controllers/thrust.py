@@ -36,7 +36,7 @@ MISSES = 0.005
 class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `thrust`."""
 
-    target: Annotated[float, unit("N", "Mean thrust to hold.", gt=0, le=10)]
+    target: Annotated[float, unit("N", "Mean thrust to hold.", gt=0, le=10, usual=1)]
     C: Annotated[
         float,
         unit("1", "Reverse when the fin's speed falls to C times its last maximum.", ge=0, le=1),
@@ -52,6 +52,7 @@ class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             "Reverse after this time even if the fin shows no sign of slowing down.",
             gt=0,
             le=10,
+            usual=5,
         ),
     ] = 1.0
 

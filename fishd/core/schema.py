@@ -11,9 +11,9 @@ import math
 import re
 import reprlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
-from typing import Any, TypeVar, cast
+from typing import Any, TypeGuard, TypeVar, cast
 
 import msgspec
 from msgspec import Meta, Struct, inspect
@@ -31,14 +31,18 @@ T = TypeVar("T")
 Scalar = bool | int | float | str | None
 
 
-def unit(symbol: str, description: str, *, file: str = "", **constraints: Any) -> Meta:
+def unit(
+    symbol: str, description: str, *, file: str = "", usual: float = 0.0, **constraints: Any
+) -> Meta:
     """What a field means: `Annotated[float, unit("Hz", "Frequency of the command.", gt=0, le=10)]`.
 
     symbol: the unit in SI notation, `1` for a pure number
     file: suffix, such as `.onnx`, where a text may be the path of a file
+    usual: largest size that makes sense on a real fish, where the bounds are wider; see `doubts`
     constraints: those of `msgspec.Meta`, such as gt, ge, lt, le, min_length, pattern
     """
-    extra = {"unit": symbol} | ({"file": file} if file else {})
+    extra: dict[str, Any] = {"unit": symbol}
+    extra |= ({"file": file} if file else {}) | ({"usual": usual} if usual else {})
     return Meta(description=description, extra_json_schema=extra, **constraints)
 
 
@@ -66,6 +70,8 @@ class Field(Struct, frozen=True, omit_defaults=True):
     """Suffix, such as `.onnx`, where a text may be the path of a file: see `names_file`."""
     words: tuple[str, ...] = ()
     """Permitted beside a number, such as `auto`."""
+    usual: float = 0.0
+    """Largest size that makes sense on a real fish, where the bounds are wider; else 0."""
 
 
 class Problem(Exception):
@@ -261,6 +267,7 @@ def _describe(field: inspect.Field) -> Field:
         required=field.required,
         file=extra.get("file", ""),
         words=_words(field.type) if isinstance(kind, inspect.FloatType) else (),
+        usual=extra.get("usual", 0.0),
     )
 
 
@@ -311,7 +318,7 @@ def _explain(
     return Problem(
         path,
         f"{shown(value)} is not valid: {wanted(_describe(field))} is needed"
-        + _degrees(value, field)
+        + _other_unit(value, field)
         + _entries(value, field),
     )
 
@@ -331,17 +338,104 @@ def _unknown(
     return UnknownKey((*path, key), f"unknown key; {hint}")
 
 
-def _degrees(value: Any, field: inspect.Field) -> str:
-    """A question for whoever gave an angle [rad] that is permitted only as one in degrees."""
+def _other_unit(value: Any, field: inspect.Field) -> str:
+    """Return a question where a value is valid only in a unit that people use as well.
+
+    An angle may be in degrees, others in thousandths: ` (mN? that is 0.02 N)`.
+    """
     kind, extra, _ = _unwrapped(field.type)
-    if extra.get("unit") != "rad" or not isinstance(kind, inspect.FloatType):
+    if not isinstance(kind, inspect.FloatType) or not _is_number(value):
         return ""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 360:
+    symbol = extra.get("unit", "")
+    name, factor = _OTHER_UNITS.get(symbol, ("", 0.0))
+    if not name or not abs(value) <= (360 if symbol == "rad" else _MAX_IN_OTHER_UNIT):
         return ""
-    angle = math.radians(value)
-    above = angle >= kind.ge if kind.ge is not None else kind.gt is None or angle > kind.gt
-    below = angle <= kind.le if kind.le is not None else kind.lt is None or angle < kind.lt
-    return f" (degrees? that is {angle:.3g} rad)" if above and below else ""
+    meant = factor * value
+    above = meant >= kind.ge if kind.ge is not None else kind.gt is None or meant > kind.gt
+    below = meant <= kind.le if kind.le is not None else kind.lt is None or meant < kind.lt
+    return f" ({question(value, symbol)})" if above and below else ""
+
+
+def question(value: float, symbol: str) -> str:
+    """Return the question whether another unit was meant: `mN? that is 0.02 N`."""
+    name, factor = _OTHER_UNITS[symbol]
+    return f"{name}? that is {factor * value:.3g} {symbol}"
+
+
+_OTHER_UNITS = {
+    "rad": ("degrees", math.pi / 180.0),
+    "N": ("mN", 1e-3),
+    "s": ("ms", 1e-3),
+    "m": ("mm", 1e-3),
+    "V": ("mV", 1e-3),
+    "A": ("mA", 1e-3),
+}
+"""Units that people use instead of those of a field, and how many of the latter one of them is."""
+
+
+_MAX_IN_OTHER_UNIT = 1e6
+"""Largest value that may have been meant in another unit."""
+
+
+def doubts(values: Mapping[str, Any], fields: Iterable[Field]) -> list[str]:
+    """Return a sentence for each value that is valid, but far more than makes sense.
+
+    values: parameters by their names
+    """
+    return [
+        f"{field.name}: {with_unit(values[field.name], field.unit)} is more than makes sense: up "
+        f"to {with_unit(field.usual, field.unit)} does"
+        + (f" ({question(values[field.name], field.unit)})" if field.unit in _OTHER_UNITS else "")
+        for field in fields
+        if field.usual and is_valid_number(values, field) and abs(values[field.name]) > field.usual
+    ]
+
+
+def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
+    """Is the value of this field a number within its interval?"""
+    value = values.get(field.name)
+    if not _is_number(value):
+        return False
+    ends = re.fullmatch(r"([\[(])(\S+), (\S+)([\])])", field.interval)
+    if not ends:
+        return True
+    low, high = float(ends[2]), float(ends[3])
+    return (
+        low <= value <= high
+        and not (ends[1] == "(" and value == low)
+        and not (ends[4] == ")" and value == high)
+    )
+
+
+def with_unit(value: Any, symbol: str) -> str:
+    """Return a value with its unit, if it is a number with one: `0.01 N`, `0.6`, `default`."""
+    if value is None:
+        return "default"
+    number = f"{value:g}" if _is_number(value) and float(f"{value:g}") == value else str(value)
+    return f"{number} {symbol}" if symbol not in ("", "1") and _is_number(value) else number
+
+
+def echoed(values: Mapping[str, Any], units: Mapping[str, str], separator: str = " ") -> str:
+    """Return values with their names and units: `target=0.01 N C=0.6 amplitude=default`."""
+    words = (f"{name}={with_unit(v, units.get(name, ''))}" for name, v in values.items())
+    return separator.join(words)
+
+
+def unit_at(target: type[Struct], key: str) -> str:
+    """Return the unit of a key of a struct and its sections, in dotted form; empty if unknown."""
+    try:
+        return _describe(_field_at(target, tuple(key.split(".")))).unit
+    except StopIteration:
+        return ""
+
+
+def units_of(fields: Iterable[Field]) -> dict[str, str]:
+    """Return the unit of each field by its name."""
+    return {field.name: field.unit for field in fields}
+
+
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _entries(value: Any, field: inspect.Field) -> str:

@@ -20,14 +20,20 @@ class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     driver: Annotated[str, note("What reads the sensor: the name of a driver.")] = ""
     force_limit: Annotated[
-        float, unit("N", "A force beyond ± this is not believed.", gt=0, le=1e4)
+        float, unit("N", "A force beyond ± this is not believed.", gt=0, le=1e4, usual=100)
     ] = 10.0
     still: Annotated[
         float,
-        unit("N", "Noise of single samples, rms, up to which a tare is permitted.", gt=0, le=1e3),
+        unit(
+            "N",
+            "Noise of single samples, rms, up to which a tare is permitted.",
+            gt=0,
+            le=1e3,
+            usual=1,
+        ),
     ] = 0.02
     tare_limit: Annotated[
-        float, unit("N", "Largest force that a tare takes away.", gt=0, le=1e4)
+        float, unit("N", "Largest force that a tare takes away.", gt=0, le=1e4, usual=10)
     ] = 1.0
     frozen_after: Annotated[
         Annotated[float, Meta(ge=0.1, le=600)] | None,
@@ -35,6 +41,7 @@ class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             "s",
             "A channel whose code has not changed for so long is not believed; null where the "
             "signal is quieter than one step of the ADC.",
+            usual=60,
         ),
     ] = 2.0
 

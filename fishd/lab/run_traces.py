@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.errors import RecordingError, UnknownController
+from fishd.core.schema import echoed
 from fishd.core.signals import Event, Tick
 from fishd.recording import Run
 
@@ -147,11 +148,10 @@ def _shown(events: Iterable[Event], first: float) -> Iterator[Shown]:
                 for name, value in parameters.items()
                 if (value is not None if takes_over else value != before.get(name))
             }
-            who = [str(event.data.get("controller", event.kind))] if takes_over else []
-            settings = (
-                f"{name}={'default' if value is None else value}" for name, value in changed.items()
-            )
-            words, before = " ".join((*who, *settings)) or event.kind, parameters
+            controller = str(event.data.get("controller", event.kind))
+            settings = echoed(changed, registry.units(controller))
+            words = f"{controller} {settings}".rstrip() if takes_over else settings or event.kind
+            before = parameters
         elif event.kind == "mark":
             words = event.message
         elif event.kind == "fault":

@@ -18,7 +18,8 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """How imperfect the simulated rig is, and what its servo draws."""
 
     noise: Annotated[
-        float, unit("N", "Noise of each force, rms of the mean over one tick.", ge=0, le=1)
+        float,
+        unit("N", "Noise of each force, rms of the mean over one tick.", ge=0, le=1, usual=0.1),
     ] = 1e-3
     noise_freedom: Annotated[
         Annotated[float, Meta(ge=2.1, le=1000)] | None,
@@ -35,6 +36,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             "Amplitude of mains hum on each force, in phases that depend on the seed.",
             ge=0,
             le=10,
+            usual=0.5,
         ),
     ] = 0.0
     hum_frequency: Annotated[float, unit("Hz", "Frequency of that hum.", ge=0.1, le=1000)] = 50.0
@@ -54,14 +56,15 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             "How far off such a sample is, either way; a window is the mean of all its samples.",
             ge=0,
             le=100,
+            usual=10,
         ),
     ] = 0.1
     quantum: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1)] | None,
         unit("N", "Step in which the mean force of a window is told; null for none."),
     ] = None
-    offset_x: Annotated[float, unit("N", "Constant offset on F_x.", ge=-10, le=10)] = 0.0
-    offset_y: Annotated[float, unit("N", "Constant offset on F_y.", ge=-10, le=10)] = 0.0
+    offset_x: Annotated[float, unit("N", "Constant offset on F_x.", ge=-10, le=10, usual=1)] = 0.0
+    offset_y: Annotated[float, unit("N", "Constant offset on F_y.", ge=-10, le=10, usual=1)] = 0.0
     drift: Annotated[
         float,
         unit(
@@ -69,6 +72,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             "Amplitude of a slow drift of both offsets, a sine whose phase depends on the seed.",
             ge=0,
             le=10,
+            usual=1,
         ),
     ] = 0.0
     drift_period: Annotated[float, unit("s", "Period of that sine.", gt=0, le=1e6)] = 60.0

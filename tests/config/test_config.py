@@ -34,6 +34,20 @@ def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
     assert load(file) == Config() == load()
 
 
+def test_a_length_in_millimetres_is_refused_with_the_question_whether_it_is_one() -> None:
+    with pytest.raises(ConfigError, match=r"m is needed \(mm\? that is 0\.1 m\)$"):
+        load(None, ["swimmer.body.length=100"])
+
+
+def test_only_values_that_were_given_are_doubted(caplog: pytest.LogCaptureFixture) -> None:
+    load(None, ["start.rest=3000", "simulation.noise=0.001"])
+    (record,) = caplog.records
+    assert record.message == (
+        "careful: --set start.rest=3000: start.rest: 3000 s is more than makes sense: up to 600 s "
+        "does (ms? that is 3 s)"
+    )
+
+
 def test_the_shipped_configuration_is_good() -> None:
     config = load(Path(__file__).parents[2] / "config" / "simulated.yaml")
     assert config.start.controller == "swing"

@@ -162,7 +162,11 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
         ({"amplitude": 240}, r"swing: amplitude: 240 is not valid: .* rad \(or null\) is needed$"),
         ({"amplitude": -24}, r"swing: amplitude: -24 is not valid: .* rad \(or null\) is needed$"),
         ({"amplitude": True}, r"swing: amplitude: true is .* rad \(or null\) is needed$"),
-        ({"longest_half_period": 24}, r"swing: longest_half_period: 24 is .* s is needed$"),
+        (
+            {"longest_half_period": 24},
+            r"longest_half_period: 24 is .* s is needed \(ms\? that is 0\.024 s\)$",
+        ),
+        ({"longest_half_period": 24000}, r"swing: longest_half_period: 24000 is .* s is needed$"),
         (
             {"frequency": 0.6},
             "^unknown parameter 'frequency' of controller swing; "
@@ -177,6 +181,11 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
 def test_a_wrong_parameter_is_told_what_is_right(values: dict[str, object], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         made("swing", **values)
+
+
+def test_a_thrust_in_millinewtons_is_refused_with_the_question_whether_it_is_one() -> None:
+    with pytest.raises(ParameterError, match=r" N is needed \(mN\? that is 0\.02 N\)$"):
+        made("thrust", target=20)
 
 
 def test_every_installed_controller_describes_itself_and_its_parameters() -> None:

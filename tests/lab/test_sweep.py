@@ -452,7 +452,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         (["--frequency", "1,20"], "frequency"),
         (
             ["--frequency", "1,4", "--vary", "tick=0.05,0.2"],
-            "at most 2.5 Hz is possible (with tick=0.2)",
+            "at most 2.5 Hz is possible (with tick=0.2 s)",
         ),
         (["--amplitude", "0.3,0.6"], "amplitude_limit"),
         (["--vary", "plant.xj=1,2"], "--vary plant.xj=1"),

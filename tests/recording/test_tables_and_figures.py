@@ -87,7 +87,7 @@ def test_where_ticks_are_missing_a_curve_has_a_break(tmp_path: Path) -> None:
 
 def test_a_figure_says_which_controller_and_parameters_and_the_units(path: Path) -> None:
     drawn = traces(open_run(path))
-    said = ["swing C=0.6 longest_half_period=1.0 lead=0.0", "C=0.3"]
+    said = ["swing C=0.6 longest_half_period=1 s lead=0 s", "C=0.3"]
     assert [event.text for event in drawn.events] == said
     assert list(drawn.quantities) == ["top_speed (1)", "reversal_speed (1)", "since_reversal (s)"]
 

@@ -197,6 +197,26 @@ def test_a_wrong_command_gets_one_line(arguments: list[str], message: str, statu
     assert done.returncode == status
 
 
+@pytest.mark.parametrize(
+    ("arguments", "warning"),
+    [
+        (["thrust", "--target", "5"], "5 N is 194 times the best thrust known: .* 25.8 mN .*mN?"),
+        (["thrust", "--target", "0.03"], "0.03 N is 1.16 times the best thrust known"),
+        (["swing", "--longest-half-period", "8"], "8 s is more than makes sense: .* (ms? that"),
+        (["thrust", "--target", "0.02"], ""),
+    ],
+)
+def test_a_value_beyond_what_makes_sense_is_warned_of(arguments: list[str], warning: str) -> None:
+    done = run(*arguments, "--seconds", "8", "--settle", "5")
+    assert done.returncode == 0
+    if warning:
+        assert re.search(warning.replace("?", r"\?").replace("(", r"\("), done.stderr)
+        assert done.stderr.count("\n") == 1
+    else:
+        assert "target=0.02 N C=0.6 amplitude=default longest_half_period=1 s" in done.stdout
+        assert not done.stderr
+
+
 def test_the_half_beats_that_were_swum_are_said() -> None:
     assert "1.667 Hz, in half beats of 6 ticks\n" in run("square", "--frequency", "1.6667").stdout
     between = run("square", "--frequency", "1.709").stdout

@@ -73,7 +73,7 @@ def _parameters(controller: str | None, words: tuple[str, ...]) -> dict[str, Any
 
 
 def _print(stretch: Stretch) -> None:
-    who = f"{stretch.recorded} {spelled(stretch.parameters)}".rstrip()
+    who = spelled(stretch.recorded, stretch.parameters)
     again = "" if stretch.controller == stretch.recorded else f", {stretch.controller} again"
     echo(f"from tick {stretch.seq}: {who}{again}")
     share = f"{stretch.equal} of {counted(stretch.ticks, 'command')} equal to the last bit"

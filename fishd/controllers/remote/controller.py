@@ -46,6 +46,7 @@ class RemoteParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             "How long the agent may take for its first action; neutral until then.",
             gt=0,
             le=3600,
+            usual=600,
         ),
     ] = 10.0
     dwell: Annotated[

@@ -15,6 +15,7 @@ from fishd.config import Config
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError
+from fishd.core.schema import echoed, unit_at, with_unit
 
 MOST = 100_000
 """A grid has no more points."""
@@ -39,11 +40,16 @@ class Point(Struct, frozen=True):
         return {"controller": self.controller, **parameters, **self.keys}
 
     def label(self, *, without: Collection[str] = ()) -> str:
-        """`square frequency=1.4 amplitude=0.3`: its columns in a line, but for some."""
-        pairs = list(self.columns().items())[1:]
+        """`square frequency=1.4 Hz amplitude=0.3 rad`: its columns in a line, but for some."""
+        units = registry.units(self.controller)
+        values = {
+            PARAMETER + name: (value, units.get(name, ""))
+            for name, value in self.parameters.items()
+        }
+        values |= {key: (value, unit_at(Config, key)) for key, value in self.keys.items()}
         words = (
-            f"{name.removeprefix(PARAMETER)}={_short(value)}"
-            for name, value in pairs
+            f"{name.removeprefix(PARAMETER)}={with_unit(value, unit)}"
+            for name, (value, unit) in values.items()
             if name not in without
         )
         return " ".join((self.controller, *words))
@@ -156,7 +162,7 @@ def check(point: Point, limits: Limits) -> None:
     try:
         registry.check(point.controller, point.parameters, limits)
     except ParameterError as error:
-        where = " ".join(f"{key}={_short(value)}" for key, value in point.keys.items())
+        where = echoed(point.keys, {key: unit_at(Config, key) for key in point.keys})
         raise ParameterError(f"{error}{f' (with {where})' if where else ''}", error.path) from None
 
 
@@ -188,9 +194,3 @@ def axis(found: Sequence[Point]) -> str:
 def is_number(value: Any) -> bool:
     """Can results be drawn over it?"""
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _short(value: Any) -> str:
-    if value is None:
-        return "default"
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -73,8 +73,8 @@ class Water(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     density: Annotated[float, unit("kg/m^3", "ρ.", gt=0.0, le=1e5)] = 1000.0
     viscosity: Annotated[float, unit("m^2/s", "Kinematic viscosity ν.", ge=0.0, le=1.0)] = 1e-6
-    length: Annotated[float, unit("m", "Of the tank.", gt=0.0, le=100.0)] = 1.0
-    width: Annotated[float, unit("m", "Of the tank.", gt=0.0, le=100.0)] = 0.2
+    length: Annotated[float, unit("m", "Of the tank.", gt=0.0, le=100.0, usual=20)] = 1.0
+    width: Annotated[float, unit("m", "Of the tank.", gt=0.0, le=100.0, usual=20)] = 0.2
 
 
 class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -67,8 +67,8 @@ def test_a_policy_that_insists_loses_command_to_swing_within_two_seconds(
         "chatter",
     )
     assert event.message == (
-        "swing takes over with C=0.6, amplitude=0.42, longest_half_period=1.0, lead=0.0: ppo gave "
-        "up: in 30 of the last 40 ticks it wanted to reverse sooner than 0.2 s after its last "
+        "swing takes over with C=0.6, amplitude=0.42 rad, longest_half_period=1 s, lead=0 s: ppo "
+        "gave up: in 30 of the last 40 ticks it wanted to reverse sooner than 0.2 s after its last "
         "reversal"
     )
     assert event.message in caplog.text

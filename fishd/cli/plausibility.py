@@ -1,0 +1,61 @@
+"""Says which values of a controller's parameters are valid, but more than the fish can do."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from fishd.cli.output import echo
+from fishd.core.errors import FishdError
+from fishd.core.schema import Field, doubts, is_valid_number, question, with_unit
+
+if TYPE_CHECKING:
+    from fishd.config import Config
+
+
+def warn_of_values(
+    fields: Iterable[Field], parameters: Mapping[str, Any], config: "Callable[[], Config]"
+) -> None:
+    """Print a line for each value far beyond what makes sense, on standard error.
+
+    parameters: a value for each name, or a list of values
+    config: that of the fish; only read where a parameter is a force, which the fish has to give
+    """
+    fields = list(fields)
+    largest = {name: _largest(value) for name, value in parameters.items()}
+    forces = [each for each in fields if each.unit == "N" and is_valid_number(largest, each)]
+    beyond = _beyond_best(forces, largest, config) if forces else {}
+    lines = list(beyond.values())
+    lines += doubts(largest, (field for field in fields if field.name not in beyond))
+    for line in lines:
+        echo(f"fishctl: careful: {line}", err=True)
+
+
+def _largest(value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    return max((each for each in value if isinstance(each, int | float)), default=None)
+
+
+def _beyond_best(
+    forces: list[Field], values: Mapping[str, Any], read_config: "Callable[[], Config]"
+) -> dict[str, str]:
+    """Return a sentence for each force that is more than the best square wave's thrust."""
+    from fishd.virtual.plant.optimum import best_square_wave
+
+    try:
+        config = read_config()
+    except FishdError:  # which the verb itself reports
+        return {}
+    if config.robot == "swimmer":
+        return {}
+    best = best_square_wave(config.plant, config.amplitude_limit).thrust
+    return {
+        field.name: (
+            f"{field.name}: {with_unit(values[field.name], 'N')} is "
+            f"{values[field.name] / best:.3g} "
+            "times the best thrust known: the best square wave of the configured fish gives "
+            f"{best:.3g} N, {1e3 * best:.3g} mN"
+            + (f" ({question(values[field.name], 'N')})" if values[field.name] > 2 * best else "")
+        )
+        for field in forces
+        if 0.0 < best < values[field.name]
+    }
