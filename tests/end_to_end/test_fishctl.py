@@ -58,7 +58,7 @@ def test_parameters_change_together_or_not_at_all(daemon: Daemon, words: tuple[s
 
 @pytest.mark.parametrize("word", ["--C=0.4", "C=0.4"])
 def test_a_parameter_may_be_given_without_dashes(daemon: Daemon, word: str) -> None:
-    done = daemon.fishctl("set-controller", "swing", word, "longest_half_period=0.8 s")
+    done = daemon.fishctl("set-controller", "swing", word, "longest_half_period=0.8")
     assert "swing C=0.4 amplitude=default longest_half_period=0.8 s" in done.stdout
     done = daemon.fishctl("set-controller", "swing", "D=0.4")
     assert "No such option '--D'" in done.stderr
