@@ -10,6 +10,7 @@ from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.lab.compare import LiveComparison
 from fishd.lab.error_budget import budget, spelled, unknown_calibration
 from fishd.lab.measurement import Measured, measure, summary
+from fishd.lab.other_fish import harsh
 from fishd.lab.rig import VirtualRig
 from fishd.simulation import simulate
 
@@ -61,6 +62,14 @@ def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle
     assert measurement.total_ci95
     assert truth - measurement.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
     assert measurement.error < truth - measurement.thrust < measurement.total_ci95 < 0.02 * truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [700, 703])
+def test_delay_backlash_and_drift_turn_no_sensor_and_hide_no_rotation(seed: int) -> None:
+    fish = harsh(seed).overrides
+    assert measured(*fish, "simulation.rotation=0").rotation == 0.0
+    assert measured(*fish, "simulation.rotation=0.1").rotation == pytest.approx(0.1, abs=0.005)
 
 
 def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:

@@ -1,13 +1,15 @@
 """The fish of a running fishd, here one in virtual time: who stops it, and what may be lost."""
 
+import math
 from typing import Any, cast
 
 import pytest
-from rigs.virtual_daemon import VirtualDaemon
+from rigs.virtual_daemon import VirtualDaemon, VirtualStatus
 
 from fishd.client import Fish
+from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import NoDaemon, Refused
-from fishd.core.protocol import State
+from fishd.core.protocol import Calibrations, State
 from fishd.lab.measurement import measure
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials
@@ -143,3 +145,25 @@ def test_a_fish_that_could_not_be_stopped_may_swim_on_and_that_is_said_once(
         rig.swim("swing", {}, 1.0)
     said = "the fish could not be stopped and may swim on: no answer"
     assert caplog.messages == [said] * lines
+
+
+class Calibrated(VirtualDaemon):
+    """A fishd whose robot has a force sensor that loads have calibrated."""
+
+    def status(self) -> VirtualStatus:
+        status = super().status()
+        status.robot = "pi"
+        return status
+
+    def calibrations(self) -> Calibrations:
+        known = ForceCalibration(covariance_x=((0.02 / 1.96) ** 2, 0.0, 0.0))
+        return Calibrations(known, None, ServoCalibration(), None, 10.0)
+
+
+def test_a_thrust_on_a_robot_has_the_uncertainty_of_its_calibration() -> None:
+    with rig_of(Calibrated()) as rig:
+        measurement = measure(rig, "swing", {}, 21.0)
+    assert measurement.calibration_ci95 == pytest.approx(0.02 * measurement.thrust)
+    assert measurement.total_ci95 == pytest.approx(
+        math.hypot(measurement.error, 0.02 * measurement.thrust)
+    )

@@ -84,8 +84,8 @@ def run(case: Case, seed: int) -> tuple[float, float, float, float]:
         measurement = measured(rig, "swing", {}, RUN_SECONDS)
     assert measurement.calibration_ci95 is not None
     assert measurement.total_ci95 is not None
-    m = measurement
-    return m.thrust, m.error, m.calibration_ci95, m.total_ci95
+    calibration_ci95, total_ci95 = measurement.calibration_ci95, measurement.total_ci95
+    return measurement.thrust, measurement.error, calibration_ci95, total_ci95
 
 
 def measure(options: Namespace) -> Report:
