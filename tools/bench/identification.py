@@ -18,7 +18,8 @@ import numpy as np
 from common.report import Options, Report, table
 from fishd.config import Config, load
 from fishd.lab.identification import experiment, identify
-from fishd.lab.identification.estimation import FURTHER, SCALED
+from fishd.lab.identification.fit import FURTHER
+from fishd.lab.identification.summary import SCALED
 from fishd.lab.other_fish import harsh
 from fishd.lab.rig import VirtualRig
 from fishd.virtual.imperfections import SimulationSettings
@@ -183,7 +184,8 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
 
 SUMMARY = (
     "fish | intervals that hold | those that K_y/K does not scale | withheld | with K_y/K known | "
-    "error, median | warned in the first line | furthest off, in half-widths | more than 2 off and not warned"
+    "error, median | warned in the first line | furthest off, in half-widths | "
+    "more than 2 off and not warned"
 )
 HEAD = "quantity | error, median | error, largest | half of the 95 % interval | it covers the truth"
 OPTIONS: Options = {

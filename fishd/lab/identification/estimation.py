@@ -1,38 +1,35 @@
-"""From ticks to a fish: starts, fits, intervals, and what is to be said about them.
+"""From ticks to a fish: starts and fits, and what of the fish they are for.
 
 K, λ, K_y and K_d cannot be told apart by forces: F_x is K λ² times what the wheel does, F_y is
 K_y λ and K_d λ times it. K and λ are told apart by K_y = K. How far that may be wrong is part of
 their intervals, unless `lateral_inertia_ratio` is left out of `fit`.
 """
 
-import math
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
-from scipy.stats import chi2, t
 
 from fishd.core import text
 from fishd.core.errors import ParameterError
 from fishd.core.schema import nearest
 from fishd.lab.identification import misfit
-from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC, Problem, solve
+from fishd.lab.identification.fit import (
+    BOUNDS,
+    FURTHER,
+    LOGARITHMIC,
+    QUADRATIC,
+    Problem,
+    solve,
+)
 from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
-from fishd.lab.identification.response import Array
 from fishd.lab.identification.result import (
-    PRODUCT_UNITS,
-    UNITS,
-    Channel,
-    Estimate,
-    Fit,
     Identification,
 )
+from fishd.lab.identification.summary import CLEAR, SCALED, summarise
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -45,36 +42,10 @@ DEFAULT = (
     *("servo_delay", "backlash", "rotation"),
 )
 """What is fitted by default; what is left over may then demand some of `FURTHER`, too."""
-FURTHER = ("servo_reaction", "cable_slack", "servo_dead_zone")
-"""What is fitted where what is left over looks like it."""
 POSSIBLE = tuple(BOUNDS)
 
-_Z = 1.96
-LATERAL_INERTIA_FACTOR = 2.0
-"""K_y/K is within this factor of the configured one, in 95 % of cases, where no data tell it."""
-SCALED = {
-    "coupling": 1.0,
-    "thrust_coefficient": -2.0,
-    "lateral_inertia_ratio": 1.0,
-    "lateral_drag": -1.0,
-    "quadratic_drag": -1.0,
-    "lateral_quadratic_drag": -2.0,
-}
-"""Exponents of K_y/K: all of these may change with it in this way, and no force changes."""
-MISFIT_FACTOR = 2.0
-"""By how much the disagreement between groups of data is multiplied: there are few groups, and what
-all of them have in common does not show."""
-MIN_EXPLAINED = 0.9
-"""Smallest share of each force, out of sample, with which intervals are shown after a misfit."""
-_WORSE = 1.1
-"""Largest ratio of squares of what is left over, out of sample to in sample."""
-_CLEAR = 25.0
-"""Smallest fall of the sum of squares, in units of noise², that names what the model lacks."""
 _DEMANDED = 0.05
 """Smallest share of what is left over that something further must explain to be fitted."""
-_QUADRATIC = ("quadratic_drag", "lateral_quadratic_drag")
-_PROBED = 0.01
-"""Size of slack and dead zone whose effect is compared with what is left over [rad]."""
 _SETTLE = 2.0
 """How long the beginning of a passage is not judged, since nobody knows what was before [s]."""
 _LONGEST_SETTLE = 20.0
@@ -84,27 +55,6 @@ _ROUGH = 12
 """Steps of a fit that shows whether it is worth going on."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
 """Natural frequency, as a multiple of that of the first fish, and delay [s]."""
-_UNKNOWN = 50.0
-"""Error of a logarithm that says nothing any more."""
-_SMOOTH = 5.0
-"""For the drift that is shown [s]."""
-_SINGULAR = 1e-10
-"""Information below this share of the largest is none."""
-_SYMBOLS = {"fx": "F_x", "fy": "F_y"}
-_SIGNS = {
-    "white residual": "what is left of {} is more than noise",
-    "prediction": "data left out of the fit are predicted worse in {}",
-}
-"""Failed assumptions, as a clause of a sentence about forces."""
-_SMALLEST = {"servo_delay": 2e-3, "backlash": 2e-3}
-"""Width of an interval that is narrow enough, however small the value is [s], [rad]."""
-SIGNED = ("servo_reaction", "rotation")
-"""These may be negative."""
-OFFSETS = ("offset_x", "offset_y")
-_STRETCHES = (4, 5)
-"""Into how many stretches runs are cut, whose means tell how well the mean of a drift is known."""
-_LAGS = 20
-"""Ticks that what is left over may be correlated for."""
 
 
 def identify(
@@ -147,7 +97,7 @@ def identify(
         parts, settle = (longer, settle) if longer else (parts, _SETTLE)
         problem = Problem(parts, problem.names, settle)
         values = solve(problem, values)
-    return _summary(parts, problem, values, known, scale_is_free)
+    return summarise(parts, problem, values, known, scale_is_free)
 
 
 def _scale_is_free(names: Sequence[str], values: dict[str, float]) -> bool:
@@ -207,10 +157,10 @@ def _solved(
     problem = Problem(parts, names, _SETTLE)
     values = solve(problem, starts[0])
     problem, values = _extended(parts, problem, values, further)
-    if _all_white(problem, values):
+    if misfit.all_white(problem, values):
         return problem, values
     rough = []
-    few = tuple(name for name in names if name not in _QUADRATIC) or names
+    few = tuple(name for name in names if name not in QUADRATIC) or names
     for start in starts[1:]:
         other = Problem(parts, few, _SETTLE)
         rough.append((solve(other, start, rounds=1, steps=_ROUGH), other))
@@ -221,10 +171,6 @@ def _solved(
     return (other, best) if other.unexplained < problem.unexplained else (problem, values)
 
 
-def _all_white(problem: Problem, values: dict[str, float]) -> bool:
-    return all(map(_is_white, problem.whitened(problem.residuals(values))))
-
-
 def _extended(
     parts: Sequence[Passage],
     problem: Problem,
@@ -232,9 +178,9 @@ def _extended(
     further: Sequence[str],
 ) -> tuple[Problem, dict[str, float]]:
     """Return the fit with what of `further` the data demand, one after the other."""
-    while not _all_white(problem, values):
-        looks_like = _likenesses(problem, values, further)
-        if not looks_like or looks_like[0][1] < _CLEAR:
+    while not misfit.all_white(problem, values):
+        looks_like = misfit.likenesses(problem, values, further)
+        if not looks_like or looks_like[0][1] < CLEAR:
             break
         name, _, size = looks_like[0]
         wider = Problem(parts, check((*problem.names, name)), _SETTLE)
@@ -244,34 +190,6 @@ def _extended(
             break
         problem, values = wider, begun
     return problem, values
-
-
-def _likenesses(
-    problem: Problem, values: dict[str, float], names: Sequence[str]
-) -> list[tuple[str, float, float]]:
-    """Return what is not fitted and looks like what is left over, the most alike first.
-
-    Each is a name, the fall of the sum of squares in units of noise², and the likely value.
-    """
-    innovations = problem.whitened(problem.residuals(values))
-    jacobian = problem.jacobian(values)[:, :, _inside(problem.names, values)]
-    found = []
-    for name in names:
-        if name in problem.names or values[name]:
-            continue
-        step = None if name in SIGNED else _PROBED
-        fall, size = misfit.likeness(problem.column(values, name, step), jacobian, innovations)
-        if name in SIGNED or size > 0.0:
-            found.append((name, fall, size))
-    return sorted(found, key=lambda each: -each[1])
-
-
-def _inside(names: Sequence[str], values: dict[str, float]) -> NDArray[np.bool_]:
-    """Return which of what is fitted is not at an end of where a fit looks."""
-    lows = [values[name] <= BOUNDS[name][0] + 1e-7 * BOUNDS[name][1] for name in names]
-    ends = [_at_end(name, values[name]) for name in names]
-    inside: NDArray[np.bool_] = ~(np.array(lows) | np.array(ends))
-    return inside
 
 
 def _begun(
@@ -294,285 +212,3 @@ def _settling(values: dict[str, float]) -> float:
     omega0, xi = values["omega0"], values["xi"]
     slowest = 0.5 * omega0 * (xi - np.sqrt(max(0.0, xi * xi - 4.0)))
     return float(min(_FORGOTTEN / slowest, _LONGEST_SETTLE))
-
-
-def _summary(
-    parts: Sequence[Passage],
-    problem: Problem,
-    values: dict[str, float],
-    known: dict[str, float],
-    scale_is_free: bool,
-) -> Identification:
-    """Return what is found; `known` holds what the model does not use, too."""
-    all_values = {**known, **values}
-    residuals = problem.residuals(values)
-    innovations = problem.whitened(residuals)
-    jacobian = problem.jacobian(values)
-    statistical, untold = _covariance(jacobian, innovations)
-    labels = misfit.groups(parts, problem.skips)
-    inside = _inside(problem.names, values)
-    predicted = misfit.predicted(jacobian[:, :, inside], innovations, labels)
-    measured = problem.whitened(problem.measured)
-    drifts = [_smoothed(each, parts[0].tick) for each in residuals]
-    channels = tuple(
-        Channel(
-            name,
-            explained=_share(left, whole),
-            explained_out_of_sample=_share(unseen, whole),
-            noise=noise.white,
-            drift=float(max(d[k].max() for d in drifts) - min(d[k].min() for d in drifts)),
-            white=_is_white(left),
-        )
-        for k, (name, left, unseen, whole, noise) in enumerate(
-            zip(("fx", "fy"), innovations, predicted, measured, problem.noise, strict=True)
-        )
-    )
-    failed = _failed(channels, innovations, predicted)
-    covariance, inflation = statistical, 1.0
-    if failed:
-        further = misfit.disagreement(jacobian, innovations, labels)
-        covariance = statistical + MISFIT_FACTOR**2 * further
-        inflation = float(np.median(np.sqrt(np.diag(covariance) / np.diag(statistical))))
-        rest = [name for name in (*FURTHER, *_QUADRATIC, "rotation") if name not in problem.names]
-        alike = _likenesses(problem, values, rest)
-        failed = [*(f"{name} = 0" for name, fall, _ in alike[:1] if fall > _CLEAR), *failed]
-    identified = not failed or all(c.explained_out_of_sample >= MIN_EXPLAINED for c in channels)
-    deviations = np.sqrt(np.diag(covariance))
-    spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
-    if not identified:
-        spread = dict.fromkeys(spread, np.inf)
-    estimates = [_estimate(name, all_values[name], spread) for name in UNITS if name in all_values]
-    if scale_is_free:
-        estimates = [_with_free_scale(each) for each in estimates]
-    left = np.concatenate(residuals, axis=1)
-    slopes = problem.slopes_of_means(values)
-    means = np.concatenate(problem.forces(values), axis=1).mean(axis=1)
-    for name, of, slope, noise, mean, channel in zip(
-        OFFSETS, left, slopes, problem.noise, means, channels, strict=True
-    ):
-        told = _Z * np.sqrt(slope @ covariance @ slope + noise.white**2 / of.size)
-        if failed:  # a mean force may be as wrong as the rest of it, and no drift shows that
-            lost = max(0.0, 1.0 - channel.explained_out_of_sample)
-            told = np.hypot(told, _Z * np.sqrt(lost) * mean)
-        error = float(np.hypot(told, _wandering(of)))
-        value = float(of.mean())
-        estimates.append(Estimate(name, value, value - error, value + error))
-    return Identification(
-        headline=_headline(channels, failed, identified, inflation),
-        identified=identified,
-        estimates=tuple(estimates),
-        products=_products(problem.names, all_values, covariance, identified),
-        channels=(channels[0], channels[1]),
-        seconds=sum(one.duration for one in parts),
-        passages=len(parts),
-        remarks=_remarks(problem.names, estimates, untold),
-        names=problem.names,
-        covariance=covariance,
-        inflation=inflation,
-        failed_assumptions=tuple(failed),
-        fit=_series(problem, values, drifts),
-    )
-
-
-def _failed(channels: Sequence[Channel], innovations: Array, predicted: Array) -> list[str]:
-    """Return the assumptions about what is left over that do not hold."""
-    failed = [f"white residual of {channel.name}" for channel in channels if not channel.white]
-    for channel, fitted, unseen in zip(channels, innovations, predicted, strict=True):
-        if unseen @ unseen > _WORSE * (fitted @ fitted):
-            failed.append(f"prediction of {channel.name}")
-    return failed
-
-
-def _share(left: Array, whole: Array) -> float:
-    """Return the share of the variance that is explained."""
-    return float(1.0 - (left @ left) / (whole @ whole))
-
-
-def _with_free_scale(estimate: Estimate) -> Estimate:
-    """Return the estimate with an interval for any K_y/K that is within reason."""
-    if estimate.name not in SCALED:
-        return estimate
-    factor = LATERAL_INERTIA_FACTOR ** abs(SCALED[estimate.name])
-    low, high = estimate.low / factor, estimate.high * factor
-    if estimate.name == "lateral_inertia_ratio":
-        return replace(estimate, low=low, high=high, fitted=True)
-    if not estimate.fitted:
-        return estimate
-    return replace(estimate, low=low, high=high, if_ratio_holds=(estimate.low, estimate.high))
-
-
-def _products(
-    names: Sequence[str], values: dict[str, float], covariance: Array, identified: bool
-) -> tuple[Estimate, ...]:
-    """Return K λ², K_y λ and K_d λ with their intervals."""
-    scale, inertia = values["coupling"], values["thrust_coefficient"]
-    ratio, drag = values["lateral_inertia_ratio"], values["lateral_drag"]
-    found = []
-    for name, value, exponents in zip(
-        PRODUCT_UNITS,
-        (inertia * scale * scale, ratio * inertia * scale, drag * scale),
-        (
-            {"coupling": 2.0, "thrust_coefficient": 1.0},
-            {"coupling": 1.0, "thrust_coefficient": 1.0, "lateral_inertia_ratio": 1.0},
-            {"coupling": 1.0, "lateral_drag": 1.0},
-        ),
-        strict=True,
-    ):
-        slope = np.array([exponents.get(each, 0.0) * value for each in names])
-        if "lateral_drag" in exponents and "lateral_drag" in names:  # not fitted as a logarithm
-            slope[list(names).index("lateral_drag")] = scale
-        error = _Z * float(np.sqrt(slope @ covariance @ slope)) if identified else np.inf
-        found.append(Estimate(name, value, max(0.0, value - error), value + error))
-    return tuple(found)
-
-
-def _headline(
-    channels: Sequence[Channel], failed: Sequence[str], identified: bool, inflation: float
-) -> str:
-    """Return the first line of what is shown."""
-    explains = " and ".join(
-        f"{_percent(channel.explained_out_of_sample)} of {_SYMBOLS[channel.name]}"
-        for channel in channels
-    )
-    if not failed:
-        return f"identified: the model explains {explains}"
-    causes = [each for each in failed if each.endswith(" = 0")]
-    why = "; ".join(
-        words.format(" and ".join(symbols))
-        for sign, words in _SIGNS.items()
-        if (symbols := [s for name, s in _SYMBOLS.items() if f"{sign} of {name}" in failed])
-    )
-    if causes:
-        why += f"; it looks as if {causes[0].replace(' = 0', ' is not 0')}"
-    if not identified:
-        return f"not identified: the model explains {explains}: {why}"
-    wider = f"intervals are {inflation:.2g} times as wide as noise alone makes them"
-    return f"careful: the model lacks something and explains {explains}: {why}; {wider}"
-
-
-def _percent(share: float) -> str:
-    """Return a share with as many digits as tell it from all: 71 %, 99.63 %, 99.9950 %."""
-    rest = max(1.0 - share, 1e-6)
-    digits = min(4, max(0, -math.floor(math.log10(rest)) - 1))
-    return f"{100.0 * max(share, 0.0):.{digits}f} %"
-
-
-def _covariance(jacobian: Array, innovations: Array) -> tuple[Array, Array | None]:
-    """Of the errors in z, and the direction in which these data do not tell z, if there is one.
-
-    Where what is left over is correlated from tick to tick, the error is larger than white noise
-    would make it (Newey and West, "A simple, positive semi-definite, heteroskedasticity and
-    autocorrelation consistent covariance matrix").
-    """
-    size = np.sqrt((jacobian**2).sum(axis=(0, 1)))
-    size[size == 0.0] = 1.0
-    scaled = jacobian / size
-    information = np.einsum("cni,cnj->ij", scaled, scaled)
-    values, vectors = np.linalg.eigh(information)
-    weak = values < _SINGULAR * values[-1]
-    inverse = (vectors / np.where(weak, _SINGULAR * values[-1], values)) @ vectors.T
-    scores = scaled * innovations[:, :, None]
-    meat = np.einsum("cni,cnj->ij", scores, scores)
-    for lag in range(1, _LAGS + 1):
-        product = np.einsum("cni,cnj->ij", scores[:, lag:], scores[:, :-lag])
-        meat += (1.0 - lag / (_LAGS + 1)) * (product + product.T)
-    robust = inverse @ meat @ inverse
-    wider = np.sqrt(np.maximum(np.diag(robust) / np.diag(inverse), 1.0))
-    unscaled = wider / size
-    return inverse * np.outer(unscaled, unscaled), vectors[:, 0] if weak[0] else None
-
-
-def _wandering(residual: Array) -> float:
-    """Half of the 95 % interval of a mean, by how much the means of stretches differ [N].
-
-    Whatever the drift is, as long as a stretch is as good as another (Ibragimov and Müller,
-    "t-statistic based correlation and heterogeneity robust inference").
-    """
-    halves = []
-    for count in _STRETCHES:  # a drift whose period is one stretch is seen by the other cut
-        means = [stretch.mean() for stretch in np.array_split(residual, count)]
-        deviation = np.std(means, ddof=1) / np.sqrt(count)
-        halves.append(float(t.ppf(0.975, count - 1) * deviation))
-    return max(halves)
-
-
-def _estimate(name: str, value: float, spread: dict[str, float]) -> Estimate:
-    error = spread.get(name)
-    if error is None:
-        return Estimate(name, value, value, value, fitted=False)
-    if name in LOGARITHMIC:  # a share, and so the interval is not symmetric
-        high = value * float(np.exp(min(error, _UNKNOWN))) if np.isfinite(error) else np.inf
-        return Estimate(name, value, value * float(np.exp(-error)), high)
-    low = value - error if name in SIGNED else max(0.0, value - error)
-    return Estimate(name, value, low, value + error)
-
-
-def _is_white(innovations: Array) -> bool:
-    """The test of Ljung and Box, at one in a thousand."""
-    count = len(innovations)
-    squares = float(innovations @ innovations)
-    lags = range(1, min(_LAGS, count - 1) + 1)
-    correlations = [float(innovations[lag:] @ innovations[:-lag]) / squares for lag in lags]
-    total = sum(r * r / (count - lag) for lag, r in zip(lags, correlations, strict=True))
-    return bool(chi2.sf(count * (count + 2) * total, len(correlations)) > 1e-3)
-
-
-def _smoothed(residual: Array, tick: float) -> Array:
-    width = min(max(1, round(_SMOOTH / tick)), residual.shape[1])
-    smoothed: Array = uniform_filter1d(residual, width, axis=1, mode="nearest")
-    return smoothed
-
-
-def _series(problem: Problem, values: dict[str, float], drifts: Sequence[Array]) -> Fit:
-    gap = np.full((1,), np.nan)
-    gaps = np.full((2, 1), np.nan)
-
-    def joined(parts: Sequence[Array]) -> Array:
-        between = gap if parts[0].ndim == 1 else gaps
-        pieces = [piece for part in parts for piece in (part, between)][:-1]
-        return np.concatenate(pieces, axis=-1)
-
-    forces = problem.forces(values)
-    return Fit(*map(joined, (problem.times, problem.measured, forces, drifts)))
-
-
-def _remarks(
-    names: Sequence[str], estimates: Sequence[Estimate], untold: Array | None
-) -> tuple[str, ...]:
-    remarks = []
-    if untold is not None:
-        involved = [name for name, part in zip(names, untold, strict=True) if abs(part) > 0.3]
-        remarks.append(
-            f"these data do not tell {' and '.join(involved)}"
-            + (" apart" if len(involved) > 1 else "")
-            + "; fix one, or run fishctl identify --experiment"
-        )
-    wide = [e.name for e in estimates if e.name in names and _is_wide(e)]
-    if wide:
-        remarks.append(f"known to 10 % at best: {', '.join(wide)}")
-    ends = [
-        f"{name} = {value:.4g}"
-        for name, value in ((e.name, e.value) for e in estimates if e.name in BOUNDS)
-        if _at_end(name, value)
-    ]
-    if ends:
-        remarks.append(f"at the end of where a fit looks: {', '.join(ends)}")
-    return tuple(remarks)
-
-
-def _is_wide(estimate: Estimate) -> bool:
-    """Return whether the interval is wider than ±10 % of the value, and ±1 ms or ±1 mrad."""
-    low, high = estimate.known
-    if not estimate.fitted or not math.isfinite(high):
-        return False
-    if estimate.name in LOGARITHMIC:
-        return high > 1.2 * low
-    smallest = _SMALLEST.get(estimate.name)
-    return smallest is not None and high - low > max(0.2 * estimate.value, smallest)
-
-
-def _at_end(name: str, value: float) -> bool:
-    low, high = BOUNDS[name]
-    if name in LOGARITHMIC:
-        return value < 1.001 * low or value > 0.999 * high
-    return value >= 0.999 * high or (name in SIGNED and value <= 0.999 * low)

@@ -27,6 +27,9 @@ FORCES = (
     *("lateral_quadratic_drag", "servo_reaction", "rotation"),
 )
 """What scales and turns the forces of a motion."""
+FURTHER = ("servo_reaction", "cable_slack", "servo_dead_zone")
+"""What is fitted, unless that is fixed, only where what is left over looks like it."""
+QUADRATIC = ("quadratic_drag", "lateral_quadratic_drag")
 BOUNDS = {
     "omega0": (0.5, 200.0),
     "xi": (1e-3, 10.0),
@@ -53,6 +56,8 @@ LOGARITHMIC = frozenset(
     )
 )
 """Fitted as logarithms: they are positive, and errors of them are shares."""
+SIGNED = ("servo_reaction", "rotation")
+"""These may be negative."""
 _STEPS = {
     "servo_delay": 1e-4,
     "backlash": 2e-4,

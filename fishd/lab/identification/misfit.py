@@ -9,7 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
+from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC, SIGNED, Problem
 from fishd.lab.identification.passages import Passage
 from fishd.lab.identification.response import Array
 
@@ -21,6 +23,10 @@ _TIME_GROUPS = 8
 """Number of stretches of time, where data are grouped by time."""
 _SHARE_OF_A_GROUP = 1.0 / 24.0
 """Smallest share of all windows in a group."""
+LAGS = 20
+"""Ticks that what is left over may be correlated for."""
+_PROBED = 0.01
+"""Size of slack and dead zone whose effect is compared with what is left over [rad]."""
 _SINGULAR = 1e-10
 """Share of the largest eigenvalue below which information counts as zero."""
 
@@ -123,3 +129,54 @@ def _inverse(information: Array) -> Array:
     scaled = vectors[:, kept] / values[kept] @ vectors[:, kept].T
     inverse: Array = scaled / np.outer(size, size)
     return inverse
+
+
+def all_white(problem: Problem, values: dict[str, float]) -> bool:
+    """Return whether what is left over of both forces is no more than noise."""
+    return all(map(is_white, problem.whitened(problem.residuals(values))))
+
+
+def likenesses(
+    problem: Problem, values: dict[str, float], names: Sequence[str]
+) -> list[tuple[str, float, float]]:
+    """Return what is not fitted and looks like what is left over, the most alike first.
+
+    Each is a name, the fall of the sum of squares in units of noise², and the likely value.
+    """
+    innovations = problem.whitened(problem.residuals(values))
+    jacobian = problem.jacobian(values)[:, :, inside(problem.names, values)]
+    found = []
+    for name in names:
+        if name in problem.names or values[name]:
+            continue
+        step = None if name in SIGNED else _PROBED
+        fall, size = likeness(problem.column(values, name, step), jacobian, innovations)
+        if name in SIGNED or size > 0.0:
+            found.append((name, fall, size))
+    return sorted(found, key=lambda each: -each[1])
+
+
+def inside(names: Sequence[str], values: dict[str, float]) -> NDArray[np.bool_]:
+    """Return which of what is fitted is not at an end of where a fit looks."""
+    lows = [values[name] <= BOUNDS[name][0] + 1e-7 * BOUNDS[name][1] for name in names]
+    ends = [at_end(name, values[name]) for name in names]
+    free: NDArray[np.bool_] = ~(np.array(lows) | np.array(ends))
+    return free
+
+
+def is_white(innovations: Array) -> bool:
+    """Return the answer of the test of Ljung and Box, at one in a thousand."""
+    count = len(innovations)
+    squares = float(innovations @ innovations)
+    lags = range(1, min(LAGS, count - 1) + 1)
+    correlations = [float(innovations[lag:] @ innovations[:-lag]) / squares for lag in lags]
+    total = sum(r * r / (count - lag) for lag, r in zip(lags, correlations, strict=True))
+    return bool(chi2.sf(count * (count + 2) * total, len(correlations)) > 1e-3)
+
+
+def at_end(name: str, value: float) -> bool:
+    """Return whether a value is at an end of where a fit looks, where that is not zero."""
+    low, high = BOUNDS[name]
+    if name in LOGARITHMIC:
+        return value < 1.001 * low or value > 0.999 * high
+    return value >= 0.999 * high or (name in SIGNED and value <= 0.999 * low)
