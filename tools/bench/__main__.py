@@ -17,6 +17,7 @@ NAMES = (
     "chatter",
     "measurement",
     "calibration",
+    "live_thrust",
     "sweep",
     "identification",
     "estimators",

@@ -1,330 +1,437 @@
-"""The thrust of the fish as it swims, and how well it is known while the force sensor drifts.
+"""The thrust of the swimming fish with its 95 % interval, while the force sensor drifts.
 
-Over whole beats, thrust is proportional to the mean square of the fin velocity, and that is free of
-drift: F_x = −Kαα̈ averages to K times the mean of α̇². The factor is not known beforehand. Two
-numbers are tracked by a Kalman filter, from the mean force of each beat and of each piece of a
-rest: the force that the sensor shows without any thrust, its zero, which wanders; and the factor,
-which hardly does. So each rest makes the thrust known, and each change between rest and swimming
-makes it better known.
+Over whole beats, thrust is proportional to the mean square of the fin velocity, the power, which
+does not drift: F_x = −Kαα̈ averages to K times the mean of α̇². The measured force is
+
+    force = zero + factor · power + noise
+
+In a steady swim every pair of zero and factor with the same sum explains the force equally well. So
+a steady swim says nothing about the factor, however long it lasts; only a change of the power does:
+from rest to swimming and back, from one wave or one amplitude to another. The factor is updated at
+such changes alone, once for each, from the difference of the forces just before and just after it;
+between two changes its variance only grows. docs/measuring.md has the argument in full.
 """
 
 import math
 from collections import deque
-from typing import Any
+from collections.abc import Sequence
 
+from fishd.control.estimators.thrust_factor import DRIFT_LAG, Drift, Factor, Level, Wave
 from fishd.core.signals import Observation
 
 SWIM_SETTLES = 1.5
-"""The fin swims steadily after so long [s]."""
+"""Time until a fin that has begun to swim swims steadily [s]."""
 REST_SETTLES = 1.0
-"""The fin hangs still after so long, fading included [s]."""
+"""Time until a fin hangs still, fading to neutral included [s]."""
 STILL = 2.5
-"""A tail that has not been moved for so long rests, whoever has command [s]."""
+"""Time without a movement of the tail after which it rests, whichever controller is active [s]."""
 PIECE = 0.5
-"""A rest is cut in pieces of this length, and beats are taken together until they last so [s]."""
+"""Length of the pieces that a rest is cut into, and shortest block of whole beats [s]."""
 SPAN = 4.0
-"""The thrust is that of the latest beats, of no more than this in all [s]."""
+"""Longest time over which the shown thrust is averaged, in whole beats [s]."""
 LONGEST_BEAT = 10.0
-"""A tail that has not reversed for so long does not beat [s]."""
-FACTOR_WALKS = 0.002
-"""How fast the factor becomes uncertain: share of it, standard deviation after a second."""
-SHAPE = 0.01
-"""The factor is not the same for every beat of a wave: it differs by this share."""
-OTHER_WAVE = 0.3
-"""Nor for every wave, where `estimator.leak` is not that of the fish: standard deviation, a share
-of it. The zero is still known when the wave changes, so the factor is soon known again."""
-OTHER_SIZE = 0.12
-"""Nor for a wave of another amplitude or frequency: standard deviation, a share of it for each
-e-fold of the fin's speed or of the frequency (rms of 40 random simulated fish)."""
-INTERVAL = 1.96
-"""Half of a 95 % interval, over the standard deviation."""
-BROKEN = 8.0
-"""A force at rest so many standard deviations off is no drift: by so much the zero is uncertain."""
-WANDER_FADES = 0.9
-"""What rests showed of a faster drift counts this much less with each further rest."""
-UNKNOWN = 1.0
-"""Standard deviation of a zero that nothing is known of, and of a thrust [N]."""
-MOST_KNOWN = 0.1
-"""A thrust that is known no better than this is not known [N]."""
-_NOISE = 1e-3
-"""What blocks are thought to vary by until there are two to compare [N]."""
-_COMPARISONS = 10
-"""How many comparisons of blocks the variance of blocks remembers."""
-
-
-Wave = tuple[str, dict[str, Any]]
-"""A controller's name, and its parameters."""
+"""Time without a reversal after which a tail does not beat [s]."""
+RETUNE_PAUSE = 4.0
+"""Parameters may change more often than this; then beats count while the fin settles [s]."""
+BEAT_SCATTER = 0.01
+"""Half-width by which the factor differs from beat to beat of one wave, as a fraction of it."""
+SIZE_STEP, SAME_SIZE = 0.2, 0.1
+"""Change of the logarithm of speed or frequency that makes another size of a wave, and its largest
+deviation within one size."""
+CLEAR_STEP = 5.0
+"""Least change of the size, in standard deviations of the size of one block."""
+Z95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations."""
+JUMP = 8.0
+"""Number of standard deviations by which a spike or a step of the force differs from noise."""
+MAX_CI95 = 0.1
+"""Largest half-width of a thrust that is shown as known [N]."""
+MIN_BLOCKS, MAX_BLOCKS = 2, 8
+"""Least and most blocks over which the force before or after a change is averaged."""
+LONG_BLOCK = 1.0
+"""One block of this length is enough, too [s]."""
+MIN_DRIFT_LAG = 1.0
+"""Shortest time over which the drift is observed [s]."""
+INITIAL_NOISE = 1e-3
+"""Standard deviation of the force of a block until two blocks have been compared [N]."""
+NOISE_MEMORY = 10
+"""Number of comparisons over which the variance of blocks is averaged."""
 
 
 class LiveThrust:
-    """Thrust over the latest whole beats, and half of its 95 % interval."""
+    """Thrust over the latest whole beats, and the half-width of its 95 % interval."""
 
     def __init__(self, zero_drift: float) -> None:
-        """zero_drift: how fast the zero wanders, standard deviation after a second [N/√s].
+        """Start without any knowledge.
 
-        Where rests show that it wanders faster, that is taken instead.
+        zero_drift: standard deviation of the change of the zero after a second [N/√s]; where the
+        forces show a faster drift, that is taken instead
         """
         self.thrust: float | None = None
-        """Of the latest beats; at rest, of the latest piece of it [N]. None while not known."""
+        """Thrust of the latest beats; at rest, of its latest piece [N]. None while not known."""
         self.error = 0.0
-        """Half of its 95 % interval [N]."""
-        self._least_wander = self._wander = zero_drift**2
-        self._zero = self._factor = 0.0
-        self._zero_variance, self._covariance = UNKNOWN**2, 0.0
-        self._factor_variance: float | None = None
-        self._anchored = False
-        """Is the zero known, or a factor from when it was?"""
-        self._time = self._rested = -math.inf
-        self._at_rest = 0.0
+        """Half-width of the 95 % interval of `thrust` [N]."""
+        self.factor: tuple[float, float] | None = None
+        """Thrust over the mean square of `fin_velocity`, and the half-width of its interval [N].
+
+        None while the half-width is larger than the factor."""
+        self._factor = self._prior = Factor()
+        """The factor, and what it was before the latest change."""
+        self._drift = Drift(zero_drift**2)
         self._noises = {True: _Noise(), False: _Noise()}
-        self._swims = False
+        """Noise of swims and of rests."""
+        self._swims = self._recording = False
         self._wave: Wave = ("", {})
-        self._factor_wave: Wave | None = None
-        """Which wave the factor was found from."""
-        self._size: complex | None = None
-        """Logarithm of the fin's speed in the latest beat, and i times that of its frequency."""
-        self._factor_size: complex | None = None
-        """The same of the beats that the factor was found from."""
-        self._angle = self._still = 0.0
-        self._phase = 0.0
-        self._side = 0.0
-        self._block: _Block | None = None
-        self._beats: deque[_Block] = deque()
-        self._power = 0.0
+        self._run_wave = self._wave
+        self._now = self._phase = self._still = self._angle = self._side = 0.0
+        self._settling_since = -math.inf
+        self._block = _Block(False)
+        self._shown: deque[_Block] = deque()
+        """The latest blocks of the swim, no longer than `SPAN` in all."""
+        self._start_run(None)
 
     def forget_zero(self) -> None:
-        """The sensor's zero was set: find it anew, in the next rest."""
-        self._zero_variance, self._covariance = UNKNOWN**2, 0.0
-        self._block = self.thrust = None
+        """Discard the forces so far: the zero of the sensor was set."""
+        self._start_run(None)
+        self._recording, self.thrust = False, None
 
     def forget(self) -> None:
-        """The sensor's calibration was changed: nothing found so far holds."""
-        self._factor, self._factor_variance, self._anchored = 0.0, None, False
-        self._factor_size = None
+        """Discard everything: the calibration of the sensor was changed."""
+        self._factor, self.factor = Factor(), None
         self.forget_zero()
 
     def forget_factor(self) -> None:
-        """The fin velocity has another scale from now on; the zero is what it was."""
-        self._factor, self._factor_variance, self._covariance = 0.0, None, 0.0
-        self._block = None
-        self._beats.clear()
+        """Discard the factor, since the fin velocity has another scale from now on."""
+        before = self._level()
+        if before and before.power:  # its thrust stays known
+            thrust, variance = self._thrust_of(before)
+            before = before._replace(thrust=thrust, thrust_variance=variance, power=0.0)
+        self._factor, self.factor = Factor(), None
+        self._shown.clear()
+        self._start_run(before)
+        self._recording, self._phase = False, 0.0
 
     def interrupt(self) -> None:
-        """The latest force is not to be believed: its beat, or piece of a rest, does not count."""
-        self._block = None
-        if self._swims:  # the fin velocity settles anew
+        """Discard the open block: the latest force is suspect."""
+        self._recording = False
+        if self._swims:  # the fin velocity must settle again
             self._phase = 0.0
 
     def calibrate(self, factor: float, error: float) -> None:
-        """Take the factor from a measurement.
+        """Set the factor to that of a measurement.
 
         factor: thrust over the mean square of `fin_velocity`
-        error: half of its 95 % interval
+        error: half-width of its 95 % interval
         """
-        self._factor, self._factor_variance = factor, (error / INTERVAL) ** 2
-        self._anchored, self._covariance = True, 0.0
-        self._factor_size = self._size
-
-    @property
-    def factor(self) -> tuple[float, float] | None:
-        """Thrust over the mean square of `fin_velocity`, and half of its 95 % interval [N].
-
-        None while the error is larger than the factor.
-        """
-        if self._factor_variance is None or not self._anchored:
-            return None
-        spread = math.sqrt(self._factor_variance + self._of_size)
-        error = math.hypot(INTERVAL * spread, SHAPE * self._factor)
-        return (self._factor, error) if error < self._factor else None
+        size = self._size() or self._factor.size
+        variance = (error / Z95) ** 2
+        self._prior = self._factor = Factor(factor, variance, self._now, size, self._factor.wave)
+        self._first = None
+        self._show_factor()
 
     def update(self, seen: Observation, running: bool, wave: Wave) -> None:
         """Take in a tick.
 
-        running: is a controller active?
-        wave: which one it is, and with which parameters; another object where it is another one
+        running: whether a controller is active
+        wave: the active controller and its parameters; a new object after each change
         """
-        moved = seen.instruction_angle != self._angle
-        self._still = 0.0 if moved else self._still + seen.dt
-        self._angle = seen.instruction_angle
+        angle, self._now = seen.instruction_angle, seen.time
+        self._still = 0.0 if angle != self._angle else self._still + seen.dt
+        self._angle = angle
         swims = running and self._still < STILL
-        if swims != self._swims or (swims and wave is not self._wave):
-            self._swims, self._wave, self._phase, self._side = swims, wave, 0.0, 0.0
-            self._block = None
-            self._beats.clear()
-            self._at_rest = 0.0
-            self._noises[swims].forget()  # there was drift since
-            if swims:
-                self._take_up(wave)
+        if swims is not self._swims or (swims and wave is not self._wave):
+            self._change(swims, wave)
         self._phase += seen.dt
-        # Of the instruction angle during this window: a beat ends with the window before it.
-        ends = self._reversed(seen.instruction_angle) if swims else True
-        if ends and self._block:
-            self._block.beats += 1
-        if ends and self._block and self._block.lasts >= PIECE - 1e-9:
-            self._close(self._block, seen.time - seen.dt)
-            self._block = None
-        if ends and not self._block and self._phase > (SWIM_SETTLES if swims else REST_SETTLES):
-            self._block = _Block()
-        if self._block:
+        if not swims or self._reverses(angle):
+            # The angle of this window follows a reversal: the beat ended with the window before.
+            if self._recording:
+                self._block.beats += 1
+                if self._block.duration >= PIECE - 1e-9:
+                    self._block.end = seen.time - seen.dt
+                    self._recording = False
+                    self._close(self._block)
+            if not self._recording and self._phase > (SWIM_SETTLES if swims else REST_SETTLES):
+                self._block, self._recording = _Block(swims), True
+        if self._recording:
             self._block.add(seen)
-            if self._block.lasts > LONGEST_BEAT:
-                self._block = None
-                self._beats.clear()
-        self._know(seen)
+            if self._block.duration > LONGEST_BEAT:
+                self._recording = False
+                self._shown.clear()
+        if not (self._shown if swims else self._run):
+            self._show_settling(seen)
 
-    def _take_up(self, wave: Wave) -> None:
-        """Another wave than that of the factor makes the factor uncertain."""
-        other = self._factor_wave is not None and wave != self._factor_wave
-        if other and self._factor_variance is not None:
-            self._factor_variance += (OTHER_WAVE * self._factor) ** 2
-            self._factor_size = None  # its size is in that already
-        self._factor_wave = wave
-
-    def _reversed(self, angle: float) -> bool:
-        """Has the instruction angle become positive?"""
+    def _reverses(self, angle: float) -> bool:
+        """Return whether the instruction angle has become positive."""
         before = self._side
         if angle:
             self._side = math.copysign(1.0, angle)
         return before < 0.0 < self._side
 
-    def _close(self, block: "_Block", time: float) -> None:
-        """Learn from a block that ended at `time` [s]."""
-        power = 0.0
+    def _change(self, swims: bool, wave: Wave) -> None:
+        """Begin a rest, a swim, or a swim of another controller."""
+        goes_on = swims and self._swims and wave[0] == self._wave[0]
+        self._swims, self._wave = swims, wave
+        if goes_on:  # in another phase, or with other parameters: their effect shows in the beats
+            if self._now - self._settling_since > RETUNE_PAUSE:
+                self._settling_since = self._now
+                self._recording, self._phase = False, 0.0
+            return
+        self._settling_since = self._now
+        self._start_run(self._level() or self._before)
+        self._recording, self._phase, self._side = False, 0.0, 0.0
+        self._shown.clear()
+        self._show_factor()
+
+    def _start_run(self, before: Level | None) -> None:
+        """Begin a run of blocks of one wave and size, or of one rest.
+
+        before: the force before it; None where that is not known
+        """
+        self._before, self._prior = before, self._factor
+        self._run: deque[_Block] = deque(maxlen=2 * MAX_BLOCKS)
+        self._first: list[_Block] | None = []
+        """The first blocks of the run; None where the change before it must not be used."""
+        self._odd: _Block | None = None
+        """The latest block, where its force has jumped: the next one tells a spike from a step."""
+        self._doubt = 0.0
+        """Variance of the level by a jump that the next block must confirm [N²]."""
+        self._resized: list[_Block] = []
+        """The latest blocks, where they are of another size than the run."""
+        self._jumped = 0.0
+        """Variance of the change before the run by jumps since then [N²]."""
+        self._drift.start()
+
+    def _close(self, block: "_Block") -> None:
+        """Take in a block of whole beats, or a piece of a rest."""
         if self._swims:
-            power = block.power
-            self._beats.append(block)
-            while len(self._beats) > 1 and sum(beat.lasts for beat in self._beats) > SPAN:
-                self._beats.popleft()
-            lasts = sum(beat.lasts for beat in self._beats)
-            self._power = sum(beat.power * beat.lasts for beat in self._beats) / lasts
-            if power > 0.0:
-                frequency = block.beats / block.lasts
-                self._size = complex(0.5 * math.log(power), math.log(frequency))
-            if self._factor_variance is None and power > 0.0:
-                self._factor_variance = (UNKNOWN / power) ** 2
+            self._shown.append(block)
+            while len(self._shown) > 1 and sum(each.duration for each in self._shown) > SPAN:
+                self._shown.popleft()
+        if not self._resizes(block) and not self._jumps(block):
+            self._append(block)
+        if self._before and self._first:
+            after = _level(self._first[: self._count(block.duration)], self._noise)
+            after = after._replace(variance=after.variance + self._jumped)
+            self._factor = self._prior.after_step(
+                self._before, after, self._drift.rate, self._run_wave
+            )
+        if self._swims:
+            self._show_beats()
         else:
-            self._anchored = True
-        self._wait(time)
-        noise, before = self._noises[self._swims], self._factor_variance
-        if self._factor_size is None:
-            self._factor_size = self._size
-        shape = self._of_size * power**2
-        if self._learn(block.force, power, noise.variance + shape):
-            noise.compare(block.force)
-        else:
-            noise.forget()
-        if power > 0.0 and before:
-            self._move_size(1.0 - (self._factor_variance or 0.0) / before)
-        self._at_rest = block.force - self._zero
-        if not self._swims:
-            self._rested = time
+            self._show_rest(block)
 
     @property
-    def _of_size(self) -> float:
-        """Variance that the factor has for the latest beats, as it is of beats of another size."""
-        if self._size is None or self._factor_size is None:
-            return 0.0
-        return (OTHER_SIZE * abs(self._size - self._factor_size) * self._factor) ** 2
+    def _noise(self) -> "_Noise":
+        return self._noises[self._swims]
 
-    def _move_size(self, learnt: float) -> None:
-        """The factor is now by so large a share that of the latest beat."""
-        if self._size is not None and self._factor_size is not None:
-            self._factor_size += learnt * (self._size - self._factor_size)
+    def _count(self, duration: float) -> int:
+        """Return how many blocks of that duration [s] give the most certain mean.
 
-    def _wait(self, time: float) -> None:
-        """What is known becomes less certain with time."""
-        passed = max(0.0, time - self._time) if self._time > -math.inf else 0.0
-        self._time = time
-        self._zero_variance += self._wander * passed
-        if self._factor_variance is not None:
-            self._factor_variance += (FACTOR_WALKS * self._factor) ** 2 * passed
-
-    def _learn(self, force: float, power: float, variance: float) -> bool:
-        """A step of the filter: force = zero + factor * power + noise of that variance.
-
-        False where the zero has jumped, or this was a spike: what comes next will tell.
+        Fewer have more noise, more have more drift.
         """
-        a, b, c = self._zero_variance, self._covariance, self._factor_variance or 0.0
-        surprise = force - self._zero - self._factor * power
-        along, across = a + b * power, b + c * power
-        total = along + across * power + variance
-        if power == 0.0 and surprise**2 > BROKEN**2 * total:
-            self._zero_variance += surprise**2
+        drift = self._drift.rate * duration
+        best = math.sqrt(3.0 * self._noise.variance / drift) if drift else MAX_BLOCKS
+        least = MIN_BLOCKS if duration < LONG_BLOCK else 1
+        return round(max(least, min(MAX_BLOCKS, best)))
+
+    def _level(self) -> Level | None:
+        """Return the level at the end of the run; None where it has no block."""
+        if not self._run:
+            return None
+        count = self._count(self._run[-1].duration)
+        level = _level(list(self._run)[-count:], self._noise)
+        return level._replace(variance=level.variance + self._doubt)
+
+    def _difference(self, block: "_Block", *others: "_Block") -> float:
+        """Return the force of a block beyond that of others, their powers allowed for [N].
+
+        others: the latest blocks of the run by default
+        """
+        others = others or tuple(self._run)[-MIN_BLOCKS:]
+        force = sum(each.force for each in others) / len(others)
+        power = sum(each.power for each in others) / len(others)
+        return block.force - force - self._factor.value * (block.power - power)
+
+    def _jumps(self, block: "_Block") -> bool:
+        """Set a block aside whose force jumps, or begin again where the jump lasts.
+
+        Return True where the block is not part of the run, or is already.
+        """
+        if not self._run:
             return False
-        gap = self._time - self._rested
-        if power == 0.0 and 2.0 * PIECE < gap < math.inf:  # a swim was between
-            more = surprise**2 - total if surprise**2 > INTERVAL**2 * total else 0.0
-            self._wander = max(self._least_wander, WANDER_FADES * self._wander + more / gap)
-        self._zero += along / total * surprise
-        self._factor += across / total * surprise
-        self._zero_variance = max(0.0, a - along * along / total)
-        self._covariance = b - along * across / total
-        if self._factor_variance is not None:
-            self._factor_variance = max(0.0, c - across * across / total)
+        odd, self._odd, self._doubt = self._odd, None, 0.0
+        difference = self._difference(block)
+        lag = block.end - self._run[-1].end
+        limit = JUMP**2 * (1.5 * self._noise.variance + self._drift.rate * lag)
+        if difference**2 <= limit:
+            return False  # and an odd block before it was a spike
+        if odd is None:
+            self._odd, self._doubt = block, difference**2
+            return True
+        if self._first is not None and len(self._first) < MAX_BLOCKS:
+            self._jumped += difference**2
+            if not self._swims:
+                self._first.clear()
+        self._run.clear()
+        if self._difference(block, odd) ** 2 > limit:
+            self._doubt = difference**2
+        self._append(block)
         return True
 
-    def _know(self, seen: Observation) -> None:
-        """Thrust and error now."""
-        passed = seen.time - self._time
-        if self._swims and self._beats and self._factor_variance is not None:
-            thrust = self._factor * self._power
-            spread = self._factor_variance + (FACTOR_WALKS * self._factor) ** 2 * passed
-            spread += self._of_size
-            error = math.hypot(INTERVAL * self._power * math.sqrt(spread), SHAPE * thrust)
-        elif not self._swims:
-            thrust = self._at_rest
-            spread = self._zero_variance + self._wander * passed + self._noises[False].variance
-            error = INTERVAL * math.sqrt(spread)
-        elif seen.frequency:  # the first beats, or the first of another wave
-            thrust = seen.thrust - self._zero
-            spread = self._zero_variance + self._wander * passed + self._noises[True].variance
-            error = INTERVAL * math.sqrt(spread)
-        else:
-            thrust, error = 0.0, math.inf
-        known = self._anchored and error < MOST_KNOWN
-        self.thrust, self.error = (thrust, error) if known else (None, 0.0)
+    def _resizes(self, block: "_Block") -> bool:
+        """Begin another run where the wave has another size, and keeps it.
+
+        Return True where the block is not part of the run, or is already.
+        """
+        if block.size is None or not self._run or self._run[0].size is None:
+            return False
+        reference = sum(each.size or 0j for each in self._run) / len(self._run)
+        limit = max(SIZE_STEP, CLEAR_STEP * math.sqrt(self._noise.size_variance))
+        if abs(block.size - reference) <= limit:
+            self._resized.clear()
+            return False
+        resized = self._resized = [*self._resized[-MAX_BLOCKS:], block][-self._count(PIECE) :]
+        mean = sum(each.size or 0j for each in resized) / len(resized)
+        alike = all(abs((each.size or 0j) - mean) < SAME_SIZE for each in resized)
+        if len(resized) >= MIN_BLOCKS and alike:
+            self._start_run(self._level())
+            for each in resized:
+                self._append(each)
+        return True
+
+    def _append(self, block: "_Block") -> None:
+        """Add a block to the run, and compare it with those before."""
+        run = self._run
+        if not run:
+            self._run_wave = self._wave
+        if run and block.begin - run[-1].end < 0.5 * block.duration:
+            size = abs(block.size - run[-1].size) if block.size and run[-1].size else 0.0
+            self._noise.add(self._difference(block, run[-1]), size)
+        for other in run:
+            lag = block.end - other.end
+            if lag <= DRIFT_LAG + 1e-9:
+                if lag >= MIN_DRIFT_LAG:
+                    self._drift.add(self._difference(block, other), lag, self._noise.variance)
+                break
+        run.append(block)
+        if self._first is not None and len(self._first) < MAX_BLOCKS:
+            self._first.append(block)
+
+    def _size(self) -> complex | None:
+        """Return the size of the shown beats; None where there are none."""
+        return _level(tuple(self._shown), self._noise).size if self._shown else None
+
+    def _thrust_of(self, level: Level) -> tuple[float, float]:
+        """Return the thrust of a level [N], and its variance [N²]."""
+        factor = self._prior if level is self._before else self._factor
+        thrust = level.thrust + factor.value * level.power
+        if not level.power:
+            return thrust, level.thrust_variance
+        return thrust, level.thrust_variance + factor.variance * level.power**2
+
+    def _show(self, thrust: float, ci95: float) -> None:
+        known = ci95 < MAX_CI95
+        self.thrust, self.error = (thrust, ci95) if known else (None, 0.0)
+
+    def _show_factor(self) -> None:
+        """Renew `factor`, for the shown beats where there are some."""
+        factor = self._factor.at(self._now)
+        wave = None if self._shown or not self._swims else self._wave
+        spread = factor.variance + factor.scatter(self._size(), wave)
+        ci95 = math.hypot(Z95 * math.sqrt(spread), BEAT_SCATTER * factor.value)
+        self.factor = (factor.value, ci95) if ci95 < factor.value else None
+
+    def _show_beats(self) -> None:
+        self._show_factor()
+        factor, beats = self._factor.at(self._now), _level(tuple(self._shown), self._noise)
+        thrust = factor.value * beats.power
+        spread = factor.variance + factor.scatter(beats.size)
+        self._show(thrust, math.hypot(Z95 * beats.power * math.sqrt(spread), BEAT_SCATTER * thrust))
+
+    def _show_rest(self, piece: "_Block") -> None:
+        self._show_factor()
+        level = self._level()
+        assert level
+        spread = level.variance + self._noise.variance + self._drift.rate * piece.duration
+        self._show(piece.force - level.force, Z95 * math.sqrt(spread))
+
+    def _show_settling(self, seen: Observation) -> None:
+        """Show the force beyond the zero before the change, until beats or pieces are whole."""
+        if self._before is None or (self._swims and not seen.frequency):
+            self.thrust = None
+            return
+        before, noise = self._before, self._noise.variance
+        thrust, spread = self._thrust_of(before)
+        spread += before.variance + noise + self._drift.rate * (seen.time - before.end)
+        force = seen.thrust - before.force + thrust if self._swims else 0.0
+        self._show(force, Z95 * math.sqrt(spread))
 
 
 class _Block:
-    """Sums of a whole beat, or of a piece of a rest."""
+    """Some whole beats of a swim, or a piece of a rest."""
 
-    def __init__(self) -> None:
-        self.lasts = 0.0
+    __slots__ = ("_energy", "_impulse", "_swims", "beats", "duration", "end")
+
+    def __init__(self, swims: bool) -> None:
+        self.duration = self.end = 0.0
         self.beats = 0
+        self._swims = swims
         self._impulse = self._energy = 0.0
 
     def add(self, seen: Observation) -> None:
-        self.lasts += seen.dt
+        self.duration += seen.dt
         self._impulse += seen.fx * seen.dt
         self._energy += seen.fin_velocity**2 * seen.dt
 
     @property
+    def begin(self) -> float:
+        """[s]"""
+        return self.end - self.duration
+
+    @property
     def force(self) -> float:
         """Mean F_x [N]."""
-        return self._impulse / self.lasts
+        return self._impulse / self.duration
 
     @property
     def power(self) -> float:
-        """Mean square of the fin velocity."""
-        return self._energy / self.lasts
+        """Mean square of the fin velocity; 0 at rest."""
+        return self._energy / self.duration if self._swims else 0.0
+
+    @property
+    def size(self) -> complex | None:
+        """Size of the wave, as in `Level`; None where the fin does not move."""
+        power = self.power
+        if not power > 0.0:
+            return None
+        return complex(0.5 * math.log(power), math.log(self.beats / self.duration))
+
+
+def _level(blocks: Sequence[_Block], noise: "_Noise") -> Level:
+    """Return the means over consecutive blocks."""
+    duration = sum(each.duration for each in blocks)
+    power = sum(each.power * each.duration for each in blocks) / duration
+    beats = sum(each.beats for each in blocks)
+    return Level(
+        force=sum(each.force * each.duration for each in blocks) / duration,
+        variance=noise.variance / len(blocks),
+        power=power,
+        size=complex(0.5 * math.log(power), math.log(beats / duration)) if power > 0.0 else None,
+        begin=blocks[0].begin,
+        end=blocks[-1].end,
+    )
 
 
 class _Noise:
-    """Variance of the force of blocks, from one to the next, so that hardly any drift is in it."""
+    """Variances of the force and of the size of blocks, from each to the next."""
 
     def __init__(self) -> None:
-        self.variance = _NOISE**2
+        self.variance = INITIAL_NOISE**2
+        self.size_variance = 0.0
         self._count = 1
-        self._before: float | None = None
 
-    def compare(self, force: float) -> None:
-        """Take in the force of another block."""
-        if self._before is not None:
-            found = 0.5 * (force - self._before) ** 2
-            self._count = min(self._count + 1, _COMPARISONS)
-            self.variance += (found - self.variance) / self._count
-        self._before = force
-
-    def forget(self) -> None:
-        """The next block is not to be compared with those before."""
-        self._before = None
+    def add(self, force: float, size: float) -> None:
+        """Take in the differences between a block and the one before it."""
+        self._count = min(self._count + 1, NOISE_MEMORY)
+        self.variance += (0.5 * force**2 - self.variance) / self._count
+        self.size_variance += (0.5 * size**2 - self.size_variance) / self._count
