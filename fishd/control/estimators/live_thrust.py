@@ -75,20 +75,18 @@ class LiveThrust:
         """Thrust over the mean square of `fin_velocity`, and the half-width of its interval [N].
 
         None while the half-width is larger than the factor."""
-        self._factor = self._prior = Factor()
-        """The factor, and what it was before the latest change."""
+        self._factor = Factor()
         self._drift = Drift(zero_drift**2)
         self._noises = {True: _Noise(), False: _Noise()}
         """Noise of swims and of rests."""
         self._swims = self._recording = False
         self._wave: Wave = ("", {})
-        self._run_wave = self._wave
         self._now = self._phase = self._still = self._angle = self._side = 0.0
         self._settling_since = -math.inf
         self._block = _Block(False)
         self._shown: deque[_Block] = deque()
         """The latest blocks of the swim, no longer than `SPAN` in all."""
-        self._start_run(None)
+        self._run = _Run(None, self._factor)
 
     def forget_zero(self) -> None:
         """Discard the forces so far: the zero of the sensor was set."""
@@ -125,8 +123,8 @@ class LiveThrust:
         """
         size = self._size() or self._factor.size
         variance = (error / Z95) ** 2
-        self._prior = self._factor = Factor(factor, variance, self._now, size, self._factor.wave)
-        self._first = None
+        self._factor = Factor(factor, variance, self._now, size, self._factor.wave)
+        self._run.before = None  # the measurement has used that change
         self._show_factor()
 
     def update(self, seen: Observation, running: bool, wave: Wave) -> None:
@@ -157,7 +155,7 @@ class LiveThrust:
             if self._block.duration > LONGEST_BEAT:
                 self._recording = False
                 self._shown.clear()
-        if not (self._shown if swims else self._run):
+        if not (self._shown if swims else self._run.blocks):
             self._show_settling(seen)
 
     def _reverses(self, angle: float) -> bool:
@@ -177,28 +175,14 @@ class LiveThrust:
                 self._recording, self._phase = False, 0.0
             return
         self._settling_since = self._now
-        self._start_run(self._level() or self._before)
+        self._start_run(self._level() or self._run.before)
         self._recording, self._phase, self._side = False, 0.0, 0.0
         self._shown.clear()
         self._show_factor()
 
     def _start_run(self, before: Level | None) -> None:
-        """Begin a run of blocks of one wave and size, or of one rest.
-
-        before: the force before it; None where that is not known
-        """
-        self._before, self._prior = before, self._factor
-        self._run: deque[_Block] = deque(maxlen=2 * MAX_BLOCKS)
-        self._first: list[_Block] | None = []
-        """The first blocks of the run; None where the change before it must not be used."""
-        self._odd: _Block | None = None
-        """The latest block, where its force has jumped: the next one tells a spike from a step."""
-        self._doubt = 0.0
-        """Variance of the level by a jump that the next block must confirm [N²]."""
-        self._resized: list[_Block] = []
-        """The latest blocks, where they are of another size than the run."""
-        self._jumped = 0.0
-        """Variance of the change before the run by jumps since then [N²]."""
+        """Begin a run; before: the level before it, None where that is not known."""
+        self._run = _Run(before, self._factor)
         self._drift.start()
 
     def _close(self, block: "_Block") -> None:
@@ -209,12 +193,12 @@ class LiveThrust:
                 self._shown.popleft()
         if not self._resizes(block) and not self._jumps(block):
             self._append(block)
-        if self._before and self._first:
-            after = _level(self._first[: self._count(block.duration)], self._noise)
-            after = after._replace(variance=after.variance + self._jumped)
-            self._factor = self._prior.after_step(
-                self._before, after, self._drift.rate, self._run_wave
-            )
+        run = self._run
+        if run.before and run.first:
+            run.started = run.started or len(run.first) >= self._count(block.duration)
+            after = _level(run.first, self._noise)
+            after = after._replace(variance=after.variance + run.jumped)
+            self._factor = run.prior.after_step(run.before, after, self._drift.rate, run.wave)
         if self._swims:
             self._show_beats()
         else:
@@ -236,64 +220,67 @@ class LiveThrust:
 
     def _level(self) -> Level | None:
         """Return the level at the end of the run; None where it has no block."""
-        if not self._run:
+        run = self._run
+        if not run.blocks:
             return None
-        count = self._count(self._run[-1].duration)
-        level = _level(list(self._run)[-count:], self._noise)
-        return level._replace(variance=level.variance + self._doubt)
+        count = self._count(run.blocks[-1].duration)
+        level = _level(list(run.blocks)[-count:], self._noise)
+        return level._replace(variance=level.variance + run.doubt)
 
     def _difference(self, block: "_Block", *others: "_Block") -> float:
-        """Return the force of a block beyond that of others, their powers allowed for [N].
+        """Return the force of a block less that of others, the powers allowed for [N].
 
         others: the latest blocks of the run by default
         """
-        others = others or tuple(self._run)[-MIN_BLOCKS:]
+        others = others or tuple(self._run.blocks)[-MIN_BLOCKS:]
         force = sum(each.force for each in others) / len(others)
         power = sum(each.power for each in others) / len(others)
         return block.force - force - self._factor.value * (block.power - power)
 
     def _jumps(self, block: "_Block") -> bool:
-        """Set a block aside whose force jumps, or begin again where the jump lasts.
+        """Set aside a block whose force jumps; begin again with the next one if it confirms that.
 
-        Return True where the block is not part of the run, or is already.
+        Return True where the block is not to be appended to the run.
         """
-        if not self._run:
+        run = self._run
+        if not run.blocks:
             return False
-        odd, self._odd, self._doubt = self._odd, None, 0.0
+        odd, run.odd, run.doubt = run.odd, None, 0.0
         difference = self._difference(block)
-        lag = block.end - self._run[-1].end
+        lag = block.end - run.blocks[-1].end
         limit = JUMP**2 * (1.5 * self._noise.variance + self._drift.rate * lag)
         if difference**2 <= limit:
             return False  # and an odd block before it was a spike
         if odd is None:
-            self._odd, self._doubt = block, difference**2
+            run.odd, run.doubt = block, difference**2
             return True
-        if self._first is not None and len(self._first) < MAX_BLOCKS:
-            self._jumped += difference**2
+        if not run.started:
+            run.jumped += difference**2
             if not self._swims:
-                self._first.clear()
-        self._run.clear()
+                run.first.clear()
+        run.blocks.clear()
         if self._difference(block, odd) ** 2 > limit:
-            self._doubt = difference**2
-        self._append(block)
-        return True
+            run.doubt = difference**2
+        return False
 
     def _resizes(self, block: "_Block") -> bool:
         """Begin another run where the wave has another size, and keeps it.
 
-        Return True where the block is not part of the run, or is already.
+        Return True where the block is not to be appended to the run.
         """
-        if block.size is None or not self._run or self._run[0].size is None:
+        run = self._run
+        if block.size is None or not run.blocks or run.blocks[0].size is None:
             return False
-        reference = sum(each.size or 0j for each in self._run) / len(self._run)
+        reference = sum(each.size or 0j for each in run.blocks) / len(run.blocks)
         limit = max(SIZE_STEP, CLEAR_STEP * math.sqrt(self._noise.size_variance))
         if abs(block.size - reference) <= limit:
-            self._resized.clear()
+            run.resized.clear()
             return False
-        resized = self._resized = [*self._resized[-MAX_BLOCKS:], block][-self._count(PIECE) :]
+        count = max(MIN_BLOCKS, self._count(block.duration))
+        resized = run.resized = [*run.resized, block][-count:]
         mean = sum(each.size or 0j for each in resized) / len(resized)
         alike = all(abs((each.size or 0j) - mean) < SAME_SIZE for each in resized)
-        if len(resized) >= MIN_BLOCKS and alike:
+        if alike and len(resized) >= MIN_BLOCKS:
             self._start_run(self._level())
             for each in resized:
                 self._append(each)
@@ -301,21 +288,21 @@ class LiveThrust:
 
     def _append(self, block: "_Block") -> None:
         """Add a block to the run, and compare it with those before."""
-        run = self._run
-        if not run:
-            self._run_wave = self._wave
-        if run and block.begin - run[-1].end < 0.5 * block.duration:
-            size = abs(block.size - run[-1].size) if block.size and run[-1].size else 0.0
-            self._noise.add(self._difference(block, run[-1]), size)
-        for other in run:
+        run, blocks = self._run, self._run.blocks
+        if not blocks:
+            run.wave = self._wave
+        elif block.begin - blocks[-1].end < 0.5 * block.duration:
+            size = abs(block.size - blocks[-1].size) if block.size and blocks[-1].size else 0.0
+            self._noise.add(self._difference(block, blocks[-1]), size)
+        for other in blocks:
             lag = block.end - other.end
             if lag <= DRIFT_LAG + 1e-9:
                 if lag >= MIN_DRIFT_LAG:
                     self._drift.add(self._difference(block, other), lag, self._noise.variance)
                 break
-        run.append(block)
-        if self._first is not None and len(self._first) < MAX_BLOCKS:
-            self._first.append(block)
+        blocks.append(block)
+        if not run.started:
+            run.first.append(block)
 
     def _size(self) -> complex | None:
         """Return the size of the shown beats; None where there are none."""
@@ -323,7 +310,7 @@ class LiveThrust:
 
     def _thrust_of(self, level: Level) -> tuple[float, float]:
         """Return the thrust of a level [N], and its variance [N²]."""
-        factor = self._prior if level is self._before else self._factor
+        factor = self._run.prior if level is self._run.before else self._factor
         thrust = level.thrust + factor.value * level.power
         if not level.power:
             return thrust, level.thrust_variance
@@ -357,10 +344,10 @@ class LiveThrust:
 
     def _show_settling(self, seen: Observation) -> None:
         """Show the force beyond the zero before the change, until beats or pieces are whole."""
-        if self._before is None or (self._swims and not seen.frequency):
+        before, noise = self._run.before, self._noise.variance
+        if before is None or (self._swims and not seen.frequency):
             self.thrust = None
             return
-        before, noise = self._before, self._noise.variance
         thrust, spread = self._thrust_of(before)
         spread += before.variance + noise + self._drift.rate * (seen.time - before.end)
         force = seen.thrust - before.force + thrust if self._swims else 0.0
@@ -405,6 +392,27 @@ class _Block:
         if not power > 0.0:
             return None
         return complex(0.5 * math.log(power), math.log(self.beats / self.duration))
+
+
+class _Run:
+    """Blocks of one wave of one size, or of one rest, and the level before them."""
+
+    def __init__(self, before: Level | None, prior: Factor) -> None:
+        self.before, self.prior = before, prior
+        """The level and the factor before the change that began the run."""
+        self.wave: Wave = ("", {})
+        self.blocks: deque[_Block] = deque(maxlen=2 * MAX_BLOCKS)
+        """The latest blocks."""
+        self.first: list[_Block] = []
+        """The first blocks, which are compared with `before`."""
+        self.started = False
+        """Whether these are all of them."""
+        self.resized: list[_Block] = []
+        """Blocks of another size since the latest block of the run."""
+        self.odd: _Block | None = None
+        """The latest block, where its force jumped."""
+        self.doubt = self.jumped = 0.0
+        """Variances of the level now, and of the change before the run, by jumps [N²]."""
 
 
 def _level(blocks: Sequence[_Block], noise: "_Noise") -> Level:

@@ -9,7 +9,8 @@ import math
 from typing import Any, NamedTuple
 
 FACTOR_WALK = 0.001
-"""Standard deviation by which the true factor changes in a second, as a fraction of it [1/√s]."""
+"""Standard deviation by which the true factor changes in a second, as a fraction of it [1/√s]: 6 %
+in an hour."""
 WAVE_SCATTER = 0.3
 """Standard deviation of the factor from one wave to another, as a fraction of it. It is as large as
 that where `estimator.leak` is not that of the fish."""
@@ -23,6 +24,8 @@ UNKNOWN_THRUST = 1.0
 DRIFT_NEAR = 8
 """Number of comparisons from which the drift near a change is taken, before it and after it: about
 5 s of a swim."""
+CLEAR_DRIFT = 2.0
+"""Number of standard deviations of the noise beyond which a change of the force is a drift."""
 DRIFT_LAG = 2.5
 """Time over which the drift is observed, about that from a rest to a steady swim [s]."""
 
@@ -156,11 +159,12 @@ class Drift:
         """Take in a change of the force in a steady swim or rest.
 
         change: change of the force, that of the power allowed for [N]
-        lag: time of that change, at most `DRIFT_LAG` [s]; in a longer one the force is taken to
-            change in proportion
+        lag: time of that change, at most `DRIFT_LAG` [s]
         noise: variance of either force by noise [N²]
         """
-        rate = (change**2 - 2.0 * noise) * DRIFT_LAG / lag**2
+        rate = (change**2 - 2.0 * noise) / lag
+        if change**2 > CLEAR_DRIFT**2 * 2.0 * noise:  # it may go on at this speed
+            rate *= DRIFT_LAG / lag
         self._sum += rate
         self._count += 1
         self._fresh += 1

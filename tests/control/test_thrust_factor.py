@@ -1,0 +1,128 @@
+"""The ratio of thrust to power is learned from changes of the force, and from nothing else."""
+
+import math
+import random
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fishd.control.estimators.live_thrust import LiveThrust
+from fishd.core.signals import Observation
+
+TICK = 0.3
+"""A beat has two ticks [s]."""
+TRUE_FACTOR = 75.0
+POWER = 3.4e-4
+"""Mean square of the fin velocity: a thrust of 25.5 mN."""
+
+
+class Rig:
+    """Whole beats of a fish whose force sensor is noisy and drifts."""
+
+    def __init__(
+        self,
+        seed: int,
+        force_noise: float = 1e-3,
+        power_noise: float = 0.03,
+        walk: float = 6e-4,
+        zero_drift: float = 6e-4,
+    ) -> None:
+        """Set up a sensor.
+
+        force_noise: standard deviation of the force of a tick [N]
+        power_noise: standard deviation of the measured power of a beat, as a fraction of it
+        walk: standard deviation of the change of the zero after a second [N/√s]
+        """
+        self.random = random.Random(seed)
+        self.live = LiveThrust(zero_drift)
+        self.zero = self.time = 0.0
+        self.force_noise, self.power_noise, self.walk = force_noise, power_noise, walk
+        self.wave = ("swing", {"C": 0.6})
+
+    def _tick(self, angle: float, thrust: float, velocity: float) -> None:
+        self.time += TICK
+        self.zero += self.random.gauss(0.0, self.walk * math.sqrt(TICK))
+        fx = self.zero + thrust + self.random.gauss(0.0, self.force_noise)
+        seen = Observation(
+            self.time, TICK, fx, 0.0, 0.0, velocity, angle, angle, fx, 1.0 / (2 * TICK)
+        )
+        self.live.update(seen, angle != 0.0, self.wave)
+
+    def rest(self, seconds: float = 3.0) -> None:
+        for _ in range(round(seconds / TICK)):
+            self._tick(0.0, 0.0, 0.0)
+
+    def beats(self, count: int, power: float = POWER) -> None:
+        """Swim; the power of each beat is measured with an error of its own."""
+        for _ in range(count):
+            measured = power * max(0.1, self.random.gauss(1.0, self.power_noise))
+            velocity = math.sqrt(measured)
+            for angle in (0.4, -0.4):
+                self._tick(angle, TRUE_FACTOR * power, velocity)
+
+
+class Judged(NamedTuple):
+    """Errors of the factor, as fractions of it."""
+
+    error: float
+    ci95: float
+
+
+def judged(rig: Rig) -> Judged:
+    assert rig.live.factor
+    value, ci95 = rig.live.factor
+    return Judged(value / TRUE_FACTOR - 1.0, ci95 / TRUE_FACTOR)
+
+
+def test_a_steady_swim_of_20_000_beats_changes_no_factor() -> None:
+    rig = Rig(0)
+    rig.rest()
+    rig.beats(20)
+    before = judged(rig)
+    rig.beats(20_000)
+    after = judged(rig)
+    assert after.error == pytest.approx(before.error, abs=1e-5)
+    assert abs(after.error) < after.ci95
+    assert after.ci95 > before.ci95
+
+
+def random_swims(rig: Rig, beats: int) -> Iterator[Judged]:
+    """Rests, waves of several sizes, and changes between them at random."""
+    swum = 0
+    while swum < beats:
+        if rig.random.random() < 0.4:
+            rig.rest(rig.random.uniform(2.5, 8.0))
+        power = POWER * math.exp(rig.random.uniform(-2.0, 0.3))
+        count = rig.random.randint(8, 120)
+        rig.beats(count, power)
+        swum += count
+        if rig.live.factor:
+            yield judged(rig)
+
+
+@pytest.mark.slow
+def test_the_factor_is_unbiased_over_100_000_beats_of_random_waves() -> None:
+    found = [each for seed in range(20) for each in random_swims(Rig(seed), 5_000)]
+    mean = sum(each.error for each in found) / len(found)
+    inside = sum(abs(each.error) < each.ci95 for each in found) / len(found)
+    assert abs(mean) < 0.005
+    assert inside > 0.93
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    force_noise=st.sampled_from((0.0, 1e-3, 5e-3)),
+    power_noise=st.sampled_from((0.0, 0.02, 0.1)),
+    walk=st.sampled_from((0.0, 6e-4, 3e-3)),
+)
+def test_the_interval_of_the_factor_holds_it_whatever_the_noise_and_the_drift(
+    seed: int, force_noise: float, power_noise: float, walk: float
+) -> None:
+    found = list(random_swims(Rig(seed, force_noise, power_noise, walk), 1_000))
+    off = [each for each in found if abs(each.error) > each.ci95]
+    assert len(off) <= 0.25 * len(found) + 1
+    assert all(abs(each.error) < 3.0 * each.ci95 for each in found)
