@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.core.signals import Observation
@@ -104,25 +102,21 @@ def random_swims(rig: Rig, beats: int) -> Iterator[Judged]:
 
 
 @pytest.mark.slow
-def test_the_factor_is_unbiased_over_100_000_beats_of_random_waves() -> None:
-    found = [each for seed in range(20) for each in random_swims(Rig(seed), 5_000)]
-    mean = sum(each.error for each in found) / len(found)
-    inside = sum(abs(each.error) < each.ci95 for each in found) / len(found)
-    assert abs(mean) < 0.005
-    assert inside > 0.93
-
-
-@settings(max_examples=10, deadline=None)
-@given(
-    seed=st.integers(0, 10_000),
-    force_noise=st.sampled_from((0.0, 1e-3, 5e-3)),
-    power_noise=st.sampled_from((0.0, 0.02, 0.1)),
-    walk=st.sampled_from((0.0, 6e-4, 3e-3)),
-)
-def test_the_interval_of_the_factor_holds_it_whatever_the_noise_and_the_drift(
-    seed: int, force_noise: float, power_noise: float, walk: float
-) -> None:
-    found = list(random_swims(Rig(seed, force_noise, power_noise, walk), 1_000))
-    off = [each for each in found if abs(each.error) > each.ci95]
-    assert len(off) <= 0.25 * len(found) + 1
+def test_the_factor_is_unbiased_over_100_000_beats_whatever_the_noise_and_the_drift() -> None:
+    found = []
+    for seed in range(100):
+        chance = random.Random(seed)
+        rig = Rig(
+            seed,
+            force_noise=chance.choice((0.0, 1e-3, 5e-3)),
+            power_noise=chance.choice((0.0, 0.02, 0.1)),
+            walk=chance.choice((0.0, 6e-4, 3e-3)),
+        )
+        found += random_swims(rig, 1_000)
+    # each weighed by how well it claims to be known
+    weights = [each.ci95**-2 for each in found]
+    weighed = zip(found, weights, strict=True)
+    mean = sum(each.error * weight for each, weight in weighed) / sum(weights)
+    assert abs(mean) < 0.01
+    assert sum(abs(each.error) < each.ci95 for each in found) > 0.9 * len(found)
     assert all(abs(each.error) < 3.0 * each.ci95 for each in found)

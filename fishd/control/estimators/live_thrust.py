@@ -83,7 +83,7 @@ class LiveThrust:
         self._wave: Wave = ("", {})
         self._now = self._phase = self._still = self._angle = self._side = 0.0
         self._settling_since = -math.inf
-        self._block = _Block(False)
+        self._block = _Block()
         self._shown: deque[_Block] = deque()
         """The latest blocks of the swim, no longer than `SPAN` in all."""
         self._run = _Run(None, self._factor)
@@ -124,8 +124,11 @@ class LiveThrust:
         size = self._size() or self._factor.size
         variance = (error / Z95) ** 2
         self._factor = Factor(factor, variance, self._now, size, self._factor.wave)
-        self._run.before = None  # the measurement has used that change
-        self._show_factor()
+        self._run.used = True  # that change, by the measurement
+        if self._shown:
+            self._show_beats()
+        else:
+            self._show_factor()
 
     def update(self, seen: Observation, running: bool, wave: Wave) -> None:
         """Take in a tick.
@@ -140,16 +143,19 @@ class LiveThrust:
         if swims is not self._swims or (swims and wave is not self._wave):
             self._change(swims, wave)
         self._phase += seen.dt
-        if not swims or self._reverses(angle):
+        side = self._side
+        if swims and angle:
+            self._side = angle
+        if not swims or side < 0.0 < angle:
             # The angle of this window follows a reversal: the beat ended with the window before.
             if self._recording:
                 self._block.beats += 1
                 if self._block.duration >= PIECE - 1e-9:
-                    self._block.end = seen.time - seen.dt
+                    self._block.close(seen.time - seen.dt, swims)
                     self._recording = False
                     self._close(self._block)
             if not self._recording and self._phase > (SWIM_SETTLES if swims else REST_SETTLES):
-                self._block, self._recording = _Block(swims), True
+                self._block, self._recording = _Block(), True
         if self._recording:
             self._block.add(seen)
             if self._block.duration > LONGEST_BEAT:
@@ -157,13 +163,6 @@ class LiveThrust:
                 self._shown.clear()
         if not (self._shown if swims else self._run.blocks):
             self._show_settling(seen)
-
-    def _reverses(self, angle: float) -> bool:
-        """Return whether the instruction angle has become positive."""
-        before = self._side
-        if angle:
-            self._side = math.copysign(1.0, angle)
-        return before < 0.0 < self._side
 
     def _change(self, swims: bool, wave: Wave) -> None:
         """Begin a rest, a swim, or a swim of another controller."""
@@ -194,7 +193,7 @@ class LiveThrust:
         if not self._resizes(block) and not self._jumps(block):
             self._append(block)
         run = self._run
-        if run.before and run.first:
+        if run.before and run.first and not run.used:
             run.started = run.started or len(run.first) >= self._count(block.duration)
             after = _level(run.first, self._noise)
             after = after._replace(variance=after.variance + run.jumped)
@@ -232,10 +231,12 @@ class LiveThrust:
 
         others: the latest blocks of the run by default
         """
+        difference = 0.0
         others = others or tuple(self._run.blocks)[-MIN_BLOCKS:]
-        force = sum(each.force for each in others) / len(others)
-        power = sum(each.power for each in others) / len(others)
-        return block.force - force - self._factor.value * (block.power - power)
+        for other in others:
+            power = block.power - other.power
+            difference += block.force - other.force - self._factor.value * power
+        return difference / len(others)
 
     def _jumps(self, block: "_Block") -> bool:
         """Set aside a block whose force jumps; begin again with the next one if it confirms that.
@@ -269,11 +270,10 @@ class LiveThrust:
         Return True where the block is not to be appended to the run.
         """
         run = self._run
-        if block.size is None or not run.blocks or run.blocks[0].size is None:
+        if block.size is None or run.size is None:
             return False
-        reference = sum(each.size or 0j for each in run.blocks) / len(run.blocks)
         limit = max(SIZE_STEP, CLEAR_STEP * math.sqrt(self._noise.size_variance))
-        if abs(block.size - reference) <= limit:
+        if abs(block.size - run.size) <= limit:
             run.resized.clear()
             return False
         count = max(MIN_BLOCKS, self._count(block.duration))
@@ -301,6 +301,10 @@ class LiveThrust:
                     self._drift.add(self._difference(block, other), lag, self._noise.variance)
                 break
         blocks.append(block)
+        if block.size is not None:
+            run.size = (
+                block.size if run.size is None else run.size + (block.size - run.size) / len(blocks)
+            )
         if not run.started:
             run.first.append(block)
 
@@ -357,41 +361,33 @@ class LiveThrust:
 class _Block:
     """Some whole beats of a swim, or a piece of a rest."""
 
-    __slots__ = ("_energy", "_impulse", "_swims", "beats", "duration", "end")
-
-    def __init__(self, swims: bool) -> None:
-        self.duration = self.end = 0.0
+    def __init__(self) -> None:
+        self.duration = 0.0
         self.beats = 0
-        self._swims = swims
+        self.begin = self.end = 0.0
+        """[s]; these and the following are set by `close`."""
+        self.force = 0.0
+        """Mean F_x [N]."""
+        self.power = 0.0
+        """Mean square of the fin velocity; 0 at rest."""
+        self.size: complex | None = None
+        """Size of the wave, as in `Level`; None where the fin does not move."""
         self._impulse = self._energy = 0.0
 
     def add(self, seen: Observation) -> None:
-        self.duration += seen.dt
-        self._impulse += seen.fx * seen.dt
-        self._energy += seen.fin_velocity**2 * seen.dt
+        """Take in a tick."""
+        dt = seen.dt
+        self.duration += dt
+        self._impulse += seen.fx * dt
+        self._energy += seen.fin_velocity**2 * dt
 
-    @property
-    def begin(self) -> float:
-        """[s]"""
-        return self.end - self.duration
-
-    @property
-    def force(self) -> float:
-        """Mean F_x [N]."""
-        return self._impulse / self.duration
-
-    @property
-    def power(self) -> float:
-        """Mean square of the fin velocity; 0 at rest."""
-        return self._energy / self.duration if self._swims else 0.0
-
-    @property
-    def size(self) -> complex | None:
-        """Size of the wave, as in `Level`; None where the fin does not move."""
-        power = self.power
-        if not power > 0.0:
-            return None
-        return complex(0.5 * math.log(power), math.log(self.beats / self.duration))
+    def close(self, end: float, swims: bool) -> None:
+        """End the block at a time [s]."""
+        self.begin, self.end = end - self.duration, end
+        self.force = self._impulse / self.duration
+        if swims and self._energy > 0.0:
+            self.power = self._energy / self.duration
+            self.size = _size(self.power, self.beats / self.duration)
 
 
 class _Run:
@@ -403,8 +399,12 @@ class _Run:
         self.wave: Wave = ("", {})
         self.blocks: deque[_Block] = deque(maxlen=2 * MAX_BLOCKS)
         """The latest blocks."""
+        self.size: complex | None = None
+        """Mean size of the blocks; None at rest."""
         self.first: list[_Block] = []
         """The first blocks, which are compared with `before`."""
+        self.used = False
+        """Whether the change before the run must not be used."""
         self.started = False
         """Whether these are all of them."""
         self.resized: list[_Block] = []
@@ -417,17 +417,25 @@ class _Run:
 
 def _level(blocks: Sequence[_Block], noise: "_Noise") -> Level:
     """Return the means over consecutive blocks."""
-    duration = sum(each.duration for each in blocks)
-    power = sum(each.power * each.duration for each in blocks) / duration
-    beats = sum(each.beats for each in blocks)
+    duration = impulse = energy = 0.0
+    beats = 0
+    for each in blocks:
+        duration += each.duration
+        impulse += each.force * each.duration
+        energy += each.power * each.duration
+        beats += each.beats
     return Level(
-        force=sum(each.force * each.duration for each in blocks) / duration,
+        force=impulse / duration,
         variance=noise.variance / len(blocks),
-        power=power,
-        size=complex(0.5 * math.log(power), math.log(beats / duration)) if power > 0.0 else None,
+        power=energy / duration,
+        size=_size(energy / duration, beats / duration) if energy > 0.0 else None,
         begin=blocks[0].begin,
         end=blocks[-1].end,
     )
+
+
+def _size(power: float, frequency: float) -> complex:
+    return complex(0.5 * math.log(power), math.log(frequency))
 
 
 class _Noise:

@@ -26,6 +26,8 @@ DRIFT_NEAR = 8
 5 s of a swim."""
 CLEAR_DRIFT = 2.0
 """Number of standard deviations of the noise beyond which a change of the force is a drift."""
+DRIFT_MEMORY = 64
+"""Number of comparisons that the drift so far is averaged over: about 40 s."""
 DRIFT_LAG = 2.5
 """Time over which the drift is observed, about that from a rest to a steady swim [s]."""
 
@@ -145,15 +147,15 @@ class Drift:
         """least: smallest rate, as configured [N²/s]"""
         self._least = least
         self._sum = 0.0
-        self._count = self._fresh = 0
+        self._count = self._fresh = self._total = 0
         self._recent = 0.0
-        self._near: float | None = None
+        self._near = 0.0
 
     def start(self) -> None:
         """Begin a swim or a rest: the drift before it counts as half of what is near the change."""
-        self._count = DRIFT_NEAR if self._count else 0
+        self._count = min(self._total, DRIFT_NEAR)
         self._sum = self._recent * self._count
-        self._fresh, self._near = 0, None
+        self._fresh, self._near = 0, 0.0
 
     def add(self, change: float, lag: float, noise: float) -> None:
         """Take in a change of the force in a steady swim or rest.
@@ -168,7 +170,8 @@ class Drift:
         self._sum += rate
         self._count += 1
         self._fresh += 1
-        self._recent += (rate - self._recent) / min(self._count, DRIFT_NEAR)
+        self._total += 1
+        self._recent += (rate - self._recent) / min(self._total, DRIFT_MEMORY)
         if self._fresh == DRIFT_NEAR:
             self._near = self._sum / self._count
 
@@ -176,8 +179,9 @@ class Drift:
     def rate(self) -> float:
         """Variance of the change of the zero after a second [N²/s].
 
-        The largest of the configured one, of the mean since the swim or rest began, and of that
-        near its begin: a drift that has ended since still counts for the change that began it.
+        The largest of the configured one, of the means over the latest comparisons and since the
+        swim or rest began, and of that near its begin: a drift that has ended since still counts
+        for the change that began it.
         """
         mean = self._sum / self._count if self._count else 0.0
-        return max(self._least, mean, self._near or 0.0)
+        return max(self._least, self._recent, mean, self._near)
