@@ -15,6 +15,7 @@ from fishd.config.drivers import claims_of
 from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.fin_sensor import FinSensor
 from fishd.control.estimators.lateral_force import LateralForceEstimator
+from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
@@ -411,6 +412,7 @@ def build_loop(
         clock=clock,
         publisher=publisher,
         notify=notify,
+        lateral_sign=LateralSign(config.estimator.reversed_fy),
     )
     start = config.start
     if start.controller is not None:

@@ -47,6 +47,11 @@ FAULTS = {
         "computed well; or a plant of another package has failed",
         "change what the message says, and start fishd again: this fish is gone",
     ),
+    "fy-reversed": Fault(
+        "the first push of the tail has shown that F_y is reversed, `estimator.reversed_fy` is "
+        "`refuse`, and the controller uses F_y",
+        "calibrate the force sensor or the servo, as the message says",
+    ),
     "estimate-error": Fault(
         "the estimator raised an exception, or gave what is no finite number",
         "report it, with the log: it is an error in fishd",

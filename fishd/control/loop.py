@@ -25,7 +25,7 @@ from fishd.controllers.base import Controller, Limits
 from fishd.core import text
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
-from fishd.core.errors import ControllerFault, FishLost, SensorError
+from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
 from fishd.core.foreign_code import contained
 from fishd.core.signals import Measurement, Observation
 from fishd.hardware.base import Robot
@@ -62,6 +62,7 @@ class ControlLoop:
         clock: Clock,
         publisher: Publisher,
         notify: Callable[[float], None] = lambda now: None,
+        lateral_sign: LateralSign | None = None,
     ) -> None:
         """notify: called at the end of every tick with the time of its start [s, monotonic]"""
         self.robot = robot
@@ -80,7 +81,9 @@ class ControlLoop:
         self.neutral_for = 0.0
         """How long the instruction angle has been zero [s]."""
         self.thrust = thrust
-        self.lateral_sign = LateralSign()
+        self.lateral_sign = lateral_sign or LateralSign()
+        self.fy_corrected = False
+        """Whether the latest observation has F_y with the other sign than it is measured with."""
         self.observation: Observation | None = None
         """What the latest tick observed."""
         self._estimator = estimator
@@ -127,7 +130,7 @@ class ControlLoop:
         suspect = bool(measurement.suspect)
         estimated = self._estimate(self._once_more() if suspect else measurement, slot, dt)
         self.observation = observation = self._follow_thrust(estimated, suspect)
-        self._watch_sign(observation, suspect)
+        self._watch_sign(observation, measurement.fy, suspect)
         return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
@@ -156,6 +159,8 @@ class ControlLoop:
         Raises `Refused` while a fault or an emergency stop is latched.
         """
         self.supervisor.check_startable()
+        if self._is_refused(controller):
+            raise Refused("fy-reversed", self.lateral_sign.complaint)
         self._await_nobody()
         self.active.replace(name, controller)
         active = self.active
@@ -278,6 +283,9 @@ class ControlLoop:
 
     def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
         try:
+            if self.fy_corrected is not self.lateral_sign.corrected:
+                self._estimator.reverse_fy()
+                self.fy_corrected = self._estimator.fy_corrected
             seen = self._estimator.update(measurement, self.applied, slot.deadline, dt)
             if not math.isfinite(seen.fy_rate + seen.fin_velocity + seen.thrust):
                 raise ArithmeticError(f"it gave a fin velocity of {seen.fin_velocity}")
@@ -311,19 +319,28 @@ class ControlLoop:
             return observation
         return replace(observation, thrust_factor=known[0], thrust_factor_error=known[1])
 
-    def _watch_sign(self, observation: Observation, suspect: bool) -> None:
-        """Notice, when the tail sets off, that F_y is reversed."""
+    def _watch_sign(self, observation: Observation, fy: float, suspect: bool) -> None:
+        """Notice, when the tail sets off, that F_y is reversed.
+
+        fy: as it is measured [N]
+        """
         if self.supervisor.sensor_lost or not self.limits.tethered:
             return
         if suspect:
             self.lateral_sign.rest()
             return
         try:
-            if self.lateral_sign.update(observation) and self.lateral_sign.reversed:
+            if self.lateral_sign.update(observation, fy) and self.lateral_sign.reversed:
                 self.reporter.event("calibration", self.lateral_sign.complaint, "warning")
+                if self._is_refused(self.active.controller):
+                    self.supervisor.fail("fy-reversed", self.lateral_sign.complaint)
         except ArithmeticError as error:
             self.reporter.problem("the sign of F_y cannot be told, and is found anew", error)
             self.lateral_sign.forget()
+
+    def _is_refused(self, controller: Controller[Any]) -> bool:
+        # `is not False`: what another package has made of it raises nothing here.
+        return self.lateral_sign.refuses and type(controller).uses_lateral_force is not False
 
     def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].

@@ -113,6 +113,7 @@ class Reporter:
         factor_error = observation.thrust_factor_error if swims else None
         truth = loop.robot.truth() if loop.robot.truth else None
         course = truth.course if truth else None
+        corrected = loop.fy_corrected
         self._publisher.tick(
             Tick(
                 t=self._clock.wall(),
@@ -121,7 +122,7 @@ class Reporter:
                 controller=loop.active.name,
                 fx=measurement.fx,
                 fy=measurement.fy,
-                fy_rate=observation.fy_rate,
+                fy_rate=-observation.fy_rate if corrected else observation.fy_rate,
                 fin_velocity=observation.fin_velocity,
                 phi_c=loop.applied,
                 servo_on=loop.servo.on,
@@ -150,6 +151,7 @@ class Reporter:
                 thrust_factor_error=UNSET if factor_error is None else factor_error,
                 power=UNSET if power is None else power,
                 leak=UNSET if loop.found_leak is None else loop.found_leak,
+                fy_corrected=True if corrected else UNSET,
                 suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
             )
         )

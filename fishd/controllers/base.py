@@ -93,6 +93,10 @@ class Controller(ABC, Generic[P]):
     swims_like: ClassVar[Likeness | None] = None
     """What is known of the thrust of that other controller's wave holds for this one's, too."""
 
+    uses_lateral_force: ClassVar[bool] = True
+    """False where neither F_y nor the fin velocity changes what it commands: then it may start
+    although F_y is known to be reversed and `estimator.reversed_fy` is refuse."""
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Raises TypeError where its quantities cannot be shown."""
         super().__init_subclass__(**kwargs)

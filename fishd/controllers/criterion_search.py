@@ -1,13 +1,19 @@
 """Finds the C with which `swing` pushes most, by trying its neighbours there and back.
 
-What is compared is the ripple of F_x. A fin that swings as α = A sin ωt gives
-F_x = −Kαα̈ = ½KA²ω² (1 − cos 2ωt): the force ripples twice a beat, and by as much as its mean. The
-mean drifts with the sensor and the ripple does not. What a turned sensor mixes in of F_y is taken
-off first, so the sign of F_y does not matter; and what comes once a beat does not count.
+Two signs of the thrust are compared, the ripple and the mean of F_x. A fin that swings as
+α = A sin ωt gives F_x = −Kαα̈ = ½KA²ω² (1 − cos 2ωt): the force ripples twice a beat, and by as much
+as its mean. The ripple does not drift with the sensor, but other shapes of the beat have a ripple
+that is a few percent larger or smaller for the same thrust. The mean is the thrust itself, and
+drifts. The difference of a trial from the gait before and after it is free of a steady drift, and
+how much the drift bends is seen in three such gaits in turn. So each counts by how well it is
+known: on a rig that hardly drifts the mean decides, on another one the ripple.
+
+What a turned sensor mixes in of F_y is taken off first, so the sign of F_y does not matter.
 """
 
 import math
 import statistics
+from collections import deque
 from enum import Enum
 from typing import NamedTuple
 
@@ -35,6 +41,13 @@ BEATS = 3
 """Whole beats by which a rung is judged, after one in which the fin settles."""
 CLEAR = 0.01
 """A rung is taken where its ripple is larger by this share than before and after it."""
+RIPPLE_BIAS = 0.04
+"""Standard deviation of the ripple's gain from the thrust's, as gaits differ in shape [1]."""
+DRIFT_AT_FIRST = 0.03
+"""Error of a gain by the mean of F_x, by a zero that does not drift steadily, before three gaits in
+turn have shown any: as a share of the ripple [1]."""
+BENDS = 8
+"""Number of latest such errors that are remembered."""
 SURE = 1.0
 """A trial is repeated while its gain is known no better than within so many standard errors,"""
 ROUNDS = 3
@@ -69,6 +82,36 @@ class Judgement(NamedTuple):
     """Its standard error [N]."""
     half_beat: float
     """Mean [s]."""
+    level: float
+    """Mean of F_x: the thrust, and the zero of the sensor [N]."""
+    level_error: float
+    """Standard error of `level`, drift not counted [N]."""
+
+
+class Gain(NamedTuple):
+    """Relative gain of a trial over the mean of the gaits before and after it."""
+
+    ripple: float
+    """By the ripple [1]."""
+    ripple_variance: float
+    level: float
+    """By the mean of F_x [1]."""
+    level_variance: float
+
+
+def compare_gaits(before: Judgement, trial: Judgement, after: Judgement) -> Gain:
+    """Return the gain of a trial; the ripple of a sine is its thrust over √2, which is the unit."""
+    ripple = 0.5 * (before.ripple + after.ripple)
+    level = 0.5 * (before.level + after.level)
+    noise = trial.error**2 + 0.25 * (before.error**2 + after.error**2)
+    level_noise = trial.level_error**2 + 0.25 * (before.level_error**2 + after.level_error**2)
+    thrust = math.sqrt(2.0) * ripple
+    return Gain(
+        trial.ripple / ripple - 1.0,
+        noise / ripple**2,
+        (trial.level - level) / thrust,
+        level_noise / thrust**2,
+    )
 
 
 class Phase(Enum):
@@ -95,9 +138,10 @@ class CriterionSearch:
         self._lost = 0.0  # ripple that a lost gait had
         self._trials = list(NEIGHBOURS)
         self._turn = 0
-        self._reference = self._trial = Judgement(0.0, 0.0, 0.0)
-        self._gains: list[float] = []  # of this trial, in each round
-        self._noise = 0.0  # variance of their sum
+        self._reference = self._trial = Judgement(0.0, 0.0, 0.0, 0.0, 0.0)
+        self._gains: list[Gain] = []  # of this trial, in each round
+        self._levels: deque[float] = deque(maxlen=3)  # of the gait in use, in turn [N]
+        self._bends: deque[float] = deque(maxlen=BENDS)  # of the zero [N]
         self._known = 0.0
         self._watched = 0.0
         self._side = 0.0
@@ -161,7 +205,7 @@ class CriterionSearch:
 
     def _gait(self) -> Judgement:
         """As the half beats since the phase began show it."""
-        squares = self._ripples(self._halves)
+        squares, levels = self._ripples(self._halves)
         middle = statistics.median(squares)
         half_beat = self._lasted / len(self._halves)
         self.ripple = math.sqrt(middle)
@@ -171,7 +215,12 @@ class CriterionSearch:
         error = (
             0.5 * 1.25 * scatter * math.sqrt(1.5 / len(squares)) / self.ripple if middle else 0.0
         )
-        return Judgement(self.ripple, error, half_beat)
+        level = statistics.mean(levels[::2])
+        scatter = 1.25 * statistics.mean(abs(each - level) for each in levels)
+        level_error = scatter * math.sqrt(1.5 / len(levels))
+        if len(self._halves) < 2 * BEATS:  # the gait is not settled, and a turned sensor shows it
+            level_error = self.ripple
+        return Judgement(self.ripple, error, half_beat, level, level_error)
 
     def _judge(self, gait: Judgement) -> None:
         """Go on, knowing the gait of a whole phase."""
@@ -179,6 +228,8 @@ class CriterionSearch:
             case Phase.LAUNCH:
                 self._begin(Phase.BEFORE)
             case Phase.BEFORE:
+                self._levels.clear()
+                self._levels.append(gait.level)
                 self._resume(gait)
             case Phase.TRIAL:
                 self._trial = gait
@@ -221,11 +272,14 @@ class CriterionSearch:
             self._avoided.add(self._place + self._trials.pop(0))
             self._launch(before.ripple)
             return
-        self._gains.append(self._trial.ripple - 0.5 * (before.ripple + after.ripple))
-        self._noise += self._trial.error**2 + 0.25 * (before.error**2 + after.error**2)
-        rounds = len(self._gains)
-        above = sum(self._gains) / rounds - CLEAR * after.ripple
-        if abs(above) < SURE * math.sqrt(self._noise) / rounds and rounds < ROUNDS:
+        self._levels.append(after.level)
+        if len(self._levels) == 3:
+            first, middle, last = self._levels
+            self._bends.append((first - 2.0 * middle + last) / 8.0)
+        self._gains.append(compare_gaits(before, self._trial, after))
+        gain, error = self._mean_gain()
+        above = gain - CLEAR
+        if abs(above) < SURE * error and len(self._gains) < ROUNDS:
             self._begin(Phase.TRIAL)
             return
         step = self._trials.pop(0)
@@ -241,6 +295,21 @@ class CriterionSearch:
             if self._trial.ripple < WORSE * after.ripple:
                 self._avoided.add(self._place + step)
             self._try_next()
+
+    def _mean_gain(self) -> tuple[float, float]:
+        """Return the relative gain of the trial by all its rounds, and its standard error [1]."""
+        rounds = len(self._gains)
+        ripple, noise, level, level_noise = (
+            sum(column) / rounds for column in zip(*self._gains, strict=True)
+        )
+        noise, level_noise = noise / rounds, level_noise / rounds
+        ripple_now = self._reference.ripple
+        bends = [bend / ripple_now for bend in self._bends]
+        # Of the zero midway between two gaits, as a share of the thrust. Rounds do not average it.
+        level_noise += 0.5 * statistics.mean(bend**2 for bend in (*bends, DRIFT_AT_FIRST))
+        share = level_noise / (level_noise + noise + RIPPLE_BIAS**2)  # by which the ripple counts
+        error = math.hypot(share * math.sqrt(noise), (1.0 - share) * math.sqrt(level_noise))
+        return share * ripple + (1.0 - share) * level, error
 
     def _look_beyond(self) -> None:
         """This rung gives the gait that is in use: try the next one instead."""
@@ -258,7 +327,7 @@ class CriterionSearch:
             self._trials.pop(0)
         if not self._trials:
             self._known, self._watched = self._reference.ripple, 0.0
-        self._gains, self._noise = [], 0.0
+        self._gains = []
         self._begin(Phase.TRIAL if self._trials else Phase.WATCH)
 
     def _may_try(self, place: int) -> bool:

@@ -49,6 +49,7 @@ class Excitation(Controller[ExcitationParameters]):
     """
 
     Parameters = ExcitationParameters
+    uses_lateral_force = False
 
     def __init__(self, parameters: ExcitationParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)

@@ -23,6 +23,7 @@ class Hold(Controller[HoldParameters]):
     """Hold one instruction angle, neutral unless told otherwise."""
 
     Parameters = HoldParameters
+    uses_lateral_force = False
 
     @classmethod
     def check(cls, parameters: HoldParameters, limits: Limits) -> None:

@@ -9,13 +9,16 @@ SPIKE = 6.0
 """A force is a spike if it is so many times further from what is usual than half of the others."""
 
 
-def ripples(halves: list[list[tuple[float, float]]]) -> list[float]:
-    """Mean squares of the ripple in each two half beats that follow one another [N²].
+def ripples(halves: list[list[tuple[float, float]]]) -> tuple[list[float], list[float]]:
+    """Return mean squares of the ripple [N²] and means [N] of F_x.
+
+    There is one of each for each two half beats that follow one another.
 
     halves: F_x and F_y of each tick, from reversal to reversal [N]; two of them or more
     """
     cleaned = _without_spikes(_without_lateral_force(halves))
-    return [_square(np.concatenate(beat)) for beat in pairwise(cleaned)]
+    beats = [np.concatenate(beat) for beat in pairwise(cleaned)]
+    return [_square(beat) for beat in beats], [float(beat.mean()) for beat in beats]
 
 
 def _without_lateral_force(halves: list[list[tuple[float, float]]]) -> list[NDArray[np.float64]]:
@@ -24,7 +27,7 @@ def _without_lateral_force(halves: list[list[tuple[float, float]]]) -> list[NDAr
     level = fy - fy.mean()
     spread = level @ level
     if spread:
-        fx = fx - fy * (level @ fx) / spread
+        fx = fx - level * (level @ fx) / spread
     return np.split(fx, np.cumsum([len(half) for half in halves])[:-1])
 
 

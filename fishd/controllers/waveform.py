@@ -52,6 +52,7 @@ class Waveform(Controller[WaveformParameters]):
     """
 
     Parameters = WaveformParameters
+    uses_lateral_force = False
     two_ticks_are_a_beat: ClassVar[bool] = True
     """Else it stands still where each beat has just two."""
     phase: float = quantity("1", "Phase of the waveform: 0 to 1 over one period.")

@@ -203,6 +203,13 @@ class Tick(Struct, frozen=True, gc=False):
         float | UnsetType,
         unit("s", "The leak in use, with `estimator.leak: auto`; absent with a number."),
     ] = UNSET
+    fy_corrected: Annotated[
+        bool | UnsetType,
+        note(
+            "True where estimator and controller were shown `fy` and `fy_rate` with the other "
+            "sign; absent where as they are. See `estimator.reversed_fy`."
+        ),
+    ] = UNSET
     suspect: Annotated[
         str | UnsetType,
         note(
@@ -424,8 +431,8 @@ class Status(Struct, frozen=True):
     fy_reversed: Annotated[
         bool | None,
         note(
-            "Is F_y reversed against the tail, as it was seen when the tail set off from rest? "
-            "null while it was not seen."
+            "Is F_y, as it is measured, reversed against the tail? Seen when the tail set off from "
+            "rest; null while it was not seen."
         ),
     ] = None
     leak: Annotated[

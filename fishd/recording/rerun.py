@@ -203,10 +203,16 @@ class _Rerun:
             self._believed = replace(measurement, samples=0)
         else:
             measurement = self._believed
+        corrected = tick.fy_corrected is True
+        if corrected is not self._estimator.fy_corrected:
+            self._estimator.reverse_fy()
         again = self._estimator.update(measurement, applied, tick.t, dt)
+        recorded = {name: getattr(tick, name) for name in ESTIMATES}
+        if corrected:
+            recorded["fy_rate"] = -tick.fy_rate
         self.estimates.ticks += 1
         self.estimates.equal += all(
-            getattr(again, name) == getattr(tick, name) for name in ESTIMATES
+            getattr(again, name) == value for name, value in recorded.items()
         )
         if self._estimates_again:
             return again
@@ -215,7 +221,7 @@ class _Rerun:
             previous_angle=self._before,
             thrust_factor=_known(tick.thrust_factor),
             thrust_factor_error=_known(tick.thrust_factor_error),
-            **{name: getattr(tick, name) for name in ESTIMATES},
+            **recorded,
         )
 
     def _compare(

@@ -12,7 +12,10 @@ from rigs.processes import PATIENCE, Daemon, wait_until
 from fishd.client import Fish
 from fishd.core.calibration import ForceCalibration
 
-LINE = "F_y is reversed: it pushed the way in which the tail set off, so swing and policies fail"
+LINE = (
+    "F_y is reversed: it pushed the way in which the tail set off, so controllers are shown it with "
+    "the other sign"
+)
 
 REST, FIRST_PUSH = 50, 40
 """More than what the sign of F_y takes to be judged [ticks]."""

@@ -1,35 +1,41 @@
-"""A reversed F_y is noticed when the tail sets off, on any fish, and a right one never doubted."""
+"""A reversed F_y is noticed when the tail sets off, on any fish, and a right one never doubted.
+
+Then controllers swim as if it were right, or are refused, as configured.
+"""
 
 import dataclasses
+import statistics
+from collections.abc import Callable
 
 import pytest
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
-from rigs.harness import Rig, fragile_rig, observe
+from rigs.harness import Rig, Scripted, fragile_rig, observe
+from rigs.reversed_force import Interchanged, reversed_robot
 
 from fishd.control.estimators.lateral_sign import LateralSign
-from fishd.core.signals import Measurement
-from fishd.hardware.base import ForceSensor, Robot
+from fishd.core.errors import Refused
+from fishd.core.signals import Measurement, Observation, Tick
+from fishd.hardware.base import Robot
 from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH, harsh
 
 REST = 3.0
+Wrap = Callable[[Robot], Robot]
 
 
-class Interchanged:
-    """A force sensor whose wires of F_y are interchanged."""
-
-    def __init__(self, sensor: ForceSensor) -> None:
-        self._sensor = sensor
-
-    def read(self, now: float) -> Measurement:
-        measured = self._sensor.read(now)
-        return replace(measured, fy=-measured.fy)
-
-    def close(self) -> None:
-        self._sensor.close()
+def thrust(ticks: list[Tick], rig: Rig) -> float:
+    """Return the mean true thrust [N]."""
+    squares = [tick.alpha_rate**2 for tick in ticks if not isinstance(tick.alpha_rate, UnsetType)]
+    return rig.config.plant.thrust_coefficient * statistics.mean(squares)
 
 
-def reversed_robot(robot: Robot) -> Robot:
-    return dataclasses.replace(robot, sensor=Interchanged(robot.sensor))
+def swum(controller: str, parameters: dict[str, object], *overrides: str, wrap: Wrap) -> float:
+    """Return the mean thrust from 5 to 35 s after a start from rest [N]."""
+    rig = Rig(*overrides, wrap=wrap)
+    rig.run_for(REST)
+    rig.start(controller, **parameters)
+    rig.run_for(5.0)
+    return thrust(rig.run_for(30.0), rig)
 
 
 def started(rig: Rig, controller: str = "swing", **parameters: object) -> bool | None:
@@ -75,8 +81,8 @@ def test_a_right_sign_is_no_event_and_no_complaint() -> None:
 def test_a_hang_as_the_tail_sets_off_shows_nothing() -> None:
     sign = LateralSign()
     for _ in range(100):
-        sign.update(replace(observe(), dt=0.05, instruction_angle=0.0))
-    assert not sign.update(replace(observe(), dt=5.0, instruction_angle=0.42))
+        sign.update(replace(observe(), dt=0.05, instruction_angle=0.0), 0.0)
+    assert not sign.update(replace(observe(), dt=5.0, instruction_angle=0.42), 0.0)
     assert sign.reversed is None
 
 
@@ -133,3 +139,130 @@ def test_a_new_calibration_is_seen_anew_and_a_tare_asks_for_a_rest() -> None:
     rig.run_for(1.0)
     assert rig.loop.lateral_sign.reversed is None
     assert started(rig) is True
+
+
+@pytest.mark.parametrize(
+    ("controller", "parameters", "overrides"),
+    [
+        ("swing", {}, ()),
+        ("swing", {"C": 0.95, "lead": 0.1}, ("plant.servo_delay=0.05",)),
+        ("swing", {"C": "auto"}, ()),
+        ("swing", {}, ("estimator.kind=observer",)),
+        ("swing", {}, ("estimator.leak=auto", "plant.lateral_drag=0.12")),
+        ("swing", {}, harsh(FIRST_SEED).overrides),
+        ("ppo", {"policy": "default-fish"}, ()),
+        ("ppo", {"policy": "default-fish"}, harsh(FIRST_SEED).overrides),
+    ],
+)
+def test_after_the_first_push_a_fish_with_a_reversed_force_swims_as_well_as_with_a_right_one(
+    controller: str, parameters: dict[str, object], overrides: tuple[str, ...]
+) -> None:
+    right = swum(controller, parameters, *overrides, wrap=lambda robot: robot)
+    corrected = swum(controller, parameters, *overrides, wrap=reversed_robot)
+    assert corrected == pytest.approx(right, rel=0.02)
+
+
+def test_a_thrust_is_held_with_a_reversed_force_too() -> None:
+    held = swum("thrust", {"target": 0.015}, wrap=reversed_robot)
+    assert held == pytest.approx(0.015, rel=0.07)
+
+
+def test_controllers_see_the_other_sign_and_telemetry_the_force_as_measured() -> None:
+    rig = Rig("simulation.noise=0", wrap=reversed_robot)
+    seen: list[Observation] = []
+    square = [0.42] * 6 + [-0.42] * 6
+
+    def act(observation: Observation) -> float:
+        seen.append(observation)
+        return square[len(seen) % 12]
+
+    rig.run_for(REST)
+    rig.start(Scripted(act))
+    before, *ticks = rig.run_for(2.0)[-25:]
+    for last, tick, observation in zip([before, *ticks], ticks, seen[-24:], strict=False):
+        assert tick.fy_corrected is True
+        assert (observation.fy, observation.fy_rate) == (-tick.fy, -tick.fy_rate)
+        assert tick.fy_rate == pytest.approx((tick.fy - last.fy) / 0.05)
+        assert observation.fin_velocity == tick.fin_velocity
+    assert (
+        statistics.correlation(
+            [tick.fin_velocity for tick in ticks], [float(str(tick.alpha_rate)) for tick in ticks]
+        )
+        > 0.9
+    )
+
+
+def test_where_it_is_to_be_refused_the_first_push_is_a_fault_and_the_next_start_refused() -> None:
+    rig = Rig("estimator.reversed_fy=refuse", wrap=reversed_robot)
+    started(rig)
+    assert (rig.mode, rig.reason) == ("fault", "fy-reversed")
+    rig.run_for(REST)
+    rig.loop.clear_fault()
+    for controller, parameters in (("swing", {}), ("ppo", {"policy": "default-fish"})):
+        with pytest.raises(Refused, match="F_y is reversed") as refused:
+            rig.start(controller, **parameters)
+        assert refused.value.code == "fy-reversed"
+    rig.start("square", frequency=1.5)
+    rig.run_for(1.0)
+    assert rig.mode == "running"
+    rig.loop.forget_force(scale=True)
+    rig.start("swing")
+
+
+def test_a_wave_that_ignores_the_force_swims_on_where_it_is_to_be_refused() -> None:
+    rig = Rig("estimator.reversed_fy=refuse", wrap=reversed_robot)
+    assert started(rig, "square", frequency=1.5) is True
+    assert rig.mode == "running"
+
+
+def test_where_it_is_only_to_be_warned_of_nothing_is_corrected() -> None:
+    rig = Rig("estimator.reversed_fy=warn", wrap=reversed_robot)
+    assert started(rig) is True
+    assert not rig.loop.fy_corrected
+    assert "so swing and policies fail" in rig.loop.lateral_sign.complaint
+
+
+class Touched(Interchanged):
+    """A force sensor that somebody touches now and then, so that F_y seems to be reversed."""
+
+    touched = False
+
+    def read(self, now: float) -> Measurement:
+        measured = self._sensor.read(now)
+        return replace(measured, fy=-measured.fy) if self.touched else measured
+
+
+@pytest.mark.parametrize(
+    ("touches", "corrected"),
+    [((1, 0), (True, False)), ((0, 1, 0), (False,) * 3), ((0, 0, 1, 1, 0), (False,) * 5)],
+)
+def test_a_force_from_elsewhere_turns_no_sign_that_was_known_and_one_at_first_not_for_long(
+    touches: tuple[int, ...], corrected: tuple[bool, ...]
+) -> None:
+    sensors: list[Touched] = []
+
+    def touchable(robot: Robot) -> Robot:
+        sensors.append(Touched(robot.sensor))
+        return dataclasses.replace(robot, sensor=sensors[0])
+
+    rig = Rig(wrap=touchable)
+    found = []
+    for touch in touches:
+        rig.loop.stop()
+        rig.run_for(REST)
+        sensors[0].touched = bool(touch)
+        rig.start("square", frequency=1.0)
+        rig.run_for(0.5)
+        sensors[0].touched = False
+        rig.run_for(0.5)
+        found.append(rig.loop.fy_corrected)
+    assert tuple(found) == corrected
+
+
+def test_a_new_calibration_ends_the_correction_at_once() -> None:
+    rig = Rig(wrap=reversed_robot)
+    started(rig)
+    assert rig.loop.fy_corrected
+    rig.loop.forget_force(scale=True)
+    (tick,) = rig.run(1)
+    assert tick.fy_corrected is UNSET

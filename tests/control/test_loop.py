@@ -403,8 +403,8 @@ class Restless(Wrapped):
         return Measurement(now - self.reads * 1e-6, *forces, self.reads, "", extremes)
 
 
-ABSENT = {"x", "y", "speed", "heading", "leak", "suspect"}
-"""Fields of a swimmer, of an estimator that finds its leak, and of a force that nobody doubts."""
+ABSENT = {"x", "y", "speed", "heading", "leak", "suspect", "fy_corrected"}
+"""Fields of a swimmer, of an estimator that finds its leak, and of a force that is as it should."""
 
 
 @pytest.mark.parametrize(

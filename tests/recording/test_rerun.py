@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rigs.harness import Rig, fragile_rig
 from rigs.recordings import recorded, status, write
+from rigs.reversed_force import reversed_robot
 
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
@@ -51,6 +52,20 @@ def test_every_command_and_every_estimate_comes_out_to_the_last_bit(
         assert (stretch.equal, stretch.largest) == (stretch.ticks, 0.0)
     assert sum(stretch.ticks for stretch in result.stretches) == 241
     assert result.estimates.from_start
+    assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
+
+
+@pytest.mark.parametrize("kind", ["lateral_force", "observer"])
+def test_a_reversed_force_that_was_corrected_in_flight_is_corrected_again(
+    tmp_path: Path, kind: str
+) -> None:
+    rig = Rig(f"estimator.kind={kind}", wrap=reversed_robot)
+    rig.run_for(3)
+    rig.start("swing")
+    rig.run_for(5)
+    assert rig.loop.fy_corrected
+    result = rerun_of(rig, tmp_path / "run")
+    assert [(each.equal, each.ticks) for each in result.stretches] == [(100, 100)]
     assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
 
 

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from fishd.control.estimators.tail_beat import TailBeat
 from fishd.core.schema import note, unit
@@ -67,6 +68,15 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1000,
         ),
     ] = 1.0
+    reversed_fy: Annotated[
+        Literal["correct", "refuse", "warn"],
+        note(
+            "What follows when the first push of the tail shows that F_y is reversed. correct: "
+            "estimator and controllers take F_y with the other sign, and status says so. refuse: "
+            "mode fault, and no controller that uses F_y starts until F_y or the servo is "
+            "calibrated. warn: status says so, and the fish swims badly."
+        ),
+    ] = "correct"
     sensor_rotation: Annotated[
         float,
         unit(
@@ -82,6 +92,8 @@ class Estimator(ABC):
     """Adds force rate, fin velocity, thrust and tail-beat frequency to each measurement."""
 
     def __init__(self) -> None:
+        self.fy_corrected = False
+        """Whether F_y is taken with the other sign than it is measured with."""
         self._fy: float | None = None
         self._angle: float | None = None
         self._beat = TailBeat()
@@ -94,6 +106,12 @@ class Estimator(ABC):
         """The sensor's zero was set: the forces before tell nothing of those to come."""
         self._fy = None
 
+    def reverse_fy(self) -> None:
+        """Take F_y with the other sign from now on, in what is remembered of it, too."""
+        self.fy_corrected = not self.fy_corrected
+        if self._fy is not None:
+            self._fy = -self._fy
+
     def update(
         self, measurement: Measurement, instruction_angle: float, time: float, dt: float
     ) -> Observation:
@@ -103,6 +121,8 @@ class Estimator(ABC):
         time: start of the tick [s, monotonic]
         dt: time since the previous tick [s]
         """
+        if self.fy_corrected:
+            measurement = replace(measurement, fy=-measurement.fy)
         fy = measurement.fy
         fy_rate = (fy - self._fy) / dt if self._fy is not None else 0.0
         if measurement.samples:
@@ -131,4 +151,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
-        """The fin velocity now, after one more measurement; called once a tick."""
+        """The fin velocity now, after one more measurement; called once a tick.
+
+        measurement: with the sign of F_y that holds now
+        """

@@ -33,6 +33,15 @@ class LateralForceEstimator(Estimator):
         super().forget_zero()
         self._bias, self._fin_velocity = None, 0.0
 
+    def reverse_fy(self) -> None:
+        """As `Estimator.reverse_fy`."""
+        super().reverse_fy()
+        self._fin_velocity = -self._fin_velocity
+        if self._bias is not None:
+            self._bias = -self._bias
+        if self._search:
+            self._search.reverse_fy()
+
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
         """As `Estimator.fin_velocity`; about K times the fin velocity [N s]."""
         fy = measurement.fy

@@ -4,11 +4,12 @@ The water pushes back on a fin that sets off, so F_y points against the first pu
 since then is −(K α̇ + K_d α), and both grow with the fin on its way to that side (Fu et al., F_y).
 Once the fish swims, the sign cannot be told any more: half a beat later is the same as the other
 way round. Where F_y is reversed, or the servo turns the other way, the fin velocity is, too, and
-whoever goes by it reverses at the wrong moments.
+a controller that uses it reverses at the wrong moments.
 """
 
 import math
 from collections import deque
+from typing import Literal
 
 from fishd.core.signals import Observation
 
@@ -28,10 +29,19 @@ CLEAR = 10.0
 """The impulse must be so many times what noise makes of it."""
 ONE_WAY = 0.5
 """And point one way in most of the push, as a servo's own reaction may not: mean over mean size."""
+MAX_VOTES = 2
+"""Clear pushes that count at most, for a reversed F_y or against it."""
 LEAST_NOISE = 1e-6
 """No force is known better [N]."""
+Treatment = Literal["correct", "refuse", "warn"]
+"""What follows from a reversed F_y: see `estimator.reversed_fy`."""
+CONSEQUENCES: dict[Treatment, str] = {
+    "correct": "so controllers are shown it with the other sign",
+    "refuse": "so controllers that use it are refused",
+    "warn": "so swing and policies fail",
+}
 REVERSED = (
-    "F_y is reversed: it pushed the way in which the tail set off, so swing and policies fail; "
+    "F_y is reversed: it pushed the way in which the tail set off, {}; "
     "where a positive angle moves the tail to the fish's left, mend F_y with "
     "'fishctl calibrate force' (+y pulls to its left), else servo.direction with "
     "'fishctl calibrate servo'"
@@ -39,15 +49,25 @@ REVERSED = (
 
 
 class LateralSign:
-    """Watches the first push of each start from rest."""
+    """Watches the first push of each start from rest.
 
-    def __init__(self) -> None:
+    The first clear push decides at once. Each later one is a vote: so a force from elsewhere that
+    comes with one of them turns nothing round, and of one vote on either side the right sign wins.
+    """
+
+    def __init__(self, treatment: Treatment = "correct") -> None:
+        self.treatment = treatment
         self.forget()
 
     def forget(self) -> None:
         """The calibration of the sensor or of the servo was changed: nothing seen so far holds."""
         self.reversed: bool | None = None
-        """What the latest push that told anything showed; None while there was none."""
+        """Whether F_y is reversed as it is measured; None while no clear push was seen."""
+        self.corrected = False
+        """Whether F_y is to be taken with the other sign."""
+        self.refuses = False
+        """Whether controllers that use F_y may not swim."""
+        self._votes = 0  # of clear pushes, for a reversed F_y
         self.rest()
 
     def rest(self) -> None:
@@ -61,12 +81,15 @@ class LateralSign:
     @property
     def complaint(self) -> str:
         """One line: what is wrong and what to do; empty where F_y was not seen to be reversed."""
-        return REVERSED if self.reversed else ""
+        return REVERSED.format(CONSEQUENCES[self.treatment]) if self.reversed else ""
 
-    def update(self, seen: Observation) -> bool:
-        """Take in a tick; True where that shows the other sign than was known before."""
+    def update(self, seen: Observation, fy: float) -> bool:
+        """Take in a tick; True where another sign holds from now on than before.
+
+        fy: F_y as it is measured [N]; that of the observation may be corrected
+        """
         if self._push is None and seen.instruction_angle == 0.0:
-            self._at_rest(seen)
+            self._at_rest(seen, fy)
             return False
         if self._push is None:
             if self._rested < LEAST_REST:
@@ -77,20 +100,24 @@ class LateralSign:
         if size > LARGER * self._largest > 0.0:
             self._push = _Push(seen.instruction_angle, *self._level())
         self._largest = max(self._largest, size)
-        if self._push.add(seen):
+        if self._push.add(seen, fy):
             return False
         verdict = self._push.reversed
         self.rest()
-        if verdict is None or verdict is self.reversed:
+        if verdict is None:
             return False
-        self.reversed = verdict
-        return True
+        votes = self._votes + (1 if verdict else -1)
+        self._votes = max(-MAX_VOTES, min(MAX_VOTES, votes))
+        before, self.reversed = self.reversed, self._votes > 0
+        self.corrected = self.reversed and self.treatment == "correct"
+        self.refuses = self.reversed and self.treatment == "refuse"
+        return self.reversed is not before
 
-    def _at_rest(self, seen: Observation) -> None:
+    def _at_rest(self, seen: Observation, fy: float) -> None:
         self._still += seen.dt
         if self._still <= SETTLES:
             return
-        self._rest.append((seen.fy, seen.dt))
+        self._rest.append((fy, seen.dt))
         self._rested += seen.dt
         while self._rested > MOST_REST + 0.5 * seen.dt:
             self._rested -= self._rest.popleft()[1]
@@ -114,7 +141,7 @@ class _Push:
         self._time = self._pushed = self._lasted = 0.0
         self._impulse = self._sum = self._size = 0.0
 
-    def add(self, seen: Observation) -> bool:
+    def add(self, seen: Observation, fy: float) -> bool:
         """Take in a tick; False once the push is over."""
         self._over = self._over or self._side * seen.instruction_angle <= 0.0
         self._time += seen.dt
@@ -123,7 +150,7 @@ class _Push:
         late = self._time - self._pushed > AFTER + 1e-9
         if late or self._time > LONGEST + 1e-9:
             return False
-        self._impulse -= self._side * (seen.fy - self._level) * seen.dt
+        self._impulse -= self._side * (fy - self._level) * seen.dt
         self._sum += self._impulse * seen.dt
         self._size += abs(self._impulse) * seen.dt
         self._lasted = self._time

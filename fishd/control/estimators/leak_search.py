@@ -78,6 +78,13 @@ class LeakSearch:
             self._time = 0.0
             self._look()
 
+    def reverse_fy(self) -> None:
+        """Take F_y with the other sign from now on: what is odd in it changes its sign."""
+        self._velocity, self._angle = -self._velocity, -self._angle
+        self._across, self._mixed = -self._across, -self._mixed
+        for filtered in (self._hastened, self._forces):
+            filtered.scale(np.array([1.0, -1.0]))
+
     def _look(self) -> None:
         before, self._found = self._found, self._best()
         if self._found and 1.0 / AGREE < before / self._found < AGREE:
@@ -117,6 +124,11 @@ class _HighPass:
         """time: slower than that [s]"""
         self._time = time
         self._slow: Array | None = None
+
+    def scale(self, factors: Array) -> None:
+        """Multiply what is known of each value."""
+        if self._slow is not None:
+            self._slow = self._slow * factors
 
     def of(self, values: Array, dt: float) -> Array:
         """What is left of these values, `dt` s after those before."""

@@ -69,6 +69,13 @@ class Observer(Estimator):
         super().forget_zero()
         self._offset, self._covariance = None, np.diag(np.square(_UNKNOWN))
 
+    def reverse_fy(self) -> None:
+        """As `Estimator.reverse_fy`; the motion was corrected the wrong way, so it is not known."""
+        super().reverse_fy()
+        self._covariance = np.diag(np.square(_UNKNOWN))
+        if self._offset is not None:
+            self._offset = -self._offset
+
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
         """As `Estimator.fin_velocity`, but after the servo's delay, when the next instruction acts.
 
