@@ -13,8 +13,8 @@ from fishd.client import Fish
 from fishd.core.calibration import ForceCalibration
 
 LINE = (
-    "F_y is reversed: it pushed the way in which the tail set off, so controllers are shown it with "
-    "the other sign"
+    "F_y is reversed: it pushed the way in which the tail set off, "
+    "so controllers are shown it with the other sign"
 )
 
 REST, FIRST_PUSH = 50, 40

@@ -1,18 +1,20 @@
 """`swing --C auto` on fish that differ from the model: beside C = 0.6, after a minute and before.
 
 The single changes are those of a real rig, one at a time. The harsh fish have all of them, in
-random sizes. Relative thrusts are shares of each fish's own best square wave, of its true thrust.
+random sizes; the mild ones are as random, on clean rigs. Relative thrusts are shares of each fish's
+own best square wave, of its true thrust.
 """
 
 import os
 import statistics
 from argparse import Namespace
 from concurrent.futures import ProcessPoolExecutor
+from itertools import chain
 from typing import NamedTuple
 
 from common.report import BrokenPromise, Options, Report, table
 from fishd.config import Config, load
-from fishd.lab.other_fish import CHANGES, HARSH_FISH, OtherFish, harsh_fish
+from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
 from fishd.simulation import simulate
 
 DOCUMENT = "swing-efficiency.md"
@@ -24,6 +26,12 @@ RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2, 3)
 
 
 OMEGA0, AMPLITUDE = 12.5, 0.42
+GROUPS = {
+    "20 harsh fish": harsh_fish(),
+    "40 other harsh fish (seeds 720 to 759)": tuple(map(harsh, range(720, 760))),
+    "40 mild fish (seeds 300 to 339)": tuple(map(mild, range(300, 340))),
+}
+"""Random fish; nothing was chosen with those that have their seeds here."""
 
 
 def at_ratio(ratio: float) -> OtherFish:
@@ -64,15 +72,16 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """One table; a minute."""
-    fish = harsh_fish()
-    cases = [*CHANGES, *map(at_ratio, RATIOS), *fish]
+    """One table; a minute or two."""
+    single = [*CHANGES, *map(at_ratio, RATIOS)]
+    cases = [*single, *chain.from_iterable(GROUPS.values())]
     with ProcessPoolExecutor(options.jobs) as pool:
         found = dict(zip(cases, pool.map(measured, cases), strict=True))
-    rows = [[case.name, *map(percent, found[case])] for case in cases if case not in fish]
-    for name, pick in (("median", statistics.median), ("worst", min)):
-        shares = [pick(column) for column in zip(*(found[case] for case in fish), strict=True)]
-        rows.append([f"{HARSH_FISH} harsh fish, {name}", *map(percent, shares)])
+    rows = [[case.name, *map(percent, found[case])] for case in single]
+    for group, fish in GROUPS.items():
+        for name, pick in (("median", statistics.median), ("worst", min)):
+            shares = [pick(column) for column in zip(*(found[case] for case in fish), strict=True)]
+            rows.append([f"{group}, {name}", *map(percent, shares)])
     head = "change | C = 0.6 | auto, first minute | auto, second minute"
     figures = {case.name: found[case]._asdict() for case in cases}
     return Report({"bench swing": table(head, rows)}, figures)

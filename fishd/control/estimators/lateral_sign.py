@@ -40,12 +40,6 @@ CONSEQUENCES: dict[Treatment, str] = {
     "refuse": "so controllers that use it are refused",
     "warn": "so swing and policies fail",
 }
-REVERSED = (
-    "F_y is reversed: it pushed the way in which the tail set off, {}; "
-    "where a positive angle moves the tail to the fish's left, mend F_y with "
-    "'fishctl calibrate force' (+y pulls to its left), else servo.direction with "
-    "'fishctl calibrate servo'"
-)
 
 
 class LateralSign:
@@ -81,7 +75,14 @@ class LateralSign:
     @property
     def complaint(self) -> str:
         """One line: what is wrong and what to do; empty where F_y was not seen to be reversed."""
-        return REVERSED.format(CONSEQUENCES[self.treatment]) if self.reversed else ""
+        if not self.reversed:
+            return ""
+        return (
+            "F_y is reversed: it pushed the way in which the tail set off, "
+            f"{CONSEQUENCES[self.treatment]}; where a positive angle moves the tail to the fish's "
+            "left, mend F_y with 'fishctl calibrate force' (+y pulls to its left), else "
+            "servo.direction with 'fishctl calibrate servo'"
+        )
 
     def update(self, seen: Observation, fy: float) -> bool:
         """Take in a tick; True where another sign holds from now on than before.
