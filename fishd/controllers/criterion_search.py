@@ -5,7 +5,7 @@ Two signs of the thrust are compared, the ripple and the mean of F_x. A fin that
 as its mean. The ripple does not drift with the sensor, but other shapes of the beat have a ripple
 that is a few percent larger or smaller for the same thrust. The mean is the thrust itself, and
 drifts. The difference of a trial from the gait before and after it is free of a steady drift, and
-how much the drift bends is seen in three such gaits in turn. So each counts by how well it is
+how much the zero drifts is seen from before a trial to after it. So each counts by how well it is
 known: on a rig that hardly drifts the mean decides, on another one the ripple.
 
 What a turned sensor mixes in of F_y is taken off first, so the sign of F_y does not matter.
@@ -43,11 +43,13 @@ CLEAR = 0.01
 """A rung is taken where its ripple is larger by this share than before and after it."""
 RIPPLE_BIAS = 0.04
 """Standard deviation of the ripple's gain from the thrust's, as gaits differ in shape [1]."""
+UNSTEADY = 0.25
+"""Share of the move of the zero, from before a trial to after it, that is taken for unsteady: by so
+much the zero within the trial may differ from the mean of the two [1]."""
+MOVES = 8
+"""Number of latest trials whose moves are remembered."""
 DRIFT_AT_FIRST = 0.03
-"""Error of a gain by the mean of F_x, by a zero that does not drift steadily, before three gaits in
-turn have shown any: as a share of the ripple [1]."""
-BENDS = 8
-"""Number of latest such errors that are remembered."""
+"""One more such difference, for the first trials: as a share of the ripple [1]."""
 SURE = 1.0
 """A trial is repeated while its gain is known no better than within so many standard errors,"""
 ROUNDS = 3
@@ -140,8 +142,7 @@ class CriterionSearch:
         self._turn = 0
         self._reference = self._trial = Judgement(0.0, 0.0, 0.0, 0.0, 0.0)
         self._gains: list[Gain] = []  # of this trial, in each round
-        self._levels: deque[float] = deque(maxlen=3)  # of the gait in use, in turn [N]
-        self._bends: deque[float] = deque(maxlen=BENDS)  # of the zero [N]
+        self._moves: deque[float] = deque(maxlen=MOVES)  # of the zero, within a trial [N]
         self._known = 0.0
         self._watched = 0.0
         self._side = 0.0
@@ -228,8 +229,6 @@ class CriterionSearch:
             case Phase.LAUNCH:
                 self._begin(Phase.BEFORE)
             case Phase.BEFORE:
-                self._levels.clear()
-                self._levels.append(gait.level)
                 self._resume(gait)
             case Phase.TRIAL:
                 self._trial = gait
@@ -272,10 +271,7 @@ class CriterionSearch:
             self._avoided.add(self._place + self._trials.pop(0))
             self._launch(before.ripple)
             return
-        self._levels.append(after.level)
-        if len(self._levels) == 3:
-            first, middle, last = self._levels
-            self._bends.append((first - 2.0 * middle + last) / 8.0)
+        self._moves.append(after.level - before.level)
         self._gains.append(compare_gaits(before, self._trial, after))
         gain, error = self._mean_gain()
         above = gain - CLEAR
@@ -284,6 +280,8 @@ class CriterionSearch:
             return
         step = self._trials.pop(0)
         if above > 0.0:
+            if WORSE * (1.0 + gain) > 1.0:
+                self._avoided.add(self._place)
             self._former = self._place
             self._place += step
             ahead = 1 if step > 0 else -1
@@ -304,9 +302,9 @@ class CriterionSearch:
         )
         noise, level_noise = noise / rounds, level_noise / rounds
         ripple_now = self._reference.ripple
-        bends = [bend / ripple_now for bend in self._bends]
-        # Of the zero midway between two gaits, as a share of the thrust. Rounds do not average it.
-        level_noise += 0.5 * statistics.mean(bend**2 for bend in (*bends, DRIFT_AT_FIRST))
+        drifts = [UNSTEADY * move / ripple_now for move in self._moves]
+        # As a share of the thrust. Rounds do not average it.
+        level_noise += 0.5 * statistics.mean(drift**2 for drift in (*drifts, DRIFT_AT_FIRST))
         share = level_noise / (level_noise + noise + RIPPLE_BIAS**2)  # by which the ripple counts
         error = math.hypot(share * math.sqrt(noise), (1.0 - share) * math.sqrt(level_noise))
         return share * ripple + (1.0 - share) * level, error

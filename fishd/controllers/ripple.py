@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 SPIKE = 6.0
 """A force is a spike if it is so many times further from what is usual than half of the others."""
+LARGE_SPIKE = 2.0
+"""And a spike for the mean of F_x, too, beyond so many standard deviations of F_x."""
 
 
 def ripples(halves: list[list[tuple[float, float]]]) -> tuple[list[float], list[float]]:
@@ -16,9 +18,12 @@ def ripples(halves: list[list[tuple[float, float]]]) -> tuple[list[float], list[
 
     halves: F_x and F_y of each tick, from reversal to reversal [N]; two of them or more
     """
-    cleaned = _without_spikes(_without_lateral_force(halves))
-    beats = [np.concatenate(beat) for beat in pairwise(cleaned)]
-    return [_square(beat) for beat in beats], [float(beat.mean()) for beat in beats]
+    forces = _without_lateral_force(halves)
+    squares = [_square(np.concatenate(beat)) for beat in pairwise(_without_spikes(forces, 0.0))]
+    # Of halves that differ in length, what is far from usual may be thrust.
+    certain = LARGE_SPIKE * float(np.concatenate(forces).std())
+    cleaned = _without_spikes(forces, certain)
+    return squares, [float(np.concatenate(beat).mean()) for beat in pairwise(cleaned)]
 
 
 def _without_lateral_force(halves: list[list[tuple[float, float]]]) -> list[NDArray[np.float64]]:
@@ -31,8 +36,13 @@ def _without_lateral_force(halves: list[list[tuple[float, float]]]) -> list[NDAr
     return np.split(fx, np.cumsum([len(half) for half in halves])[:-1])
 
 
-def _without_spikes(halves: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-    """With what is usual so long after a reversal, where a force is far from that [N]."""
+def _without_spikes(
+    halves: list[NDArray[np.float64]], smallest: float
+) -> list[NDArray[np.float64]]:
+    """With what is usual so long after a reversal, where a force is far from that [N].
+
+    smallest: what is nearer is not a spike [N]
+    """
     lengths = np.array([len(half) for half in halves])
     table = np.full((len(halves), lengths.max()), np.nan)  # a row for each half beat
     there = np.arange(lengths.max()) < lengths[:, None]
@@ -43,7 +53,7 @@ def _without_spikes(halves: list[NDArray[np.float64]]) -> list[NDArray[np.float6
     low, high = np.floor(inner).astype(int), np.ceil(inner).astype(int)
     usual = 0.5 * (ordered[low, columns] + ordered[high, columns])
     distance = np.abs(table - usual)
-    limit = SPIKE * np.median(distance[there])
+    limit = max(smallest, SPIKE * float(np.median(distance[there])))
     cleaned = np.where(distance > limit, usual, table)
     return [row[:length] for row, length in zip(cleaned, lengths, strict=True)]
 
