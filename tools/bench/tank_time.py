@@ -155,6 +155,7 @@ def tank(options: Namespace) -> str:
             [
                 fish,
                 rule,
+                str(len(runs)),
                 _seconds([run.reached for run in runs]),
                 *(spread([run.at(seconds) for run in runs]) for seconds in AFTER),
                 spread([run.at(math.inf) for run in runs]),
@@ -164,7 +165,7 @@ def tank(options: Namespace) -> str:
         )
     heads = " | ".join(
         (
-            "fish | the best is chosen by | tank time to 97 % (s)",
+            "fish | the best is chosen by | seeds | tank time to 97 % (s)",
             *(f"after {seconds / 60:g} min" for seconds in AFTER),
             f"after {STEPS} steps | below the best candidate | whole tank time (s)",
         )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import joblib
 from msgspec.structs import replace
 
-from common.report import DOCS, progress
+from common.report import DOCS, progress, spread
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config, load
 from fishd.learning import settings as training
@@ -132,3 +132,10 @@ def several(
             last = result.points[-1]
             progress(f"{row}, seed {seed}: {last.relative_thrust:.1%}, best {result.best[-1]:.1%}")
     return found
+
+
+def to_reach(runs: list[Trained], share: float) -> list[str]:
+    """The cells of a row: steps to that relative thrust, and how many seeds reached it."""
+    steps = [one.steps_to(share) for one in runs]
+    reached = sum(map(math.isfinite, steps))
+    return [spread(steps, 1.0, 0).replace("inf", "never"), f"{reached} of {len(runs)}"]

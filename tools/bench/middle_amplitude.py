@@ -1,0 +1,116 @@
+"""Learning at Φ = 0.3 rad, for `learning amplitude`: why a seed may stay at five ticks."""
+
+import math
+import statistics
+import tempfile
+from argparse import Namespace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from msgspec.structs import replace
+
+from bench.trainings import Row, rig, settings_of, several, to_reach
+from common.report import progress, spread, table
+from fishd.config import Config
+from fishd.learning.env.environment import SwimEnv, best_thrust
+from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.run_folder.checkpoints import all_in, load_policy
+from fishd.learning.run_folder.tables import best_so_far, read_evaluations
+from fishd.learning.train.jobs import Job
+from fishd.learning.train.training import train
+from fishd.virtual.plant.optimum import square_wave
+
+AMPLITUDE_RAD = 0.3
+SEEDS = range(250, 261)
+"""Seeds that no setting was chosen with."""
+STEPS, LONG_STEPS = 2048, 8000
+"""Control steps of each training, and of the trainings that have not reached `ENOUGH` by then."""
+NEARLY, ENOUGH = 0.95, 0.97
+WATCHED_TICKS = 400
+"""Ticks in which the commands of a policy are looked at."""
+
+
+class Checkpoint(NamedTuple):
+    """What a policy does after some steps of its training."""
+
+    steps: int
+    half_beat: float
+    """Median half beat without exploration [ticks]."""
+    stay: float
+    """Median probability of exploration to delay a reversal by one tick."""
+
+
+def amplitude(options: Namespace) -> str:
+    """Return the table of trainings, and what the policies explore that stay at five ticks."""
+    config, seeds = rig(AMPLITUDE_RAD), SEEDS[: options.seeds]
+    name = f"Φ = {AMPLITUDE_RAD} rad"
+    runs = several({name: Row(config, settings_of(None, STEPS))}, seeds, options.jobs)[name]
+    cells = [name, *to_reach(runs, NEARLY), *to_reach(runs, ENOUGH)]
+    cells.append(spread([run.best[-1] for run in runs]))
+    cells.append(spread([run.exported.frequency for run in runs], 1.0, 3))
+    heads = (
+        f" | {100 * NEARLY:.0f} % | seeds | {100 * ENOUGH:.0f} % | seeds | best policy (%) | "
+        "its frequency (Hz)"
+    )
+    stuck = [seed for seed, run in zip(seeds, runs, strict=True) if run.best[-1] < ENOUGH]
+    waves = (wave(config, ticks) for ticks in (4, 5, 6, 7))
+    parts = [
+        f"Steps until the best policy so far has that relative thrust, and the best policy after "
+        f"{STEPS} steps, median [lowest – highest] of seeds {seeds[0]} to {seeds[-1]}:",
+        table(heads, [cells]),
+        f"Square waves by the ticks of half a beat: {', '.join(waves)}.",
+        *(watched(config, seed) for seed in stuck),
+    ]
+    return "\n\n".join(parts)
+
+
+def wave(config: Config, ticks: int) -> str:
+    """Return the relative thrust of a square wave whose half beats have so many ticks."""
+    frequency = 0.5 / (ticks * config.tick)
+    thrust = square_wave(config.plant, config.amplitude_limit, frequency).thrust
+    return f"{ticks} ticks ({frequency:.2f} Hz) {100 * thrust / best_thrust(config):.1f} %"
+
+
+def watched(config: Config, seed: int) -> str:
+    """Train a seed for longer, and return a table of what its policies explore meanwhile."""
+    fish = replace(config, simulation=replace(config.simulation, seed=seed))
+    settings = replace(settings_of(None, LONG_STEPS), seed=seed, checkpoint_every=500)
+    with tempfile.TemporaryDirectory() as temporary:
+        job = Job(config=fish, settings=settings, folder=Path(temporary) / "run")
+        train(job)
+        points = read_evaluations(job.folder)
+        shares = {point.steps: point.relative_thrust for point in points}
+        best = best_so_far(points)[-1]
+        folders = [each for each in all_in(job.folder) if each.name.startswith("step-")]
+        found = [checkpoint(fish, each) for each in folders[1:]]
+    rows = []
+    for each in (found[0], *found[1:4:2], *found[7::8]):
+        share = 100.0 * shares.get(each.steps, math.nan)
+        cells = (each.steps, f"{share:.1f}", f"{each.half_beat:g}", f"{each.stay:.0e}")
+        rows.append([str(cell) for cell in cells])
+        progress(f"seed {seed}", *rows[-1])
+    heads = "steps | relative thrust (%) | half beat (ticks) | delays a reversal with probability"
+    return f"Seed {seed}, best policy after {LONG_STEPS} steps {100 * best:.1f} %:\n\n" + table(
+        heads, rows
+    )
+
+
+def checkpoint(config: Config, folder: Path) -> Checkpoint:
+    """Let the policy of a checkpoint swim without exploration, and look at its reversals."""
+    policy, _ = load_policy(folder)
+    env = SwimEnv(SimulatedLink(config), config, settings_of(None).environment)
+    seen, _ = env.reset(seed=0)
+    halves, stays = [], []
+    for _ in range(WATCHED_TICKS):
+        side = math.copysign(1.0, env.latest.instruction_angle)
+        elapsed = round(abs(env.latest.side_time) / config.tick)
+        with torch.no_grad():
+            mean = float(policy.get_distribution(torch.from_numpy(seen[None])).mode())
+            deviation = float(policy.log_std.exp())
+        if mean * side < 0.0:
+            halves.append(elapsed)
+            stays.append(0.5 * math.erfc(abs(mean) / deviation / math.sqrt(2.0)))
+        seen = env.step(torch.tensor([max(-1.0, min(1.0, mean))]).numpy())[0]
+    half = statistics.median(halves or [math.inf])
+    return Checkpoint(int(folder.name[5:]), half, statistics.median(stays or [math.nan]))
