@@ -3,6 +3,7 @@
 import datetime
 import os
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, TypeVar
 
 import click
@@ -10,7 +11,7 @@ import click
 from fishd.cli.completion import active_parameters, complete_pair
 from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
 from fishd.cli.output import echo, echo_rows, made_printable, measured, print_json, spelled
-from fishd.cli.plausibility import warn_of_values
+from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core.addresses import ENDPOINT_VARIABLE
@@ -108,15 +109,13 @@ def set_parameter(words: tuple[str, ...], endpoint: str | None, as_json: bool) -
     pairs = list(_pairs(words))
 
     def change(fish: Fish) -> State:
-        from fishd.config import adopt
-
         known = active_parameters(fish)
         # The daemon refuses a name that the controller does not have, and says which it has.
         values = {
             name: _converted(known[name], text) if name in known else text for name, text in pairs
         }
         state = fish.set_parameters(**values)
-        warn_of_values(known.values(), values, lambda: adopt(fish.config()))
+        warn_of_values(known.values(), values, partial(running_config, fish))
         return state
 
     _change(endpoint, as_json, change)

@@ -10,7 +10,7 @@ from click.shell_completion import CompletionItem
 
 from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
-from fishd.cli.plausibility import warn_of_values
+from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core import files
@@ -154,16 +154,16 @@ def describe(field: Field) -> str:
     return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
 
 
-def _fish_of(values: dict[str, Any]) -> "Config":
+def _fish_of(values: dict[str, Any]) -> "Config | None":
     """Return the configuration of the fish that the options of a verb are about.
 
-    Raises `FishdError`.
+    None where its forces are not in newtons. Raises `FishdError`.
     """
-    from fishd.config import adopt, load
+    from fishd.config import load
 
     if "endpoint" in values and not values.get("file") and not values.get("overrides"):
         with Fish(values["endpoint"]) as fish:
-            return adopt(fish.config())
+            return running_config(fish)
     return load(values.get("file"), values.get("overrides", ()))
 
 

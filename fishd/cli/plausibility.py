@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fishd.cli.output import echo
+from fishd.client import Fish
 from fishd.core.errors import FishdError
 from fishd.core.schema import Field, doubts, is_valid_number, question, with_unit
 
@@ -12,12 +13,15 @@ if TYPE_CHECKING:
 
 
 def warn_of_values(
-    fields: Iterable[Field], parameters: Mapping[str, Any], config: "Callable[[], Config]"
+    fields: Iterable[Field],
+    parameters: Mapping[str, Any],
+    config: "Callable[[], Config | None]",
 ) -> None:
     """Print a line for each value far beyond what makes sense, on standard error.
 
     parameters: a value for each name, or a list of values
-    config: that of the fish; only read where a parameter is a force, which the fish has to give
+    config: that of the fish, None where its forces are in another unit; only read where a
+        parameter is a force, which the fish has to give
     """
     fields = list(fields)
     largest = {name: _largest(value) for name, value in parameters.items()}
@@ -29,6 +33,13 @@ def warn_of_values(
         echo(f"fishctl: careful: {line}", err=True)
 
 
+def running_config(fish: Fish) -> "Config | None":
+    """Return the configuration of a running fishd; None where its forces are not in newtons."""
+    from fishd.config import adopt
+
+    return adopt(fish.config()) if fish.status().force_unit == "N" else None
+
+
 def _largest(value: Any) -> Any:
     if not isinstance(value, list):
         return value
@@ -36,7 +47,7 @@ def _largest(value: Any) -> Any:
 
 
 def _beyond_best(
-    forces: list[Field], values: Mapping[str, Any], read_config: "Callable[[], Config]"
+    forces: list[Field], values: Mapping[str, Any], read_config: "Callable[[], Config | None]"
 ) -> dict[str, str]:
     """Return a sentence for each force that is more than the best square wave's thrust."""
     from fishd.virtual.plant.optimum import best_square_wave
@@ -45,7 +56,7 @@ def _beyond_best(
         config = read_config()
     except FishdError:  # which the verb itself reports
         return {}
-    if config.robot == "swimmer":
+    if config is None or config.robot == "swimmer":
         return {}
     best = best_square_wave(config.plant, config.amplitude_limit).thrust
     return {

@@ -94,6 +94,9 @@ def _thrust(summary: Summary) -> str:
         return "–"
     error = "?" if summary.thrust_error is None else _thousandths(summary.thrust_error)
     unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
+    if error == "0.00":  # of no noise
+        name = "" if summary.force_unit == "N" else summary.force_unit
+        return text.measured(summary.thrust, summary.thrust_error, name)
     return f"{_thousandths(summary.thrust)} ± {error}{unit}"
 
 
