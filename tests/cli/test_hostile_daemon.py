@@ -39,6 +39,8 @@ def _evil(kind: inspect.Type, known: dict[str, Any] | None = None) -> Any:
             return _evil(next(one for one in kind.types if not isinstance(one, inspect.NoneType)))
         case inspect.ListType() | inspect.VarTupleType():
             return [_evil(kind.item_type)]
+        case inspect.TupleType():
+            return [_evil(part) for part in kind.item_types]
         case inspect.DictType():
             return {EVIL: _evil(kind.value_type)}
         case inspect.StrType() | inspect.AnyType():
