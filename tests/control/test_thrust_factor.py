@@ -54,7 +54,7 @@ class Rig:
             self._tick(0.0, 0.0, 0.0)
 
     def beats(self, count: int, power: float = POWER) -> None:
-        """Swim; the power of each beat is measured with an error of its own."""
+        """Swim; the power of each beat is measured with an error."""
         for _ in range(count):
             measured = power * max(0.1, self.random.gauss(1.0, self.power_noise))
             velocity = math.sqrt(measured)
@@ -103,7 +103,7 @@ def random_swims(rig: Rig, beats: int) -> Iterator[Judged]:
 
 @pytest.mark.slow
 def test_the_factor_is_unbiased_over_100_000_beats_whatever_the_noise_and_the_drift() -> None:
-    found = []
+    errors = []
     for seed in range(100):
         chance = random.Random(seed)
         rig = Rig(
@@ -112,11 +112,11 @@ def test_the_factor_is_unbiased_over_100_000_beats_whatever_the_noise_and_the_dr
             power_noise=chance.choice((0.0, 0.02, 0.1)),
             walk=chance.choice((0.0, 6e-4, 3e-3)),
         )
-        found += random_swims(rig, 1_000)
+        errors += random_swims(rig, 1_000)
     # each weighed by how well it claims to be known
-    weights = [each.ci95**-2 for each in found]
-    weighed = zip(found, weights, strict=True)
+    weights = [each.ci95**-2 for each in errors]
+    weighed = zip(errors, weights, strict=True)
     mean = sum(each.error * weight for each, weight in weighed) / sum(weights)
     assert abs(mean) < 0.01
-    assert sum(abs(each.error) < each.ci95 for each in found) > 0.9 * len(found)
-    assert all(abs(each.error) < 3.0 * each.ci95 for each in found)
+    assert sum(abs(each.error) < each.ci95 for each in errors) > 0.9 * len(errors)
+    assert all(abs(each.error) < 3.0 * each.ci95 for each in errors)

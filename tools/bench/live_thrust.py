@@ -5,6 +5,7 @@ the whole beats of the latest 4 s. The first 30 s after the start do not count. 
 a rest of 3 s.
 """
 
+import dataclasses
 import math
 import os
 import random
@@ -54,7 +55,7 @@ DITHERED = "swing, dithered C"
 
 
 class Drift(NamedTuple):
-    """A function of time that is added to F_x, made anew for each seed."""
+    """A function of time that is added to F_x, with a new shape for each seed."""
 
     name: str
     make: Callable[[random.Random, float], Callable[[float], float]]
@@ -108,7 +109,7 @@ DRIFTS = (
 )
 
 
-class Shown(NamedTuple):
+class Outcome(NamedTuple):
     """How good the shown thrust of one run was."""
 
     truth: float
@@ -124,11 +125,11 @@ class Shown(NamedTuple):
     drift: float
     """Change of that error in an hour, as a share of the thrust: a line through it."""
     held_miss: float = math.nan
-    """Of `thrust`: mean true thrust over its target, less 1."""
+    """Relative error of the controller `thrust`: mean true thrust over its target, less 1."""
     held_ci95: float = math.nan
-    """Of `thrust`: mean half-width of the interval of `held_thrust`, over the target."""
+    """Mean half-width of the interval of `held_thrust`, over the target."""
     held_inside: float = math.nan
-    """Of `thrust`: share of the ticks in which that interval holds the truth."""
+    """Share of the ticks in which the interval of `held_thrust` holds the truth."""
 
 
 class Drifting:
@@ -183,8 +184,8 @@ class LastTick:
 
 def swim(
     config: Config, wave: str, seconds: float, rest_each: float, drift: Drift | None = None
-) -> Shown:
-    """Swim, after a rest and with further ones, and compare what is shown with the truth.
+) -> Outcome:
+    """Swim, after a rest and with further ones, and compare the shown thrust with the true one.
 
     rest_each: time from the begin of a rest to that of the next [s]
     """
@@ -229,20 +230,18 @@ def swim(
 
 
 def replace_sensor(robot: Any, added: Callable[[float], float]) -> Any:
-    """The same robot with a drift of F_x."""
-    import dataclasses
-
+    """Return the same robot with a drift of F_x."""
     return dataclasses.replace(robot, sensor=Drifting(robot.sensor, added))
 
 
 def _judge(
     rows: Any, withheld: int, ticks: int, held: list[tuple[float, float]], target: float | None
-) -> Shown:
+) -> Outcome:
     time, thrust, error, truth = rows.T
     off = thrust - truth
     slope = float(np.polyfit(time, off, 1)[0]) if len(rows) > 2 else 0.0
     mean = float(truth.mean())
-    shown = Shown(
+    outcome = Outcome(
         mean,
         float(np.mean(np.abs(off) <= error)),
         withheld / ticks,
@@ -251,21 +250,21 @@ def _judge(
         slope * 3600.0 / mean,
     )
     if not held or target is None:
-        return shown
+        return outcome
     miss, ci95 = np.array(held).T
-    return shown._replace(
+    return outcome._replace(
         held_miss=mean / target - 1.0,
         held_ci95=float(ci95.mean()) / target,
         held_inside=float(np.mean(np.abs(miss) <= ci95)),
     )
 
 
-def quiet(wave: str, seed: int) -> Shown:
+def quiet(wave: str, seed: int) -> Outcome:
     """Five minutes of the default configuration, whose sensor does not drift."""
     return swim(load(None, [f"simulation.seed={seed}"]), wave, 300.0, math.inf)
 
 
-def drifting(wave: str, seed: int, rest_each: float) -> Shown:
+def drifting(wave: str, seed: int, rest_each: float) -> Outcome:
     """An hour of the rig of `make run`: its drift, offset and rotation."""
     config = Config(
         simulation=replace(
@@ -275,12 +274,12 @@ def drifting(wave: str, seed: int, rest_each: float) -> Shown:
     return swim(config, wave, 3600.0, rest_each)
 
 
-def strange(drift: int, seed: int) -> Shown:
-    """Five minutes of swing on a sensor that drifts in a way that nobody configured."""
+def strange(drift: int, seed: int) -> Outcome:
+    """Five minutes of swing on a sensor that drifts in a way that is not configured."""
     return swim(load(None, [f"simulation.seed={seed}"]), "swing", 300.0, math.inf, DRIFTS[drift])
 
 
-def holding(target: float, seed: int) -> Shown:
+def holding(target: float, seed: int) -> Outcome:
     """Half an hour of `thrust`."""
     WAVES["held"] = ("thrust", {"target": target})
     return swim(load(None, [f"simulation.seed={seed}"]), "held", 1800.0, math.inf)
@@ -312,16 +311,16 @@ def measure(options: Namespace) -> Report:
                 for way in ways
             }
 
-        found = {"5 min, no drift": every(quiet, WAVES, seeds)}
+        results = {"5 min, no drift": every(quiet, WAVES, seeds)}
         strangers = every(strange, range(len(DRIFTS)), seeds)
-        found["5 min of swing"] = {DRIFTS[k].name: runs for k, runs in strangers.items()}
+        results["5 min of swing"] = {DRIFTS[k].name: runs for k, runs in strangers.items()}
         for name, each in (("1 h, one rest", math.inf), ("1 h, rests", 60.0 * MINUTES_PER_REST)):
-            found[name] = every(drifting, WAVES, hours, each)
+            results[name] = every(drifting, WAVES, hours, each)
         held = every(holding, (0.005, 0.01, 0.015, 0.02), hours)
     names = ("thrust quiet", "thrust drifts", "thrust hour", "thrust hour rests")
     sections = {
         marker: table(HEAD.format(kind), [_row(name, runs) for name, runs in ways.items()])
-        for marker, (kind, ways) in zip(names, found.items(), strict=True)
+        for marker, (kind, ways) in zip(names, results.items(), strict=True)
     }
     head = (
         "target, mN | true thrust over it, less 1 | `held_thrust`: stated ± | ticks whose interval "
@@ -340,12 +339,12 @@ def measure(options: Namespace) -> Report:
     sections["thrust held"] = table(head, rows)
     figures = {
         kind: {name: [run._asdict() for run in runs] for name, runs in ways.items()}
-        for kind, ways in (*found.items(), ("held", {str(k): v for k, v in held.items()}))
+        for kind, ways in (*results.items(), ("held", {str(k): v for k, v in held.items()}))
     }
     return Report(sections, figures)
 
 
-def _row(name: str, runs: list[Shown]) -> tuple[str, ...]:
+def _row(name: str, runs: list[Outcome]) -> tuple[str, ...]:
     def mean(values: Iterable[float]) -> float:
         return float(np.mean(list(values)))
 

@@ -62,7 +62,7 @@ class LiveThrust:
     """Thrust over the latest whole beats, and the half-width of its 95 % interval."""
 
     def __init__(self, zero_drift: float) -> None:
-        """Start without any knowledge.
+        """Start with nothing known.
 
         zero_drift: standard deviation of the change of the zero after a second [N/√s]; where the
         forces show a faster drift, that is taken instead
@@ -89,7 +89,7 @@ class LiveThrust:
         self._run = _Run(None, self._factor)
 
     def forget_zero(self) -> None:
-        """Discard the forces so far: the zero of the sensor was set."""
+        """Discard all earlier forces: the zero of the sensor was set."""
         self._start_run(None)
         self._recording, self.thrust = False, None
 

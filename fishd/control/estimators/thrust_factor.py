@@ -27,7 +27,7 @@ DRIFT_NEAR = 8
 CLEAR_DRIFT = 2.0
 """Number of standard deviations of the noise beyond which a change of the force is a drift."""
 DRIFT_MEMORY = 64
-"""Number of comparisons that the drift so far is averaged over: about 40 s."""
+"""Number of comparisons that the drift is averaged over: about 40 s."""
 DRIFT_LAG = 2.5
 """Time over which the drift is observed, about that from a rest to a steady swim [s]."""
 
@@ -113,11 +113,10 @@ class Factor(NamedTuple):
         variance, known = prior.variance, math.isfinite(prior.variance)
         if not known:
             variance = (UNKNOWN_THRUST / max(power, before.power)) ** 2
-            if step:  # a first guess, for the scatter alone
-                prior = prior._replace(value=(change + before.thrust) / step)
-        other = prior.scatter(after.size, wave) if power and before.power else 0.0
-        if known and power and not before.power:
-            other = prior.scatter(after.size, wave)
+            if step:  # a first guess, for the scatter between the two sizes
+                guess = (change + before.thrust) / step
+                prior = prior._replace(value=guess, size=before.size)
+        other = prior.scatter(after.size, wave) if power else 0.0
         value = prior.value if known else 0.0
         noise = before.variance + after.variance + before.thrust_variance
         noise += before.drift_variance(after, drift)
