@@ -317,7 +317,7 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
         table.add_row(
             standing.contestant,
             *cells,
-            text.measured(standing.thrust, _whole(standing.error, standing.total_ci95)),
+            text.format_measured(standing.thrust, _whole(standing.error, standing.total_ci95)),
             *([] if simulated else _parts(standing)),
             *(_costs(standing) if metered else []),
             f"{standing.frequency:.3f}" if standing.frequency else "–",
@@ -332,7 +332,7 @@ def _costs(standing: "Standing") -> list[str]:
     whole = _whole(standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95)
     return [
         f"{standing.power or 0.0:.3f}",
-        text.measured(standing.thrust_per_watt or 0.0, whole),
+        text.format_measured(standing.thrust_per_watt or 0.0, whole),
     ]
 
 
@@ -344,8 +344,8 @@ def _whole(statistical_ci95: float | None, total_ci95: float | None) -> float | 
 def _parts(standing: "Standing") -> list[str]:
     """What the interval of a measured thrust is made of."""
     part = standing.calibration_ci95
-    calibration = "unknown" if part is None else text.half_width(part)
-    return [text.half_width(standing.error or 0.0), calibration]
+    calibration = "unknown" if part is None else text.format_half_width(part)
+    return [text.format_half_width(standing.error or 0.0), calibration]
 
 
 def _of_simulated(standings: "list[Standing]") -> str | None:

@@ -18,7 +18,7 @@ from fishd.core.addresses import ENDPOINT_VARIABLE
 from fishd.core.console import power_words, thrust_words
 from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
-from fishd.core.schema import Field, echoed, nearest
+from fishd.core.schema import Field, format_values, nearest
 from fishd.core.signals import Percentiles, Reason, Status
 
 T = TypeVar("T")
@@ -214,7 +214,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
-        *([("survived", echoed(survived, {}))] if survived else []),
+        *([("survived", format_values(survived, {}))] if survived else []),
         *([("late", missed)] if status.missed or status.overruns else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),

@@ -127,7 +127,7 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
     anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
     return [
         ("controller", f"{spelled(report.controller, report.parameters)}{anew}"),
-        ("speed", f"{text.measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
+        ("speed", f"{text.format_measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
         *_trend(report),
         ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),
         ("heading", f"{report.heading:+.3f} rad"),

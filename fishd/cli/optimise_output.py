@@ -10,7 +10,7 @@ from msgspec import Struct
 from fishd.cli.output import counted, echo
 from fishd.core import text
 from fishd.core.console import power_words
-from fishd.core.schema import echoed
+from fishd.core.schema import format_values
 
 if TYPE_CHECKING:
     from fishd.core.calibration import ForceCalibration
@@ -80,7 +80,7 @@ def told(
     best: what seems so, once there is enough to say it
     unit: of the force; units: of the parameters
     """
-    thrust = text.measured(trial.thrust, trial.error, unit)
+    thrust = text.format_measured(trial.thrust, trial.error, unit)
     measured = f"{number}: {_spelled(trial.parameters, units)}: {thrust}"
     if math.isfinite(trial.power):
         measured += f" for {power_words(trial.power)}"
@@ -91,7 +91,7 @@ def told(
 
 
 def _spelled(parameters: dict[str, float], units: dict[str, str]) -> str:
-    return echoed({name: float(f"{value:.4g}") for name, value in parameters.items()}, units)
+    return format_values({name: float(f"{value:.4g}") for name, value in parameters.items()}, units)
 
 
 def optimum_of(

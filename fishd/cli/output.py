@@ -10,7 +10,7 @@ import msgspec
 
 from fishd.controllers import registry
 from fishd.core import text
-from fishd.core.schema import echoed
+from fishd.core.schema import format_values
 
 T = TypeVar("T")
 
@@ -46,7 +46,9 @@ def made_printable(value: T) -> T:
 
 def spelled(controller: str, parameters: dict[str, Any]) -> str:
     """Return a controller with its parameters, as `square frequency=1.7 Hz amplitude=default`."""
-    return text.line(f"{controller} {echoed(parameters, registry.units(controller))}".rstrip())
+    return text.line(
+        f"{controller} {format_values(parameters, registry.units(controller))}".rstrip()
+    )
 
 
 def measured(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[str, str]]:

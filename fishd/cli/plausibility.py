@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core.errors import FishdError
-from fishd.core.schema import Field, doubts, is_valid_number, question, with_unit
+from fishd.core.schema import Field, ask_for_unit, find_doubts, format_quantity, is_valid_number
 
 if TYPE_CHECKING:
     from fishd.config import Config
@@ -28,7 +28,7 @@ def warn_of_values(
     forces = [each for each in fields if each.unit == "N" and is_valid_number(largest, each)]
     beyond = _beyond_best(forces, largest, config) if forces else {}
     lines = list(beyond.values())
-    lines += doubts(largest, (field for field in fields if field.name not in beyond))
+    lines += find_doubts(largest, (field for field in fields if field.name not in beyond))
     for line in lines:
         echo(f"fishctl: careful: {line}", err=True)
 
@@ -61,11 +61,15 @@ def _beyond_best(
     best = best_square_wave(config.plant, config.amplitude_limit).thrust
     return {
         field.name: (
-            f"{field.name}: {with_unit(values[field.name], 'N')} is "
+            f"{field.name}: {format_quantity(values[field.name], 'N')} is "
             f"{values[field.name] / best:.3g} "
             "times the best thrust known: the best square wave of the configured fish gives "
             f"{best:.3g} N, {1e3 * best:.3g} mN"
-            + (f" ({question(values[field.name], 'N')})" if values[field.name] > 2 * best else "")
+            + (
+                f" ({ask_for_unit(values[field.name], 'N')})"
+                if values[field.name] > 2 * best
+                else ""
+            )
         )
         for field in forces
         if 0.0 < best < values[field.name]

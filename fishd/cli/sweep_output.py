@@ -60,7 +60,7 @@ def _figures(result: "Found", quantity: "Quantity") -> str:
         return f"no {quantity.name}: {result.trouble}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
     steady = "" if getattr(result, "settled", 0.0) is not None else ", not yet steady"
-    return f"{text.measured(result.value, result.error, quantity.unit)}{beats}{steady}"
+    return f"{text.format_measured(result.value, result.error, quantity.unit)}{beats}{steady}"
 
 
 def conclude(
@@ -117,7 +117,7 @@ def conclude(
 
 def _proposal(best: "Best", unit: str, of: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
-    value = text.measured(best.value, best.error, of)
+    value = text.format_measured(best.value, best.error, of)
     if best.x is None:
         return value
     if best.at_edge:
@@ -132,7 +132,7 @@ def _proposal(best: "Best", unit: str, of: str) -> str:
 
 
 def _measured(found: "WholeTicks", force_unit: str) -> str:
-    thrust = text.measured(found.thrust, found.error, force_unit)
+    thrust = text.format_measured(found.thrust, found.error, force_unit)
     best = f"best measured at {found.frequency:.4g} Hz: {thrust}"
     if found.nearer is None:
         return best

@@ -23,8 +23,8 @@ from fishd.core.errors import ConfigError
 from fishd.core.schema import (
     Problem,
     convert,
-    doubts,
     fields_of,
+    find_doubts,
     leaves,
     note,
     unit,
@@ -288,7 +288,7 @@ def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> N
             continue
         (name,) = path[-1:]
         fields = [field for field in fields_of(type(section)) if field.name == name]
-        for doubt in doubts({name: getattr(section, name, None)}, fields):
+        for doubt in find_doubts({name: getattr(section, name, None)}, fields):
             log.warning("careful: %s: %s", place, ".".join((*path[:-1], doubt)))
 
 

@@ -10,7 +10,7 @@ from fishd.control.supervisor import Mode
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.errors import FishdError
-from fishd.core.schema import echoed
+from fishd.core.schema import format_values
 from fishd.core.signals import Event, EventKind, Level, Reason, Tick
 
 if TYPE_CHECKING:
@@ -158,4 +158,4 @@ class Reporter:
 
 
 def _spelled(parameters: Mapping[str, Any], units: Mapping[str, str]) -> str:
-    return echoed(parameters, units, ", ") or "no parameters"
+    return format_values(parameters, units, ", ") or "no parameters"

@@ -44,7 +44,7 @@ def thrust_words(status: Status) -> str:
         return f"– {unit}"
     if status.thrust_error is None:
         return f"{1e3 * status.thrust:.2f} ± ? {unit}"
-    return text.measured(status.thrust, status.thrust_error, status.force_unit)
+    return text.format_measured(status.thrust, status.thrust_error, status.force_unit)
 
 
 def power_words(power: float) -> str:

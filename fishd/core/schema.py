@@ -38,7 +38,8 @@ def unit(
 
     symbol: the unit in SI notation, `1` for a pure number
     file: suffix, such as `.onnx`, where a text may be the path of a file
-    usual: largest size that makes sense on a real fish, where the bounds are wider; see `doubts`
+    usual: largest size that makes sense on a real fish, where the bounds are wider, as
+        `find_doubts` uses it
     constraints: those of `msgspec.Meta`, such as gt, ge, lt, le, min_length, pattern
     """
     extra: dict[str, Any] = {"unit": symbol}
@@ -353,10 +354,10 @@ def _other_unit(value: Any, field: inspect.Field) -> str:
     meant = factor * value
     above = meant >= kind.ge if kind.ge is not None else kind.gt is None or meant > kind.gt
     below = meant <= kind.le if kind.le is not None else kind.lt is None or meant < kind.lt
-    return f" ({question(value, symbol)})" if above and below else ""
+    return f" ({ask_for_unit(value, symbol)})" if above and below else ""
 
 
-def question(value: float, symbol: str) -> str:
+def ask_for_unit(value: float, symbol: str) -> str:
     """Return the question whether another unit was meant: `mN? that is 0.02 N`."""
     name, factor = _OTHER_UNITS[symbol]
     return f"{name}? that is {factor * value:.3g} {symbol}"
@@ -377,18 +378,23 @@ _MAX_IN_OTHER_UNIT = 1e6
 """Largest value that may have been meant in another unit."""
 
 
-def doubts(values: Mapping[str, Any], fields: Iterable[Field]) -> list[str]:
+def find_doubts(values: Mapping[str, Any], fields: Iterable[Field]) -> list[str]:
     """Return a sentence for each value that is valid, but far more than makes sense.
 
     values: parameters by their names
     """
-    return [
-        f"{field.name}: {with_unit(values[field.name], field.unit)} is more than makes sense: up "
-        f"to {with_unit(field.usual, field.unit)} does"
-        + (f" ({question(values[field.name], field.unit)})" if field.unit in _OTHER_UNITS else "")
-        for field in fields
-        if field.usual and is_valid_number(values, field) and abs(values[field.name]) > field.usual
-    ]
+    found = []
+    for field in fields:
+        if not (field.usual and is_valid_number(values, field)):
+            continue
+        value, symbol = values[field.name], field.unit
+        if abs(value) > field.usual:
+            hint = f" ({ask_for_unit(value, symbol)})" if symbol in _OTHER_UNITS else ""
+            found.append(
+                f"{field.name}: {format_quantity(value, symbol)} is more than makes sense: up to "
+                f"{format_quantity(field.usual, symbol)} does{hint}"
+            )
+    return found
 
 
 def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
@@ -407,7 +413,7 @@ def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
     )
 
 
-def with_unit(value: Any, symbol: str) -> str:
+def format_quantity(value: Any, symbol: str) -> str:
     """Return a value with its unit, if it is a number with one: `0.01 N`, `0.6`, `default`."""
     if value is None:
         return "default"
@@ -415,9 +421,9 @@ def with_unit(value: Any, symbol: str) -> str:
     return f"{number} {symbol}" if symbol not in ("", "1") and _is_number(value) else number
 
 
-def echoed(values: Mapping[str, Any], units: Mapping[str, str], separator: str = " ") -> str:
+def format_values(values: Mapping[str, Any], units: Mapping[str, str], separator: str = " ") -> str:
     """Return values with their names and units: `target=0.01 N C=0.6 amplitude=default`."""
-    words = (f"{name}={with_unit(v, units.get(name, ''))}" for name, v in values.items())
+    words = (f"{name}={format_quantity(v, units.get(name, ''))}" for name, v in values.items())
     return separator.join(words)
 
 

@@ -36,14 +36,14 @@ def quoted(word: str) -> str:
     return line(word, LONGEST_WORD)
 
 
-def half_width(ci95: float) -> str:
+def format_half_width(ci95: float) -> str:
     """Return the half-width of a 95 % interval in thousandths: `± 0.12`, or `exact`."""
     if ci95 < EXACT_CI95:
         return "exact"
     return f"± {1e3 * ci95:.2f}" if ci95 >= 5e-6 else f"± {1e3 * ci95:.1g}"
 
 
-def measured(value: float, ci95: float | None, unit: str = "") -> str:
+def format_measured(value: float, ci95: float | None, unit: str = "") -> str:
     """Return a value in thousandths, with its interval: `25.74 ± 0.12 mN` or `25.74 mN (exact)`.
 
     ci95: half-width of the 95 % interval; None where it is not known
@@ -52,7 +52,7 @@ def measured(value: float, ci95: float | None, unit: str = "") -> str:
     unit = f" m{quoted(unit)}" if unit else ""
     if ci95 is None:
         return f"{1e3 * value:.2f}{unit}"
-    interval = half_width(ci95)
+    interval = format_half_width(ci95)
     if interval == "exact":
         return f"{1e3 * value:.2f}{unit} (exact)"
     return f"{1e3 * value:.2f} {interval}{unit}"

@@ -73,10 +73,10 @@ def spelled(
         total_ci95 = statistical_ci95
         part = "unknown" if unit.startswith("N") else "none"
     else:
-        part = text.half_width(calibration_ci95)
+        part = text.format_half_width(calibration_ci95)
     return (
-        f"{text.measured(value, total_ci95, unit)} "
-        f"(statistical {text.half_width(statistical_ci95)}, calibration {part})"
+        f"{text.format_measured(value, total_ci95, unit)} "
+        f"(statistical {text.format_half_width(statistical_ci95)}, calibration {part})"
     )
 
 

@@ -46,4 +46,6 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
         below.axhline(0.0, color=GREY, linewidth=0.6)
         below.set_ylabel(f"without drift [m{found.unit}]")
         below.set_xlabel("time [s]")
-        below.set_title(f"{found.controller}: {text.measured(found.thrust, whole, found.unit)}")
+        below.set_title(
+            f"{found.controller}: {text.format_measured(found.thrust, whole, found.unit)}"
+        )

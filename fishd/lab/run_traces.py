@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.errors import RecordingError, UnknownController
-from fishd.core.schema import echoed
+from fishd.core.schema import format_values
 from fishd.core.signals import Event, Tick
 from fishd.recording import Run
 
@@ -149,7 +149,7 @@ def _shown(events: Iterable[Event], first: float) -> Iterator[Shown]:
                 if (value is not None if takes_over else value != before.get(name))
             }
             controller = str(event.data.get("controller", event.kind))
-            settings = echoed(changed, registry.units(controller))
+            settings = format_values(changed, registry.units(controller))
             words = f"{controller} {settings}".rstrip() if takes_over else settings or event.kind
             before = parameters
         elif event.kind == "mark":

@@ -81,4 +81,4 @@ def test_an_exception_is_named_whatever_it_is(error: BaseException, line: str) -
 def test_an_interval_of_zero_is_called_exact_and_never_shown_as_zero(
     ci95: float | None, said: str
 ) -> None:
-    assert text.measured(25.74e-3, ci95, "N") == said
+    assert text.format_measured(25.74e-3, ci95, "N") == said

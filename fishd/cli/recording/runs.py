@@ -96,7 +96,7 @@ def _thrust(summary: Summary) -> str:
     unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
     if error == "0.00":  # of no noise
         name = "" if summary.force_unit == "N" else summary.force_unit
-        return text.measured(summary.thrust, summary.thrust_error, name)
+        return text.format_measured(summary.thrust, summary.thrust_error, name)
     return f"{_thousandths(summary.thrust)} ± {error}{unit}"
 
 

@@ -132,7 +132,7 @@ def _draw_bar(
 def _describe(axis: Any, standing: Standing, unit: str) -> None:
     whole = standing.error if standing.total_ci95 is None else standing.total_ci95
     words = (
-        f"{text.measured(standing.thrust, whole, unit)}, {standing.frequency:.2f} Hz\n"
+        f"{text.format_measured(standing.thrust, whole, unit)}, {standing.frequency:.2f} Hz\n"
         f"$|φ_c|/Φ$ {standing.fullness:.2f}, square {standing.squareness:.2f}"
     )
     style = {"va": "top", "fontsize": 6, "color": "0.35", "transform": _across(axis)}

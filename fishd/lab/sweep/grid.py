@@ -15,7 +15,7 @@ from fishd.config import Config
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError
-from fishd.core.schema import echoed, unit_at, with_unit
+from fishd.core.schema import format_quantity, format_values, unit_at
 
 MOST = 100_000
 """A grid has no more points."""
@@ -48,7 +48,7 @@ class Point(Struct, frozen=True):
         }
         values |= {key: (value, unit_at(Config, key)) for key, value in self.keys.items()}
         words = (
-            f"{name.removeprefix(PARAMETER)}={with_unit(value, unit)}"
+            f"{name.removeprefix(PARAMETER)}={format_quantity(value, unit)}"
             for name, (value, unit) in values.items()
             if name not in without
         )
@@ -162,7 +162,7 @@ def check(point: Point, limits: Limits) -> None:
     try:
         registry.check(point.controller, point.parameters, limits)
     except ParameterError as error:
-        where = echoed(point.keys, {key: unit_at(Config, key) for key in point.keys})
+        where = format_values(point.keys, {key: unit_at(Config, key) for key in point.keys})
         raise ParameterError(f"{error}{f' (with {where})' if where else ''}", error.path) from None
 
 
