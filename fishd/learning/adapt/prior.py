@@ -33,14 +33,14 @@ _CORRELATED = 0.3
 """Distance at which deviations of square waves are still alike, as a logarithm of frequency."""
 
 
-def model_of(found: Identification) -> Model:
+def model_of(identification: Identification) -> Model:
     """Return how far the identified fish can be used to choose among gaits.
 
     Where it lacks something, the standard error of a thrust is as large as the rms of the force
     that it does not predict, as a fraction of that of the force.
     """
-    explained = min(channel.explained_out_of_sample for channel in found.channels)
-    if not found.failed_assumptions:
+    explained = min(channel.explained_out_of_sample for channel in identification.channels)
+    if not identification.failed_assumptions:
         return Model(explained=explained, error=MODEL_ERROR)
     if not explained >= MIN_EXPLAINED:
         return Model(explained=explained, error=None)

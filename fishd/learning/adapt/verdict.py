@@ -43,20 +43,20 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
     """
     square = next(one for one in contenders if one.name == SQUARE)
     others = [one for one in contenders if one is not square]
-    shares = {one.name: _share(one, square, len(others)) for one in others}
+    shares = {one.name: _relative_thrust(one, square, len(others)) for one in others}
     ranking = rank([_candidate(one) for one in contenders])
     names = [each.name for each in ranking.undecided]
     if ranking.is_decided:
-        chosen, claim = names[0], _win(names[0], shares)
+        chosen, claim = names[0], _format_win(names[0], shares)
     else:
-        left = _likely(contenders, names, model)
+        left = _not_excluded_by(contenders, names, model)
         chosen = left[0]
-        reason = _reason(ranking.reason, chosen == names[0], len(left), model)
+        reason = _explain_choice(ranking.reason, chosen == names[0], len(left), model)
         claim = format_choice([NAMES[name] for name in names], NAMES[chosen], reason)
         if shares:
-            claim += f"; thrust relative to {NAMES[SQUARE]}: {_list(shares)}"
-        if unused := _unused(model):
-            claim += f"; {unused}"
+            claim += f"; thrust relative to {NAMES[SQUARE]}: {_format_shares(shares)}"
+        if disuse := _explain_disuse(model):
+            claim += f"; {disuse}"
     relative_thrust, low, high = shares.get(chosen, (1.0, 1.0, 1.0))
     return Verdict(
         chosen=chosen,
@@ -74,7 +74,9 @@ def _candidate(one: Contender) -> Candidate:
     return Candidate(one.name, one.thrust, one.error, complexity(one.controller))
 
 
-def _share(one: Contender, square: Contender, comparisons: int) -> tuple[float, float, float]:
+def _relative_thrust(
+    one: Contender, square: Contender, comparisons: int
+) -> tuple[float, float, float]:
     """Return a relative thrust with its interval; raises `FishdError`."""
     widths = [half_width(_candidate(each), comparisons) for each in (one, square)]
     share = ratio(one.thrust, widths[0], square.thrust, widths[1])
@@ -87,7 +89,7 @@ def _share(one: Contender, square: Contender, comparisons: int) -> tuple[float, 
     return share
 
 
-def _likely(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
+def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
     """Return the undecided gaits that the identified fish leaves possible, too, in their order."""
     expected = np.array([one.expected for one in contenders]).T
     if model.error is None or model.is_rejected or not expected.size or expected[0].min() <= 0.0:
@@ -109,7 +111,7 @@ def _likely(contenders: Sequence[Contender], names: list[str], model: Model) -> 
     return [name for name in names if name in left] or names
 
 
-def _reason(simplest: str, is_simplest: bool, left: int, model: Model) -> str:
+def _explain_choice(simplest: str, is_simplest: bool, left: int, model: Model) -> str:
     """Return why a gait is chosen among those that the measurement leaves undecided.
 
     simplest: the reason for the simplest one; left: how many the identified fish leaves
@@ -122,7 +124,7 @@ def _reason(simplest: str, is_simplest: bool, left: int, model: Model) -> str:
     return f"it is the simplest that {fish}, leaves possible"
 
 
-def _unused(model: Model) -> str:
+def _explain_disuse(model: Model) -> str:
     """Return why the identified fish has no part in a choice; empty where it has."""
     if model.error is None:
         return (
@@ -134,13 +136,13 @@ def _unused(model: Model) -> str:
     return ""
 
 
-def _win(name: str, shares: dict[str, tuple[float, float, float]]) -> str:
+def _format_win(name: str, shares: dict[str, tuple[float, float, float]]) -> str:
     if name in shares:
         return f"{NAMES[name]} wins: it thrusts {format_ratio(shares[name])} of {NAMES[SQUARE]}"
     if not shares:
         return f"{NAMES[SQUARE]} wins: it is the only one that could be measured"
-    return f"{NAMES[SQUARE]} wins; thrust relative to it: {_list(shares)}"
+    return f"{NAMES[SQUARE]} wins; thrust relative to it: {_format_shares(shares)}"
 
 
-def _list(shares: dict[str, tuple[float, float, float]]) -> str:
+def _format_shares(shares: dict[str, tuple[float, float, float]]) -> str:
     return join([f"{NAMES[name]} {format_ratio(share)}" for name, share in shares.items()])
