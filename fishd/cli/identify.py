@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     metavar="NAME,...",
     help="What to fit; the rest is as in the configuration. [default: omega0, xi, quadratic_drag, "
     "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_inertia_ratio, lateral_drag, "
-    "lateral_quadratic_drag, servo_delay, backlash, rotation; and where the forces show it "
+    "servo_delay, backlash, rotation; and where the forces show it lateral_quadratic_drag, "
     "cable_slack, servo_dead_zone, servo_reaction]",
 )
 @click.option(

@@ -38,12 +38,15 @@ if TYPE_CHECKING:
 
 DEFAULT = (
     *("omega0", "xi", "quadratic_drag", "coupling", "servo_speed", "servo_lag"),
-    *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag", "lateral_quadratic_drag"),
+    *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag"),
     *("servo_delay", "backlash", "rotation"),
 )
 """What is fitted by default; what is left over may then demand some of `FURTHER`, too."""
 POSSIBLE = tuple(BOUNDS)
 
+_LIKELY = 4.0
+"""Smallest fall of the sum of squares, in units of noise², with which quadratic lateral drag is
+fitted: two standard errors."""
 _DEMANDED = 0.05
 """Smallest share of what is left over that something further must explain to be fitted."""
 _SETTLE = 2.0
@@ -78,19 +81,18 @@ def identify(
     Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
     that is not possible, and what `fishd.recording.read` raises.
     """
-    names = check(DEFAULT if fit is None else fit, fix)
+    known = msgspec.structs.asdict(start or PlantParameters())
+    known["rotation"] = (rig or SimulationSettings()).rotation
+    further = tuple(name for name in FURTHER if fit is None and name not in fix)
+    names = check((*DEFAULT, *filter(known.get, FURTHER)) if fit is None else fit, fix)
     parts = passages([_table(run) for run in _several(runs)])
     if not any(one.commands.any() for one in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
-    known = msgspec.structs.asdict(start or PlantParameters())
-    known["rotation"] = (rig or SimulationSettings()).rotation
     values = {name: float(known[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
-    problem, values = _solved(
-        parts, names, values, tuple(name for name in FURTHER if fit is None and name not in fix)
-    )
+    problem, values = _solved(parts, names, values, further)
     settle = _settling(values)
     if settle > _SETTLE:
         longer = [one for one in parts if one.duration > settle + SHORTEST]
@@ -177,16 +179,23 @@ def _extended(
     values: dict[str, float],
     further: Sequence[str],
 ) -> tuple[Problem, dict[str, float]]:
-    """Return the fit with what of `further` the data demand, one after the other."""
-    while not misfit.all_white(problem, values):
-        looks_like = misfit.likenesses(problem, values, further)
-        if not looks_like or looks_like[0][1] < CLEAR:
+    """Return the fit with what of `further` the data demand, one after the other.
+
+    Quadratic lateral drag is fitted at the least sign of it, even if what is left over is white: a
+    little of it makes others wrong before it is seen. Where there is none, it would cost precision.
+    """
+    while True:
+        white = misfit.all_white(problem, values)
+        looks_like = misfit.likenesses(
+            problem, values, [name for name in further if name in QUADRATIC or not white]
+        )
+        if not looks_like or looks_like[0][1] < (_LIKELY if white else CLEAR):
             break
         name, _, size = looks_like[0]
         wider = Problem(parts, check((*problem.names, name)), _SETTLE)
         begun = {**values, name: float(np.clip(size, *BOUNDS[name]))}
         begun = solve(wider, begun)
-        if wider.unexplained > problem.unexplained - 0.5 * _DEMANDED:
+        if not white and wider.unexplained > problem.unexplained - 0.5 * _DEMANDED:
             break
         problem, values = wider, begun
     return problem, values

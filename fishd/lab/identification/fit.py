@@ -27,7 +27,7 @@ FORCES = (
     *("lateral_quadratic_drag", "servo_reaction", "rotation"),
 )
 """What scales and turns the forces of a motion."""
-FURTHER = ("servo_reaction", "cable_slack", "servo_dead_zone")
+FURTHER = ("lateral_quadratic_drag", "servo_reaction", "cable_slack", "servo_dead_zone")
 """What is fitted, unless that is fixed, only where what is left over looks like it."""
 QUADRATIC = ("quadratic_drag", "lateral_quadratic_drag")
 BOUNDS = {

@@ -28,7 +28,7 @@ from fishd.learning.adapt.tank import Tank
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
-FITTED = (*DEFAULT, "servo_dead_zone", "servo_reaction")
+FITTED = (*DEFAULT, "lateral_quadratic_drag", "servo_dead_zone", "servo_reaction")
 """What is fitted: all of a fish that a fit can find, but slack, which backlash stands for."""
 LEAST_EXPLAINED = 0.1
 """Where the fit explains a smaller share of a force, that is mostly noise, and no fish is known."""
