@@ -5,6 +5,7 @@ the thrust of the best square wave of the same fish and amplitude.
 
     relative_thrust  learning curves: several fish and settings; draws docs/learning-curves.png
     amplitude        Φ = 0.3 rad, where two waves of whole ticks are nearly as good
+    exploration      why one of these seeds goes to five ticks and stays there
     choices          what each of the default settings is worth
     transfer         policies for one fish on sixteen others
     tank             tank time of trainings on a robot, evaluations included
@@ -24,7 +25,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.learning_curves import learning_curves
-from bench.middle_amplitude import amplitude
+from bench.middle_amplitude import amplitude, exploration
 from bench.policy import policy_file
 from bench.tank_time import tank
 from bench.trainings import (
@@ -329,6 +330,7 @@ def inference(config: Config, policy: str) -> str:
 PARTS = {
     "relative_thrust": relative_thrust,
     "amplitude": amplitude,
+    "exploration": exploration,
     "choices": choices,
     "transfer": transfer,
     "tank": tank,
