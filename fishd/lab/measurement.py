@@ -12,12 +12,16 @@ from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTL
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab import error_budget
-from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
+from fishd.lab.drift import LEAST_BLOCKS, RESPONSE_TIMES_S, Array, Blocks, fit
 from fishd.lab.objective import per_watt
 from fishd.lab.rig import Rig, refuse_lost
 
 SWIM, REST = 6.0, 2.75
-"""How long the fish swims and rests in turn [s]."""
+"""How long the fish swims and rests in turn, on average [s]."""
+SHORT_SWIM, SHORT_REST = 4.5, 2.25
+"""The shortest of these [s]."""
+GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
+"""Multiples of the golden ratio, less their whole part, are spread evenly and never recur."""
 UNSTEADY, RESTLESS = 0.05, 0.01
 """The power of the fin may change by this share in a swim, and be this share of it at rest."""
 LONGEST = 3600.0
@@ -235,9 +239,8 @@ def plan(
     Raises `ParameterError` where two swims do not fit.
     """
     frequency = parameters.get("frequency")
-    swim = settle + SWIM - SWIM_SETTLES
-    if isinstance(frequency, int | float) and frequency > 0.0:
-        swim = max(swim, settle + 3.0 / frequency)
+    slow = 3.0 / frequency if isinstance(frequency, int | float) and frequency > 0.0 else 0.0
+    swim = settle + max(SWIM - SWIM_SETTLES, slow)
     rest = _still(settle) + REST - REST_SETTLES
     if not 2 * swim + 3 * rest <= seconds <= LONGEST:  # NaN is not
         raise ParameterError(
@@ -246,9 +249,12 @@ def plan(
             "the most"
         )
     count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
-    stretched = seconds / (rest + count * (swim + rest))
-    cycle = [(True, swim * stretched), (False, rest * stretched)]
-    return [(False, rest * stretched), *cycle * count]
+    least = rest - REST + SHORT_REST, settle + max(SHORT_SWIM - SWIM_SETTLES, slow)
+    shares = [((GOLDEN_RATIO * (index + 1) / 2) % 1.0) ** 2 for index in range(2 * count + 1)]
+    spare = (seconds - count * sum(least) - least[False]) / sum(shares)
+    return [
+        (bool(index % 2), least[index % 2] + spare * share) for index, share in enumerate(shares)
+    ]
 
 
 def _still(settle: float) -> float:
@@ -292,7 +298,7 @@ def evaluate(
     known = steps if len(steps) >= FEW_STEPS else [*steps, *alike]
     beats, rests = _spread(known if len(known) >= FEW_STEPS else [*known, *still]), _spread(still)
     spread = np.where(swims, beats.force, rests.force)
-    blocks = Blocks(time, force, spread / lasts, swims)
+    blocks = Blocks(time, force, spread / lasts, swims, _responses(phases, time, first, tick))
     result = fit(blocks)
     lasting = sum(block.lasts for block in swimming)
     return Measured(
@@ -311,6 +317,19 @@ def evaluate(
         steps=steps,
         **_watts(swimming, beats.watts),
     )
+
+
+def _responses(phases, time, first: int, tick: float) -> Array:
+    """First-order responses of a zero that follows swimming, at these times; a column for each time constant."""
+    taus = np.array(RESPONSE_TIMES_S)
+    begins = [(phase[0].seq - first) * tick for phase in phases]
+    found, level = np.zeros((len(time), len(taus))), np.zeros(len(taus))
+    for phase, begin, end in zip(phases, begins, [*begins[1:], math.inf], strict=True):
+        inside = (time >= begin) & (time < end)
+        target = float(phase[0].swims)
+        found[inside] = target + (level - target) * np.exp(-(time[inside, None] - begin) / taus)
+        level = target + (level - target) * np.exp(-(end - begin) / taus)
+    return found
 
 
 def block_of(phase: Sequence[Sample], tick: float, settles: float) -> "Block | None":
@@ -453,8 +472,12 @@ def _steps(found: Sequence[Block], swims: bool) -> Iterator[Step]:
             )
 
 
+def _robust(squares) -> float:
+    a = np.array(squares); 
+    return float(a[a <= 20.0 * np.median(a)].mean())
+
+
 def _spread(steps: Sequence[Step]) -> Step:
     """Their means; next to nothing where there are none."""
-    count = max(1, len(steps))
-    force, watts = (sum(each) / count for each in zip(*steps, strict=True)) if steps else (0.0, 0.0)
+    force, watts = (_robust(each) for each in zip(*steps, strict=True)) if steps else (0.0, 0.0)
     return Step(max(force, 1e-12), max(watts, 1e-12))
