@@ -117,8 +117,6 @@ def _measure(
         echo(_line(found))
     for line in _careful(found):
         echo(f"fishctl: {line}", err=True)
-    if found.remark:
-        echo(f"fishctl: {found.remark}; measure again with a longer --settle", err=True)
     if picture:
         from fishd.lab.measurement_figure import draw
 
@@ -128,13 +126,20 @@ def _measure(
 
 def _line(found: "Measured") -> str:
     from fishd.lab import error_budget
+    from fishd.lab.disturbances import spell
 
     what = spelled(found.controller, dict(found.parameters))
     thrust = error_budget.spelled(
         found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
     )
     line = f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"
-    return line + _power(found)
+    words = spell(found.disturbances, found.unit)
+    return (
+        line
+        + _power(found)
+        + (f"; accounted for: {words}" if words else "")
+        + (f"; careful: {found.remark}" if found.remark else "")
+    )
 
 
 def _careful(found: "Measured") -> "Iterator[str]":

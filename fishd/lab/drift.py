@@ -7,40 +7,32 @@ Kinds and strengths are not chosen but averaged over, each weighed by its restri
 (REML; Patterson & Thompson, Biometrika 58 (1971) 545; Gaussian processes: Rasmussen & Williams,
 Gaussian Processes for Machine Learning, 2006, section 2.7).
 
-Three kinds of disturbance that no such drift describes are searched for: a step of the zero
-between two blocks, a block that is far off, and a zero that follows swimming like a first-order
-system. Each is a regressor with a Gaussian prior of its size and a prior probability. The set of
-disturbances is built by adding or exchanging one at a time while that makes the whole more
-probable; the result is averaged over that set and all sets that differ from it by one disturbance.
+What no such drift describes is searched for (`fishd.lab.disturbances`): a step of the zero, a block
+that is far off, and a zero that follows swimming. The result is averaged over the set of
+disturbances that was found and all sets that differ from it by one disturbance.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Self
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fishd.lab.disturbances import NAMED_ODDS, RESPONSE_TIMES_S, Disturbance, Search, candidates
+
 Array = NDArray[np.float64]
 
-WALKS = (0.0, 0.01, 0.1, 1.0, 10.0)
+WALKS = (0.0, 0.03, 0.5, 8.0)
 """Variances of the random walk after a second, over that of a block, that are tried."""
 TIMES = (2.5, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 40.0)
 """Correlation times of the smooth drift that are tried [s]."""
-STRENGTHS = tuple(10.0**exponent for exponent in range(-1, 6))
+STRENGTHS = tuple(10.0**exponent for exponent in (-0.5, 0.75, 2.0, 3.25, 4.5))
 """Variances of the smooth drift, over that of a block, that are tried."""
 LEAST_BLOCKS = 6
 """Fewer say nothing about a drift."""
-
-RESPONSE_TIMES_S = (3.0, 6.0, 12.0, 24.0, 48.0)
-"""Time constants of a zero that follows swimming that are tried [s]."""
-RESPONSE_PROBABILITY = 3.0
-STEPS_PER_SECOND = 1 / 60
-"""Expected rate of steps of the zero before the force is seen [1/s]."""
-OUTLIER_PROBABILITY = 0.01
-SIZE = 15.0
-"""Prior standard deviation of the size of a disturbance, over that of a block."""
-MAX_DISTURBANCES = 12
+MAX_BLOCKS_AT_ONCE = 150
+"""More blocks are fitted in parts, because time and memory grow faster than their number."""
 
 
 class Blocks(NamedTuple):
@@ -51,11 +43,11 @@ class Blocks(NamedTuple):
     force: Array
     """Mean force in it [N]."""
     variance: Array
-    """What that varies by, drift aside, up to a common factor."""
+    """Variance of that without drift, as neighbours differ [N²]."""
     swims: NDArray[np.bool_]
     """Did the fish swim? It rested where not."""
-    responses: Array | None = None
-    """n×k"""
+    responses: Array
+    """First-order responses to swimming, for each of `RESPONSE_TIMES_S`; n×k, k may be 0."""
 
 
 class Fit(NamedTuple):
@@ -67,121 +59,10 @@ class Fit(NamedTuple):
     """Half of the 95 % interval [N]."""
     drift: Array
     """The force without swimming, block by block [N]."""
-    steps: float = 0.0
-    outliers: float = 0.0
-    response: float = 0.0
-    chosen: tuple = ()
-
-
-class _State(NamedTuple):
-    """All drifts (m) with a set of disturbances; and candidates (c)."""
-
-    chosen: tuple[int, ...]
-    u: Array
-    d: Array
-    k: Array
-    """Coefficient of swimming in a regression of the candidate."""
-    left: Array
-    weight: Array
-    force: Array
-    unsure: Array
-    used: tuple[tuple[Array, Array, int], ...]
-
-
-class _Search:
-    def __init__(self, blocks: Blocks) -> None:
-        time, force, variance, swims, responses = blocks
-        n = len(time)
-        self.n = n
-        seconds = time - time[0]
-        noise = np.diag(variance / variance.mean())
-        base = np.column_stack((np.ones(n), seconds - seconds.mean()))
-        self.degrees = n - 3
-        self.responses = np.empty((n, 0)) if responses is None else responses
-        nr = self.responses.shape[1]
-        V = np.concatenate([noise + w for w in _covariances(seconds)])
-        self.wander = V
-        factor = np.linalg.cholesky(V)
-        logdet = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-        inv = np.linalg.inv(V)
-        left = inv @ base
-        info = base.T @ left
-        self.P = P = inv - left @ np.linalg.solve(info, left.swapaxes(1, 2))
-        self.base_weight = -logdet - 0.5 * np.linalg.slogdet(info)[1]
-        gaps = np.diff(time)
-        self.prior = np.log(np.concatenate((
-            gaps * STEPS_PER_SECOND, np.full(n, OUTLIER_PROBABILITY),
-            np.full(nr, RESPONSE_PROBABILITY / max(1, nr)))))
-        # what candidates are
-        H = np.concatenate((np.tri(n, n, -1)[:, :-1], np.eye(n), self.responses), axis=1)
-        self.H = H
-        Py = P @ force
-        Pt = P @ swims.astype(float)
-        self.yPy = Py @ force
-        self.tPt = Pt @ swims
-        self.ty = Pt @ force
-        self.u0 = self.project(Py)
-        self.t0 = self.project(Pt)
-        upper = (P * np.tri(n, n, -1).T).sum(axis=2)
-        diag = np.diagonal(P, axis1=1, axis2=2)
-        steps = np.cumsum((diag + 2 * upper)[:, ::-1], axis=1)[:, ::-1][:, 1:]
-        PR = P @ self.responses
-        self.d0 = np.concatenate((steps, diag, (PR * self.responses).sum(axis=1)), axis=1)
-        self.columns: dict[int, Array] = {}
-        t = self.t0
-        self.empty = _State(
-            (), self.u0 - t * (self.ty / self.tPt)[:, None], self.d0 - t**2 / self.tPt[:, None],
-            t / self.tPt[:, None], self.yPy - self.ty**2 / self.tPt,
-            self.base_weight - 0.5 * np.log(self.tPt), self.ty / self.tPt, 1 / self.tPt, ())
-        self.kind = np.array([0] * (n - 1) + [1] * n + [2] * nr)
-
-    def project(self, v: Array) -> Array:
-        s = np.cumsum(v[:, ::-1], axis=1)[:, ::-1][:, 1:]
-        return np.concatenate((s, v, v @ self.responses), axis=1)
-
-    def column(self, c: int) -> Array:
-        if c not in self.columns:
-            v = self.P @ self.H[:, c]
-            g = self.project(v)
-            self.columns[c] = g - self.t0 * (self.t0[:, c] / self.tPt)[:, None]
-        return self.columns[c]
-
-    def add(self, s: _State, c: int) -> _State:
-        g = self.column(c)
-        for gr, dr, r in s.used:
-            g = g - gr * (gr[:, c] / dr)[:, None]
-        d = s.d[:, c] + 1 / SIZE**2
-        a = s.u[:, c] / d
-        return _State(
-            (*s.chosen, c), s.u - g * a[:, None], s.d - g**2 / d[:, None],
-            s.k - g * (s.k[:, c] / d)[:, None], s.left - s.u[:, c] * a,
-            s.weight - 0.5 * np.log(d * SIZE**2) + self.prior[c], s.force - s.k[:, c] * a,
-            s.unsure + s.k[:, c] ** 2 / d, (*s.used, (g, d, c)))
-
-    def of(self, chosen: Sequence[int]) -> _State:
-        s = self.empty
-        for c in chosen:
-            s = self.add(s, c)
-        return s
-
-    def likely(self, s: _State) -> Array:
-        return s.weight - 0.5 * self.degrees * np.log(s.left)
-
-    def additions(self, s: _State):
-        d = np.maximum(s.d, 0) + 1 / SIZE**2
-        a = s.u / d
-        left = s.left[:, None] - s.u * a
-        w = s.weight[:, None] - 0.5 * np.log(d * SIZE**2) + self.prior - 0.5 * self.degrees * np.log(left)
-        barred = list(s.chosen)
-        if any(self.kind[c] == 2 for c in s.chosen):
-            barred += list(np.flatnonzero(self.kind == 2))
-        w[:, barred] = -1e9
-        return w, left, s.force[:, None] - s.k * a, s.unsure[:, None] + s.k**2 / d
-
-
-def lse(w, axis=None):
-    m = w.max(axis=axis, keepdims=True)
-    return np.squeeze(m, axis) + np.log(np.exp(w - m).sum(axis=axis)) if axis is not None else m.max() + math.log(np.exp(w - m.max()).sum())
+    disturbances: Sequence[Disturbance] = ()
+    """What was found beside a drift, and accounted for."""
+    is_disturbed: bool = False
+    """Were there as many disturbances as can be told apart, or more?"""
 
 
 def fit(blocks: Blocks) -> Fit:
@@ -189,62 +70,75 @@ def fit(blocks: Blocks) -> Fit:
 
     Raises ValueError for fewer than `LEAST_BLOCKS` blocks, or without both swimming and rest.
     """
-    time, force, variance, swims, responses = blocks
-    n = len(time)
+    n, swims = len(blocks.time), blocks.swims
     if n < LEAST_BLOCKS or swims.all() or not swims.any():
         raise ValueError("blocks of swimming and of rest are needed, six at least")
-    S = _Search(blocks)
-    limit = min(MAX_DISTURBANCES, (n - 3) // 4)
-    chosen: tuple[int, ...] = ()
-    best = lse(S.likely(S.empty))
-    for _ in range(4 * limit):
-        # additions, and exchanges
-        options = []
-        if len(chosen) < limit:
-            sc = lse(S.additions(S.of(chosen))[0], 0)
-            c = int(sc.argmax()); options.append((sc[c], (*chosen, c)))
-        if not options or options[0][0] <= best:
-            for drop in chosen:
-                rest = tuple(c for c in chosen if c != drop)
-                st = S.of(rest)
-                options.append((lse(S.likely(st)), rest))
-                sc = lse(S.additions(st)[0], 0)
-                c = int(sc.argmax()); options.append((sc[c], (*rest, c)))
-        if not options: break
-        top = max(options)
-        if top[0] <= best + 1e-9: break
-        best, chosen = top
-    # average
-    ws, fs, vs, sets = [], [], [], []
-    def take(w, left, f, v):
-        ws.append(w.ravel()); fs.append(f.ravel()); vs.append((v * left / S.degrees * S.degrees / max(1, S.degrees - 2)).ravel())
-    full = S.of(chosen)
-    take(S.likely(full), full.left, full.force, full.unsure)
-    if len(chosen) < limit: take(*S.additions(full))
-    for drop in chosen:
-        st = S.of([c for c in chosen if c != drop])
-        take(S.likely(st), st.left, st.force, st.unsure)
-        w, *rest = S.additions(st)
-        w[:, drop] = -1e9
-        take(w, *rest)
-    w = np.concatenate(ws); f = np.concatenate(fs); v = np.concatenate(vs)
-    w = np.exp(w - w.max()); w /= w.sum()
-    mean = float(w @ f)
-    spread = float(w @ (v + (f - mean) ** 2))
-    kinds = [S.kind[c] for c in chosen]
-    return Fit(mean, 1.96 * spread**0.5, np.zeros(n), kinds.count(0), kinds.count(1), kinds.count(2), chosen)
+    parts = math.ceil(n / MAX_BLOCKS_AT_ONCE)
+    pieces = (np.array_split(array, parts) for array in blocks)
+    fits = [_fit(Blocks(*part)) for part in zip(*pieces, strict=True)]
+    if parts == 1:
+        return fits[0]
+    weights = np.array([part.error**-2 for part in fits])
+    return Fit(
+        float(weights @ [part.force for part in fits] / weights.sum()),
+        float(weights.sum() ** -0.5),
+        np.concatenate([part.drift for part in fits]),
+        [disturbance for part in fits for disturbance in part.disturbances],
+        any(part.is_disturbed for part in fits),
+    )
 
 
-def _covariances(seconds: Array) -> Iterator[Array]:
-    """Of all drifts that are tried, at these times; over the variance of a block.
+def _fit(blocks: Blocks) -> Fit:
+    time, force, variance, swims, responses = blocks
+    noise = variance / variance.mean()
+    precision, evidence = _precisions(time - time[0], noise)
+    known = candidates(time, responses)
+    swimming = swims.astype(np.float64)
+    search = Search(precision, evidence, force, swimming, known, float(variance.mean()))
+    chosen = search.find()
+    mean, spread = search.average(chosen)
+    sizes, drift = search.explain(chosen, noise)
+    found = [
+        _disturbance(candidate, size, time)
+        for candidate, size in zip(chosen, sizes.tolist(), strict=True)
+        if search.odds(chosen, candidate) >= NAMED_ODDS
+    ]
+    return Fit(mean, 1.96 * spread**0.5, drift, found, search.is_full(chosen))
 
-    Several at once, shape (·, n, n), since numpy takes as long to be called as for a small matrix.
-    Each counts as much as any other before the forces are seen: a kind that is added here with n
-    strengths counts n times.
+
+def _disturbance(candidate: int, size: float, time: Array) -> Disturbance:
+    """Return what a candidate is; they are in the order of `candidates`."""
+    n = len(time)
+    if candidate < n - 1:
+        return Disturbance("step", size, float(0.5 * (time[candidate] + time[candidate + 1])))
+    if candidate < 2 * n - 1:
+        return Disturbance("outlier", size, float(time[candidate - n + 1]))
+    return Disturbance("response", size, None, RESPONSE_TIMES_S[candidate - 2 * n + 1])
+
+
+def _precisions(seconds: Array, noise: Array) -> tuple[Array, Array]:
+    """Return the inverse covariance of each drift beside a level and a trend, and its evidence.
+
+    Each drift counts as much as any other before the forces are seen: a kind that is added here
+    with n strengths counts n times.
+
+    seconds: middles of the blocks; noise: their variances, over that of an average one
     """
-    walk = np.minimum.outer(seconds, seconds)
+    walk = np.multiply.outer(WALKS, np.minimum.outer(seconds, seconds)) + np.diag(noise)
     gap = np.subtract.outer(seconds, seconds)
-    for time in TIMES:
-        smooth = np.exp(-0.5 * (gap / time) ** 2)
-        for strength in STRENGTHS:
-            yield np.multiply.outer(WALKS, walk) + strength * smooth
+    covariances = np.concatenate(
+        [
+            walk + strength * np.exp(-0.5 * (gap / time) ** 2)
+            for time in TIMES
+            for strength in STRENGTHS
+        ]
+    )
+    base = np.column_stack((np.ones(len(seconds)), seconds - seconds.mean()))
+    factors = np.linalg.cholesky(covariances)
+    evidence = -np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
+    del factors
+    precision = np.linalg.inv(covariances)
+    pulled = precision @ base
+    information = base.T @ pulled
+    precision -= pulled @ np.linalg.solve(information, pulled.swapaxes(1, 2))
+    return precision, evidence - 0.5 * np.linalg.slogdet(information)[1]

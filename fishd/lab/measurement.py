@@ -12,7 +12,8 @@ from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTL
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab import error_budget
-from fishd.lab.drift import LEAST_BLOCKS, RESPONSE_TIMES_S, Array, Blocks, fit
+from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
+from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
 from fishd.lab.objective import per_watt
 from fishd.lab.rig import Rig, refuse_lost
 
@@ -26,10 +27,15 @@ UNSTEADY, RESTLESS = 0.05, 0.01
 """The power of the fin may change by this share in a swim, and be this share of it at rest."""
 LONGEST = 3600.0
 """The longest measurement [s]."""
+LONGER = "measure again with a longer --settle"
+DISTURBED = "the zero of F_x was disturbed too often for the interval to be trusted; measure again"
+"""What is said of a measurement that may be wrong."""
 MOST_BLOCKS = 200
 """Beats and pieces of a rest are taken together until there are no more blocks than this."""
 FEW_STEPS = 3
 """From fewer beat to beat nobody knows how beats differ."""
+UNUSUAL = 20.0
+"""Squares of differences beyond so many times their median do not count: 3 standard deviations."""
 SHORT_BEAT = 0.4
 """Beats are taken together until they last so long [s]."""
 
@@ -92,6 +98,8 @@ class Measured(NamedTuple):
     """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
     lateral: float = 0.0
     """Mean F_y that swimming adds [N]."""
+    disturbances: Sequence[Disturbance] = ()
+    """Disturbances of the zero that the fit found and accounted for."""
 
 
 class Step(NamedTuple):
@@ -203,6 +211,8 @@ class Summary(Struct, frozen=True):
     """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
     thrust_per_watt_total_ci95: float | None = None
     """As `total_ci95`, of the thrust for each watt [N/W]."""
+    disturbances: Sequence[Disturbance] = ()
+    """Disturbances of the zero that the fit found and accounted for."""
 
 
 def summary(found: Measured, tick: float) -> Summary:
@@ -227,6 +237,7 @@ def summary(found: Measured, tick: float) -> Summary:
         found.total_ci95,
         found.rotation,
         per_watt(found.thrust, found.total_ci95, found.watts, found.watts_error)[1],
+        list(found.disturbances),
     )
 
 
@@ -298,7 +309,7 @@ def evaluate(
     known = steps if len(steps) >= FEW_STEPS else [*steps, *alike]
     beats, rests = _spread(known if len(known) >= FEW_STEPS else [*known, *still]), _spread(still)
     spread = np.where(swims, beats.force, rests.force)
-    blocks = Blocks(time, force, spread / lasts, swims, _responses(phases, time, first, tick))
+    blocks = Blocks(time, force, spread / lasts, swims, _responses(phases, time, tick, first))
     result = fit(blocks)
     lasting = sum(block.lasts for block in swimming)
     return Measured(
@@ -313,23 +324,30 @@ def evaluate(
         drift=result.drift,
         ticks=[],
         unit="N",
-        remark=_remark(kept),
+        remark=_remark(kept) or (DISTURBED if result.is_disturbed else ""),
         steps=steps,
+        disturbances=result.disturbances,
         **_watts(swimming, beats.watts),
     )
 
 
-def _responses(phases, time, first: int, tick: float) -> Array:
-    """First-order responses of a zero that follows swimming, at these times; a column for each time constant."""
-    taus = np.array(RESPONSE_TIMES_S)
+def _responses(phases: Sequence[Sequence[Sample]], time: Array, tick: float, first: int) -> Array:
+    """Return first-order responses to swimming, which begin at 0, at these times; n×k.
+
+    There is one for each of `RESPONSE_TIMES_S`.
+
+    first: index that time is counted from
+    """
+    constants = np.array(RESPONSE_TIMES_S)
     begins = [(phase[0].seq - first) * tick for phase in phases]
-    found, level = np.zeros((len(time), len(taus))), np.zeros(len(taus))
+    responses, level = np.empty((len(time), len(constants))), np.zeros(len(constants))
     for phase, begin, end in zip(phases, begins, [*begins[1:], math.inf], strict=True):
         inside = (time >= begin) & (time < end)
-        target = float(phase[0].swims)
-        found[inside] = target + (level - target) * np.exp(-(time[inside, None] - begin) / taus)
-        level = target + (level - target) * np.exp(-(end - begin) / taus)
-    return found
+        gap = level - phase[0].swims
+        fading = np.exp(-(time[inside, np.newaxis] - begin) / constants)
+        responses[inside] = phase[0].swims + gap * fading
+        level = phase[0].swims + gap * np.exp(-(end - begin) / constants)
+    return responses
 
 
 def block_of(phase: Sequence[Sample], tick: float, settles: float) -> "Block | None":
@@ -384,11 +402,12 @@ def _remark(kept: Sequence[Sequence["Block"]]) -> str:
     begins = sum(block.power for blocks in swims for block in blocks[: len(blocks) // 2])
     ends = sum(block.power for blocks in swims for block in blocks[-(len(blocks) // 2) :])
     if begins and abs(ends / begins - 1.0) > UNSTEADY:
-        return f"the fin was not steady: its power changed by {ends / begins - 1.0:+.0%} in a swim"
+        change = ends / begins - 1.0
+        return f"the fin was not steady: its power changed by {change:+.0%} in a swim; {LONGER}"
     count = sum(len(blocks) // 2 for blocks in swims)
     if begins and rests and np.mean(rests) > RESTLESS * begins / count:
         share = np.mean(rests) * count / begins
-        return f"the fin did not rest: it had {share:.0%} of its power left"
+        return f"the fin did not rest: it had {share:.0%} of its power left; {LONGER}"
     return ""
 
 
@@ -472,12 +491,14 @@ def _steps(found: Sequence[Block], swims: bool) -> Iterator[Step]:
             )
 
 
-def _robust(squares) -> float:
-    a = np.array(squares); 
-    return float(a[a <= 20.0 * np.median(a)].mean())
-
-
 def _spread(steps: Sequence[Step]) -> Step:
-    """Their means; next to nothing where there are none."""
-    force, watts = (_robust(each) for each in zip(*steps, strict=True)) if steps else (0.0, 0.0)
+    """Their means without those far off; next to nothing where there are none."""
+    force, watts = (map(_usual_mean, zip(*steps, strict=True))) if steps else (0.0, 0.0)
     return Step(max(force, 1e-12), max(watts, 1e-12))
+
+
+def _usual_mean(squares: Sequence[float]) -> float:
+    """Return the mean of these, without those that a disturbance of the force has made."""
+    largest = UNUSUAL * float(np.median(squares))
+    usual = [square for square in squares if square <= largest]
+    return sum(usual) / len(usual)
