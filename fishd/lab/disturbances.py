@@ -32,8 +32,8 @@ SIZE = 15.0
 """Prior standard deviation of the size of a disturbance, over the standard deviation of a block."""
 MAX_DISTURBANCES = 12
 """Largest number of disturbances in one fit."""
-BLOCKS_PER_DISTURBANCE = 4
-"""Smallest number of blocks for each disturbance."""
+MIN_BLOCKS, BLOCKS_PER_DISTURBANCE = 11, 3
+"""Numbers of blocks that are needed beside disturbances, and for each: one swim has too few."""
 
 
 class Kind(IntEnum):
@@ -101,14 +101,14 @@ def candidates(time: Array, responses: Array) -> Candidates:
     """Return a step at each boundary of blocks, an outlier at each block, and the responses.
 
     time: middle of each block [s]
-    responses: n×k, for the time constants in `RESPONSE_TIMES_S`
+    responses: n×k, for the last k of `RESPONSE_TIMES_S`
     """
     n, kinds = len(time), responses.shape[1]
     columns = np.concatenate((np.tri(n, n, -1)[:, :-1], np.eye(n), responses), axis=1)
     odds = (
         STEP_ODDS_PER_SECOND * np.diff(time),
         np.full(n, OUTLIER_ODDS),
-        np.full(kinds, RESPONSE_ODDS / max(1, kinds)),
+        np.full(kinds, RESPONSE_ODDS / len(RESPONSE_TIMES_S)),
     )
     kind = np.repeat([Kind.STEP, Kind.OUTLIER, Kind.RESPONSE], [n - 1, n, kinds])
     return Candidates(columns, kind, np.log(np.concatenate(odds)))
@@ -171,8 +171,9 @@ class Search:
         """
         self._precision = precision
         self._force, self._swims, self._known = force, swims, known
+        self._variance = variance
         self._degrees = len(force) - 2
-        self._limit = min(MAX_DISTURBANCES, (len(force) - 3) // BLOCKS_PER_DISTURBANCE)
+        self._limit = min(MAX_DISTURBANCES, (len(force) - MIN_BLOCKS) // BLOCKS_PER_DISTURBANCE)
         pulled, swum = precision @ force, precision @ swims
         self._pulled = pulled
         self._information = swum @ swims
@@ -185,7 +186,7 @@ class Search:
             pull=pulled @ known.columns - self._crossed * of_swims[:, np.newaxis],
             weight=self._weights() - self._crossed * share,
             share=share,
-            left=pulled @ force - of_swims**2 * self._information + variance,
+            left=np.maximum(pulled @ force - of_swims**2 * self._information, 0.0) + variance,
             evidence=evidence - 0.5 * np.log(self._information),
             force=of_swims,
             unsure=1.0 / self._information,
@@ -226,7 +227,7 @@ class Search:
             pull=state.pull - column * size[:, np.newaxis],
             weight=state.weight - column**2 / weight[:, np.newaxis],
             share=state.share - column * (share / weight)[:, np.newaxis],
-            left=state.left - state.pull[:, candidate] * size,
+            left=np.maximum(state.left - state.pull[:, candidate] * size, self._variance),
             evidence=state.evidence
             - 0.5 * np.log(weight * SIZE**2)
             + self._known.log_odds[candidate],
@@ -254,7 +255,7 @@ class Search:
         """
         kinds = self._known.kinds
         weight = np.maximum(state.weight, 0.0) + SIZE**-2
-        left = state.left[:, np.newaxis] - state.pull**2 / weight
+        left = np.maximum(state.left[:, np.newaxis] - state.pull**2 / weight, self._variance)
         likely = (
             state.evidence[:, np.newaxis]
             - 0.5 * np.log(weight * SIZE**2)
@@ -303,7 +304,7 @@ class Search:
 
     def is_full(self, chosen: Sequence[int]) -> bool:
         """Return whether no more disturbances than these can be told apart."""
-        return bool(self._limit) and len(chosen) >= self._limit
+        return len(chosen) >= self._limit > 0
 
     def average(self, chosen: Sequence[int]) -> tuple[float, float]:
         """Return force [N] and variance [N²], over these disturbances and all sets one away."""

@@ -29,6 +29,8 @@ TIMES = (2.5, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 40.0)
 """Correlation times of the smooth drift that are tried [s]."""
 STRENGTHS = tuple(10.0**exponent for exponent in (-0.5, 0.75, 2.0, 3.25, 4.5))
 """Variances of the smooth drift, over that of a block, that are tried."""
+LEAST_NOISE = 1e-3
+"""Smallest variance of a block over that of an average one, for the covariances to be inverted."""
 LEAST_BLOCKS = 6
 """Fewer say nothing about a drift."""
 MAX_BLOCKS_AT_ONCE = 150
@@ -47,7 +49,7 @@ class Blocks(NamedTuple):
     swims: NDArray[np.bool_]
     """Did the fish swim? It rested where not."""
     responses: Array
-    """First-order responses to swimming, for each of `RESPONSE_TIMES_S`; n×k, k may be 0."""
+    """First-order responses to swimming, for the last k of `RESPONSE_TIMES_S`; n×k."""
 
 
 class Fit(NamedTuple):
@@ -90,7 +92,7 @@ def fit(blocks: Blocks) -> Fit:
 
 def _fit(blocks: Blocks) -> Fit:
     time, force, variance, swims, responses = blocks
-    noise = variance / variance.mean()
+    noise = np.maximum(variance / variance.mean(), LEAST_NOISE)
     precision, evidence = _precisions(time - time[0], noise)
     known = candidates(time, responses)
     swimming = swims.astype(np.float64)
@@ -99,21 +101,25 @@ def _fit(blocks: Blocks) -> Fit:
     mean, spread = search.average(chosen)
     sizes, drift = search.explain(chosen, noise)
     found = [
-        _disturbance(candidate, size, time)
+        _disturbance(candidate, size, time, responses.shape[1])
         for candidate, size in zip(chosen, sizes.tolist(), strict=True)
         if search.odds(chosen, candidate) >= NAMED_ODDS
     ]
     return Fit(mean, 1.96 * spread**0.5, drift, found, search.is_full(chosen))
 
 
-def _disturbance(candidate: int, size: float, time: Array) -> Disturbance:
-    """Return what a candidate is; they are in the order of `candidates`."""
+def _disturbance(candidate: int, size: float, time: Array, responses: int) -> Disturbance:
+    """Return what a candidate is; they are in the order of `candidates`.
+
+    responses: how many of them are responses
+    """
     n = len(time)
     if candidate < n - 1:
         return Disturbance("step", size, float(0.5 * (time[candidate] + time[candidate + 1])))
     if candidate < 2 * n - 1:
         return Disturbance("outlier", size, float(time[candidate - n + 1]))
-    return Disturbance("response", size, None, RESPONSE_TIMES_S[candidate - 2 * n + 1])
+    constant = RESPONSE_TIMES_S[candidate - 2 * n + 1 - responses]
+    return Disturbance("response", size, None, constant)
 
 
 def _precisions(seconds: Array, noise: Array) -> tuple[Array, Array]:

@@ -309,7 +309,9 @@ def evaluate(
     known = steps if len(steps) >= FEW_STEPS else [*steps, *alike]
     beats, rests = _spread(known if len(known) >= FEW_STEPS else [*known, *still]), _spread(still)
     spread = np.where(swims, beats.force, rests.force)
-    blocks = Blocks(time, force, spread / lasts, swims, _responses(phases, time, tick, first))
+    blocks = Blocks(
+        time, force, spread / lasts, swims, _responses(phases, time, tick, first, settles)
+    )
     result = fit(blocks)
     lasting = sum(block.lasts for block in swimming)
     return Measured(
@@ -331,14 +333,18 @@ def evaluate(
     )
 
 
-def _responses(phases: Sequence[Sequence[Sample]], time: Array, tick: float, first: int) -> Array:
+def _responses(
+    phases: Sequence[Sequence[Sample]], time: Array, tick: float, first: int, settles: float
+) -> Array:
     """Return first-order responses to swimming, which begin at 0, at these times; n×k.
 
-    There is one for each of `RESPONSE_TIMES_S`.
+    There is one for each of `RESPONSE_TIMES_S` that is twice as long as a swim takes to settle:
+    faster ones cannot be told from thrust. With a single swim, none can.
 
     first: index that time is counted from
     """
-    constants = np.array(RESPONSE_TIMES_S)
+    several = sum(phase[0].swims for phase in phases) > 1
+    constants = np.array([each for each in RESPONSE_TIMES_S if several and each >= 2.0 * settles])
     begins = [(phase[0].seq - first) * tick for phase in phases]
     responses, level = np.empty((len(time), len(constants))), np.zeros(len(constants))
     for phase, begin, end in zip(phases, begins, [*begins[1:], math.inf], strict=True):
@@ -500,5 +506,5 @@ def _spread(steps: Sequence[Step]) -> Step:
 def _usual_mean(squares: Sequence[float]) -> float:
     """Return the mean of these, without those that a disturbance of the force has made."""
     largest = UNUSUAL * float(np.median(squares))
-    usual = [square for square in squares if square <= largest]
+    usual = [square for square in squares if not square > largest]  # NaN stays
     return sum(usual) / len(usual)

@@ -1,5 +1,6 @@
 """Thrust is told apart from whatever the force sensor drifts, with an interval that holds."""
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -9,6 +10,7 @@ from msgspec.structs import replace
 from fishd.config import Config, load
 from fishd.core.errors import ParameterError
 from fishd.lab import drift
+from fishd.lab.disturbances import spell
 from fishd.lab.measurement import (
     MOST_BLOCKS,
     Measured,
@@ -83,6 +85,13 @@ def test_a_plan_takes_its_time_and_begins_and_ends_at_rest(
     assert min(length for swims, length in phases if swims) > 3.0 / frequency + 1.0
 
 
+def test_swims_and_rests_differ_in_length_so_that_no_drift_keeps_time_with_them() -> None:
+    lengths = [length for _, length in plan(60.0, {})]
+    for same in (lengths[::2], lengths[1::2]):
+        assert max(same) > 1.5 * min(same)
+        assert len({round(length, 2) for length in same}) == len(same)
+
+
 @pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0, 1e9])
 def test_a_length_that_is_not_possible_is_told_with_what_is_needed(seconds: float) -> None:
     with pytest.raises(ParameterError, match=r"two swims of 6 s .* need 20\.25 s, and 3600 s"):
@@ -106,6 +115,73 @@ def test_a_force_that_is_not_to_be_believed_spoils_no_measurement() -> None:
     again = evaluate(samples_of(ticks), RIG.tick)
     assert again.thrust == pytest.approx(found.thrust, abs=found.error)
     assert again.error < 3.0 * found.error
+
+
+@cache
+def undisturbed(seconds: float) -> Measured:
+    return measured(replace(RIG, simulation=replace(RIG.simulation, seed=77)), seconds)
+
+
+def disturbed(seconds: float, force: Callable[[float, bool], float]) -> Measured:
+    """A measurement with a force added to F_x, at a time since its start, swimming or not."""
+    ticks = undisturbed(seconds).ticks
+    return evaluate(
+        samples_of(
+            replace(
+                tick,
+                fx=tick.fx + force((tick.seq - ticks[0].seq) * RIG.tick, tick.mode == "running"),
+            )
+            for tick in ticks
+        ),
+        RIG.tick,
+    )
+
+
+@pytest.mark.parametrize("at", [8.0, 13.5, 14.3, 22.0])  # in swims, before one, in a rest
+def test_a_step_of_the_zero_is_found_and_accounted_for(at: float) -> None:
+    clean, found = undisturbed(30.0), disturbed(30.0, lambda time, _: 5e-3 * (time > at))
+    (step,) = [each for each in found.disturbances if each.kind == "step"]
+    assert step.size == pytest.approx(5e-3, abs=1e-3)
+    assert step.time == pytest.approx(at, abs=1.5)
+    assert abs(found.thrust - clean.thrust) < found.error < 2.0 * clean.error
+    assert found.drift[-1] - found.drift[0] == pytest.approx(5e-3, abs=1e-3)
+    assert "the zero stepped by +" in spell(found.disturbances, "N")
+
+
+@pytest.mark.parametrize("at", [6.0, 11.0])  # in a swim, in a rest
+def test_a_tick_far_off_is_found_and_hardly_moves_the_thrust(at: float) -> None:
+    clean, found = undisturbed(30.0), disturbed(30.0, lambda time, _: 0.1 * (abs(time - at) < 0.02))
+    (outlier,) = found.disturbances
+    assert (outlier.kind, outlier.time) == ("outlier", pytest.approx(at, abs=0.6))
+    assert abs(found.thrust - clean.thrust) < found.error < 1.3 * clean.error
+
+
+def test_a_zero_that_follows_swimming_is_named_and_not_taken_for_thrust() -> None:
+    level = 0.0
+
+    def follow(_: float, swims: bool) -> float:
+        nonlocal level
+        level += (swims - level) * RIG.tick / 10.0
+        return 4e-3 * level
+
+    found = disturbed(60.0, follow)
+    (response,) = found.disturbances
+    assert response.kind == "response"
+    assert response.size == pytest.approx(4e-3, rel=0.3)
+    assert abs(found.thrust - truth()) < found.error < 0.5e-3
+
+
+def test_nothing_is_named_where_the_zero_holds_still() -> None:
+    assert not undisturbed(30.0).disturbances
+    assert not undisturbed(60.0).disturbances
+    assert not undisturbed(60.0).remark
+
+
+def test_a_zero_with_more_disturbances_than_are_searched_for_is_a_remark(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("fishd.lab.disturbances.MAX_DISTURBANCES", 1)
+    assert "disturbed too often" in disturbed(30.0, lambda time, _: 5e-3 * (time > 8.0)).remark
 
 
 def candidate(generator: np.random.Generator, half_beat: int) -> list[Sample]:
@@ -144,7 +220,8 @@ def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_p
 
 
 def test_swimming_alone_cannot_be_told_from_a_drift() -> None:
-    blocks = drift.Blocks(np.arange(9.0), np.ones(9), np.ones(9), np.ones(9, dtype=bool))
+    swims = np.ones(9, dtype=bool)
+    blocks = drift.Blocks(np.arange(9.0), np.ones(9), np.ones(9), swims, np.empty((9, 0)))
     with pytest.raises(ValueError, match="of rest are needed"):
         drift.fit(blocks)
 
