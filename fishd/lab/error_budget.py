@@ -110,7 +110,8 @@ def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> fl
     """Return by what angle F_x and F_y are turned into each other while the fish swims [rad].
 
     Over whole beats of a symmetric gait the true F_x, at even harmonics, and the true F_y, at odd
-    ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD` or not known.
+    ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD`, or its interval has 0
+    in it.
 
     settles: time until a swim is steady [s]
     """
@@ -125,7 +126,9 @@ def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> fl
     if most < MIN_ELONGATION * least:
         return 0.0
     angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
-    return angle if abs(angle) >= MIN_ROTATION_RAD else 0.0
+    # The error of a principal axis: Anderson, Ann. Math. Stat. 34 (1963) 122.
+    angle_ci95 = 1.96 * math.sqrt(least * most / len(forces)) / (most - least)
+    return angle if abs(angle) >= max(MIN_ROTATION_RAD, angle_ci95) else 0.0
 
 
 def lateral_force(ticks: Iterable[Tick]) -> float:
