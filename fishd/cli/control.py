@@ -10,7 +10,15 @@ import click
 
 from fishd.cli.completion import active_parameters, complete_pair
 from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
-from fishd.cli.output import echo, echo_rows, made_printable, measured, print_json, spelled
+from fishd.cli.output import (
+    criterion_words,
+    echo,
+    echo_rows,
+    made_printable,
+    measured,
+    print_json,
+    spelled,
+)
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.client import Fish
 from fishd.controllers import registry
@@ -211,6 +219,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("angle", f"{_angle(status)}, {_range(status)}"),
         *_swum(status),
         *([("leak", f"{status.leak:.3g} s, found")] if status.leak is not None else []),
+        *_criterion(status),
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
@@ -219,6 +228,15 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]
+
+
+def _criterion(status: Status) -> list[tuple[str, str]]:
+    """Return what `swing --C auto` has found, or tries."""
+    quantities = status.quantities
+    if status.parameters.get("C") != "auto" or "criterion" not in quantities:
+        return []
+    when = "on trial, or the best so far" if quantities.get("searching") else "found"
+    return [("C auto", criterion_words(quantities, when))]
 
 
 def _swum(status: Status) -> list[tuple[str, str]]:

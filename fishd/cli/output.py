@@ -1,7 +1,7 @@
 """How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any, TypeVar
 
@@ -105,3 +105,14 @@ def _escaped(document: bytes) -> str:
         return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4))
 
     return re.sub(r"[^\x20-\x7e\n]", escape, document.decode())
+
+
+def criterion_words(quantities: Mapping[str, float], when: str) -> str:
+    """Return the C that `swing --C auto` uses, from its quantities.
+
+    when: such as "at the end"
+    """
+    lead = quantities.get("lead")
+    ahead = f", of the speed that is predicted {lead:g} s ahead" if lead else ""
+    turns = ", in turn with another one" if quantities.get("halfway") else ""
+    return f"C = {quantities['criterion']:g} {when}{ahead}{turns}"

@@ -10,7 +10,7 @@ import click
 from fishd.cli.config import fish_options
 from fishd.cli.free_swim_options import SETTLE, SwimmerOptions, swimmer_options
 from fishd.cli.options import ControllerGroup, json_option
-from fishd.cli.output import echo, echo_rows, print_json, spelled, warn_of_fin
+from fishd.cli.output import criterion_words, echo, echo_rows, print_json, spelled, warn_of_fin
 from fishd.config import Config, load
 from fishd.core.console import power_words
 from fishd.core.errors import MissingPackage
@@ -173,10 +173,7 @@ def _chosen(report: "Report") -> list[tuple[str, str]]:
     """What the controller chose where it was left to it."""
     if report.parameters.get("C") != "auto" or "criterion" not in report.quantities:
         return []
-    found = report.quantities
-    ahead = f", of the speed that is predicted {found['lead']:g} s ahead" if found["lead"] else ""
-    turns = ", in turn with another one" if found["halfway"] else ""
-    return [("", f"C = {found['criterion']:g} at the end{ahead}{turns}")]
+    return [("", criterion_words(report.quantities, "at the end"))]
 
 
 def _frequency(report: "Report", tick: float) -> str:

@@ -22,6 +22,7 @@ NAMES = (
     "identification",
     "estimators",
     "swing",
+    "lateral_sign",
     "adapt",
     "harsh",
     "thrust",

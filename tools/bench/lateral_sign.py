@@ -1,0 +1,120 @@
+"""What a reversed F_y costs, with and without its correction, on fish that differ from the model.
+
+Each fish rests for 3 s and then swims for 40 s, of which the last 30 s are judged: once as it is,
+once with F_y reversed and corrected, and once with F_y reversed and only warned of. Relative
+thrusts are shares of each fish's own best square wave, of its true thrust.
+"""
+
+import dataclasses
+import logging
+import math
+import os
+import statistics
+from argparse import Namespace
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
+
+from msgspec.structs import replace
+
+from bench.swing import percent
+from common.report import Options, Report, table
+from fishd.config import load
+from fishd.core.signals import Measurement
+from fishd.hardware.base import ForceSensor
+from fishd.lab.other_fish import CHANGES, OtherFish, harsh_fish, mild
+from fishd.simulation import simulate
+from fishd.simulation.virtual_run import VirtualRun
+
+DOCUMENT = "calibration.md"
+REST_S = 3.0
+"""Time at rest before the start [s]."""
+SECONDS, SETTLE = 40.0, 10.0
+GROUPS = {
+    "the default fish": CHANGES[:1],
+    "20 mild fish (seeds 340 to 359)": tuple(map(mild, range(340, 360))),
+    "20 harsh fish": harsh_fish(),
+}
+CONTROLLERS: dict[str, dict[str, Any]] = {
+    "swing": {},
+    "swing --C auto": {"C": "auto"},
+    "default-fish": {"policy": "default-fish"},
+}
+
+
+class Reversed:
+    """A force sensor whose wires of F_y are interchanged."""
+
+    def __init__(self, sensor: ForceSensor) -> None:
+        self._sensor = sensor
+
+    def read(self, now: float) -> Measurement:
+        """Read the sensor."""
+        measurement = self._sensor.read(now)
+        return replace(measurement, fy=-measurement.fy)
+
+    def close(self) -> None:
+        """Close the sensor."""
+        self._sensor.close()
+
+
+class Case(NamedTuple):
+    """A run of one fish."""
+
+    fish: OtherFish
+    contestant: str
+    turned: bool
+    """Whether F_y is reversed."""
+    treatment: str
+    """Value of `estimator.reversed_fy`."""
+
+
+def relative_thrust(case: Case) -> float:
+    """Swim a fish, and return its relative thrust [1]."""
+    logging.getLogger("fishd").setLevel(logging.ERROR)  # each reversed fish is a warning
+
+    def rest(run: VirtualRun) -> None:
+        loop = run.loop
+        if case.turned:
+            loop.robot = dataclasses.replace(loop.robot, sensor=Reversed(loop.robot.sensor))
+        for _ in range(math.ceil(REST_S / loop.limits.tick)):
+            run.tick()
+
+    overrides = (*case.fish.overrides, f"estimator.reversed_fy={case.treatment}")
+    controller = "ppo" if case.contestant == "default-fish" else "swing"
+    parameters = CONTROLLERS[case.contestant]
+    config = load(None, overrides)
+    return simulate(config, controller, parameters, SECONDS, SETTLE, begun=rest).relative_thrust
+
+
+OPTIONS: Options = {
+    "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
+}
+COLUMNS = ((False, "correct"), (True, "correct"), (True, "warn"))
+
+
+def measure(options: Namespace) -> Report:
+    """One table; a minute or two."""
+    cases = [
+        Case(fish, contestant, turned, treatment)
+        for group in GROUPS.values()
+        for fish in group
+        for contestant in CONTROLLERS
+        for turned, treatment in COLUMNS
+    ]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        shares = dict(zip(cases, pool.map(relative_thrust, cases), strict=True))
+    rows = []
+    for name, group in GROUPS.items():
+        for contestant in CONTROLLERS:
+            columns = [
+                [shares[Case(fish, contestant, *column)] for fish in group] for column in COLUMNS
+            ]
+            rows.append([name, f"`{contestant}`", *map(_median_and_worst, columns)])
+    head = "fish | controller | F_y right | reversed, `correct` | reversed, `warn`"
+    figures = [{**case._asdict(), "relative_thrust": share} for case, share in shares.items()]
+    return Report({"bench lateral_sign": table(head, rows)}, figures)
+
+
+def _median_and_worst(shares: list[float]) -> str:
+    median = percent(statistics.median(shares))
+    return median if len(shares) == 1 else f"{median} / {percent(min(shares))}"
