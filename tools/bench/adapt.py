@@ -191,7 +191,7 @@ def summary(found: list[Adapted]) -> str:
         ["interval of the chosen gait's relative thrust covers the truth", _covered(claims)],
         ["the same, of every gait but the square wave", _covered(every)],
         [
-            "interval of a thrust covers the truth",
+            "statistical interval of a thrust covers the truth",
             f"{sum(abs(value - true) <= error for value, error, true in thrusts)} of "
             f"{len(thrusts)}",
         ],
