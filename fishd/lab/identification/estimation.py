@@ -45,8 +45,8 @@ DEFAULT = (
 POSSIBLE = tuple(BOUNDS)
 
 _LIKELY = 4.0
-"""Smallest fall of the sum of squares, in units of noise², with which quadratic lateral drag is
-fitted: two standard errors."""
+"""Smallest fall of the sum of squares, in units of noise², with which something further is fitted
+though what is left over is white: two standard errors."""
 _DEMANDED = 0.05
 """Smallest share of what is left over that something further must explain to be fitted."""
 _SETTLE = 2.0
@@ -181,14 +181,12 @@ def _extended(
 ) -> tuple[Problem, dict[str, float]]:
     """Return the fit with what of `further` the data demand, one after the other.
 
-    Quadratic lateral drag is fitted at the least sign of it, even if what is left over is white: a
-    little of it makes others wrong before it is seen. Where there is none, it would cost precision.
+    They are fitted at the first sign of them, even if what is left over is white: a little of them
+    makes others wrong before it is seen. Where there is none, they would cost precision.
     """
     while True:
         white = misfit.all_white(problem, values)
-        looks_like = misfit.likenesses(
-            problem, values, [name for name in further if name in QUADRATIC or not white]
-        )
+        looks_like = misfit.likenesses(problem, values, further)
         if not looks_like or looks_like[0][1] < (_LIKELY if white else CLEAR):
             break
         name, _, size = looks_like[0]
