@@ -81,6 +81,8 @@ def metadata(path: Path) -> dict[str, dict[str, str]] | None:
         if isinstance(last, Metadata):
             found[last.name] = last.metadata
         elif isinstance(last, Chunk):
+            if last.compression != "zstd":  # damaged, or written by another program
+                return None
             try:
                 content = decompressor.decompress(last.data, last.uncompressed_size)
             except _WRONG:

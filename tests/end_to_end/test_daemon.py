@@ -32,8 +32,10 @@ SHIPPED = str(ROOT / "config" / "simulated.yaml")
 
 EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # which a simulated fish leaves out
 OF_A_SWIMMER = {"x", "y", "speed", "heading"}
-AT_TIMES = {"thrust_error", "thrust_factor", "thrust_factor_error", "quantities", "leak", "suspect"}
-"""From the first rest on; where the controller has any; with estimator.leak: auto; in doubt."""
+KNOWN_THRUST = {"thrust_error", "thrust_factor", "thrust_factor_error"}
+"""Fields from the first rest on."""
+AT_TIMES = KNOWN_THRUST | {"quantities", "leak", "fy_corrected", "suspect"}
+"""Fields that are absent where there is nothing to say."""
 TICK_FIELDS = {
     name: kind if isinstance(kind, type) else float
     for name, kind in get_type_hints(Tick).items()

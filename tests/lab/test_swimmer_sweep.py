@@ -153,7 +153,7 @@ def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
     fast = ["--settle", "0.5", "--periods", "2", "--jobs", "1", "--folder", str(folder)]
     done = fishctl("sweep", "sine", "--frequency", "5", *OPTIONS, *fast)
     assert done.returncode == 0
-    assert "sine frequency=5: " in done.stdout
+    assert "sine frequency=5 Hz: " in done.stdout
     assert " mm/s, 5.0" in done.stdout
     with (folder / "points.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)

@@ -21,6 +21,7 @@ ELSEWHERE = {
         "servo_speed",
         "servo_lag",
         "thrust_coefficient",
+        "lateral_inertia_ratio",
     },
     "simulation": {"drift_period", "drift_rate", "hum_frequency", "motor", "sample_rate", "seed"},
 }
