@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.swing import Case, harsh
 from common.report import Options, Report, table
 from fishd.config import Config, load
 from fishd.lab.measurement import measure as measured
 from fishd.lab.measurement import summary
+from fishd.lab.other_fish import OtherFish, harsh
 from fishd.lab.rig import VirtualRig
 from fishd.simulation import KeepingPublisher, VirtualRun, simulate
 
@@ -171,7 +171,7 @@ def on_model(job: tuple[str, float, int]) -> Held:
     return held(overrides, target, factor_of(way, overrides, target), wave)
 
 
-def on_harsh(job: tuple[str, Case]) -> Held:
+def on_harsh(job: tuple[str, OtherFish]) -> Held:
     """A run on a harsh fish, at half of the thrust that it swings with."""
     way, case = job
     config: Config = load(None, case.overrides)
