@@ -1,10 +1,10 @@
 """`swing`: reverse when the fin slows down. The paper's model-free control (Fu et al.)."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta, Struct
 
-from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of
+from fishd.controllers.base import Amplitude, Controller, Likeness, Limits, amplitude_of
 from fishd.controllers.criterion_search import BEGIN, LADDER, CriterionSearch, Phase, Rung
 from fishd.controllers.quantities import quantity
 from fishd.controllers.reversal import Reversal
@@ -64,6 +64,8 @@ class Swing(Controller[SwingParameters]):
     """
 
     Parameters = SwingParameters
+    # A lead changes no more than the size of the wave; and `thrust`, which has none, swims alike.
+    swims_like: ClassVar[Likeness | None] = Likeness("swing", frozenset({"lead"}))
     top_speed: float = quantity(
         "1",
         "The fin's highest speed in a half beat: of this one, once past it; before, of the last.",

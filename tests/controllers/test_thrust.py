@@ -119,6 +119,14 @@ def test_it_finds_the_target_again_with_another_fin() -> None:
     assert true_thrust(rig.run_for(10), coefficient) == pytest.approx(0.010, rel=0.15)
 
 
+def test_it_makes_the_wave_of_swing_whose_factor_is_then_its_own() -> None:
+    rig = rested(factor=None)
+    rig.start("swing")
+    wave = rig.loop.active.wave
+    rig.start("thrust", target=0.010)
+    assert rig.loop.active.wave == wave
+
+
 def test_what_was_measured_of_swing_holds_for_it() -> None:
     rig = rested(factor=None)
     rig.start("swing")

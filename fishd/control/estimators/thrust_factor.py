@@ -99,9 +99,11 @@ class Factor(NamedTuple):
     def after_step(self, before: Level, after: Level, drift: float, wave: Wave) -> "Factor":
         """Return the factor updated by the change of the force from one level to another.
 
-        This is a step of a Kalman filter for the factors of both levels, whose difference has the
-        variance `scatter`. Neither level's zero is estimated: only their difference enters, with
-        the variance of its drift.
+        This is a step of a Kalman filter. Another wave has another factor, which differs by the
+        variance `scatter`; another size of the wave is a less certain sample of the same factor,
+        and the size that the factor holds for moves there by the fraction of the variance that it
+        removes. Neither level's zero is estimated: only their difference enters, with the variance
+        of its drift.
 
         drift: variance of the change of the zero after a second [N²/s]
         wave: the wave of `after`
@@ -120,6 +122,10 @@ class Factor(NamedTuple):
         value = prior.value if known else 0.0
         noise = before.variance + after.variance + before.thrust_variance
         noise += before.drift_variance(after, drift)
+        moves = not known or (wave != self.wave if power else False)
+        if not moves:  # the factor stays that of its size, which this level is a sample of
+            noise += other * power**2
+            other = 0.0
         surprise = change + before.thrust - value * step
         total = variance * step**2 + other * power**2 + noise
         excess = max(0.0, surprise**2 - CONTRADICTION**2 * total)
@@ -130,13 +136,12 @@ class Factor(NamedTuple):
                 total += excess
         common = variance * step + other * power
         gain = common / total
-        return Factor(
-            value + gain * surprise,
-            max(0.0, variance + other - gain * common),
-            after.end,
-            after.size or self.size,
-            wave if power else self.wave,
-        )
+        left = max(0.0, variance + other - gain * common)
+        size = after.size or self.size
+        if not moves and not excess and size is not None and self.size is not None:
+            size = self.size + (1.0 - left / variance) * (size - self.size)
+        new_wave = wave if power else self.wave
+        return Factor(value + gain * surprise, left, after.end, size, new_wave)
 
 
 class Drift:
