@@ -171,6 +171,18 @@ def clip(rig: Rig, robot: Wrapped, fx: float) -> None:
     robot.fx, robot.suspect = None, ""
 
 
+def test_beats_that_suspect_forces_have_made_old_are_not_shown() -> None:
+    rig, robot = fragile_rig()
+    rig.run_for(3.0)
+    rig.start("square", frequency=5.0 / 3.0)
+    thrust = rig.run_for(5.0)[-1].thrust
+    for _ in range(15):  # no whole beat is left between them
+        clip(rig, robot, 0.1)
+        ticks = rig.run_for(0.8)
+    assert ticks[-1].thrust != thrust
+    assert known(ticks)[1] > 3e-3
+
+
 @pytest.mark.parametrize("fx", [0.1, 1.0, -5.0])
 def test_a_force_at_rest_that_is_not_to_be_believed_moves_no_zero(fx: float) -> None:
     rig, robot = fragile_rig()

@@ -114,6 +114,8 @@ class LiveThrust:
         self._recording = False
         if self._swims:  # the fin velocity must settle again
             self._phase = 0.0
+            if self._shown and self._now - self._shown[-1].end > LONGEST_BEAT:
+                self._shown.clear()  # too old to be shown
 
     def calibrate(self, factor: float, error: float) -> None:
         """Set the factor to that of a measurement.
