@@ -2,8 +2,12 @@
 
 import re
 import tomllib
+from email import message_from_bytes
+from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
+from hatchling.build import build_wheel
 from rigs.documents import ROOT, text_of
 
 from rooms import arrows, purpose, rooms
@@ -34,6 +38,18 @@ def test_the_checked_layers_are_the_rooms() -> None:
     named = [room.strip() for layer in layers["layers"] for room in layer.split(":")]
     named += layers["exhaustive_ignores"]
     assert sorted(named) == sorted(path.stem for path in ROOMS.values())
+
+
+def test_a_wheel_names_its_licence_and_carries_its_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    with ZipFile(tmp_path / build_wheel(str(tmp_path))) as wheel:
+        files = {name.partition(".dist-info/")[2]: name for name in wheel.namelist()}
+        metadata = message_from_bytes(wheel.read(files["METADATA"]))
+        licence = wheel.read(files["licenses/LICENSE"]).decode()
+    assert (metadata["License-Expression"], metadata["License-File"]) == ("MIT", "LICENSE")
+    assert licence.startswith("MIT License\n\nCopyright (c) 2026 The fishd authors\n")
 
 
 @pytest.mark.slow
