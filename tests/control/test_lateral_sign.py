@@ -11,8 +11,8 @@ import pytest
 from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 from rigs.harness import Rig, Scripted, fragile_rig, observe
-from rigs.reversed_force import Interchanged, reversed_robot
 
+from common.reversed_force import ReversedSensor, reversed_robot
 from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.core.errors import Refused
 from fishd.core.signals import Measurement, Observation, Tick
@@ -222,7 +222,7 @@ def test_where_it_is_only_to_be_warned_of_nothing_is_corrected() -> None:
     assert "so swing and policies fail" in rig.loop.lateral_sign.complaint
 
 
-class Touched(Interchanged):
+class Touched(ReversedSensor):
     """A force sensor that somebody touches now and then, so that F_y seems to be reversed."""
 
     touched = False

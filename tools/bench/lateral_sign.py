@@ -5,7 +5,6 @@ once with F_y reversed and corrected, and once with F_y reversed and only warned
 thrusts are shares of each fish's own best square wave, of its true thrust.
 """
 
-import dataclasses
 import logging
 import math
 import os
@@ -14,13 +13,10 @@ from argparse import Namespace
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
 
-from msgspec.structs import replace
-
 from bench.swing import percent
 from common.report import Options, Report, table
+from common.reversed_force import reversed_robot
 from fishd.config import load
-from fishd.core.signals import Measurement
-from fishd.hardware.base import ForceSensor
 from fishd.lab.other_fish import CHANGES, OtherFish, harsh_fish, mild
 from fishd.simulation import simulate
 from fishd.simulation.virtual_run import VirtualRun
@@ -41,22 +37,6 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 }
 
 
-class Reversed:
-    """A force sensor whose wires of F_y are interchanged."""
-
-    def __init__(self, sensor: ForceSensor) -> None:
-        self._sensor = sensor
-
-    def read(self, now: float) -> Measurement:
-        """Read the sensor."""
-        measurement = self._sensor.read(now)
-        return replace(measurement, fy=-measurement.fy)
-
-    def close(self) -> None:
-        """Close the sensor."""
-        self._sensor.close()
-
-
 class Case(NamedTuple):
     """A run of one fish."""
 
@@ -75,7 +55,7 @@ def relative_thrust(case: Case) -> float:
     def rest(run: VirtualRun) -> None:
         loop = run.loop
         if case.turned:
-            loop.robot = dataclasses.replace(loop.robot, sensor=Reversed(loop.robot.sensor))
+            loop.robot = reversed_robot(loop.robot)
         for _ in range(math.ceil(REST_S / loop.limits.tick)):
             run.tick()
 

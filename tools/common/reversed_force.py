@@ -1,4 +1,4 @@
-"""A robot whose F_y has the wrong sign."""
+"""A robot whose F_y has the wrong sign, for tests and measurements."""
 
 import dataclasses
 
@@ -8,19 +8,22 @@ from fishd.core.signals import Measurement
 from fishd.hardware.base import ForceSensor, Robot
 
 
-class Interchanged:
+class ReversedSensor:
     """A force sensor whose wires of F_y are interchanged."""
 
     def __init__(self, sensor: ForceSensor) -> None:
         self._sensor = sensor
 
     def read(self, now: float) -> Measurement:
-        measured = self._sensor.read(now)
-        return replace(measured, fy=-measured.fy)
+        """Read the sensor, with F_y reversed."""
+        measurement = self._sensor.read(now)
+        return replace(measurement, fy=-measurement.fy)
 
     def close(self) -> None:
+        """Close the sensor."""
         self._sensor.close()
 
 
 def reversed_robot(robot: Robot) -> Robot:
-    return dataclasses.replace(robot, sensor=Interchanged(robot.sensor))
+    """Return the robot with its F_y reversed."""
+    return dataclasses.replace(robot, sensor=ReversedSensor(robot.sensor))
