@@ -84,14 +84,17 @@ class Ppo(Controller[PpoParameters]):
             self._choose(self._latest)
 
     def update(self, observation: Observation) -> float:
-        """Φ times the network's output, which is cut to ±1 [rad].
+        """Return Φ times the network's output, which is cut to ±1 [rad].
 
-        An output that is not finite is returned as it is, which is the fault `controller-error`.
+        A network with left-right symmetry returns zero where all its inputs are zero, as at rest
+        without noise; the fish is then pushed to plus. An output that is not finite is returned as it is, which is the fault `controller-error`.
         Raises `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
         self.action = action = self._choose(observation)
-        if math.isfinite(action):
+        if action == 0.0 and not self._network.row.any():
+            action = 1.0
+        elif math.isfinite(action):
             action = max(-1.0, min(1.0, action))
         angle = self._limit.apply(self._amplitude * action, observation.dt)
         self.held = self._limit.share

@@ -31,3 +31,9 @@ def test_it_swims_fish_on_clean_rigs(seed: int) -> None:
     report = simulate(config, "ppo", {"policy": "default-fish"}, seconds=25.0, settle=10.0)
     assert report.relative_thrust > 0.9
     assert report.fallback is None
+
+
+def test_it_starts_at_rest_on_a_rig_without_noise() -> None:
+    config = load(None, ["simulation.noise=0"])
+    report = simulate(config, "ppo", {"policy": "default-fish"}, seconds=25.0, settle=10.0)
+    assert report.relative_thrust > 0.99
