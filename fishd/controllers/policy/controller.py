@@ -87,7 +87,8 @@ class Ppo(Controller[PpoParameters]):
         """Return Φ times the network's output, which is cut to ±1 [rad].
 
         A network with left-right symmetry returns zero where all its inputs are zero, as at rest
-        without noise; the fish is then pushed to plus. An output that is not finite is returned as it is, which is the fault `controller-error`.
+        without noise; the fish is then pushed to plus.
+        An output that is not finite is returned as it is, which is the fault `controller-error`.
         Raises `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
