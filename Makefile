@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -20)
 
-.PHONY: help run test test-fast lint docs figures bench clean
+.PHONY: help run test test-realtime test-fast lint docs figures bench clean
 
 help:  ## List what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
@@ -18,19 +18,14 @@ help:  ## List what there is to make
 run: $(VENV)/installed  ## Swim a simulated fish until Ctrl-C
 	$(BIN)/fishd --config config/simulated.yaml --print-status
 
-# What judges real time goes ahead of the others, where that is permitted; else it follows alone.
 # Signals as in a terminal, also below nohup or in the background of a script.
 PYTEST := env --default-signal=HUP,INT,QUIT $(BIN)/python -m pytest
-SHARED := $(PYTEST) -n $(JOBS) --dist worksteal -m "not realtime"
-ALONE := $(PYTEST) --realtime
 
-test: $(VENV)/installed-dev  ## Run the whole test suite
-	@if [ -n "$(AHEAD)" ]; then \
-	  $(AHEAD) $(ALONE) >$(VENV)/realtime.txt 2>&1 & \
-	  $(SHARED); shared=$$?; wait $$!; alone=$$?; cat $(VENV)/realtime.txt; \
-	else \
-	  $(SHARED); shared=$$?; $(ALONE); alone=$$?; \
-	fi; exit $$((shared || alone))
+test: $(VENV)/installed-dev  ## Run all tests but those that judge real time
+	$(PYTEST) -n $(JOBS) --dist worksteal -m "not realtime"
+
+test-realtime: $(VENV)/installed-dev  ## Run the tests that judge real time, alone, on a machine with nothing else to do
+	$(AHEAD) $(PYTEST) --realtime
 
 test-fast: $(VENV)/installed-dev  ## Run what is on the virtual clock: no processes, no torch
 	@# These compute and hardly ever wait.
@@ -88,4 +83,4 @@ trial-systemd: $(VENV)/installed-dev  ## Start, hang and kill fishd under a real
 trial-arm64: $(VENV)/installed-dev  ## Install on arm64 Debian 12 and 13 under qemu; needs root, an hour
 	FISHCTL=$(CURDIR)/$(BIN)/fishctl tools/arm64_trial.sh
 
-release-check: lint test trial-systemd trial-arm64  ## All of these, once before each release; needs root
+release-check: lint test test-realtime trial-systemd trial-arm64  ## All of these, once before each release; needs root

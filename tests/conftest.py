@@ -1,10 +1,13 @@
 """What holds for every test: which are fast, what may be reported, how many threads compute."""
 
+import contextlib
 import gc
 import os
 import re
 import signal
+import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -27,8 +30,19 @@ gc.disable()
 settings.register_profile("fishd", deadline=None)
 settings.load_profile("fishd")
 
-STOLEN = 0.03
-"""A test that fails is judged again if so much was stolen meanwhile [s]."""
+LOST = 0.03
+"""A test of real time that fails is repeated if the machine lost so much time meanwhile [s]."""
+STALLS = """
+import time
+before = time.monotonic()
+while True:
+    time.sleep(0.01)
+    now = time.monotonic()
+    if now - before > {limit}:
+        print(f"{{now - before - 0.01:.3f}}", flush=True)
+    before = now
+"""
+"""Prints by how much it was woken late, each time that this was long [s]."""
 
 SLOW = re.compile(
     r"subprocess|multiprocessing|asyncio|time\.sleep|SystemClock|running\("
@@ -98,34 +112,85 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+class LostTime:
+    """Processor time that neither fishd nor a test had any use of."""
+
+    def __init__(self) -> None:
+        limit = LOST + 0.01
+        self._watch = subprocess.Popen(
+            [sys.executable, "-S", "-E", "-c", STALLS.format(limit=limit)], stdout=subprocess.PIPE
+        )
+        assert self._watch.stdout
+        self._pipe = self._watch.stdout.fileno()
+        os.set_blocking(self._pipe, False)
+        self._stolen = stolen()
+
+    def since_last(self) -> float:
+        """Return the time that was lost since the call before [s]."""
+        before, self._stolen = self._stolen, stolen()
+        stalls = b""
+        with contextlib.suppress(BlockingIOError):
+            stalls = os.read(self._pipe, 65536)
+        return max(self._stolen - before, sum(map(float, stalls.split())))
+
+    def close(self) -> None:
+        with self._watch:
+            self._watch.kill()
+
+
+LOST_TIME = pytest.StashKey[LostTime]()
+
+
+def stolen() -> float:
+    """Return the processor time, of all cores, that the host has given to others [s]."""
+    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """What judges real time is judged again, and that is said, if it fails while the host of a
-    virtual machine takes processor time away: that says nothing of fishd. Nothing else is ever
-    tried twice.
+    """Repeat a test of real time once, and say so, if it fails while the machine loses time.
+
+    The host of a virtual machine has taken the processor away, or everything stood still: that
+    says nothing of fishd. No other test is ever tried twice.
     """
-    if not item.get_closest_marker("realtime"):
+    lost_time = item.config.stash.get(LOST_TIME, None)
+    if lost_time is None:
         return None
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for _ in range(3):
-        before = stolen()
-        reports = runtestprotocol(item, log=False, nextitem=nextitem)
-        if stolen() - before < STOLEN or not any(report.failed for report in reports):
-            break
+    lost_time.since_last()
+    reports = runtestprotocol(item, log=False, nextitem=nextitem)
+    lost = lost_time.since_last()
+    if lost > LOST and any(report.failed for report in reports):
         if terminal := item.config.pluginmanager.get_plugin("terminalreporter"):
-            taken = f"failed while the host took {stolen() - before:.2f} s away: judged again"
             failures = "\n".join(report.longreprtext for report in reports if report.failed)
-            terminal.write_line(f"\n{item.nodeid}: {taken}\n{failures}")
+            message = f"failed while the machine lost {lost:.2f} s: repeated once"
+            terminal.write_line(f"\n{item.nodeid}: {message}\n{failures}")
         item.session._setupstate.teardown_exact(None)
+        reports = runtestprotocol(item, log=False, nextitem=nextitem)
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
 
 
-def stolen() -> float:
-    """Processor time that the host has given to others, of all cores since start [s]."""
-    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
+def pytest_sessionstart(session: pytest.Session) -> None:
+    if session.config.option.realtime:
+        session.config.stash[LOST_TIME] = LostTime()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if lost_time := config.stash.get(LOST_TIME, None):
+        lost_time.close()
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say how many tests were skipped, by what would enable them."""
+    reports = terminalreporter.stats.get("skipped", [])
+    reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in reports)
+    if reasons:
+        terminalreporter.section("skipped")
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} × {reason}")
 
 
 @pytest.hookimpl(wrapper=True)

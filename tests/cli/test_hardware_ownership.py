@@ -55,9 +55,9 @@ def as_nobody() -> tuple[str, ...]:
     pytest.skip("another user cannot start this fishd: its folder, or Python's, is private")
 
 
-def refusal(folder: Path, *arguments: str, under: tuple[str, ...] = ()) -> str:
+def refusal(folder: Path, *arguments: str, **command: tuple[str, ...]) -> str:
     """What a fishd that does not start says."""
-    status, _, err = Daemon(folder, *arguments, under=under).finish()
+    status, _, err = Daemon(folder, *arguments, **command).finish()
     assert status == 1
     assert err.count("\n") == 1
     return err
@@ -90,11 +90,11 @@ def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
     nobody = as_nobody()
     one, other = folders
     private = ("sh", "-c", 'umask 077; exec "$@"', "sh", *nobody)
-    with running(one, *pi_settings(one), under=private) as killed:
+    with running(one, *pi_settings(one), under=private, start=(FISHD,)) as killed:
         assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other))
         killed.kill()
     with running(other, *pi_settings(other)) as mine:  # whose lock files are somebody else's
-        said = refusal(one, *pi_settings(one), under=nobody)
+        said = refusal(one, *pi_settings(one), under=nobody, start=(FISHD,))
         assert f"(pid {mine.process.pid})" in said
 
 

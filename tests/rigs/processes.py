@@ -7,28 +7,25 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import msgspec
 import zmq
 
+from common.processes import FISHCTL, FISHD, PATIENCE, Process, call, sets, wait_until
 from fishd.cli.main import main
 from fishd.client import Fish, NoDaemon
 from fishd.core.interruption import SIGNALS
 from fishd.core.signals import Status
 
-FISHD = str(Path(sys.executable).with_name("fishd"))
-FISHCTL = str(Path(sys.executable).with_name("fishctl"))
-PATIENCE = 60.0
-"""How long anything may take before a test gives up on it [s]."""
+__all__ = [
+    "FISHCTL", "FISHD", "PATIENCE", "Daemon", "Process", "Subscriber", "addresses", "call",
+    "fishctl", "install", "one_line", "running", "sets", "wait_until",
+]  # fmt: skip
 
-
-def call(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end; options: those of `subprocess.run`."""
-    usual = {"capture_output": True, "text": True, "check": False, "timeout": PATIENCE}
-    return subprocess.run(command, **(usual | options))
+UNHURRIED_FISHD = str(Path(__file__).with_name("unhurried_fishd.py"))
 
 
 def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -60,13 +57,11 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     return done.stderr
 
 
-def sets(*pairs: str) -> list[str]:
-    """The words of a command line that override these keys of the configuration."""
-    return [word for pair in pairs for word in ("--set", pair)]
-
-
-UNHURRIED = [] if os.environ.get("JUDGES_REAL_TIME") else sets("realtime.warm_up=false")
-"""Of a fishd whose lateness nobody judges: it computes half as much."""
+if os.environ.get("JUDGES_REAL_TIME"):
+    START: tuple[str, ...] = (FISHD,)
+else:  # it computes half as much, and nothing is too late
+    START = (sys.executable, "-P", UNHURRIED_FISHD, *sets("realtime.warm_up=false"))
+"""The command that starts a fishd."""
 
 
 def addresses(folder: Path) -> list[str]:
@@ -91,51 +86,22 @@ def install(
         (site / f"{name}.py").write_text(code)
 
 
-def wait_until(true: Callable[[], bool]) -> None:
-    """Looks more seldom where a look is dear: it would slow down what is waited for."""
-    looked = time.monotonic()
-    deadline = looked + PATIENCE
-    while not true():
-        now = time.monotonic()
-        assert now < deadline
-        time.sleep(max(0.02, 4.0 * (now - looked)))
-        looked = time.monotonic()
-
-
-class Process:
-    """A program that runs beside the test; as a context manager it is gone afterwards."""
-
-    def __init__(self, *command: str) -> None:
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with self.process:
-            self.process.kill()
-
-    def finish(self, patience: float = PATIENCE) -> tuple[int, str, str]:
-        """Wait until it ends by itself; exit status, output and errors."""
-        out, err = self.process.communicate(timeout=patience)
-        return self.process.returncode, out, err
-
-    def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal, if it still runs, and return exit status, output and errors."""
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-        return self.finish()
-
-
 class Daemon(Process):
     """A running fishd with addresses of its own."""
 
-    def __init__(self, folder: Path, *arguments: str, under: Sequence[str] = ()) -> None:
-        """under: a command that starts the daemon, `setpriv` say."""
+    def __init__(
+        self,
+        folder: Path,
+        *arguments: str,
+        under: Sequence[str] = (),
+        start: Sequence[str] = START,
+    ) -> None:
+        """
+        under: the beginning of the command that starts the daemon, `setpriv` say
+        start: the rest of it
+        """
         self.endpoint = f"ipc://{folder}/control"
-        super().__init__(*under, FISHD, *addresses(folder), *UNHURRIED, *arguments)
+        super().__init__(*under, *start, *addresses(folder), *arguments)
 
     def wait_until_up(self) -> Self:
         deadline = time.monotonic() + PATIENCE
@@ -174,10 +140,6 @@ class Daemon(Process):
         socket.connect(self.endpoint)
         return socket
 
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait(PATIENCE)
-
 
 def _rests(fish: Fish) -> bool:
     fish.clear_fault()  # that of the test before, or one that a busy machine brought since
@@ -186,9 +148,11 @@ def _rests(fish: Fish) -> bool:
 
 
 @contextlib.contextmanager
-def running(folder: Path, *arguments: str, under: Sequence[str] = ()) -> Iterator[Daemon]:
+def running(
+    folder: Path, *arguments: str, under: Sequence[str] = (), start: Sequence[str] = START
+) -> Iterator[Daemon]:
     """A daemon that is up, and gone afterwards whatever happens."""
-    daemon = Daemon(folder, *arguments, under=under)
+    daemon = Daemon(folder, *arguments, under=under, start=start)
     try:
         yield daemon.wait_until_up()
     finally:

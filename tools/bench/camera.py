@@ -17,8 +17,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from common.daemon import BIN, Fishd
+from common.daemon import Fishd
 from common.machine import machine_in_short
+from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter

@@ -13,8 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from common.daemon import BIN, Fishd, virtual_pi_settings
+from common.daemon import Fishd, virtual_pi_settings
 from common.machine import load, priorities, scheduling, stress
+from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
 from fishd.core.signals import Tick
 

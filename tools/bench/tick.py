@@ -21,8 +21,9 @@ from msgspec import Struct
 
 from bench.compare import compare
 from bench.contestants import PLAIN_LOOPS, CyclicTest, Lateness, PlainLoop, lateness
-from common.daemon import BIN, Fishd
+from common.daemon import Fishd
 from common.machine import load, machine, priorities, scheduling, stress
+from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
 from fishd.control.statistics import PHASES
 from fishd.core.signals import Percentiles, Tick, Timing

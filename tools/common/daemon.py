@@ -4,17 +4,15 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Self
 
 import msgspec
 import zmq
 
+from common.processes import FISHD, Process, sets
 from fishd.client import Fish
 from fishd.core.clock import SystemClock
 from fishd.core.signals import Status, Tick
@@ -24,13 +22,12 @@ from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.virtual_pi import VirtualPi
 from fishd.virtual.plant.parameters import PlantParameters
 
-BIN = Path(sys.executable).parent
-FISHD = (str(BIN / "fishd"), "--no-print-status")
+START = (FISHD, "--no-print-status")
 PATIENCE = 20.0
 """How long a fishd may take to start or to end [s]."""
 
 
-class Fishd:
+class Fishd(Process):
     """It swings a simulated fish unless `settings`, each KEY=VALUE, say otherwise.
 
     A context manager; on leaving, fishd is asked to end, and killed when it does not.
@@ -39,7 +36,7 @@ class Fishd:
     def __init__(
         self,
         *settings: str,
-        command: Sequence[str] = FISHD,
+        command: Sequence[str] = START,
         environment: dict[str, str] | None = None,
         output: int | None = None,
         tcp: bool = False,
@@ -70,29 +67,16 @@ class Fishd:
         pairs = [*(f"{key}={value}" for key, value in own.items()), *settings]
         with self.log.open("wb") as log:
             self.started = time.time()
-            self.process = subprocess.Popen(
-                [*command, *(word for pair in pairs for word in ("--set", pair))],
+            super().__init__(
+                *command,
+                *sets(*pairs),
                 env={**os.environ, **(environment or {})},
                 stdout=log if output is None else output,
                 stderr=log if output is None else output,
             )
 
-    @property
-    def pid(self) -> int:
-        """Its process."""
-        return self.process.pid
-
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
-        self.process.send_signal(signal.SIGCONT)
-        self.process.terminate()
-        try:
-            self.process.wait(PATIENCE)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self.end_or_kill(PATIENCE)
         self._context.destroy(linger=0)
         self._folder.cleanup()
 
@@ -127,8 +111,8 @@ class Fishd:
         with Fish(self.endpoint) as fish:
             return fish.status()
 
-    def end(self, number: signal.Signals) -> float:
-        """Send a signal; how long the process takes to end [s]."""
+    def seconds_to_end(self, number: signal.Signals) -> float:
+        """Send a signal; return how long the process takes to end [s]."""
         begun = time.monotonic()
         self.process.send_signal(number)
         self.process.wait(PATIENCE)

@@ -19,7 +19,7 @@ from threading import Barrier, Lock
 
 from msgspec import Struct
 
-from common.daemon import FISHD, PATIENCE, Fishd, virtual_pi
+from common.daemon import PATIENCE, START, Fishd, virtual_pi
 from common.report import Options, Report, progress, table
 from fishd.client import Fish, NoDaemon
 from fishd.virtual.pi.virtual_pi import VirtualPi
@@ -141,7 +141,7 @@ def swim_again(fishd: Fishd) -> None:
 
 def die(name: str, together: Barrier) -> Outcome:
     """Do one of DEATHS or PHASES to a fishd, once all of `together` swim, and watch its servo."""
-    command: Sequence[str] = FISHD
+    command: Sequence[str] = START
     deed = DEATHS[name][1] if name in DEATHS else signalled(signal.SIGUSR1)
     if name in PHASES:
         module, owner, method = PHASES[name]

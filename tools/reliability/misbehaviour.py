@@ -18,7 +18,8 @@ from pathlib import Path
 import zmq
 from msgspec import Struct
 
-from common.daemon import BIN, PATIENCE, Fishd
+from common.daemon import PATIENCE, Fishd
+from common.processes import BIN
 from common.report import DOCS, Options, Report, progress, table
 from fishd.client import Fish, NoDaemon, Refused
 from fishd.core.protocol import LOADING
@@ -191,7 +192,7 @@ def refused_loads(cases: list[tuple[str, str]], patience: float | None) -> tuple
         fish.set_controller("square")
         await_mode(fish, "running")
         ended = len(cases) - refusals.count("too-slow")
-        return ended, fishd.end(signal.SIGTERM), fishd.process.returncode
+        return ended, fishd.seconds_to_end(signal.SIGTERM), fishd.process.returncode
 
 
 def refusal_of_load(endpoint: str, case: tuple[str, str]) -> str:
@@ -217,7 +218,7 @@ def importing() -> Outcome:
                 ended += 1
             except Refused as refusal:
                 ended += refusal.code not in ("unknown-controller", "too-slow")
-        took = fishd.end(signal.SIGTERM)
+        took = fishd.seconds_to_end(signal.SIGTERM)
         status = fishd.process.returncode
     does = f"left out, after {LOADING:g} s at most"
     return Outcome("an import that raises or never ends", does, 2, ended, took, [status])
@@ -286,7 +287,7 @@ def ends(method: str, ways: list[str]) -> list[tuple[float, int]]:
         return fishd
 
     def end(fishd: Fishd) -> tuple[float, int]:
-        return fishd.end(signal.SIGTERM), fishd.process.returncode
+        return fishd.seconds_to_end(signal.SIGTERM), fishd.process.returncode
 
     with contextlib.ExitStack() as stack, ThreadPoolExecutor(len(ways)) as pool:
         return list(pool.map(end, list(pool.map(hang, ways))))
@@ -303,7 +304,7 @@ def unread(number: signal.Signals, terminal: bool) -> Callable[[], Outcome]:
         fill(writer)
         with running(output=writer) as (fishd, _):
             time.sleep(1.5)  # a status line, which is stuck
-            took = fishd.end(number)
+            took = fishd.seconds_to_end(number)
             status = fishd.process.returncode
         os.close(reader)
         os.close(writer)

@@ -19,8 +19,9 @@ from pathlib import Path
 import zmq
 from msgspec import Struct
 
-from common.daemon import BIN, Fishd
+from common.daemon import Fishd
 from common.machine import machine
+from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
@@ -95,7 +96,7 @@ def kill_fishd(folder: Path, name: str, instant: float) -> Kill:
         fishd.next_tick()
         with recorder(fishd, folder, name):
             time.sleep(instant)
-            fishd.end(signal.SIGKILL)
+            fishd.seconds_to_end(signal.SIGKILL)
             time.sleep(0.2)
             heard = fishd.waiting_ticks()[-1].seq
             time.sleep(1.0)
