@@ -53,8 +53,8 @@ class Adapted(Struct, frozen=True):
     """Relative thrust of the chosen gait over the square wave found, and its interval."""
     claims: dict[str, tuple[float, float, float, float]]
     """Of each but the square wave: the same, and the truth."""
-    thrusts: dict[str, tuple[float, float, float]]
-    """Measured, half of the 95 % interval, true [N]."""
+    thrusts: dict[str, tuple[float, float, float, float]]
+    """Measured, half-widths of its 95 % intervals by statistics and in total, true [N]."""
     tank_time: float
     """[s]"""
 
@@ -100,7 +100,15 @@ def adapted(task: tuple[int, int, float]) -> Adapted:
             name: (*claim, truth(contenders[name]) / truth(square))
             for name, claim in verdict.others.items()
         },
-        thrusts={one.name: (one.thrust, one.error, truth(one)) for one in state.contenders},
+        thrusts={
+            one.name: (
+                one.thrust,
+                one.error,
+                one.error if one.total_ci95 is None else one.total_ci95,
+                truth(one),
+            )
+            for one in state.contenders
+        },
         tank_time=state.tank_time,
     )
 
@@ -162,13 +170,13 @@ def summary(found: list[Adapted]) -> str:
     shares = [each.share for each in found]
     claims = [each.claims[each.chosen] for each in found if each.chosen in each.claims]
     every = [claim for each in found for claim in each.claims.values()]
-    policies = [each.thrusts["policy"][2] / each.best for each in found if "policy" in each.thrusts]
+    policies = [each.thrusts["policy"][3] / each.best for each in found if "policy" in each.thrusts]
     thrusts = [thrust for each in found for thrust in each.thrusts.values()]
     decided = [each for each in found if each.decided]
-    lost = [1.0 - each.thrusts[each.chosen][2] / _largest(each) for each in found]
+    lost = [1.0 - each.thrusts[each.chosen][3] / _largest(each) for each in found]
     # What rounding of a simulation makes of equal gaits is no difference.
     kept = [
-        max(each.thrusts[k][2] for k in each.undecided) > 0.9999 * _largest(each) for each in found
+        max(each.thrusts[k][3] for k in each.undecided) > 0.9999 * _largest(each) for each in found
     ]
     rows = [
         ["chosen gait, of the best square wave, median", f"{percent(statistics.median(shares))} %"],
@@ -190,11 +198,14 @@ def summary(found: list[Adapted]) -> str:
         ["the same, worst", f"{percent(max(lost))} %"],
         ["interval of the chosen gait's relative thrust covers the truth", _covered(claims)],
         ["the same, of every gait but the square wave", _covered(every)],
-        [
-            "statistical interval of a thrust covers the truth",
-            f"{sum(abs(value - true) <= error for value, error, true in thrusts)} of "
-            f"{len(thrusts)}",
-        ],
+        *(
+            [
+                f"{name} of a thrust covers the truth",
+                f"{sum(abs(each[0] - each[3]) <= each[column] for each in thrusts)} of "
+                f"{len(thrusts)}",
+            ]
+            for column, name in enumerate(("statistical interval", "total interval"), 1)
+        ),
         ["longest tank time", f"{max(each.tank_time for each in found):.0f} s"],
     ]
     if policies:
@@ -206,7 +217,7 @@ def summary(found: list[Adapted]) -> str:
 
 def _largest(one: Adapted) -> float:
     """Return the largest true thrust of the three [N]."""
-    return max(true for _, _, true in one.thrusts.values())
+    return max(true for *_, true in one.thrusts.values())
 
 
 def _covered(claims: list[tuple[float, float, float, float]]) -> str:
