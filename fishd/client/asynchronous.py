@@ -1,5 +1,6 @@
 """`AsyncFish`: the client for asyncio programs."""
 
+import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import closing
 from typing import Any, Self, TypeVar
@@ -7,6 +8,7 @@ from typing import Any, Self, TypeVar
 import zmq.asyncio
 
 from fishd.client.connection import (
+    ESTOP_WAIT_S,
     SECOND_LOOK,
     TIMEOUT,
     Connection,
@@ -17,6 +19,7 @@ from fishd.client.connection import (
 )
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
+from fishd.core.errors import NoDaemon, Untrusted
 from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
@@ -75,8 +78,19 @@ class AsyncFish(Connection):
         return await self._call(State, "stop")
 
     async def estop(self, message: str = "requested by a client") -> State:
-        """Stop the servo's pulses at once."""
-        return await self._call(State, "estop", message=message)
+        """Stop the servo's pulses at once, as `Fish.estop`."""
+        try:
+            state = await self._call(
+                State, "estop", patience=ESTOP_WAIT_S - self.timeout, message=message
+            )
+        except Untrusted:
+            raise
+        except NoDaemon:
+            if answer := await asyncio.to_thread(self.estop_without_gateway, message):
+                return answer
+            state = await self._call(State, "estop", message=message)
+        self.estop_taken_by = "control"
+        return state
 
     async def clear_fault(self) -> State:
         """Leave mode fault or estop."""
@@ -148,7 +162,7 @@ class AsyncFish(Connection):
             self._socket = dealer(self._context, self.endpoint)
         identity, request = self.request(op, args)
         wanted = zmq.POLLOUT
-        for deadline in deadlines(self.timeout + patience, again=True):
+        for deadline in deadlines(self.timeout + patience, again=patience >= 0.0):
             while await self._socket.poll(
                 milliseconds_until(deadline),
                 wanted,  # type: ignore[call-arg]  # which the stubs forget

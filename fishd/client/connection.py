@@ -3,6 +3,7 @@
 import itertools
 import math
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar, cast
@@ -11,9 +12,16 @@ import msgspec
 import zmq
 
 from fishd.core import protocol, text
-from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, is_ipv6, socket_path
+from fishd.core.addresses import (
+    ENDPOINT_VARIABLE,
+    estop_path,
+    find_control,
+    is_ipv6,
+    socket_path,
+)
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, NoDaemon, ParameterError, Refused, Untrusted
+from fishd.core.protocol import State
 from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
 
 T = TypeVar("T")
@@ -24,6 +32,12 @@ SECOND_LOOK = 500
 """What has not come in time is looked for once more, for so long: of a process that was itself held
 up, by SIGSTOP say, it has come, but no thread has read it yet [ms].
 """
+ESTOP_WAIT_S = 0.1
+"""Time after which an emergency stop goes to fishd's own socket as well [s]."""
+ESTOP_SOCKET_WAIT_S = 0.4
+"""Longest time to wait for the answer from there [s]."""
+_RECONNECT_MS = 20
+"""Time after which a lost connection is made again, twice as long at most [ms]."""
 
 
 class Connection:
@@ -36,6 +50,8 @@ class Connection:
         self.timeout = timeout
         self.telemetry_address = telemetry
         self._ids = itertools.count(1)
+        self.estop_taken_by = ""
+        """Which socket answered the latest emergency stop: `control` or `estop`."""
 
     def check_endpoint(self) -> None:
         """Spare the wait where it is certain that nobody will answer; raises `NoDaemon`.
@@ -93,6 +109,24 @@ class Connection:
             raise ParameterError(f"{op}: the request is longer than {protocol.MAX_MESSAGE} bytes")
         return identity, payload
 
+    def estop_without_gateway(self, message: str) -> State | None:
+        """Ask for an emergency stop at fishd's own socket; None where nothing answers there."""
+        path = estop_path(self.endpoint)
+        identity, request = self.request("estop", {"message": message})
+        if path is None:
+            return None
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+            client.settimeout(ESTOP_SOCKET_WAIT_S)
+            try:
+                client.bind("")  # any free name: the answer needs one
+                client.connect(os.fspath(path))
+                client.send(request)
+                reply = client.recv(2**20)
+            except OSError:
+                return None
+        self.estop_taken_by = "estop"
+        return self.result((reply,), identity, State)
+
     def result(self, frames: Sequence[bytes], identity: int, kind: type[T]) -> T | None:
         """The result in a reply; None when it answers an earlier request that timed out."""
         reply: protocol.Reply = self.read(protocol.decode_reply, frames)
@@ -122,28 +156,29 @@ S = TypeVar("S", bound="zmq.Socket[Any]")
 
 def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
     """A socket for requests; raises `NoDaemon` when the endpoint is no address."""
-    socket = context.socket(zmq.DEALER)
-    socket.set(zmq.LINGER, 0)
-    socket.set(zmq.IMMEDIATE, 1)  # do not queue for a daemon that is not there
-    _connect(socket, endpoint)
-    return socket
+    requests = context.socket(zmq.DEALER)
+    requests.set(zmq.LINGER, 0)
+    requests.set(zmq.RECONNECT_IVL, _RECONNECT_MS)
+    requests.set(zmq.IMMEDIATE, 1)  # do not queue for a daemon that is not there
+    _connect(requests, endpoint)
+    return requests
 
 
 def subscriber(context: "zmq.Context[S]", address: str, *topics: bytes) -> S:
     """A socket for topics of telemetry; raises `NoDaemon` when the address is none."""
-    socket = context.socket(zmq.SUB)
+    messages = context.socket(zmq.SUB)
     for topic in topics:
-        socket.set(zmq.SUBSCRIBE, topic)
-    _connect(socket, address)
-    return socket
+        messages.set(zmq.SUBSCRIBE, topic)
+    _connect(messages, address)
+    return messages
 
 
-def _connect(socket: "zmq.Socket[Any]", address: str) -> None:
+def _connect(client: "zmq.Socket[Any]", address: str) -> None:
     try:
-        socket.set(zmq.IPV6, is_ipv6(address))
-        socket.connect(address)
+        client.set(zmq.IPV6, is_ipv6(address))
+        client.connect(address)
     except zmq.ZMQError as error:
-        socket.close()
+        client.close()
         raise NoDaemon(
             f"'{address}' is no address: {zmq.strerror(error.errno or 0)}; "
             "write ipc://PATH or tcp://HOST:PORT"

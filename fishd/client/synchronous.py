@@ -7,6 +7,7 @@ from typing import Any, Self, TypeVar
 import zmq
 
 from fishd.client.connection import (
+    ESTOP_WAIT_S,
     SECOND_LOOK,
     TIMEOUT,
     Connection,
@@ -17,6 +18,7 @@ from fishd.client.connection import (
 )
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
+from fishd.core.errors import NoDaemon, Untrusted
 from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
@@ -90,8 +92,22 @@ class Fish(Connection):
         return self._call(State, "stop")
 
     def estop(self, message: str = "requested by a client") -> State:
-        """Stop the servo's pulses at once."""
-        return self._call(State, "estop", message=message)
+        """Stop the servo's pulses at once.
+
+        Where the control socket does not answer at once, fishd's own socket is asked as well.
+        """
+        try:
+            state = self._call(
+                State, "estop", patience=ESTOP_WAIT_S - self.timeout, message=message
+            )
+        except Untrusted:
+            raise
+        except NoDaemon:
+            if answer := self.estop_without_gateway(message):
+                return answer
+            state = self._call(State, "estop", message=message)
+        self.estop_taken_by = "control"
+        return state
 
     def clear_fault(self) -> State:
         """Leave mode fault or estop."""

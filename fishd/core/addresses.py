@@ -122,6 +122,12 @@ def socket_path(address: str) -> Path | None:
     return Path(path) if path != address else None
 
 
+def estop_path(control: str) -> Path | None:
+    """Return fishd's own socket for an emergency stop; None where control is not a Unix socket."""
+    path = socket_path(control)
+    return path.with_name(f"{path.name}.estop") if path else None
+
+
 def control_address() -> str:
     """The default address for a daemon; makes its folder where that is fishd's own business.
 
@@ -208,7 +214,7 @@ def listen(address: str, key: str, *, group: bool = False, in_use: str = IN_USE)
         where = parse(address)
         if isinstance(where, Ipc):
             server = socket.socket(socket.AF_UNIX)
-            unix_sockets.bind(server, Path(where.path), 0o117 if group else None)
+            unix_sockets.bind(server, Path(where.path), unix_sockets.GROUP_MASK if group else None)
         else:
             server = socket.socket(socket.AF_INET6 if ":" in where.host else socket.AF_INET)
             server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -21,6 +21,8 @@ LONGEST_PATH = 107
 """Of the path of a Unix socket, by Linux [bytes]."""
 LEAVING, AGAIN = 1.0, 0.02
 """How long the gateways of a fishd that was killed may take to leave, and a pause meanwhile [s]."""
+GROUP_MASK = 0o117
+"""The umask of a socket to which user and group of this process may connect, and no other user."""
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _ROOT = 0
 

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Container
 from typing import Any
 
 from fishd.core import protocol, text
@@ -60,11 +60,19 @@ class ControlServer:
             while not self.send(part):  # a reply that is not whole would never make room for more
                 await asyncio.sleep(_NO_ROOM)
 
-    async def _reply(self, came: float, payload: bytes) -> bytes:
+    async def reply_to_estop(self, payload: bytes) -> bytes:
+        """Carry out a request for an emergency stop, and refuse any other one."""
+        return await self._reply(time.monotonic(), payload, {"estop"})
+
+    async def _reply(
+        self, came: float, payload: bytes, permitted: Container[str] | None = None
+    ) -> bytes:
         identity: protocol.RequestId = None
         try:
             request = protocol.decode_request(payload)
             identity = request.id
+            if permitted is not None and request.op not in permitted:
+                raise Refused("unknown-op", "this socket takes nothing but estop")
             _check_age(request.op, time.monotonic() - came)
             return protocol.success(identity, await self._perform(request.op, request.args))
         except Refused as error:

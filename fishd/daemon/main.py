@@ -28,6 +28,7 @@ from fishd.core.errors import ConfigError, FishdError, ServoError
 from fishd.daemon import realtime
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
+from fishd.daemon.estop_socket import EstopSocket
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
 from fishd.daemon.lockstep import Lockstep
 from fishd.daemon.logs import UNHURRIED, LogWriter
@@ -118,6 +119,9 @@ class Daemon:
             self._server = ControlServer(self._operations.perform, config.tick)
             self._gateways.serve(self._server, self._loop.reporter)
             stack.callback(self._server.close)
+            if path := addresses.estop_path(address):
+                estop_socket = EstopSocket(path, self._server.reply_to_estop, config.tick)
+                stack.callback(estop_socket.close)
             self._stack = stack.pop_all()
         return self
 

@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import signal
+import socket as sockets
 import subprocess
 import sys
 import time
@@ -139,6 +140,14 @@ class Daemon(Process):
         socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
         socket.connect(self.endpoint)
         return socket
+
+    def estop_socket(self) -> sockets.socket:
+        """A bare client of fishd's own socket for an emergency stop."""
+        client = sockets.socket(sockets.AF_UNIX, sockets.SOCK_DGRAM)
+        client.settimeout(PATIENCE)
+        client.bind("")
+        client.connect(self.endpoint.removeprefix("ipc://") + ".estop")
+        return client
 
 
 def _rests(fish: Fish) -> bool:

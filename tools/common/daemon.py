@@ -119,9 +119,23 @@ class Fishd(Process):
         return time.monotonic() - begun
 
     def gateways(self) -> list[int]:
-        """The processes that fishd has started."""
-        children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text(encoding="ascii")
-        return [int(child) for child in children.split()]
+        """Return the processes of the gateways, and first that of their fork server."""
+        servers = _children(self.pid)
+        return [*servers, *(pid for server in servers for pid in _children(server))]
+
+    def gateway(self, kind: str) -> int:
+        """Return the process of a gateway: `control`, `telemetry` or `gateways` for their parent.
+
+        Waits until there is one.
+        """
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            for pid in self.gateways():
+                with contextlib.suppress(OSError):
+                    if Path(f"/proc/{pid}/comm").read_text(encoding="ascii") == f"fishd-{kind}\n":
+                        return pid
+            time.sleep(0.001)
+        raise SystemExit(f"fishd has no gateway of {kind}: {self.log.read_text(encoding='utf-8')}")
 
     def cpu_seconds(self) -> float:
         """User and system time so far, of all threads and of the gateways [s]."""
@@ -162,6 +176,14 @@ def virtual_pi_settings(address: Path, port: int) -> list[str]:
         f"virtual_pi.socket={address}",
         f"servo.port={port}",
     ]
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
+    except OSError:  # it has ended
+        return []
+    return [int(child) for child in children.split()]
 
 
 def _cpu_seconds(of: Path) -> float:

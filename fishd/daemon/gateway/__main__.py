@@ -1,57 +1,126 @@
-"""A gateway's process: `python -m fishd.daemon.gateway KIND LINK LISTENER ADDRESS`.
+"""The fork server of the gateways: `python -m fishd.daemon.gateway LINK`.
 
-KIND: telemetry or control. LINK and LISTENER: file descriptors that fishd has opened, the link to
-it and the socket that clients connect to, which outlives this process. Only fishd starts it.
+It has loaded all that gateways need, and forks one when fishd asks for it: that takes hundredths of
+a second, where the start of Python takes tenths. Only fishd starts it. It ends with fishd, and the
+gateways end with it, even where they are stopped: the kernel sends them SIGKILL.
+
+LINK: file descriptor of the link to fishd.
 """
 
+import ctypes
 import gc
-import importlib
 import os
+import signal
 import socket
 import sys
-import time
 from contextlib import suppress
+from types import ModuleType
 
 from fishd.daemon.gateway import link
 
-_PAUSE = 0.3
-"""Time until connections are accepted again [s]."""
-_FAREWELL = 100
-"""How long the last messages may take to leave [ms]."""
+_LINGER_MS = 100
+"""Longest time for the last messages to leave [ms]."""
+_PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 
 
-def main(kind: str, link_number: str, listener_number: str, address: str) -> int:
-    """Serve until fishd ends; begin anew, with nothing, when a limit is exceeded."""
+def main(number: str) -> int:
+    """Fork gateways on request until fishd ends."""
+    _end_with_parent()
+    own = os.getpid()
+    _set_name("fishd-gateways")
+    for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ignored, signal.SIG_IGN)  # these processes end when fishd does
     gc.disable()  # nothing that is loaded is garbage: to look for it takes a tenth of the time
+    from fishd.daemon.gateway import publisher, router
+
+    gc.freeze()  # keeps the pages shared with the gateways
+    modules = {link.TELEMETRY: publisher, link.CONTROL: router}
+    connection = socket.socket(fileno=int(number))
+    connection.setblocking(True)
+    children: dict[str, int] = {}
+    try:
+        connection.send(link.READY)
+        while True:
+            message, descriptors, _, _ = socket.recv_fds(connection, link.LONGEST, 2)
+            if message == link.PING:
+                connection.send(link.PONG)
+            elif message.startswith(link.START):
+                kind, address = link.kind_and_address(message)
+                former = children.pop(kind, None)
+                if former is not None:  # a child that nobody has waited for keeps its number
+                    os.kill(former, signal.SIGKILL)
+                try:
+                    pid = os.fork()
+                except OSError as error:
+                    outcome = f"it cannot be started: {error.strerror}"
+                else:
+                    if not pid:
+                        _end_with_parent()
+                        connection.close()
+                        if os.getppid() != own:
+                            os._exit(1)
+                        _serve(modules[kind], kind, address, *descriptors)
+                    children[kind] = pid
+                    outcome = ""
+                for descriptor in descriptors:
+                    os.close(descriptor)
+                if former is not None:
+                    status = os.waitstatus_to_exitcode(os.waitpid(former, 0)[1])
+                    outcome = outcome or f"its process ended with status {status}"
+                connection.send(link.started(kind, outcome))
+            else:
+                return 0
+    except ConnectionError:  # fishd was killed
+        return 0
+
+
+def _serve(module: ModuleType, kind: str, address: str, link_number: int, listener: int) -> None:
+    """Be a gateway until fishd ends or a limit is exceeded; never returns."""
+    status = 1
+    try:
+        _set_name(f"fishd-{kind}")
+        gc.enable()
+        status = _run(module, address, socket.socket(fileno=link_number), listener)
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+    finally:
+        sys.stderr.flush()
+        os._exit(status)  # without closing ZeroMQ, which would take long to free what it holds
+
+
+def _run(module: ModuleType, address: str, connection: socket.socket, listener: int) -> int:
+    """Serve at the listener; returns the exit status."""
     import zmq
 
     from fishd.daemon.gateway.limits import ResourceLimits
 
-    connection = socket.socket(fileno=int(link_number))
-    name = {link.TELEMETRY: "publisher", link.CONTROL: "router"}[kind]
-    gateway = importlib.import_module(f"fishd.daemon.gateway.{name}")  # and not the other one
-    gc.freeze()
-    gc.enable()
+    connection.setblocking(False)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    server = context.socket(gateway.SOCKET)
-    gateway.configure(server)
-    server.set(zmq.USE_FD, os.dup(int(listener_number)))  # which is closed when this begins anew
+    server = context.socket(module.SOCKET)
+    module.configure(server)
+    server.set(zmq.USE_FD, listener)
     server.bind(address)
-    limits = ResourceLimits(gateway.MEMORY, gateway.CONNECTIONS)
+    limits = ResourceLimits(module.MEMORY, module.CONNECTIONS)
     with suppress(OSError):  # as below
         connection.send(link.READY)
-    why = gateway.run(connection, server, limits)
+    why = module.run(connection, server, limits)
     if why:
         with suppress(OSError):  # fishd has ended, or takes nothing just now
             connection.send(link.NOTICE + why.encode())
-        time.sleep(_PAUSE)
-        # Not by fishd, which must not wait for a process to start; and without closing ZeroMQ,
-        # which would take long to free what it holds.
-        again = [sys.executable, "-P", "-m", "fishd.daemon.gateway", *sys.argv[1:]]
-        os.execv(sys.executable, again)
-    server.close(linger=_FAREWELL)
+        return 1
+    server.close(linger=_LINGER_MS)
     context.term()
     return 0
+
+
+def _end_with_parent() -> None:
+    """Let the kernel send SIGKILL to this process when its parent ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+
+
+def _set_name(name: str) -> None:
+    """Set the name that ps and top show."""
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,18 @@
-"""The gateways as fishd sees them: processes that are started again when they end, and links."""
+"""The gateways as fishd sees them: links to processes that are started again when they end or hang.
+
+Each process answers heartbeats over its link. One that does not is killed by its parent, the fork
+server, and a new one serves in its place; a fork server that does not is killed with its gateways.
+"""
 
 import asyncio
 import os
+import select
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 
 import msgspec
@@ -22,70 +27,237 @@ from fishd.daemon.gateway.link import (
     END,
     LONGEST,
     NOTICE,
+    PING,
+    PONG,
     READY,
+    STARTED,
     TELEMETRY,
+    kind_and_outcome,
     pair,
     published,
+    start,
 )
 
-PAUSES = 0.05, 2.0
-"""Shortest and longest pause before a gateway is started again [s]."""
-HEALTHY = 10.0
-"""A gateway that ran for so long is started again after the shortest pause [s]."""
+BEAT_S = 0.08
+"""Time between two heartbeats [s]."""
+MAX_UNANSWERED = {CONTROL: 4, TELEMETRY: 10}
+"""Heartbeats in a row that a gateway may leave unanswered; then it hangs."""
+MAX_STARTING = 25
+"""Heartbeats during which a gateway may start; then it hangs."""
+MAX_SERVER_STARTING = 750
+"""Heartbeats during which the fork server may start: a busy Pi may take long to load Python."""
+MIN_PERIOD_S = 0.1
+"""Shortest time between two starts of a gateway [s]."""
+MIN_FAILED_PERIOD_S = 0.25
+"""The same where the one before has never served [s]."""
+LIMIT_PAUSE_S = 0.3
+"""Time without a gateway after one that has exceeded a limit [s]."""
+MIN_SERVER_PERIOD_S = 1.0
+"""Shortest time between two starts of the fork server [s]."""
 RETURN = 1.0
-"""How long clients may take to connect again, once a gateway serves [s]."""
-START = 30.0
-"""After this time a restart is reported, even if the new gateway does not serve yet [s]."""
+"""Longest time for subscribers to connect again, once a gateway serves [s]."""
+MAX_REPORT_DELAY_S = {CONTROL: 2.0, TELEMETRY: 30.0}
+"""Time after which a restart is reported, even if the new gateway does not serve yet [s]."""
 FAREWELL = 0.5
-"""How long it may take to pass on the last messages from when it is told to end [s]."""
+"""Longest time for a gateway to pass on the last messages, once it is to end [s]."""
 
 # Memory that a flood took goes back to the system.
 _ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "MALLOC_TRIM_THRESHOLD_": "1048576"}
 
 
-class Gateway:
-    """The process of one socket and the link to it; for the thread of the asyncio loop only."""
+class _Peer:
+    """A process at the other end of a link; for the thread of the asyncio loop only."""
 
-    def __init__(self, kind: str, listener: socket.socket, address: str) -> None:
+    def __init__(self, max_unanswered: int, max_starting: int) -> None:
+        self._events = asyncio.get_running_loop()
+        self._link: socket.socket | None = None
+        self._serves = False
+        self._unanswered = 0
+        """Heartbeats since the latest sign of life."""
+        self._max_unanswered, self._max_starting = max_unanswered, max_starting
+        self._wanted = True
+        self._reading = False
+
+    def beat(self) -> None:
+        """Send a heartbeat, or end the link to a process that left too many unanswered."""
+        if self._link is None or not self._reading:  # an answer may wait unread
+            return
+        if self._unanswered >= (self._max_unanswered if self._serves else self._max_starting):
+            self._lost(f"it left {self._unanswered} heartbeats unanswered")
+            return
+        self._unanswered += 1
+        if self._serves:
+            with suppress(OSError):  # full, or its end is noticed where it is read from
+                self._link.send(PING)
+
+    def _connect(self, ours: socket.socket) -> None:
+        self._link = ours
+        self._serves = False
+        self._unanswered = 0
+        self._listen(self._wanted)
+
+    def _readable(self) -> None:
+        assert self._link
+        try:
+            message = self._link.recv(2 * LONGEST)
+        except BlockingIOError:
+            return
+        except OSError:
+            message = b""
+        if not message:
+            self._lost("")
+            return
+        self._unanswered = 0
+        if message == READY:
+            self._serves = True
+            self._ready()
+        elif message != PONG:
+            self._take(message)
+
+    def _ready(self) -> None:
+        """The process serves from now on."""
+
+    def _take(self, message: bytes) -> None:
+        raise NotImplementedError
+
+    def _lost(self, why: str) -> None:
+        """The process has ended; why: or why it is of no use any more."""
+        raise NotImplementedError
+
+    def _drop_link(self) -> None:
+        if self._link is not None:
+            self._listen(False)
+            self._link.close()
+            self._link = None
+
+    def _listen(self, wanted: bool) -> None:
+        if self._link is not None and wanted is not self._reading:
+            if wanted:
+                self._events.add_reader(self._link, self._readable)
+            else:
+                self._events.remove_reader(self._link)
+            self._reading = wanted
+
+
+class ForkServer(_Peer):
+    """The parent of the gateways; started again when it ends or hangs, and they with it."""
+
+    def __init__(self) -> None:
+        """Start it; must be made inside a running asyncio loop. Raises `StartupError`."""
+        super().__init__(MAX_UNANSWERED[TELEMETRY], MAX_SERVER_STARTING)
+        self.gateways: dict[str, Gateway] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        try:
+            self._start()
+        except OSError as error:
+            raise StartupError(
+                f"{sys.executable}: cannot be started for the gateways: {error.strerror}"
+            ) from None
+
+    @property
+    def serves(self) -> bool:
+        """Whether it has begun to fork gateways."""
+        return self._serves
+
+    def fork(self, kind: str, address: str, link: socket.socket, listener: socket.socket) -> None:
+        """Ask for a gateway, in place of the one before it; raises OSError."""
+        if self._link is None:
+            raise ConnectionError
+        socket.send_fds(self._link, [start(kind, address)], [link.fileno(), listener.fileno()])
+
+    def close(self) -> None:
+        """Kill it, and with it what is left of its gateways; may be called twice."""
+        if self._timer:
+            self._timer.cancel()
+        self._drop_link()
+        self._process.kill()
+        self._process.wait()
+
+    def _start(self) -> None:
+        ours, theirs = pair()
+        with theirs, ExitStack() as stack:
+            stack.callback(ours.close)
+            self._process = subprocess.Popen(
+                # -P: not what lies in the working directory.
+                [sys.executable, "-P", "-m", "fishd.daemon.gateway", str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env=os.environ | _ENVIRONMENT,
+                start_new_session=True,  # a Ctrl-C in the terminal is for fishd alone
+            )
+            stack.pop_all()
+        self._started = self._events.time()
+        self._connect(ours)
+
+    def _take(self, message: bytes) -> None:
+        if message.startswith(STARTED):
+            kind, outcome = kind_and_outcome(message)
+            self.gateways[kind].started(outcome)
+
+    def _lost(self, why: str) -> None:
+        """Kill it, which ends its gateways as well."""
+        self._drop_link()
+        self._process.kill()
+        for gateway in self.gateways.values():
+            gateway.server_lost(f"the fork server of the gateways was lost: {why or 'it ended'}")
+        pause = self._started + MIN_SERVER_PERIOD_S - self._events.time()
+        self._timer = self._events.call_later(max(0.0, pause), self._start_again)
+
+    def _start_again(self) -> None:
+        """Start it, once the one before has ended."""
+        try:
+            if self._process.poll() is None:
+                self._timer = self._events.call_later(0.1 * MIN_PERIOD_S, self._start_again)
+                return
+            self._start()
+        except OSError:  # Python is being upgraded, perhaps
+            self._timer = self._events.call_later(MIN_SERVER_PERIOD_S, self._start_again)
+
+
+class Gateway(_Peer):
+    """The link to the process of one socket."""
+
+    def __init__(
+        self, kind: str, listener: socket.socket, address: str, server: ForkServer
+    ) -> None:
         """Start it; must be made inside a running asyncio loop.
 
         kind: TELEMETRY or CONTROL
         listener: what clients connect to; it stays open while the process is started again
         address: the ZeroMQ address of the listener
-        Raises `StartupError`.
         """
+        super().__init__(MAX_UNANSWERED[kind], MAX_STARTING)
         self.kind = kind
         self.address = address
         self.take: Callable[[bytes], None] = lambda message: None
-        """Called with every message that comes, once `read` was told to take them."""
+        """Called with every message that comes, once `read` has let them in."""
         self.restarts = 0
-        """How often it was started again."""
+        """Number of restarts."""
         self.lost = 0
         """Messages to it that were dropped."""
         self.on_restart: Callable[[str], None] = lambda why: None
         """Called once it was started again, or should have been, with the latest reason."""
         self._listener = listener
-        self._events = asyncio.get_running_loop()
-        self._link: socket.socket | None = None
+        self._server = server
         self._wanted = kind == TELEMETRY  # its only messages: that it serves, and why it ends
-        self._reading = False
-        self._pause = PAUSES[0]
         self._why = ""
+        self._notice = ""
+        """Which limit the process has exceeded, by itself."""
+        self._begun = 0.0
+        """Time of the latest start [s]."""
         self._telling: asyncio.TimerHandle | None = None
         self._tell_by = 0.0
         self._timer: asyncio.TimerHandle | None = None
-        self._closed = False
-        try:
-            self._start()
-        except OSError as error:
-            raise StartupError(
-                f"{sys.executable}: cannot be started for the gateway of {kind}: {error.strerror}"
-            ) from None
+        self._ending: float | None = None
+        """Time until which it may pass on the last messages, once it is to end [s]."""
+        server.gateways[kind] = self
+        self._start()
 
     def send(self, message: bytes) -> bool:
         """Send without waiting; False if the pipe is full: the message counts as lost.
 
-        What is sent while there is no process is lost as well: nobody waits for it there.
+        What is sent while there is no process is lost as well: no client waits for it there.
         """
         try:
             if self._link is None:
@@ -105,122 +277,97 @@ class Gateway:
 
     def end(self) -> None:
         """Let it pass on what it has, and end; may be called twice."""
-        if self._closed:
+        if self._ending is not None:
             return
-        self._closed = True
-        self._farewell = time.monotonic() + FAREWELL
+        self._ending = time.monotonic() + FAREWELL
         for timer in (self._timer, self._telling):
             if timer:
                 timer.cancel()
+        self._listen(False)
         if self._link is not None:
             self.send(END)
-            self._drop_link()
 
     def close(self) -> None:
         """Wait until it has ended; may be called twice."""
         self.end()
-        try:
-            self._process.wait(max(0.0, self._farewell - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        assert self._ending is not None
+        while self._link is not None:
+            left = self._ending - time.monotonic()
+            if left <= 0.0 or not select.select([self._link], [], [], left)[0]:
+                break
+            try:
+                ended = not self._link.recv(2 * LONGEST)
+            except OSError:
+                ended = True
+            if ended:
+                break
+        self._drop_link()
+
+    def beat(self) -> None:
+        """Send a heartbeat; a gateway that waits for the fork server has not begun to start."""
+        if self._serves or self._server.serves:
+            super().beat()
+
+    def started(self, outcome: str) -> None:
+        """Take note of how the process before this one ended."""
+        self._why = self._why or outcome
+
+    def server_lost(self, why: str) -> None:
+        """The fork server has ended, and with it the process."""
+        if self._link is not None and self._ending is None:
+            self._lost(why)
 
     def _start(self) -> None:
         """Raises OSError."""
         ours, theirs = pair()
         with theirs, ExitStack() as stack:
             stack.callback(ours.close)
-            numbers = [theirs.fileno(), self._listener.fileno()]
-            self._process = subprocess.Popen(
-                # -P: not what lies in the working directory.
-                [sys.executable, "-P", "-m", "fishd.daemon.gateway", self.kind]
-                + [str(number) for number in numbers]
-                + [self.address],
-                pass_fds=numbers,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                env=os.environ | _ENVIRONMENT,
-                start_new_session=True,  # a Ctrl-C in the terminal is for fishd alone
-            )
+            self._server.fork(self.kind, self.address, theirs, self._listener)
             stack.pop_all()
-        self._link = ours
-        self._started = self._events.time()
-        self._listen(self._wanted)
+        self._begun = self._events.time()
+        self._connect(ours)
 
-    def _readable(self) -> None:
-        assert self._link
-        try:
-            message = self._link.recv(2 * LONGEST)
-        except BlockingIOError:
-            return
-        except OSError:
-            message = b""
-        if not message:
-            self._ended()
-        elif message == READY:
-            self._serves()
-        elif message.startswith(NOTICE):
-            self._tell(message[1:].decode(errors="replace"))
+    def _take(self, message: bytes) -> None:
+        if message.startswith(NOTICE):
+            self._notice = message[1:].decode(errors="replace")
         else:
             self.take(message)
 
-    def _ended(self) -> None:
+    def _lost(self, why: str) -> None:
+        period = MIN_PERIOD_S if self._serves else MIN_FAILED_PERIOD_S
+        pause = LIMIT_PAUSE_S if self._notice else self._begun + period - self._events.time()
         self._drop_link()
-        if self._telling:  # nobody would hear it now
+        self._why = why or self._notice
+        self._notice = ""
+        if self._telling:  # subscribers are gone again
             self._tell_at(self._tell_by)
-        lived = self._events.time() - self._started
-        self._pause = PAUSES[0] if lived > HEALTHY else min(2.0 * self._pause, PAUSES[1])
-        self._timer = self._events.call_later(self._pause, self._start_again)
+        self._timer = self._events.call_later(max(0.0, pause), self._start_again)
 
     def _start_again(self) -> None:
-        status = self._process.poll()
-        if status is None:  # its link is gone, so it is of no use
-            self._process.kill()
-            self._timer = self._events.call_later(PAUSES[0], self._start_again)
-            return
         try:
             self._start()
-            self._tell(f"its process ended with status {status}")
-        except OSError as error:  # Python was renewed, say, and is not there just now
-            self._tell(f"it cannot be started: {error.strerror}", RETURN)
-            self._pause = PAUSES[1]
-            self._timer = self._events.call_later(self._pause, self._start_again)
-
-    def _tell(self, why: str, within: float = START) -> None:
-        """Count a restart, and report it once subscribers are back, or `within` so long [s]."""
+        except OSError:  # the fork server is being started, or has no room for the request
+            self._timer = self._events.call_later(MIN_PERIOD_S, self._start_again)
+            return
         self.restarts += 1
-        self._why = why
-        if self._telling is None:
-            self._tell_by = self._events.time() + within
-        self._tell_at(self._tell_by)
+        if not self._telling:
+            self._tell_by = self._events.time() + MAX_REPORT_DELAY_S[self.kind]
+            self._tell_at(self._tell_by)
 
-    def _serves(self) -> None:
-        """From now on subscribers can come back, and hear of the restart then."""
+    def _ready(self) -> None:
+        """Report a restart; one of telemetry when subscribers have had time to connect again."""
         if self._telling:
-            self._tell_at(min(self._tell_by, self._events.time() + RETURN))
+            pause = RETURN if self.kind == TELEMETRY else 0.0
+            self._tell_at(min(self._tell_by, self._events.time() + pause))
 
     def _tell_at(self, when: float) -> None:
         if self._telling:
             self._telling.cancel()
-        self._telling = self._events.call_at(when, self._told)
+        self._telling = self._events.call_at(when, self._tell)
 
-    def _told(self) -> None:
+    def _tell(self) -> None:
         self._telling = None
-        self.on_restart(self._why)
-
-    def _drop_link(self) -> None:
-        assert self._link
-        self._listen(False)
-        self._link.close()
-        self._link = None
-
-    def _listen(self, wanted: bool) -> None:
-        if self._link is not None and wanted is not self._reading:
-            if wanted:
-                self._events.add_reader(self._link, self._readable)
-            else:
-                self._events.remove_reader(self._link)
-            self._reading = wanted
+        self.on_restart(self._why or "its process ended")
 
 
 class Gateways:
@@ -232,9 +379,14 @@ class Gateways:
         control, telemetry: addresses, which must be `claimed`
         Raises `StartupError`.
         """
-        self.control = _open(CONTROL, control, stack)
-        self.telemetry = _open(TELEMETRY, telemetry, stack)
+        self._events = asyncio.get_running_loop()
+        self._server = ForkServer()
+        stack.callback(self._server.close)
+        self.control = _open(CONTROL, control, self._server, stack)
+        self.telemetry = _open(TELEMETRY, telemetry, self._server, stack)
         stack.callback(self.control.end)  # so that both end at the same time
+        self._beat()
+        stack.callback(lambda: self._timer.cancel())
 
     def serve(self, server: ControlServer, reporter: Reporter) -> None:
         """Let requests come in and replies go out, and tell when a gateway was started again."""
@@ -243,6 +395,11 @@ class Gateways:
         self.control.read(True)
         for gateway in (self.control, self.telemetry):
             gateway.on_restart = partial(_tell_restart, reporter, gateway.kind)
+
+    def _beat(self) -> None:
+        for peer in (self._server, self.control, self.telemetry):
+            peer.beat()
+        self._timer = self._events.call_later(BEAT_S, self._beat)
 
     def counters(self) -> dict[str, int]:
         """What was survived, since start."""
@@ -253,10 +410,13 @@ class Gateways:
         }
 
 
-def _open(kind: str, address: str, stack: ExitStack) -> Gateway:
+def _open(kind: str, address: str, server: ForkServer, stack: ExitStack) -> Gateway:
     listener = addresses.listen(address, f"{kind}.address", group=kind == CONTROL)
     stack.callback(listener.close)
-    gateway = Gateway(kind, listener, addresses.served(address, listener))
+    try:
+        gateway = Gateway(kind, listener, addresses.served(address, listener), server)
+    except OSError as error:
+        raise StartupError(f"the gateway of {kind} cannot be started: {error.strerror}") from None
     stack.callback(gateway.close)
     return gateway
 

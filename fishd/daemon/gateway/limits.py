@@ -3,7 +3,6 @@
 import ctypes
 import os
 import resource
-import signal
 import time
 from contextlib import suppress
 from typing import IO, Literal
@@ -33,8 +32,6 @@ class ResourceLimits:
         memory: what it may take beyond what it has now [bytes]
         connections: file descriptors beyond those that are open now
         """
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.SIG_IGN)  # it ends when fishd does
         _stand_back()
         with suppress(OSError), _own("oom_score_adj", "wb") as file:
             file.write(b"500")  # rather than fishd
@@ -72,19 +69,16 @@ class ResourceLimits:
 
 
 def _stand_back() -> None:
-    """Take a lower priority than fishd; where this process has begun anew, no lower one again."""
-    with suppress(ProcessLookupError):  # fishd has just ended, and so will this
-        own = os.getpriority(os.PRIO_PROCESS, 0)
-        fishd = os.getpriority(os.PRIO_PROCESS, os.getppid())
-        os.setpriority(os.PRIO_PROCESS, 0, _behind(own, fishd))
+    """Take a lower priority than fishd, whose priority this process was forked with."""
+    os.setpriority(os.PRIO_PROCESS, 0, _behind(os.getpriority(os.PRIO_PROCESS, 0)))
 
 
-def _behind(own: int, fishd: int) -> int:
-    """The nice value of a gateway, from its own so far and that of fishd.
+def _behind(fishd: int) -> int:
+    """Return the nice value of a gateway, from that of fishd.
 
     That of a fishd that goes before others goes before them as well.
     """
-    return max(own, min(_NICE, fishd + _NICE))
+    return max(fishd, min(_NICE, fishd + _NICE))
 
 
 def _files() -> int:

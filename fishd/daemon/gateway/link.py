@@ -12,6 +12,10 @@ TELEMETRY, CONTROL = "telemetry", "control"
 REQUEST, READY, NOTICE, END = b"?", b"^", b"!", b"."
 """First bytes: a client's request, that a gateway serves from now on, why it ends, and that fishd
 does."""
+PING, PONG = b"~", b"-"
+"""First bytes of a heartbeat and of the answer to it."""
+START, STARTED = b"*", b"/"
+"""First bytes of a request to the fork server for a gateway, and of the answer to it."""
 _PART, _LAST = b"+", b"="
 
 _HEAD = 9
@@ -23,6 +27,30 @@ def pair() -> tuple[socket.socket, socket.socket]:
     for end in ends:
         end.setblocking(False)
     return ends
+
+
+def start(kind: str, address: str) -> bytes:
+    """Return a request for a gateway; its link and its listener go with it."""
+    return START + f"{kind} {address}".encode()
+
+
+def kind_and_address(message: bytes) -> tuple[str, str]:
+    """Return what a request for a gateway names."""
+    kind, _, address = message[1:].decode().partition(" ")
+    return kind, address
+
+
+def started(kind: str, outcome: str) -> bytes:
+    """Return the answer to a request for a gateway.
+
+    outcome: how the gateway before it ended, or why this one could not be started, in words
+    """
+    return STARTED + f"{kind} {outcome}".encode()
+
+
+def kind_and_outcome(message: bytes) -> tuple[str, str]:
+    """Return what the answer to a request for a gateway says."""
+    return kind_and_address(message)
 
 
 def published(topic: bytes, payload: bytes) -> bytes:

@@ -2,11 +2,12 @@
 
 import select
 import socket
+from contextlib import suppress
 
 import zmq
 
 from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import END, frames
+from fishd.daemon.gateway.link import END, PING, PONG, frames
 
 SOCKET = zmq.PUB
 MEMORY = 16 * 2**20
@@ -37,6 +38,10 @@ def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
             return ""
         if message in (b"", END):
             return ""
+        if message == PING:
+            with suppress(OSError):  # of a fishd that was killed, the next look tells
+                link.send(PONG)
+            continue
         server.send_multipart(frames(message), zmq.DONTWAIT)
     return why
 

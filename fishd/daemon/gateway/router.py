@@ -3,13 +3,14 @@
 import socket
 import time
 from collections import deque
+from contextlib import suppress
 
 import zmq
 
 from fishd.core import protocol
 from fishd.core.errors import Refused
 from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import END, LONGEST, Replies, request
+from fishd.daemon.gateway.link import END, LONGEST, PING, PONG, Replies, request
 
 SOCKET = zmq.ROUTER
 MEMORY = 48 * 2**20
@@ -108,6 +109,10 @@ class Router:
             if message in (b"", END):
                 self._ended = True
                 return
+            if message == PING:
+                with suppress(OSError):  # of a fishd that was killed, the next look tells
+                    self._link.send(PONG)
+                continue
             found = self._replies.take(message)
             if found:
                 number, payload = found
