@@ -16,7 +16,7 @@ from fishd.camera.frames import Pixels
 from fishd.camera.messages import FrameHeader, Until, ViewHeader
 from fishd.camera.monitor import Monitor
 from fishd.camera.settings import CameraSettings, without_password
-from fishd.camera.sockets import Publisher, Requests
+from fishd.camera.sockets import MAX_UNKNOWN_BYTES, Publisher, Requests
 from fishd.camera.sources.base import Shot, Source, Timeline, Trouble
 from fishd.core import text
 from fishd.daemon.systemd_notify import SystemdNotifier
@@ -33,6 +33,8 @@ AGAIN = 1.0
 """A source that has failed begins anew after so long [s]."""
 LEAVING = 2.0
 """How long the source may take to let go of its camera [s]."""
+WARNING_PERIOD_S = 60.0
+"""Shortest time between two warnings of subscribers that were disconnected [s]."""
 _LOOK = 50
 """Longest time between two looks at the rest [ms]."""
 _WAITING = 4096
@@ -55,7 +57,7 @@ class Server:
         self._failure = ""
         """The latest error that nobody had expected."""
         self._sessions = 0
-        self._next_view = self._next_state = 0.0
+        self._next_view = self._next_state = self._next_warning = 0.0
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -86,18 +88,35 @@ class Server:
             self._publisher.address,
             self._requests.address,
         )
-        poller = zmq.Poller()
-        for each in (self._publisher.socket, self._requests.socket, self._news):
-            poller.register(each, zmq.POLLIN)
+        self._watch()
         thread = threading.Thread(target=self._run_source, name="source", daemon=True)
         thread.start()
         try:
             while not stopping():
-                self._turn({each for each, _ in poller.poll(_LOOK)})
+                self._turn({source for source, _ in self._poller.poll(_LOOK)})
         finally:
             self._notifier.stopping()
             self._stopping.set()
             thread.join(LEAVING)
+
+    def _watch(self) -> None:
+        self._poller = zmq.Poller()
+        for source in (self._publisher.socket, self._requests.socket, self._news):
+            if source is not None:
+                self._poller.register(source, zmq.POLLIN)
+
+    def _renew_publisher(self, now: float) -> None:
+        if not self._publisher.renew(now):
+            return
+        self._watch()
+        if self._publisher.socket is None and now >= self._next_warning:
+            self._next_warning = now + WARNING_PERIOD_S
+            log.warning(
+                "%s: all subscribers were disconnected, and may connect again: they had "
+                "subscribed to more than %d kB of topics that are not published",
+                self._publisher.address,
+                MAX_UNKNOWN_BYTES // 1000,
+            )
 
     def _turn(self, ready: set[object]) -> None:
         if self._news in ready:
@@ -106,6 +125,7 @@ class Server:
             self._requests.answer()
         asked = self._publisher.socket in ready and self._publisher.take_subscriptions()
         now = time.monotonic()
+        self._renew_publisher(now)
         silent = now - self._alive
         if silent > HANGS:
             self._tell(

@@ -1,13 +1,15 @@
 """The two sockets of `fishd-camera`: frames go out of one, requests come in at the other."""
 
+import ctypes
 import os
+import socket as sockets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
 import zmq
 
-from fishd.camera.messages import STATE, VIEW
+from fishd.camera.messages import FRAME, STATE, UNTIL, VIEW
 from fishd.core import addresses, protocol, text
 from fishd.core.errors import Refused
 from fishd.core.schema import nearest
@@ -18,43 +20,88 @@ LONGEST_TOPIC = 512
 """Of what a subscriber sends [bytes]."""
 GREETING = 2000
 """How long a connection may take until it speaks ZeroMQ [ms]."""
+MAX_UNKNOWN_BYTES = 50_000
+"""Largest total size of the unknown topics of all subscribers [bytes]."""
+RENEWAL_PAUSE_S = 0.3
+"""Time without connections after one has sent too many topics [s]."""
+_TOPICS = (FRAME, VIEW, STATE, UNTIL)
 _AT_ONCE = 20
-"""Requests or subscriptions that are taken before frames are looked at."""
+"""Requests that are taken before frames are looked at."""
+_SUBSCRIPTIONS_AT_ONCE = 1000
+"""Subscriptions that are taken before frames are looked at."""
 _RIVAL = "another fishd-camera"
 _IN_USE = "it is in use, by another fishd-camera perhaps; end that, or choose another address"
 _ADVICE = "end it, or give this one another publish.frames and publish.requests"
 
 
 class Publisher:
-    """The socket for frames; an XPUB, to know what is wanted. Waits for nobody."""
+    """The socket for frames, an XPUB, which tells what its subscribers want. It never blocks.
+
+    ZeroMQ stores each topic that a subscriber sends, and gives back what it stored only when the
+    connection ends. Subscribers that send more unknown topics than `MAX_UNKNOWN_BYTES` are
+    therefore disconnected, and all others with them, who connect again by themselves.
+    """
 
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Raises `StartupError`."""
-        self.socket, self.address = _listening(zmq.XPUB, address, "publish.frames", stack)
+        self._listener, self.address = _listen(address, "publish.frames", stack)
         self._topics: set[bytes] = set()
-        """Those by which somebody gets views: `view`, or how that begins."""
+        """Subscriptions that views match: `view`, or a beginning of it."""
+        self._open()
+        stack.callback(self._close)
 
     def send(self, parts: list[bytes]) -> None:
         """Publish a message."""
-        self.socket.send_multipart(parts, zmq.DONTWAIT)
+        if self.socket is not None:
+            self.socket.send_multipart(parts, zmq.DONTWAIT)
 
     @property
     def views_wanted(self) -> bool:
-        """Has anybody subscribed to pictures for people?"""
+        """Whether there is a subscription to pictures for people."""
         return bool(self._topics)
 
     def take_subscriptions(self) -> bool:
-        """Note what is wanted; true where somebody has just subscribed to the state."""
+        """Note which topics are wanted; return whether a new subscription is to the state."""
         state = False
-        for (message,) in _waiting(self.socket, 1):
-            topic = message[1:]
-            if message[:1] == b"\x01":
+        for (message,) in _waiting(self.socket, 1, _SUBSCRIPTIONS_AT_ONCE):
+            kind, topic = message[:1], message[1:]
+            if not any(known.startswith(topic) for known in _TOPICS):
+                self._unknown_bytes += len(message) * (kind == b"\x01")
+                continue
+            if kind == b"\x01":
                 if VIEW.startswith(topic):
                     self._topics.add(topic)
                 state = state or STATE.startswith(topic)
-            else:
+            elif kind == b"\x00":
                 self._topics.discard(topic)
         return state
+
+    def renew(self, now: float) -> bool:
+        """Disconnect all subscribers where too many topics are unknown, and listen again later.
+
+        now: time of a monotonic clock [s]; returns whether `socket` was replaced
+        """
+        if self.socket is None and now >= self._open_again:
+            self._open()
+            return True
+        if self.socket is None or self._unknown_bytes <= MAX_UNKNOWN_BYTES:
+            return False
+        self._close()
+        self._open_again = now + RENEWAL_PAUSE_S
+        return True
+
+    def _open(self) -> None:
+        self._unknown_bytes = 0
+        self._topics.clear()
+        self._stack = ExitStack()
+        self.socket: zmq.Socket[bytes] | None = _bound(
+            zmq.XPUB, self.address, self._listener, self._stack
+        )
+
+    def _close(self) -> None:
+        self._stack.close()
+        self.socket = None
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Requests:
@@ -62,7 +109,8 @@ class Requests:
 
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Raises `StartupError`."""
-        self.socket, self.address = _listening(zmq.ROUTER, address, "publish.requests", stack)
+        listener, self.address = _listen(address, "publish.requests", stack)
+        self.socket = _bound(zmq.ROUTER, self.address, listener, stack)
         self.operations: dict[str, Callable[[], Any]] = {}
         """What can be asked for, by name."""
 
@@ -86,37 +134,46 @@ class Requests:
         return protocol.success(request.id, self.operations[request.op]())
 
 
-def _waiting(socket: "zmq.Socket[bytes]", parts: int | None = None) -> Iterator[list[bytes]]:
-    """Messages that wait, with so many parts."""
-    for _ in range(_AT_ONCE):
+def _waiting(
+    socket: "zmq.Socket[bytes] | None", parts: int | None = None, count: int = _AT_ONCE
+) -> Iterator[list[bytes]]:
+    """Yield messages that wait, at most `count`, and only those of this number of parts."""
+    for _ in range(count if socket is not None else 0):
+        assert socket is not None
         try:
-            found = socket.recv_multipart(zmq.DONTWAIT)
+            message = socket.recv_multipart(zmq.DONTWAIT)
         except zmq.Again:
             return
-        if parts in (None, len(found)):
-            yield found
+        if parts in (None, len(message)):
+            yield message
 
 
-def _listening(
-    kind: int, address: str, key: str, stack: ExitStack
-) -> tuple["zmq.Socket[bytes]", str]:
-    """A socket that listens until `stack` is closed, and its address; raises `StartupError`."""
+def _listen(address: str, key: str, stack: ExitStack) -> tuple[sockets.socket, str]:
+    """Return a socket that listens until `stack` is closed, and its address.
+
+    Raises `StartupError`.
+    """
     stack.enter_context(addresses.claimed(address, _RIVAL, _ADVICE))
     listener = addresses.listen(address, key, in_use=_IN_USE)
     stack.callback(listener.close)
-    served = addresses.served(address, listener)
+    return listener, addresses.served(address, listener)
+
+
+def _bound(
+    kind: int, address: str, listener: sockets.socket, stack: ExitStack
+) -> "zmq.Socket[bytes]":
+    """Return a ZeroMQ socket for the connections of a listener, until `stack` is closed."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     stack.callback(context.destroy, linger=0)
     socket = context.socket(kind)
     socket.set(zmq.LINGER, 0)
     socket.set(zmq.SNDHWM, QUEUE)
+    socket.set(zmq.RCVHWM, _AT_ONCE)
     socket.set(zmq.HANDSHAKE_IVL, GREETING)
     longest = LONGEST_TOPIC if kind == zmq.XPUB else protocol.MAX_MESSAGE
     socket.set(zmq.MAXMSGSIZE, longest)
     if kind == zmq.XPUB:
         socket.set(zmq.XPUB_VERBOSE, 1)
-    else:
-        socket.set(zmq.RCVHWM, _AT_ONCE)
     socket.set(zmq.USE_FD, os.dup(listener.fileno()))
-    socket.bind(served)
-    return socket, served
+    socket.bind(address)
+    return socket

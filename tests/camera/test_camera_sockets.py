@@ -2,11 +2,12 @@
 
 import json
 import os
+import resource
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import msgspec
@@ -15,7 +16,7 @@ import pytest
 import simplejpeg
 import zmq
 from rigs.camera_process import COMMAND, CameraProcess, running_camera
-from rigs.processes import PATIENCE, Daemon, Subscriber, call, running, sets
+from rigs.processes import PATIENCE, Daemon, Subscriber, call, running, sets, wait_until
 
 from fishd.camera import requests
 from fishd.camera.client import CameraClient, CameraLost
@@ -131,6 +132,62 @@ def test_whatever_else_a_neighbour_subscribes_to_views_come(camera: CameraProces
             assert next(client.views()).jpeg
     finally:
         context.destroy(linger=0)
+
+
+@contextmanager
+def bare_subscriber(camera: CameraProcess) -> Iterator["zmq.Socket[bytes]"]:
+    """A client that sends any bytes in the place of subscriptions."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    socket = context.socket(zmq.XSUB)
+    socket.set(zmq.SNDHWM, 0)
+    try:
+        socket.connect(camera.frames)
+        yield socket
+    finally:
+        context.destroy(linger=0)
+
+
+def wait_for_view(client: CameraClient, after: float) -> None:
+    """Wait for a picture that is newer than this time of the camera's clock [s]."""
+
+    def has_come() -> bool:
+        client.poll(0.1)
+        return client.view is not None and client.view.header.time > after
+
+    wait_until(has_come)
+
+
+def test_only_an_unsubscription_ends_views(camera: CameraProcess) -> None:
+    with camera.client(views=True) as client, bare_subscriber(camera) as stranger:
+        wait_for_view(client, 0.0)
+        assert client.view
+        for message in (b"\x02view", b"view", b"", b"\xff", b"\x00state"):
+            stranger.send(message)
+        wait_for_view(client, client.view.header.time + 1.0)
+
+
+def test_subscriptions_to_unknown_topics_take_no_memory_and_viewers_come_back(
+    camera: CameraProcess,
+) -> None:
+    with camera.client(views=True) as client:
+        wait_for_view(client, 0.0)
+        before = resident(camera)
+        with bare_subscriber(camera) as stranger:
+            for _ in range(50_000):
+                stranger.send(b"\x01" + os.urandom(40))
+            end, most = time.monotonic() + 3.0, 0.0
+            while time.monotonic() < end:
+                most = max(most, resident(camera))
+                time.sleep(0.05)
+        assert client.view
+        wait_for_view(client, client.view.header.time + 3.0)
+    assert most < before + 60.0
+
+
+def resident(camera: CameraProcess) -> float:
+    """Memory of its process [MB]."""
+    statm = Path(f"/proc/{camera.process.pid}/statm").read_text()
+    return int(statm.split()[1]) * resource.getpagesize() / 2**20
 
 
 def test_within_a_tick_there_is_no_time_to_find_out_why_no_answer_comes(
