@@ -47,6 +47,7 @@ class Publisher:
         self._listener, self.address = _listen(address, "publish.frames", stack)
         self._topics: set[bytes] = set()
         """Subscriptions that views match: `view`, or a beginning of it."""
+        self._open_again = 0.0
         self._open()
         stack.callback(self._close)
 

@@ -7,23 +7,34 @@ somebody looks at here could read what the camera sees.
 
 import asyncio
 import ipaddress
+import logging
 import os
 import socket
+import time
 from collections.abc import Awaitable, Callable
 from importlib import resources
+from typing import Any
 from urllib.parse import urlsplit
 
-from aiohttp import WSMsgType, web
+from aiohttp import WSMsgType, http_exceptions, web
 
 from fishd.camera.page.feed import News
 from fishd.core.errors import StartupError
 
+log = logging.getLogger(__name__)
+
 MOST_VIEWERS = 16
 """Pages that are served at a time."""
+MAX_VIEWERS_PER_ADDRESS = 12
+"""Largest number of them that one address may have."""
 MOST_CONNECTIONS = 64
-"""Beyond them, new ones are closed."""
-GREETING = 10.0
-"""A connection that has asked for nothing within so long is closed [s]."""
+"""Largest number of connections; a new one takes the place of one that has sent no request."""
+MAX_ASKING_PER_ADDRESS = 16
+"""Largest number of connections of one address that have sent no request."""
+REQUEST_TIMEOUT_S = 3.0
+"""Time that a connection has to send its request, to the end of the headers [s]."""
+LOG_PERIOD_S = 1.0
+"""Shortest time between two lines in the log about malformed requests [s]."""
 HEARTBEAT = 10.0
 """A page that does not answer within half of this is gone [s]."""
 LEAVING = 0.4
@@ -55,8 +66,8 @@ class PageServer:
         self._viewers: set[_Viewer] = set()
         self._facts = b"{}"
         self._picture: bytes | None = None
-        self._silent: set[asyncio.BaseProtocol] = set()
-        """Connections that have asked for nothing yet."""
+        self._asking: dict[web.RequestHandler, str] = {}
+        """Connections that have sent no request yet, the oldest first, and their addresses."""
         self._names = {socket.gethostname().lower(), "localhost"}
         self._names |= {f"{name}.local" for name in self._names}
 
@@ -70,7 +81,9 @@ class PageServer:
             app,
             access_log=None,
             handle_signals=False,
-            keepalive_timeout=GREETING,
+            keepalive_timeout=REQUEST_TIMEOUT_S,
+            lingering_time=LEAVING,
+            logger=_RequestLog(log, {}),
             shutdown_timeout=LEAVING,
         )
         await self._runner.setup()
@@ -114,34 +127,53 @@ class PageServer:
             viewer.show(news)
 
     def _connected(self) -> asyncio.Protocol:
-        """What talks to a client that has just connected."""
+        """Return what talks to a client that has just connected."""
+        return _Door(self._admit)
+
+    def _admit(self, transport: asyncio.Transport) -> None:
+        """Serve a connection, in the place of another one where there are too many."""
         server = self._runner.server
         assert server
-        if len(server.connections) >= MOST_CONNECTIONS:
-            return _Refusal()
+        address = str((transport.get_extra_info("peername") or ("",))[0])
+        asking = self._asking = {
+            handler: owner for handler, owner in self._asking.items() if handler.transport
+        }
+        owners = list(asking.values())
+        crowded = ""
+        if owners.count(address) >= MAX_ASKING_PER_ADDRESS:
+            crowded = address
+        elif len(server.connections) >= MOST_CONNECTIONS:
+            crowded = max(owners, key=owners.count, default="")
+            if not crowded:
+                transport.abort()
+                return
+        if crowded:
+            self._end(next(handler for handler, owner in asking.items() if owner == crowded))
         handler = server()
-        self._silent.add(handler)
-        asyncio.get_running_loop().call_later(GREETING, self._close_if_silent, handler)
-        return handler
+        asking[handler] = address
+        transport.set_protocol(handler)
+        handler.connection_made(transport)
+        asyncio.get_running_loop().call_later(REQUEST_TIMEOUT_S, self._end, handler)
 
-    def _close_if_silent(self, handler: web.RequestHandler) -> None:
-        if handler in self._silent:
-            self._silent.discard(handler)
-            if handler.transport is not None:
-                handler.transport.close()
+    def _end(self, handler: web.RequestHandler) -> None:
+        """End a connection unless it has sent a request."""
+        if self._asking.pop(handler, None) and isinstance(handler.transport, asyncio.Transport):
+            handler.transport.abort()
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._silent.discard(request.protocol)
+        self._asking.pop(request.protocol, None)
         try:
             if not self._is_ours(request.host):
                 raise web.HTTPForbidden(text="this machine has another name\n")
             response = await handler(request)
         except web.HTTPException as error:
             error.headers.update(_HEADERS)
+            error.force_close()
             raise
         if not response.prepared:
             response.headers.update(_HEADERS)
+            response.force_close()  # a connection kept alive would take the place of others
         return response
 
     def _is_ours(self, host: str) -> bool:
@@ -163,12 +195,17 @@ class PageServer:
         origin = request.headers.get("Origin")
         if origin is not None and _place(origin) != request.host.lower():
             raise web.HTTPForbidden(text="a page from elsewhere\n")
-        if len(self._viewers) >= MOST_VIEWERS:
-            raise web.HTTPServiceUnavailable(text=f"{MOST_VIEWERS} pages are open already\n")
+        address = request.remote or ""
+        own = sum(viewer.address == address for viewer in self._viewers)
+        if len(self._viewers) >= MOST_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
+            raise web.HTTPServiceUnavailable(
+                text=f"{len(self._viewers)} pages are open already, {own} of them by {address}; "
+                "close another one\n"
+            )
         sock = web.WebSocketResponse(
             timeout=LEAVING, heartbeat=HEARTBEAT, max_msg_size=1024, compress=False
         )
-        viewer = _Viewer(sock, News(self._facts, self._picture))
+        viewer = _Viewer(sock, address, News(self._facts, self._picture))
         self._viewers.add(viewer)
         try:
             await sock.prepare(request)
@@ -181,7 +218,8 @@ class PageServer:
 class _Viewer:
     """One page; what it is too slow for it does not get."""
 
-    def __init__(self, sock: web.WebSocketResponse, first: News) -> None:
+    def __init__(self, sock: web.WebSocketResponse, address: str, first: News) -> None:
+        self.address = address
         self._sock = sock
         self._news: News | None = first
         self._waiting = asyncio.Event()
@@ -225,11 +263,47 @@ class _Viewer:
         self.end()
 
 
-class _Refusal(asyncio.Protocol):
-    """Closes the connection."""
+class _Door(asyncio.Protocol):
+    """The protocol of a connection until it is admitted, which needs its address."""
+
+    def __init__(self, admit: Callable[[asyncio.Transport], None]) -> None:
+        self._admit = admit
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport.close()
+        """Pass the connection on."""
+        assert isinstance(transport, asyncio.Transport)
+        self._admit(transport)
+
+
+class _RequestLog(logging.LoggerAdapter[logging.Logger]):
+    """The log of the HTTP server, without tracebacks for what clients send."""
+
+    _next_line = 0.0
+    _left_out = 0
+
+    def exception(self, msg: object, *args: Any, exc_info: Any = True, **options: Any) -> None:
+        """Log an error of this server with its traceback, a malformed request in one line."""
+        if isinstance(exc_info, http_exceptions.HttpProcessingError):
+            self._log_malformed(args[0] if args else "", exc_info)
+        else:
+            super().exception(msg, *args, exc_info=exc_info, **options)
+
+    def debug(self, msg: object, *args: Any, exc_info: Any = None, **options: Any) -> None:
+        """Log a malformed request in one line."""
+        if isinstance(exc_info, http_exceptions.HttpProcessingError):
+            self._log_malformed(args[0] if args else "", exc_info)
+        else:
+            super().debug(msg, *args, exc_info=exc_info, **options)
+
+    def _log_malformed(self, address: object, error: Exception) -> None:
+        now = time.monotonic()
+        if now < self._next_line:
+            self._left_out += 1
+            return
+        more = f" ({self._left_out} more since the last line)" if self._left_out else ""
+        self._next_line, self._left_out = now + LOG_PERIOD_S, 0
+        kind = type(error).__name__  # its text quotes the request
+        self.logger.debug("%s sent a malformed request: %s%s", address, kind, more)
 
 
 def _joined(news: News) -> bytes:

@@ -169,45 +169,129 @@ HALF_ASKED = (
 )
 
 
+@asynccontextmanager
+async def neighbour(server: PageServer) -> AsyncIterator[aiohttp.ClientSession]:
+    """A client with another address."""
+    connector = aiohttp.TCPConnector(local_addr=("127.0.0.2", 0))
+    async with aiohttp.ClientSession(server.url, connector=connector) as session:
+        yield session
+
+
 def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        socks = [await session.ws_connect("/live") for _ in range(page_server.MOST_VIEWERS)]
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await session.ws_connect("/live")
-        assert refused.value.status == 503
-        await socks[0].close()
-        while True:
-            try:
-                sock = await session.ws_connect("/live")
-                break
-            except aiohttp.WSServerHandshakeError:
-                await asyncio.sleep(0.02)
-        server.show(News(FACTS, b"again"))
-        while (await news_of(sock))[1] != b"again":
-            pass
-        for each in (*socks, sock):
-            await each.close()
+        async with neighbour(server) as other:
+            socks = [
+                await session.ws_connect("/live")
+                for _ in range(page_server.MAX_VIEWERS_PER_ADDRESS)
+            ]
+            await refused(session)
+            while len(socks) < page_server.MOST_VIEWERS:
+                socks.append(await other.ws_connect("/live"))
+            await refused(other)
+            await socks[0].close()
+            while True:
+                try:
+                    sock = await session.ws_connect("/live")
+                    break
+                except aiohttp.WSServerHandshakeError:
+                    await asyncio.sleep(0.02)
+            server.show(News(FACTS, b"again"))
+            while (await news_of(sock))[1] != b"again":
+                pass
+            for each in (*socks, sock):
+                await each.close()
 
     run(test)
+
+
+async def refused(session: aiohttp.ClientSession) -> None:
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+        await session.ws_connect("/live")
+    assert refusal.value.status == 503
 
 
 def test_a_flood_of_connections_is_bounded_and_ends_by_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    usual = page_server.GREETING
-    monkeypatch.setattr(page_server, "GREETING", 0.3)
+    usual = page_server.REQUEST_TIMEOUT_S
+    monkeypatch.setattr(page_server, "REQUEST_TIMEOUT_S", 0.3)
 
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        port = int(server.url.rsplit(":", 1)[1].strip("/"))
-        links = [await asyncio.open_connection("127.0.0.1", port) for _ in range(100)]
-        for reader, writer in links:  # the later ones at once, the others as they say nothing
+        links = [await connect(server) for _ in range(100)]
+        for reader, writer in links:  # most at once, the others as they say nothing
             assert await reader.read() == b""
             writer.close()
-        monkeypatch.setattr(page_server, "GREETING", usual)  # one that asks may take its time
+        monkeypatch.setattr(page_server, "REQUEST_TIMEOUT_S", usual)
         async with session.get("/") as response:
             assert response.status == 200
 
     run(test)
+
+
+async def connect(
+    server: PageServer, sent: bytes = b""
+) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    port = int(server.url.rsplit(":", 1)[1].strip("/"))
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(sent)
+    return reader, writer
+
+
+WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: keep-alive\r\n\r\n"
+
+
+@pytest.mark.parametrize("sent", [*HALF_ASKED, WHOLE])
+def test_no_client_keeps_the_page_from_others(sent: bytes) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        writers = [(await connect(server, sent))[1] for _ in range(100)]
+        await asyncio.sleep(0.2)
+        async with neighbour(server) as other:
+            for client in (session, other):
+                begun = time.monotonic()
+                async with client.get("/") as response:
+                    assert response.status == 200
+                assert time.monotonic() - begun < page_server.REQUEST_TIMEOUT_S / 2
+        for writer in writers:
+            writer.close()
+
+    run(test)
+
+
+@pytest.mark.parametrize("sent", HALF_ASKED)
+def test_half_a_request_is_ended_soon(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_server, "REQUEST_TIMEOUT_S", 0.3)
+
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        reader, writer = await connect(server, sent)
+        begun = time.monotonic()
+        await reader.read()
+        assert time.monotonic() - begun < 3.0
+        writer.close()
+
+    run(test)
+
+
+def test_malformed_requests_are_one_line_a_second_in_the_log_of_debugging(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        for sent in (
+            b"\x16\x03\x01 hello\r\n\r\n",
+            b"GET\r\n\r\n",
+            b"GET / HTTP/1.1\r\n: \r\n\r\n",
+        ) * 10:
+            reader, writer = await connect(server, sent)
+            assert b" 400 " in await reader.read()
+            writer.close()
+
+    with caplog.at_level("DEBUG"):
+        begun = time.monotonic()
+        run(test)
+        seconds = 1 + int(time.monotonic() - begun)
+    lines = [record for record in caplog.records if record.name.startswith(("fishd", "aiohttp"))]
+    assert 1 <= len(lines) <= seconds
+    assert all(record.levelname == "DEBUG" and not record.exc_info for record in lines)
+    assert "127.0.0.1 sent a malformed request" in lines[0].getMessage()
 
 
 @pytest.mark.parametrize("message", [b"x" * 2000, b"\xff", b""])
