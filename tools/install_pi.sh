@@ -189,6 +189,9 @@ put() { install -D -m 0644 "$1" "$DESTDIR$2"; }
 install_config() {
   install_one_config "$checkout/config/pi.yaml" "$CONFIG"
   install_one_config "$checkout/config/camera.yaml" "$CAMERA_CONFIG"
+  # Its group is set by systemd-tmpfiles, once there is one.
+  chmod 0640 "$DESTDIR$CAMERA_CONFIG"
+  step "$CAMERA_CONFIG: for root and group fishd only, as it may hold a camera's password"
 }
 
 install_one_config() {

@@ -1,13 +1,15 @@
 """The command `fishd-camera`: from settings to a camera that publishes until a signal ends it."""
 
 import logging
+import stat
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import click
 
 from fishd import __version__
-from fishd.camera.settings import CameraSettings, load
+from fishd.camera.settings import CameraSettings, load, public
 from fishd.camera.sources.base import Source
 from fishd.core import text
 from fishd.core.console import complain, run
@@ -72,6 +74,8 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
         complain(NAME, f"{text.said(error)}; install the extra: pip install 'fishd[camera]'", 1)
     logs = LogWriter(log_format)
     logging.getLogger("linuxpy").setLevel(logging.WARNING)
+    if path is not None:
+        warn_of_readers(path, settings)
     stopping = threading.Event()
     try:
         with on_signal(stopping.set), Server(settings, source) as server:
@@ -85,6 +89,20 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
     finally:
         logs.close(UNHURRIED)
     return 0
+
+
+def warn_of_readers(path: Path, settings: CameraSettings) -> None:
+    """Log a warning where every user of this machine can read the password of a camera."""
+    url = settings.stream.url
+    if url is None or public(url) == url:
+        return
+    with suppress(OSError):
+        if path.stat().st_mode & stat.S_IROTH:
+            log.warning(
+                "%s holds a password, and every user of this machine can read it: run "
+                "chmod 640 %s, and chgrp fishd %s where fishd-camera is a service",
+                *(path,) * 3,
+            )
 
 
 def main() -> None:

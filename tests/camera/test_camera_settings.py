@@ -10,6 +10,7 @@ from rigs.camera_process import COMMAND
 from rigs.documents import ROOT
 from rigs.processes import call, one_line
 
+from fishd.camera import main
 from fishd.camera.settings import CameraSettings, SimulatedSettings, load, public, to_yaml
 from fishd.camera.simulated.settings import WEB
 from fishd.core.errors import ConfigError
@@ -99,3 +100,24 @@ def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: s
 )
 def test_nobody_is_told_a_password_wherever_a_camera_wants_it(url: str, shown: str) -> None:
     assert public(url) == shown
+
+
+@pytest.mark.parametrize(
+    ("url", "mode", "warns"),
+    [
+        ("rtsp://me:secret@host/", 0o644, True),
+        ("rtsp://me:secret@host/", 0o640, False),
+        ("rtsp://host/", 0o644, False),
+    ],
+)
+def test_a_password_that_every_user_can_read_is_warned_of(
+    url: str, mode: int, warns: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text(f"source: stream\nstream: {{url: '{url}'}}\n")
+    file.chmod(mode)
+    main.warn_of_readers(file, load(file))
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == warns
+    assert all("every user of this machine can read it: run chmod 640" in line for line in lines)
+    assert "secret" not in "".join(lines)

@@ -114,6 +114,19 @@ def test_the_installed_programs_run_from_their_final_place(installed: Pi) -> Non
     assert str(installed.disk) in where.decode()
 
 
+def test_the_settings_of_the_camera_are_not_for_every_user(pi: Pi) -> None:
+    camera = pi.disk / "etc/fishd/camera.yaml"
+    assert camera.stat().st_mode & 0o777 == 0o640
+    camera.write_text("source: stream\nstream: {url: 'rtsp://me:secret@host/'}\n")
+    camera.chmod(0o644)  # as an older version had installed it
+    said = "\n".join(pi.run("install_config"))
+    assert camera.stat().st_mode & 0o777 == 0o640
+    assert "camera.yaml: for root and group fishd only, as it may hold a camera's password" in said
+    # Its group, once there is one.
+    lines = (pi.disk / "etc/tmpfiles.d/fishd.conf").read_text().splitlines()
+    assert "z /etc/fishd/camera.yaml 0640 root fishd -" in lines
+
+
 def test_every_file_under_systemd_is_installed(installed: Pi) -> None:
     shipped = {path.name for path in (CHECKOUT / "systemd").rglob("*") if path.is_file()}
     assert shipped <= {Path(name).name for name in files(installed.disk)}
