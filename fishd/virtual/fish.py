@@ -23,6 +23,8 @@ class SimulatedFish:
         self.fish = open_plant(plant, settings.motor)
         self.window: Window = PlantWindow(tick, 0.0, 0.0, 0.0, 0.0, 0.0)
         """The latest window with its true mean forces; nothing happens before the first read."""
+        self._power: float | None = None
+        """Mean power in that window [W]; None until it is read."""
         self._imperfections = Imperfections(settings, tick)
         self._sample_rate = settings.sample_rate
         self._tick = tick
@@ -41,8 +43,9 @@ class SimulatedFish:
             self._start = self._time = now - self._tick
         duration = round(now - self._time, 9)
         self._time = now
-        samples = max(1, round(self._sample_rate * duration))
+        samples = round(self._sample_rate * duration) or 1
         self.window = window = self.fish.advance(self._angle, duration, samples)
+        self._power = None
         fx, fy = self._imperfections.apply(
             window.sampled_thrust,
             window.sampled_lateral_force,
@@ -74,11 +77,13 @@ class SimulatedFish:
         self._fin_speed = state.alpha_rate
         # Where the fin has not turned, it is at the end that it has gone furthest.
         peak = window.fin_peak if turned else abs(state.alpha)
-        return TrueWindow(window.duration, window.thrust, peak, window.power)
+        return TrueWindow(window.duration, window.thrust, peak, self.power())
 
-    def power(self, now: float) -> float:
+    def power(self, now: float = 0.0) -> float:
         """Mean electrical power of the servo over the latest window, which ended `now` [W]."""
-        return self.window.power
+        if self._power is None:
+            self._power = self.window.power
+        return self._power
 
     def write(self, angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""

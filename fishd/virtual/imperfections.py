@@ -154,10 +154,13 @@ class Imperfections:
             step = settings.drift_walk * math.sqrt(duration)
             self._walk_x += gauss(0.0, step)
             self._walk_y += gauss(0.0, step)
-        angle = math.tau * time / settings.drift_period
-        steady = settings.drift_rate * time
-        drift_x = settings.drift * math.sin(angle + self._phase_x) + steady + self._walk_x
-        drift_y = settings.drift * math.sin(angle + self._phase_y) + steady + self._walk_y
+        drift_x = drift_y = settings.drift_rate * time
+        if settings.drift:
+            angle = math.tau * time / settings.drift_period
+            drift_x += settings.drift * math.sin(angle + self._phase_x)
+            drift_y += settings.drift * math.sin(angle + self._phase_y)
+        drift_x += self._walk_x
+        drift_y += self._walk_y
         shown_x = self._cos * fx - self._sin * fy + settings.offset_x + drift_x
         shown_y = self._sin * fx + self._cos * fy + settings.offset_y + drift_y
         shown_x += random_noise(0.0, noise)

@@ -298,8 +298,8 @@ def _swum(p: PlantParameters, command: Array, interval: float) -> tuple[Array, A
     fish.state = PlantState(phi=fish.state.phi)
     free = np.eye(2)
     for angle in commands:
-        for segment, _ in fish.advance(angle, interval, 1).course:
-            free = segment.free_motion @ free
+        for stretch in fish.advance(angle, interval, 1).course:
+            free = stretch.segment.free_motion @ free
     forced = (fish.state.alpha, fish.state.alpha_rate)
     alpha, rate = np.linalg.solve(np.eye(2) - free, forced).tolist()
     fish.state = PlantState(fish.state.phi, alpha, rate)

@@ -153,8 +153,8 @@ def _half_period(parameters: PlantParameters, amplitude: float, frequency: float
     from_rest = fish.advance(amplitude, half_period, samples=1)
     forced = (fish.state.alpha, fish.state.alpha_rate)
     free = np.eye(2)
-    for segment, _ in from_rest.course:
-        free = segment.free_motion @ free
+    for stretch in from_rest.course:
+        free = stretch.segment.free_motion @ free
     alpha, rate = np.linalg.solve(free + np.eye(2), np.negative(forced)).tolist()
     fish.state = PlantState(swing - lag, alpha, rate)
     fish.cables.tail = tail

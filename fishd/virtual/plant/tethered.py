@@ -16,7 +16,7 @@ from msgspec import Struct
 from fishd.virtual.plant.base import REST, Plant, PlantState
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
 from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
-from fishd.virtual.plant.motor import Motor
+from fishd.virtual.plant.motor import Motor, Stretch
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 
 # Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
@@ -32,11 +32,12 @@ REACTION_TIME = 0.01
 
 
 class FinWindow(Struct, frozen=True, eq=False):
-    """A `Window` whose peak is worked out when asked for.
+    """A `Window` whose peak and power are worked out when they are read.
 
     Attributes:
-        course: the segments of the window and the fin's response in each, for `fin_peak`.
-        power: mean electrical power of the servo, W; NaN where the fish has no motor.
+        course: the segments of the window, with the motion of wheel and fin in each.
+        motor: of the servo; None where its power is of no interest.
+        drives: arguments of `Motor.energy` for each part of the window with pulses.
     """
 
     duration: float
@@ -44,13 +45,25 @@ class FinWindow(Struct, frozen=True, eq=False):
     lateral_force: float
     sampled_thrust: float
     sampled_lateral_force: float
-    course: Sequence[tuple[Segment, Vector]]
-    power: float = math.nan
+    course: Sequence[Stretch]
+    motor: Motor | None = None
+    drives: Sequence[tuple[float, float, Sequence[Stretch]]] = ()
 
     @property
     def fin_peak(self) -> float:
         """Largest |α| within the window [rad]."""
-        return max(segment.peak(response) for segment, response in self.course)
+        return max(stretch.segment.peak(stretch.response) for stretch in self.course)
+
+    @property
+    def power(self) -> float:
+        """Mean electrical power of the servo [W]; NaN where the fish has no motor."""
+        motor = self.motor
+        if motor is None:
+            return math.nan
+        energy = 0.0
+        for before, after, course in self.drives:
+            energy += motor.energy(before, after, course)
+        return motor.idle + energy / self.duration
 
 
 class TetheredFish(Plant[PlantParameters]):
@@ -86,8 +99,11 @@ class TetheredFish(Plant[PlantParameters]):
         self._momentum = 0.0
         """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
         self._motor = Motor(motor, parameters) if motor else None
+        self._lag = 0.0
+        """lag/Δ at the end of the latest window; 0 where the servo had no pulses."""
         self._pulls = True
         """Did the wheel move the tail in the latest segment?"""
+        self._side_inertia = parameters.lateral_inertia
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> FinWindow:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
@@ -115,8 +131,9 @@ class TetheredFish(Plant[PlantParameters]):
             sum(w.lateral_force * w.duration for w in windows) / duration,
             sum(w.sampled_thrust for w in windows),
             sum(w.sampled_lateral_force for w in windows),
-            [segment for w in windows for segment in w.course],
-            sum(w.power * w.duration for w in windows) / duration,
+            [stretch for w in windows for stretch in w.course],
+            self._motor,
+            [drive for w in windows for drive in w.drives],
         )
 
     def _swim(
@@ -131,7 +148,7 @@ class TetheredFish(Plant[PlantParameters]):
         duration = part[1] - part[0]
         phi, alpha, rate = start = self.state
         command = phi if angle is None else self._reached(angle, phi)
-        lag = (command - phi) / p.servo_lag
+        begin = lag = (command - phi) / p.servo_lag
         cuts = self._cuts(command, phi, lag, duration) if lag else ()
         segments: Sequence[Segment] = (
             self._segments(whole, samples, part, cuts)
@@ -143,18 +160,16 @@ class TetheredFish(Plant[PlantParameters]):
         if self._brakes:
             segments, responses = self._cut_at_turns(segments, command, lag)
         cause = self._cause
-        course: list[tuple[Segment, Vector]] = []
+        course: list[Stretch] = []
         thrust = sampled_thrust = sampled_acceleration = sampled_rate = 0.0
         braking = sampled_braking = 0.0
         momentum = self._momentum
-        motor = self._motor if angle is not None else None
-        energy = motor.begin(lag) if motor else 0.0
         for segment in segments:
             cause[0], cause[1] = alpha, rate
-            lag = self._drive(segment, command, lag)
+            lags, lag = self._drive(segment, command, lag)
             # Half the overhead of @:
             response = responses[len(course)] if responses else segment.response.dot(cause)
-            course.append((segment, response))
+            course.append(Stretch(segment, response, lags, self._pulls))
             integral, total = segment.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
             alpha, rate, total_acceleration, total_rate = response[3 * N :].tolist()
             thrust -= integral
@@ -166,15 +181,12 @@ class TetheredFish(Plant[PlantParameters]):
                 integral, total = segment.sums.dot(np.abs(rates) * rates).tolist()
                 braking += integral
                 sampled_braking += total
-            if motor:
-                energy += motor.spent(segment, response if self._pulls else None)
 
-        power = math.nan
-        if self._motor:
-            self._motor.end(lag if motor else 0.0)
-            power = self._motor.idle + energy / duration
+        pulsed = angle is not None
+        drives = ((self._lag, begin, course),) if pulsed else ()
+        self._lag = lag if pulsed else 0.0
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
-        inertia, side_inertia, drag = p.thrust_coefficient, p.lateral_inertia, p.lateral_drag
+        inertia, side_inertia, drag = p.thrust_coefficient, self._side_inertia, p.lateral_drag
         reaction = self._momentum - momentum
         braking, sampled_braking = self._side_drag * braking, self._side_drag * sampled_braking
         return FinWindow(
@@ -191,7 +203,8 @@ class TetheredFish(Plant[PlantParameters]):
             -(side_inertia * sampled_acceleration + drag * sampled_rate + sampled_braking) / samples
             + reaction / whole,
             course,
-            power,
+            self._motor,
+            drives,
         )
 
     def _cut_at_turns(
@@ -210,7 +223,7 @@ class TetheredFish(Plant[PlantParameters]):
             segment = to_do.pop()
             cause[0], cause[1] = alpha, rate
             tail = self.cables.tail
-            later = self._drive(segment, command, lag)
+            _, later = self._drive(segment, command, lag)
             response = (
                 segment.braked(cause, self._drag) if self._drag else segment.response.dot(cause)
             )
@@ -234,29 +247,29 @@ class TetheredFish(Plant[PlantParameters]):
             return angle
         return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
-    def _drive(self, segment: Segment, command: float, lag: float) -> float:
-        """Put what drives the fin meanwhile into the cause; return the lag at its end."""
+    def _drive(self, segment: Segment, command: float, lag: float) -> tuple[Vector, float]:
+        """Put what drives the fin into the cause; return lag/Δ at the nodes and at the end."""
         p = self.parameters
         cause = self._cause
-        nodes = cause[3:]
         if abs(lag) < _LINEAR_LAG:
             sinh = math.sinh(lag)
-            np.multiply(segment.node_decay, sinh, out=nodes)
-            np.arcsinh(nodes, out=nodes)
+            lags = np.arcsinh(segment.node_decay * sinh)
             later = math.asinh(segment.decay * sinh)
         else:
-            np.subtract(lag, math.copysign(1.0, lag) * segment.node_times, out=nodes)
+            lags = lag - math.copysign(1.0, lag) * segment.node_times
             later = relax(lag, segment.length / self._servo_time)
         if p.servo_reaction:
-            self._react(segment, nodes)
-        if self._motor:
-            self._motor.turn(nodes)
+            self._react(segment, lags)
         cause[2] = p.coupling * command
-        if not self.cables.taut:
-            self._pull(segment, command, lag, later)
-        return later
+        if self.cables.taut:
+            cause[3:] = lags
+        else:
+            self._pull(segment, command, lag, lags, later)
+        return lags, later
 
-    def _pull(self, segment: Segment, command: float, lag: float, later: float) -> None:
+    def _pull(
+        self, segment: Segment, command: float, lag: float, lags: Vector, later: float
+    ) -> None:
         """Take backlash and slack off what the wheel does to the fin during the segment."""
         p, cause = self.parameters, self._cause
         halfway = relax(lag, 0.5 * segment.length / self._servo_time)
@@ -265,7 +278,7 @@ class TetheredFish(Plant[PlantParameters]):
         )
         self._pulls = moves
         if moves:
-            cause[2] = p.coupling * (command - angle)
+            cause[2], cause[3:] = p.coupling * (command - angle), lags
         else:
             cause[2], cause[3:] = p.coupling * angle, 0.0
 
