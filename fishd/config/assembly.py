@@ -392,11 +392,12 @@ def build_loop(
     config: Config,
     robot: Robot,
     clock: Clock,
-    publisher: Publisher,
-    notify: Callable[[float], None] = lambda now: None,
+    publisher: Publisher | None,
+    notify: Callable[[float], None] | None = None,
 ) -> ControlLoop:
     """A loop in which `config.start.controller` is active, if there is one.
 
+    publisher: gets the record of every tick, and every event; with None, no record is made
     notify: called at the end of every tick with the time of its start [s, monotonic]
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """

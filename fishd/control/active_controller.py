@@ -71,13 +71,14 @@ class ActiveController:
         )
 
     def update(self, observation: Observation) -> Any:
-        """What it commands, unchecked; raises what it raises."""
+        """Return what it commands, unchecked; raises what it raises, so call this `contained`."""
+        controller = self.controller
         if self._fresh:
-            contained(self.controller.activate, observation)
+            controller.activate(observation)
             self._fresh = False
-        command = contained(self.controller.update, observation)
+        command = controller.update(observation)
         if self.quantity_units:
-            self.quantities = contained(values_of, self.controller, self.quantity_units)
+            self.quantities = values_of(controller, self.quantity_units)
         return command
 
     def retune(self, parameters: Struct) -> None:

@@ -44,8 +44,11 @@ class Guard:
         angle = command if type(command) is float else real_number(command, "the command")
         if not math.isfinite(angle):
             raise ValueError(f"the command is {angle}, not an angle")
-        wanted = max(self.lowest, min(self.highest, angle))
-        return _towards(wanted, previous, self.step)
+        if angle > self.highest:
+            angle = self.highest
+        elif angle < self.lowest:
+            angle = self.lowest
+        return _towards(angle, previous, self.step)
 
     def fade(self, previous: float) -> float:
         """The next instruction angle on the way to neutral [rad]."""
@@ -53,6 +56,9 @@ class Guard:
 
 
 def _towards(wanted: float, previous: float, step: float) -> float:
-    if abs(wanted - previous) <= step * (1.0 + 1e-9):  # rounding must not cost another tick
-        return wanted
-    return previous + math.copysign(step, wanted - previous)
+    reach = step * (1.0 + 1e-9)  # rounding must not cost another tick
+    if wanted > previous + reach:
+        return previous + step
+    if wanted < previous - reach:
+        return previous - step
+    return wanted

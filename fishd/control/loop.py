@@ -7,7 +7,7 @@ Everything else here is called between two ticks, by the thread that ticks.
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec.structs import replace
 
@@ -29,6 +29,9 @@ from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
 from fishd.core.foreign_code import contained
 from fishd.core.signals import Measurement, Observation
 from fishd.hardware.base import Robot
+
+if TYPE_CHECKING:
+    from fishd.hardware.panel import RpiGpioPanel
 
 UPDATE_BUDGET = 0.5
 """Share of the period that a controller's update may take."""
@@ -60,11 +63,14 @@ class ControlLoop:
         guard: Guard,
         limits: Limits,
         clock: Clock,
-        publisher: Publisher,
-        notify: Callable[[float], None] = lambda now: None,
+        publisher: Publisher | None,
+        notify: Callable[[float], None] | None = None,
         lateral_sign: LateralSign | None = None,
     ) -> None:
-        """notify: called at the end of every tick with the time of its start [s, monotonic]"""
+        """
+        publisher: gets the record of every tick, and every event; with None, no record is made
+        notify: called at the end of every tick with the time of its start [s, monotonic]
+        """
         self.robot = robot
         self.guard = guard
         self.limits = limits
@@ -91,6 +97,7 @@ class ControlLoop:
         """As of the estimator, at the latest tick [s]."""
         self._now = clock.monotonic
         self._notify = notify
+        self._budget = UPDATE_BUDGET * limits.tick
         self._believed = Measurement(clock.monotonic(), 0.0, 0.0, 0)
         """The latest measurement that was to be believed."""
         self._index = -1
@@ -122,29 +129,40 @@ class ControlLoop:
         self.statistics.missed += slot.missed
         dt = (slot.index - self._index) * self.limits.tick
         self._index = slot.index
-        self._begin_awaited()
-        self._attend_panel(slot)
+        if self._awaited:
+            self._begin_awaited(*self._awaited)
+        if self.robot.panel:
+            self._attend_panel(self.robot.panel, slot)
         measurement = self._read(slot)
-        power = self.power.read(slot.deadline)
+        power = self.power.read(slot.deadline) if self.power.metered else None
         read = self._now()
         suspect = bool(measurement.suspect)
-        estimated = self._estimate(self._once_more() if suspect else measurement, slot, dt)
-        self.observation = observation = self._follow_thrust(estimated, suspect)
-        self._watch_sign(observation, measurement.fy, suspect)
+        observation = self._estimate(self._once_more() if suspect else measurement, slot, dt)
+        if not (self.supervisor.failures and self.supervisor.sensor_lost):
+            observation = self._follow_thrust(observation, suspect)
+            if self.limits.tethered:
+                self._watch_sign(observation, measurement.fy, suspect)
+        self.observation = observation
         return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
         """Second half of a tick: let the controller choose, drive the servo, publish."""
-        before, self.applied = self.applied, self._update(turn.observation)
+        slot, _, observation, (started, read, estimated), _ = turn
+        before, self.applied = self.applied, self._update(observation, estimated)
         moved = before or self.applied
-        self.neutral_for = 0.0 if moved else self.neutral_for + turn.observation.dt
+        self.neutral_for = 0.0 if moved else self.neutral_for + observation.dt
         updated = self._now()
-        self._write(neutral=self.settled)
+        self._write(neutral=not moved and self.settled)
         written = self._now()
-        self._publish(turn, written)
-        marks = (*turn.marks, updated, written, self._now())
-        self._keep_time(turn.slot, marks)
-        self._notify(marks[0])
+        if self.reporter.publishes:
+            self._publish(turn, written)
+        marks = (started, read, estimated, updated, written, self._now())
+        late = self.statistics.add(self.seq, slot.now - slot.deadline, slot.missed, marks)
+        if late:
+            self.reporter.event("overrun", late, "warning", seq=self.seq, missed=slot.missed)
+            self.supervisor.overran(self.seq)
+        if self._notify:
+            self._notify(started)
 
     def warm_up(self) -> None:
         """Let the active controller warm up for the next tick, which is imminent."""
@@ -207,11 +225,10 @@ class ControlLoop:
     def _servo_calibration(self) -> ServoCalibration | None:
         return self.robot.calibrated.servo.calibration if self.robot.calibrated else None
 
-    def _begin_awaited(self) -> None:
-        if self._awaited is None:
-            return
-        rest, name, controller, calibration = self._awaited
-        if self._servo_calibration is not calibration:
+    def _begin_awaited(
+        self, rest: int, name: str, controller: Controller[Any], servo: ServoCalibration | None
+    ) -> None:
+        if self._servo_calibration is not servo:
             self._await_nobody()
             message = f"{name} does not begin by itself any more: the servo has another calibration"
             self.reporter.event("calibration", message, "warning")
@@ -243,11 +260,8 @@ class ControlLoop:
         """Latch a fault; an error while one is latched is logged all the same, once."""
         self.supervisor.fail(code, self.reporter.problem(what, error))
 
-    def _attend_panel(self, slot: Slot) -> None:
+    def _attend_panel(self, panel: "RpiGpioPanel", slot: Slot) -> None:
         """Show the mode on the operator's panel, and stop at once while its button is pressed."""
-        panel = self.robot.panel
-        if panel is None:
-            return
         try:
             if panel.update(self.supervisor.mode.value, slot.now):
                 self.estop("the E-stop button is pressed")
@@ -266,7 +280,8 @@ class ControlLoop:
             problem = f"the force sensor cannot be read: {text.named(error)}"
             measurement = self._once_more()
         else:
-            self.supervisor.check("sensor-range", measurement.suspect)
+            if measurement.suspect or self.supervisor.failures:
+                self.supervisor.check("sensor-range", measurement.suspect)
             if not measurement.samples:  # it says again what may have been suspect
                 measurement = replace(measurement, fx=self._believed.fx, fy=self._believed.fy)
         if not measurement.suspect:
@@ -274,7 +289,8 @@ class ControlLoop:
         age = slot.now - measurement.time
         if problem is None and age > STALE * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
-        self.supervisor.check("sensor-stale", problem)
+        if problem or self.supervisor.failures:
+            self.supervisor.check("sensor-stale", problem)
         return measurement
 
     def _once_more(self) -> Measurement:
@@ -300,8 +316,6 @@ class ControlLoop:
 
         suspect: is the force of this tick not to be believed?
         """
-        if self.supervisor.sensor_lost:
-            return observation
         try:
             if self._estimator.found_leak != self.found_leak:
                 self.found_leak = self._estimator.found_leak
@@ -324,8 +338,6 @@ class ControlLoop:
 
         fy: as it is measured [N]
         """
-        if self.supervisor.sensor_lost or not self.limits.tethered:
-            return
         if suspect:
             self.lateral_sign.rest()
             return
@@ -342,21 +354,19 @@ class ControlLoop:
         # `is not False`: what another package has made of it raises nothing here.
         return self.lateral_sign.refuses and type(controller).uses_lateral_force is not False
 
-    def _update(self, observation: Observation, *, may_succeed: bool = True) -> float:
+    def _update(self, observation: Observation, began: float, *, may_succeed: bool = True) -> float:
         """The angle to apply: the controller's after the guard, or the next step to neutral [rad].
 
+        began: when the controller's time begins [s, monotonic]
         may_succeed: may a controller that gives up name another one? Once in a tick.
         """
         if self.supervisor.mode is Mode.ESTOP:
             return self.applied
         if self.supervisor.mode is not Mode.RUNNING:
             return self.guard.fade(self.applied)
-        name, started = self.active.name, self._now()
+        name = self.active.name
         try:
-            command = self.active.update(observation)
-            applied = contained(self.guard.apply, command, self.applied)
-            self._check_budget(name, self._now() - started)
-            return applied
+            applied = contained(self._command, observation)
         except ControllerFault as error:
             code, successor = told(error)
             if successor and may_succeed:
@@ -365,7 +375,16 @@ class ControlLoop:
                 self._fail(code, f"controller {name} gave up", error)
         except Exception as error:
             self._fail("controller-error", f"controller {name} failed", error)
-        return self._update(observation, may_succeed=False)
+        else:
+            seconds = self._now() - began
+            if seconds > self._budget or self.supervisor.failures:
+                self._check_budget(name, seconds)
+            return applied
+        return self._update(observation, self._now(), may_succeed=False)
+
+    def _command(self, observation: Observation) -> float:
+        """The angle that the controller chooses, after the guard [rad]; raises what it raises."""
+        return self.guard.apply(self.active.update(observation), self.applied)
 
     def _succeed(self, error: ControllerFault, code: str, successor: Successor) -> None:
         before = self.active.name
@@ -377,7 +396,7 @@ class ControlLoop:
             self._fail("controller-error", what, problem)
 
     def _check_budget(self, name: str, seconds: float) -> None:
-        budget, problem = UPDATE_BUDGET * self.limits.tick, None
+        budget, problem = self._budget, None
         if seconds > budget:
             took = f"{seconds * 1e3:.1f} ms of its {budget * 1e3:.1f} ms"
             problem = f"controller {name} took {took}"
@@ -407,9 +426,3 @@ class ControlLoop:
             self.reporter.tick(self, turn, now)
         except Exception as error:
             self._fail("publish-error", "telemetry cannot be published", error)
-
-    def _keep_time(self, slot: Slot, marks: tuple[float, ...]) -> None:
-        late = self.statistics.add(self.seq, slot.now - slot.deadline, slot.missed, marks)
-        if late:
-            self.reporter.event("overrun", late, "warning", seq=self.seq, missed=slot.missed)
-        self.supervisor.overrun(late is not None)

@@ -32,7 +32,10 @@ class Publisher(Protocol):
 class Reporter:
     """Stamps what the loop says with the time and hands it to the publisher."""
 
-    def __init__(self, clock: Clock, publisher: Publisher) -> None:
+    def __init__(self, clock: Clock, publisher: Publisher | None) -> None:
+        """publisher: None where ticks and events have no reader; events are logged all the same"""
+        self.publishes = publisher is not None
+        """Whether the records of ticks have a reader."""
         self._clock = clock
         self._publisher = publisher
         self._latest_problem = ""
@@ -41,6 +44,8 @@ class Reporter:
         """Publish and log an event; never raises, since bad news must not make things worse."""
         message = text.line(message)
         log.log(logging.getLevelNamesMapping()[level.upper()], "%s: %s", kind, message)
+        if self._publisher is None:
+            return
         try:
             self._publisher.event(Event(self._clock.wall(), level, kind, message, data))
         except Exception:
@@ -105,6 +110,7 @@ class Reporter:
 
         now: the time after the servo was driven [s, monotonic]
         """
+        assert self._publisher
         slot, measurement, observation, marks, power = turn
         thrust, error = loop.known_thrust
         extremes = measurement.extremes

@@ -1,5 +1,6 @@
 """The servo as the loop drives it: what it gets in which mode, and what is known of its pulses."""
 
+import math
 from collections.abc import Callable
 
 from fishd.control.supervisor import Mode
@@ -17,6 +18,7 @@ class ServoOutput:
         """True while the servo cannot be reached: if it was on, it may still have pulses."""
         self._servo = robot.servo
         self._countdown = robot.countdown
+        self._counts_down = robot.countdown < math.inf
         self._now = now
         self._written = now()
 
@@ -25,10 +27,12 @@ class ServoOutput:
 
         It is at neutral, or has no pulses any more: it must not begin again by itself.
         """
-        return "" if not self.on or self.lost else self.why_silent()
+        return self.why_silent() if self.on and not self.lost else ""
 
     def why_silent(self) -> str:
         """One line if the latest write began longer ago than the countdown lasts; else empty."""
+        if not self._counts_down:
+            return ""
         silence = self._now() - self._written
         if silence <= self._countdown:
             return ""
@@ -50,7 +54,8 @@ class ServoOutput:
                 self._servo.release()  # in every tick: so a servo that is lost is noticed
                 self.on = False
             else:
-                self._written = self._now()
+                if self._counts_down:
+                    self._written = self._now()
                 self._servo.write(angle)
                 self.on = True
         except Exception:

@@ -20,6 +20,8 @@ class ServoPower:
         """tick: period of the loop [s]"""
         self.trouble = ""
         """Why it cannot be read, one line; empty while it can, and without a power meter."""
+        self.metered = robot.power is not None
+        """Whether there is a power meter."""
         self._read = robot.power
         self._reporter = reporter
         self._latest: deque[float] = deque(maxlen=max(1, round(SPAN / tick)))

@@ -7,6 +7,7 @@ from fishd.core.signals import Percentiles, Timing
 
 _STEPS = 3  # 2**3 buckets per octave: an error of at most 12 %
 _LONGEST = (1 << 40) - 1  # ns, 18 minutes; anything longer counts as this
+_LONGEST_S = _LONGEST * 1e-9
 
 PHASES = ("read", "estimate", "update", "write", "publish")
 
@@ -26,8 +27,10 @@ class Histogram:
         if seconds <= 0.0:
             self._counts[0] += 1
             return
-        nanoseconds = min(int(seconds * 1e9), _LONGEST)
-        octave = max(0, nanoseconds.bit_length() - _STEPS - 1)
+        nanoseconds = int(seconds * 1e9) if seconds < _LONGEST_S else _LONGEST
+        octave = nanoseconds.bit_length() - _STEPS - 1
+        if octave < 0:
+            octave = 0
         self._counts[(octave << _STEPS) + (nanoseconds >> octave)] += 1
         if seconds > self._worst:
             self._worst = seconds
@@ -78,10 +81,14 @@ class Statistics:
         missed: slots that were skipped just before it
         marks: times at the start of the tick and after each of PHASES [s]
         """
-        self._count(seq, lateness, marks)
-        message = self._why_long(seq, marks)
-        self.overruns += message is not None
-        if missed and not message and not self._overran:
+        busy = marks[-1] - marks[0]
+        if busy or lateness:  # in virtual time nothing takes any, and there is nothing to count
+            self._count(seq, lateness, marks)
+        message = None
+        if busy > self._period:
+            self.overruns += 1
+            message = self._why_long(seq, marks)
+        elif missed and not self._overran:
             message = (
                 f"{missed} slots were skipped before tick {seq}: fishd was woken late, "
                 "the machine is overloaded or was suspended"
@@ -90,8 +97,6 @@ class Statistics:
         return message
 
     def _count(self, seq: int, lateness: float, marks: tuple[float, ...]) -> None:
-        if lateness == 0.0 and marks[0] == marks[-1]:
-            return  # in virtual time nothing takes any, and there is nothing to count
         self._lateness.add(lateness, seq)
         before = marks[0]
         for histogram, mark in zip(self._phases, marks[1:], strict=True):
@@ -99,16 +104,13 @@ class Statistics:
             before = mark
         self._busy.add(before - marks[0], seq)
 
-    def _why_long(self, seq: int, marks: tuple[float, ...]) -> str | None:
-        """One line that blames the longest phase of a tick that took longer than a period."""
-        busy = marks[-1] - marks[0]
-        if busy <= self._period:
-            return None
+    def _why_long(self, seq: int, marks: tuple[float, ...]) -> str:
+        """Return one line that blames the longest phase of a tick that took too long."""
         durations = (after - before for before, after in pairwise(marks))
         longest, phase = max(zip(durations, PHASES, strict=True))
         return (
-            f"tick {seq} took {busy * 1e3:.1f} ms of its {self._period * 1e3:g} ms, "
-            f"{longest * 1e3:.1f} ms of it in {phase}"
+            f"tick {seq} took {(marks[-1] - marks[0]) * 1e3:.1f} ms of its "
+            f"{self._period * 1e3:g} ms, {longest * 1e3:.1f} ms of it in {phase}"
         )
 
     def timing(self) -> Timing:

@@ -6,7 +6,7 @@ any   ──fail───▶ fault  ──clear──▶ idle
 any   ──estop──▶ estop  ──clear──▶ idle
 """
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from enum import StrEnum
 
@@ -37,9 +37,10 @@ class Supervisor:
         self.mode = Mode.IDLE
         self.reason: Reason | None = None
         self._changed = changed
-        self._failures: Counter[str] = Counter()  # in a row, by the code of their fault
-        self._ticks = 0
-        self._overruns: deque[int] = deque()  # in which of the latest ticks
+        self.failures: dict[str, int] = {}
+        """Number of failures in a row of each check that failed last, by the code of its fault."""
+        self._overruns: deque[int] = deque()
+        """Numbers of the latest ticks that overran."""
 
     def check_startable(self) -> None:
         """Raises `Refused` while a fault or an emergency stop is latched."""
@@ -56,7 +57,7 @@ class Supervisor:
         It is not to blame for how slow the one before it was.
         """
         self.check_startable()
-        self._failures["controller-slow"] = 0
+        self.failures.pop("controller-slow", None)
         self._enter(Mode.RUNNING)
 
     def stop(self) -> None:
@@ -67,7 +68,7 @@ class Supervisor:
     def clear(self) -> None:
         """Forget the latched reason, if there is one, and go to idle."""
         if self.reason is not None:
-            self._failures.clear()
+            self.failures.clear()
             self._overruns.clear()
             self._enter(Mode.IDLE)
 
@@ -86,32 +87,35 @@ class Supervisor:
             self._enter(mode, Reason(text.quoted(code), text.line(message), row.remedy))
 
     def check(self, code: str, problem: str | None) -> None:
-        """Count a check, failed or passed (None or empty); `in_a_row` failures latch the fault."""
+        """Count a check, failed or passed (None or empty); `in_a_row` failures latch the fault.
+
+        One that passed makes a difference only while there are `failures`.
+        """
         enough = FAULTS[code].in_a_row
-        self._failures[code] = count = self._failures[code] + 1 if problem else 0
+        if not problem:
+            self.failures.pop(code, None)
+            return
+        self.failures[code] = count = self.failures.get(code, 0) + 1
         if count >= enough:
-            self.fail(code, f"{problem}, {count} times in a row" if enough > 1 else str(problem))
+            self.fail(code, f"{problem}, {count} times in a row" if enough > 1 else problem)
 
     @property
     def sensor_lost(self) -> bool:
         """Whether the latest reads gave no force, or none to believe."""
-        failures = self._failures
-        return (
-            failures["sensor-stale"] >= FAULTS["sensor-stale"].in_a_row
-            or failures["sensor-range"] >= FAULTS["sensor-range"].in_a_row
+        return any(
+            self.failures.get(code, 0) >= FAULTS[code].in_a_row
+            for code in ("sensor-stale", "sensor-range")
         )
 
-    def overrun(self, overran: bool) -> None:
-        """Count a tick; too many overruns latch the fault overrun."""
-        self._ticks += 1
-        while self._overruns and self._overruns[0] <= self._ticks - OVERRUN_WINDOW:
+    def overran(self, seq: int) -> None:
+        """Note that the tick of this number overran; too many among the latest latch the fault."""
+        self._overruns.append(seq)
+        while self._overruns[0] <= seq - OVERRUN_WINDOW:
             self._overruns.popleft()
-        if overran:
-            self._overruns.append(self._ticks)
-            count = len(self._overruns)
-            if count > OVERRUN_SHARE * OVERRUN_WINDOW:
-                late = f"{count} of the last {OVERRUN_WINDOW} ticks took too long or came late"
-                self.fail("overrun", late)
+        count = len(self._overruns)
+        if count > OVERRUN_SHARE * OVERRUN_WINDOW:
+            late = f"{count} of the last {OVERRUN_WINDOW} ticks took too long or came late"
+            self.fail("overrun", late)
 
     def _enter(self, mode: Mode, reason: Reason | None = None) -> None:
         before, self.mode, self.reason = self.mode, mode, reason

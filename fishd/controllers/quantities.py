@@ -1,6 +1,5 @@
 """A controller's own quantities: internal values that it shows, such as its present frequency."""
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -73,17 +72,19 @@ def quantities_of(controller: type[Any]) -> tuple[QuantityInfo, ...]:
 
 def values_of(controller: object, names: Iterable[str]) -> dict[str, float]:
     """What these quantities of a controller are now; without those that are no finite number."""
-    held, found = vars(controller), {}
+    held, found = controller.__dict__, {}
     for name in names:
-        value = held.get(name)
-        if value is None:
+        if name not in held:
             continue
+        value = held[name]
         if type(value) is not float:
+            if value is None:
+                continue
             try:
                 value = contained(real_number, value, name)
             except Exception:  # which costs no more than the quantity
                 continue
-        if math.isfinite(value):
+        if value - value == 0.0:  # it is finite
             found[name] = value
     return found
 
