@@ -16,6 +16,18 @@ NEUTRAL = 1500.0
 NEUTRAL_LIMIT = 0.3
 """Longest time from the daemon's sudden death to a neutral servo [s]."""
 CONFIG = "etc/fishd/fishd.yaml"
+STATUS = ("fishctl", "status", "--timing")
+"""Command that shows whether the loop has real-time scheduling."""
+REALTIME = "real-time scheduling"
+"""Words of its output where the loop has it."""
+FAULT = " fault: "
+"""Part of the line that fishd logs at a fault."""
+WRONG_LINE = "tik: 0.05\n"
+"""Line that makes a configuration wrong."""
+SUGGESTION = "did you mean 'tick'?"
+"""Part of what fishd says about it."""
+FAILED = "fishd has failed"
+"""Part of what the failure unit says."""
 _UNIT = "fishd.service"
 
 
@@ -49,7 +61,7 @@ class Rig:
         begun = time.monotonic()
         self.systemctl("start", _UNIT)
         time.sleep(1.5)
-        faults = [e.message for e in self.container.journal(begun) if " fault: " in e.message]
+        faults = [e.message for e in self.container.journal(begun) if FAULT in e.message]
         if faults or self.pulse() in (0.0, NEUTRAL):
             raise BrokenPromise(f"the fish does not swim: {', '.join(faults) or 'no pulses'}")
 
@@ -95,10 +107,14 @@ def start(rig: Rig) -> Row:
     rig.systemctl("start", _UNIT)
     ready = rig.when(begun, "Started fishd.service")
     rig.swim()
-    loop = rig.container.run("fishctl", "status")
-    if "real-time scheduling" not in loop:
-        raise BrokenPromise("the daemon has no real-time scheduling")
+    check_scheduling(rig.container.run(*STATUS))
     return Row("`systemctl start`", None, None, ready, "ready with the first tick")
+
+
+def check_scheduling(status: str) -> None:
+    """Raise `BrokenPromise` where the output of `STATUS` shows no real-time scheduling."""
+    if REALTIME not in status:
+        raise BrokenPromise("the daemon has no real-time scheduling")
 
 
 def stop(rig: Rig) -> Row:
@@ -141,7 +157,7 @@ def killed_again_and_again(rig: Rig) -> Row:
         if state == "active":
             rig.signal("SIGKILL")
         time.sleep(0.1)
-    said = rig.when(begun, "fishd has failed", "fishd-failure.service")
+    said = rig.when(begun, FAILED, "fishd-failure.service")
     starts = [e for e in rig.container.journal(begun) if e.message.startswith("Started fishd.")]
     if said < starts[-1].time - begun:
         raise BrokenPromise("the failure unit has acted before fishd was given up")
@@ -159,10 +175,10 @@ def wrong_config(rig: Rig) -> Row:
     good = config.read_text()
     rig.systemctl("stop", _UNIT)
     begun = time.monotonic()
-    config.write_text(good + "tik: 0.05\n")
+    config.write_text(good + WRONG_LINE)
     try:
         rig.systemctl("start", _UNIT, check=False)
-        rig.when(begun, "fishd has failed", "fishd-failure.service")
+        rig.when(begun, FAILED, "fishd-failure.service")
         time.sleep(4.0)  # several times RestartSec
         status = rig.container.show(_UNIT, "ExecMainStatus")
         restarts = rig.container.show(_UNIT, "NRestarts")
@@ -170,7 +186,7 @@ def wrong_config(rig: Rig) -> Row:
         config.write_text(good)
     if (status, restarts) != ("78", "0"):
         raise BrokenPromise(f"a wrong configuration: exit status {status}, {restarts} restarts")
-    rig.when(begun, "did you mean 'tick'?")
+    rig.when(begun, SUGGESTION)
     return Row("wrong configuration", None, None, None, "exit 78, no restart; failure unit has run")
 
 
