@@ -77,6 +77,8 @@ def parse(text: str, name: str = "the document") -> Document:
         raise YamlProblem(line, f"not valid YAML: {error.problem}") from None
     except yaml.YAMLError as error:
         raise YamlProblem(1, f"not valid YAML: {' '.join(str(error).split())}") from None
+    except (ValueError, OverflowError):  # an escape such as "\\U00110000"
+        raise YamlProblem(1, "not valid YAML: a character that does not exist") from None
     builder = _Builder(name)
     return Document({} if root is None else builder.build(root, ()), builder.lines)
 
@@ -132,6 +134,7 @@ class _Builder:
             if not isinstance(key_node, yaml.ScalarNode):
                 raise YamlProblem(line, "a key must be a plain word")
             key = str(key_node.value)
+            _check_characters(key, "a key", line)
             here = (*path, key)
             if key in mapping:
                 raise YamlProblem(
@@ -151,10 +154,22 @@ class _Builder:
             surprise = _surprise(str(node.value), node.tag)
             if surprise:
                 raise YamlProblem(line, f"{name}: '{node.value}' {surprise}")
+        _check_characters(str(node.value), name, line)
         try:
             return self._constructor.construct_object(node, deep=True)
         except (yaml.YAMLError, ValueError) as error:
             raise YamlProblem(line, f"{name}: {' '.join(str(error).split())}") from None
+        except (LookupError, AttributeError):  # PyYAML's, of an explicit tag
+            tag = node.tag.rpartition(":")[2]
+            raise YamlProblem(line, f"{name}: a value that is not of the tag '{tag}'") from None
+
+
+def _check_characters(text: str, name: str, line: int) -> None:
+    """Refuse the halves of characters, which an escape can make and no file can hold."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise YamlProblem(line, f"{name}: half of a character (\\ud800…\\udfff)") from None
 
 
 def _check_count(count: int, line: int) -> None:

@@ -31,6 +31,16 @@ def block(text: str, longest: int = LONGEST) -> str:
     )
 
 
+def escaped(text: str) -> str:
+    """Return the text with what cannot be printed as escapes, such as `\\x1b` or `\\n`."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
+        for letter in text
+    )
+
+
 def quoted(word: str) -> str:
     """A word from outside, cut to fit in a message."""
     return line(word, LONGEST_WORD)

@@ -7,12 +7,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fishd.core import text
 from fishd.core.errors import FishdError, MissingPackage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOTS_PER_INCH = 200
+LONGEST_LABEL = 120
+"""Text from outside that a figure shows [characters]."""
 FORMATS = (".pdf", ".png", ".svg")
 _MISSING = "a figure needs matplotlib, which is not installed: pip install 'fishd[lab]'"
 BLACK, BLUE, ORANGE, GREEN, PURPLE = "#1a1a1a", "#0072b2", "#d55e00", "#009e73", "#aa4499"
@@ -60,6 +63,11 @@ def check(path: str | os.PathLike[str]) -> None:
         )
     if not file.parent.is_dir():
         raise FishdError(f"{file}: the figure cannot be written: there is no folder {file.parent}")
+
+
+def plain(words: str) -> str:
+    """Return a line of text from outside that matplotlib does not read as mathematics."""
+    return text.line(words, LONGEST_LABEL).replace("$", r"\$")
 
 
 @contextmanager

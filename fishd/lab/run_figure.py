@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fishd.core import text
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, plain
 from fishd.lab.run_traces import (
     LEAST_ANGLE,
     LEAST_FORCE,
@@ -27,9 +26,10 @@ COLOURS = {"mark": PURPLE, "fault": ORANGE, "fallback": ORANGE}
 
 def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
     """Write the picture; raises `FishdError` where it cannot be, and `MissingPackage`."""
+    traces = _plain(traces)
     panels = 3 + len(traces.quantities)
     with drawn(path, (10.0, 1.9 + 1.45 * panels)) as figure:
-        figure.suptitle(_plain(traces.title), x=0.01, ha="left", fontsize=10)
+        figure.suptitle(traces.title, x=0.01, ha="left", fontsize=10)
         grid = figure.add_gridspec(1, 2 if traces.portrait else 1)
         if traces.portrait:
             grid.set_width_ratios((3, 1))
@@ -41,7 +41,7 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
         for axis, (name, values) in zip(axes[3:], traces.quantities.items(), strict=True):
             axis.plot(traces.time, values, color=GREEN, linewidth=0.9)
             axis.set_ylim(*limits(LEAST_QUANTITY, values))
-            axis.set_ylabel(_plain(name).replace(" (", "\n("))
+            axis.set_ylabel(name.replace(" (", "\n("))
         axes[-1].set_xlabel("time (s)")
         axes[0].set_xlim(traces.time[0], max(traces.time[-1], traces.time[0] + 0.1))
         for axis in axes:
@@ -111,15 +111,16 @@ def _headroom(axis: "Axes") -> None:
 
 def _events(axis: "Axes", traces: Traces, *, named: bool) -> None:
     labels = named and len(traces.events) <= MOST_LABELS
-    for index, event in enumerate(traces.events):
-        colour = COLOURS.get(event.kind, GREY)
-        axis.axvline(event.time, color=colour, linewidth=0.7, linestyle="--")
+    where = axis.get_xaxis_transform()
+    times = [event.time for event in traces.events]
+    colours = [COLOURS.get(event.kind, GREY) for event in traces.events]
+    axis.vlines(times, 0.0, 1.0, colors=colours, linewidth=0.7, linestyle="--", transform=where)
+    for index, (event, colour) in enumerate(zip(traces.events, colours, strict=True)):
         if labels:
-            where = axis.get_xaxis_transform()
             axis.text(
                 event.time,
                 1.02 + 0.09 * (index % 2),  # neighbours do not cover one another
-                _plain(event.text),
+                event.text,
                 transform=where,
                 fontsize=6.5,
                 color=colour,
@@ -141,6 +142,11 @@ def _portrait(axis: "Axes", traces: Traces, part: slice) -> None:
     axis.set_title(f"phase portrait, last {PORTRAIT:g} s")
 
 
-def _plain(words: str) -> str:
-    """A line that matplotlib does not read as mathematics."""
-    return text.line(words, 120).replace("$", r"\$")
+def _plain(traces: Traces) -> Traces:
+    """Return the traces with all their texts such that matplotlib shows them as they are."""
+    return traces._replace(
+        title=plain(traces.title),
+        unit=plain(traces.unit),
+        quantities={plain(name): values for name, values in traces.quantities.items()},
+        events=[event._replace(text=plain(event.text)) for event in traces.events],
+    )

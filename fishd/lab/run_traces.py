@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,12 @@ SHOWN = ("mark", "controller", "parameters", "fallback", "fault", "calibration")
 
 LONGEST_TEXT = 48
 """Of an event [characters]."""
+MAX_QUANTITIES = 24
+"""Quantities of controllers in one figure; of more, the first are drawn."""
+MAX_EVENTS = 500
+"""Events in one figure; of more, the first are drawn."""
+MAX_VALUE = 1e12
+"""Numbers beyond this are no signal of a fish [N, rad, s, any]."""
 
 Array = NDArray[np.float64]
 
@@ -79,34 +86,49 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         raise RecordingError(f"{run.path}: there is no tick between these times; {length}")
     rows = _with_breaks(chosen)
 
-    def column(value: Callable[[Tick], object]) -> Array:
-        found = (value(row) if isinstance(row, Tick) else math.nan for row in rows)
-        return np.array([math.nan if v is UNSET else v for v in found], dtype=float)
+    def column(name: str, value: Callable[[Tick], object] | None = None) -> Array:
+        get = value or attrgetter(name)
+        found = (get(row) if isinstance(row, Tick) else math.nan for row in rows)
+        values = np.array([math.nan if v is UNSET else v for v in found], dtype=float)
+        return _checked(run, name, values)
 
     def quantity(name: str) -> Array:
-        return column(lambda tick: _quantities(tick).get(name, math.nan))
+        return column(name, lambda tick: _quantities(tick).get(name, math.nan))
 
     simulated = chosen[0].alpha is not UNSET
-    time = np.array([(row.t if isinstance(row, Tick) else row) - first for row in rows])
+    times = [(row.t if isinstance(row, Tick) else row) - first for row in rows]
+    time = _checked(run, "the time of a tick", np.array(times))
     swims = [index for index, row in enumerate(rows) if isinstance(row, Tick) and _swims(row)]
     units = _units({tick.controller for tick in chosen})
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
+    events = [event for event in _shown(run.events, first) if begin <= event.time <= end]
+    _checked(run, "the time of an event", np.array([event.time for event in events]))
+    left_out = [
+        f"{len(whole) - most} {what} not drawn"
+        for whole, most, what in (
+            (names, MAX_QUANTITIES, "quantities"), (events, MAX_EVENTS, "events")
+        )
+        if len(whole) > most
+    ]  # fmt: skip
     return Traces(
-        title=_title(run),
-        unit=f"m{run.summary.force_unit}",
+        title="; ".join((_title(run), *left_out)),
+        unit=f"m{text.quoted(run.summary.force_unit)}",
         time=time,
-        fx=1e3 * column(lambda tick: tick.fx),
-        fy=1e3 * column(lambda tick: tick.fy),
-        phi_c=column(lambda tick: tick.phi_c),
-        thrust=1e3 * column(lambda tick: tick.thrust),
-        thrust_error=1e3 * column(lambda tick: tick.thrust_error),
-        frequency=column(lambda tick: tick.frequency),
-        fin_velocity=column(lambda tick: tick.fin_velocity),
-        alpha=column(lambda tick: tick.alpha) if simulated else None,
-        alpha_rate=column(lambda tick: tick.alpha_rate) if simulated else None,
-        quantities={f"{name} ({units.get(name, '1')})": quantity(name) for name in names},
+        fx=1e3 * column("fx"),
+        fy=1e3 * column("fy"),
+        phi_c=column("phi_c"),
+        thrust=1e3 * column("thrust"),
+        thrust_error=1e3 * column("thrust_error"),
+        frequency=column("frequency"),
+        fin_velocity=column("fin_velocity"),
+        alpha=column("alpha") if simulated else None,
+        alpha_rate=column("alpha_rate") if simulated else None,
+        quantities={
+            f"{text.quoted(name)} ({units.get(name, '1')})": quantity(name)
+            for name in list(names)[:MAX_QUANTITIES]
+        },
         portrait=_portrait(time, swims),
-        events=[each for each in _shown(run.events, first) if begin <= each.time <= end],
+        events=events[:MAX_EVENTS],
     )
 
 
@@ -117,6 +139,16 @@ def limits(least: float, *curves: Array) -> tuple[float, float]:
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     room = max(0.05 * (high - low), (least - (high - low)) / 2)
     return low - room, high + room
+
+
+def _checked(run: Run, name: str, values: Array) -> Array:
+    """The values; raises `RecordingError` where one of them is too large to be drawn."""
+    if np.any(np.abs(values) > MAX_VALUE):
+        raise RecordingError(
+            f"{run.path}: {text.quoted(name)} is {np.nanmax(np.abs(values)):.3g} somewhere, which "
+            "cannot be drawn; leave it out with --from and --until"
+        )
+    return values
 
 
 def _portrait(time: Array, swims: list[int]) -> slice | None:

@@ -1,6 +1,8 @@
 """Writes a recording as tables for other programs: CSV or Parquet, ticks and events."""
 
 import itertools
+import math
+import shutil
 from pathlib import Path
 from typing import Literal
 
@@ -9,7 +11,9 @@ import numpy as np
 import pandas
 import pyarrow
 import pyarrow.parquet
+from pandas.api.types import is_numeric_dtype
 
+from fishd.core import text
 from fishd.core.errors import RecordingError
 from fishd.core.files import write_atomically
 from fishd.recording.folder import check_new
@@ -18,6 +22,9 @@ from fishd.recording.reader import Run
 
 Format = Literal["csv", "parquet"]
 
+FORMULAS = tuple("=+-@＝＋－＠")
+"""What a text begins with that a spreadsheet computes."""
+
 
 def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> list[Path]:
     """Write `NAME.csv` and `NAME-events.csv`, or the same as Parquet; their paths.
@@ -25,23 +32,30 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
     Where a camera was recorded, also `NAME-frames.npy`, all its frames as one array of shape
     (number, height, width), and `NAME-frames.csv`, a row for each.
 
-    Ticks have a column a field, in its unit, and every bit of its value. The Parquet files carry
-    configuration and provenance as the metadata `fishd` of their schema, in JSON.
+    Ticks have a column a field, in its unit, and every bit of its value. In CSV, which terminals
+    and spreadsheets show, control characters are escaped, and a `'` stands before a text that a
+    spreadsheet would compute. The Parquet files have all texts as they are, and carry configuration
+    and provenance as the metadata `fishd` of their schema, in JSON.
 
     replace: may there be files of these names?
     Raises `RecordingError`.
     """
+    if not run.entries and not run.frame_heads:
+        why = f" ({run.damage_reason})" if run.damage_reason else ""
+        raise RecordingError(f"{run.path}: there is nothing in it to export{why}")
     tables = {folder / f"{run.name}.{form}": run.frame()}
     tables[folder / f"{run.name}-events.{form}"] = _events(run)
     pictures = folder / f"{run.name}-frames.npy"
     if run.frame_heads:
         tables[folder / f"{run.name}-frames.{form}"] = _frames(run)
     check_new([*tables, *([pictures] if run.frame_heads else [])], replace=replace)
-    about = msgspec.json.encode({"about": run.about, "configs": run.configs})
+    about = b""
+    if form == "parquet":
+        about = msgspec.json.encode({"about": run.about, "configs": run.configs})
     for path, table in tables.items():
         try:
             if form == "csv":
-                write_atomically(path, table.to_csv(index=False))
+                write_atomically(path, _harmless(table).to_csv(index=False))
             else:
                 _write_parquet(path, table, about)
         except OSError as error:
@@ -50,6 +64,22 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
         _write_pictures(pictures, run)
         return [*tables, pictures]
     return list(tables)
+
+
+def _harmless(table: pandas.DataFrame) -> pandas.DataFrame:
+    """Return the table with texts that neither a terminal nor a spreadsheet takes for commands."""
+    shown = table.copy(deep=False)
+    for name in table.columns[[not is_numeric_dtype(kind) for kind in table.dtypes]]:
+        shown[name] = shown[name].map(
+            lambda value: _harmless_text(value) if isinstance(value, str) else value
+        )
+    shown.columns = pandas.Index([_harmless_text(name) for name in table.columns])
+    return shown
+
+
+def _harmless_text(words: str) -> str:
+    """Escape control characters, and put a `'` before what a spreadsheet would compute."""
+    return ("'" if words.startswith(FORMULAS) else "") + text.escaped(words)
 
 
 def _events(run: Run) -> pandas.DataFrame:
@@ -71,6 +101,7 @@ def _write_pictures(path: Path, run: Run) -> None:
     shape = (len(run.frame_heads), *first.pixels.shape)
     part = path.with_name(path.name + ".part")
     try:
+        _check_room(path, math.prod(shape))
         array = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
         for number, frame in enumerate(itertools.chain([first], frames)):
             if frame.pixels.shape != first.pixels.shape:
@@ -87,6 +118,15 @@ def _write_pictures(path: Path, run: Run) -> None:
         raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
     finally:
         part.unlink(missing_ok=True)
+
+
+def _check_room(path: Path, size: int) -> None:
+    """Raise `RecordingError` without room for so many bytes: a full disk would kill the writer."""
+    free = shutil.disk_usage(path.parent).free
+    if size > free:
+        raise RecordingError(
+            f"{path} would take {size / 1e9:.1f} GB: there is room for {free / 1e9:.1f} GB"
+        )
 
 
 def _size(frame: RecordedFrame) -> str:

@@ -4,6 +4,7 @@ The schema is foxglove.CompressedImage, as JSON; beside its fields stand those o
 viewers pass over. PNG loses nothing, so that what was recorded can be learned from.
 """
 
+import struct
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
@@ -20,6 +21,10 @@ TOPIC = "camera"
 SCHEMA = "foxglove.CompressedImage"
 _TYPES = {"number": "number", "integer": "integer", "text": "string", "boolean": "boolean"}
 """Viewers know no type that permits null: what is not known is left out of a message."""
+MAX_PIXELS = 2**24
+"""Largest picture that is read; a few bytes can claim 4 GB."""
+_PNG_HEAD = struct.Struct(">8s4x4sII")
+"""Signature of a PNG, and the type, width and height of its first part."""
 _COMPRESSION = 1
 """Of PNG: noise cannot be compressed further, however long one tries."""
 
@@ -119,9 +124,13 @@ def decoded(payload: bytes) -> RecordedFrame:
         message = _decode(payload)
     except msgspec.DecodeError as error:
         raise RecordingError(f"a frame that cannot be read: {error}") from None
-    pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    _check_size(message)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        pixels = None
     if pixels is None:
-        raise RecordingError(f"the picture of frame {message.seq} is no PNG")
+        raise RecordingError(f"the picture of frame {message.seq} cannot be read")
     return RecordedFrame(
         message.t,
         message.time,
@@ -131,6 +140,21 @@ def decoded(payload: bytes) -> RecordedFrame:
         message.exposure,
         np.asarray(pixels, np.uint8),
     )
+
+
+def _check_size(message: ImageMessage) -> None:
+    """Raise `RecordingError` for what is not a PNG, or is a larger one than any camera's."""
+    if len(message.data) < _PNG_HEAD.size:
+        size = f"has {len(message.data)} bytes" if message.data else "is empty"
+        raise RecordingError(f"the picture of frame {message.seq} {size}, and is no PNG")
+    signature, kind, width, height = _PNG_HEAD.unpack_from(message.data)
+    if (signature, kind) != (b"\x89PNG\r\n\x1a\n", b"IHDR"):
+        raise RecordingError(f"the picture of frame {message.seq} is no PNG")
+    if width * height > MAX_PIXELS:
+        raise RecordingError(
+            f"the picture of frame {message.seq} claims {width} x {height} px, {MAX_PIXELS} pixels "
+            "at most"
+        )
 
 
 def _cv2() -> Any:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
-import yaml
 from mcap.records import Attachment, Channel, Footer, Message, Metadata
 
 from fishd.config import Config, adopt
+from fishd.core import strict_yaml, text
 from fishd.core.decoding import decoder
-from fishd.core.errors import ConfigError, RecordingError
+from fishd.core.errors import FishdError, RecordingError
 from fishd.core.frames import frame
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
@@ -33,8 +33,8 @@ T = TypeVar("T")
 TOPICS = dict(enumerate((*CHANNELS, images.TOPIC), start=1))
 """Topics of channels as `RunWriter` numbers them, for a file in which that part is damaged."""
 
-_LOADER = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
-"""libyaml's takes a tenth of the time."""
+MAX_COLUMNS = 100
+"""Quantities of controllers in one table; each takes a number a tick."""
 
 
 class Entry(NamedTuple):
@@ -56,9 +56,8 @@ class Run:
         """Run, version, git commit, host, Python, operator, subject, note, and more."""
         self.daemons: list[dict[str, str]] = []
         """Each fishd that was recorded: version, process, robot."""
-        self.configs: dict[int, dict[str, Any]] = {}
-        """The configuration of each, by its number in the recording, from 0; one that ended before
-        it could be asked has no entry."""
+        self._yaml: dict[int, bytes] = {}
+        """The configuration of each, by its number, as it stands in the file."""
         self.calibrations: list[Calibrations] = []
         """The calibrations that were in use, one after the other."""
         self.finished = False
@@ -69,6 +68,8 @@ class Run:
         """As it was when the recording ended."""
         self._damages: list[int] = []
         """How many ticks come before each damaged part that was skipped."""
+        self.damage_reason = ""
+        """What is wrong with the first damaged part, where that is known."""
         self.entries: list[Entry] = []
         """All messages of fishd in the order in which they came."""
         self.frame_heads: list[FrameHead] = []
@@ -87,16 +88,43 @@ class Run:
 
     def config_of(self, number: int) -> Config:
         """The configuration of the fishd of this number; raises `RecordingError`."""
-        if number not in self.configs:
-            raise RecordingError(f"{self.path}: the configuration of its fishd was not recorded")
         try:
-            return adopt(self.configs[number])
-        except ConfigError as error:
+            return adopt(self.settings_of(number))
+        except RecordingError:
+            raise
+        except FishdError as error:
             made = self.about.get("version", "unknown")
             raise RecordingError(
                 f"{self.path}: the configuration of fishd {made} cannot be read by this one: "
                 f"{error}"
             ) from None
+
+    def has_settings(self, number: int) -> bool:
+        """Is the configuration of this fishd in the recording?"""
+        return number in self._yaml
+
+    def settings_of(self, number: int) -> dict[str, Any]:
+        """The same as plain data; raises `RecordingError`."""
+        if not self.has_settings(number):
+            raise RecordingError(f"{self.path}: the configuration of its fishd was not recorded")
+        name = f"{self.path}: {CONFIG} of fishd {number}"
+        try:
+            data = strict_yaml.parse(self._yaml[number].decode()).data
+        except UnicodeDecodeError as error:
+            raise RecordingError(f"{name}: not a text in UTF-8 ({error.reason})") from None
+        except strict_yaml.YamlProblem as problem:
+            raise RecordingError(f"{name}: line {problem.line}: {problem}") from None
+        if not isinstance(data, dict):
+            raise RecordingError(f"{name}: keys and values are needed, such as 'tick: 0.05'")
+        return data
+
+    @cached_property
+    def configs(self) -> dict[int, dict[str, Any]]:
+        """The configuration of each fishd, by its number in the recording, from 0.
+
+        One that ended before it could be asked has no entry. Raises `RecordingError`.
+        """
+        return {number: self.settings_of(number) for number in self._yaml}
 
     @cached_property
     def ticks(self) -> list[Tick]:
@@ -184,7 +212,15 @@ class Run:
                 yield record.data
 
     def frame(self) -> "DataFrame":
-        """The ticks as a table: `fishd.core.frames.frame`."""
+        """The ticks as a table: `fishd.core.frames.frame`; raises `RecordingError`."""
+        names: set[str] = set()
+        for tick in self.ticks:
+            names.update(tick.quantities or ())
+            if len(names) > MAX_COLUMNS:
+                raise RecordingError(
+                    f"{self.path}: its controllers have more than {MAX_COLUMNS} quantities, too "
+                    "many for a table"
+                )
         return frame(self.ticks)
 
     def _scan(self) -> None:
@@ -201,6 +237,7 @@ class Run:
                     ticks += topic == "tick"
             elif isinstance(record, Damaged):
                 self._damages.append(ticks)
+                self.damage_reason = self.damage_reason or record.reason
             elif isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Metadata):
@@ -208,10 +245,13 @@ class Run:
             elif isinstance(record, Attachment):
                 try:
                     self._take_attachment(record.name, record.data)
-                except (yaml.YAMLError, msgspec.DecodeError, ValueError, LookupError):
+                except (ValueError, LookupError) as error:  # also msgspec.DecodeError
                     self._damages.append(ticks)
+                    why = f"{text.quoted(record.name)}: {text.said(error)}"
+                    self.damage_reason = self.damage_reason or why
         if not self.about and not (self.is_damaged and self.entries):
-            raise RecordingError(f"{self.path} is an MCAP file, but no recording of fishd")
+            why = f": {self.damage_reason}" if self.damage_reason else ""
+            raise RecordingError(f"{self.path} is an MCAP file, but no recording of fishd{why}")
 
     def _take_frame(self, payload: bytes) -> None:
         try:
@@ -231,7 +271,7 @@ class Run:
 
     def _take_attachment(self, name: str, data: bytes) -> None:
         if name == CONFIG:
-            self.configs[int(self.daemons[-1]["number"])] = yaml.load(data, _LOADER)
+            self._yaml[int(self.daemons[-1]["number"])] = data
         elif name == CALIBRATIONS:
             self.calibrations.append(decoder(Calibrations)(data))
 

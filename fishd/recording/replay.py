@@ -168,8 +168,11 @@ class Replay:
     def _result(self, op: str) -> Any:
         if op == "status":
             return self.status()
-        if op == "config" and self._run.configs:
-            return self._run.configs[0]
+        if op == "config" and self._run.has_settings(0):
+            try:
+                return self._run.settings_of(0)
+            except RecordingError as error:
+                raise Refused("replay", str(error)) from None
         if op == "calibrations" and self._run.calibrations:
             return self._run.calibrations[-1]
         raise Refused("replay", NOT_LIVE.format(self._run.name))

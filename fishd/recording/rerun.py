@@ -6,8 +6,9 @@ same bits from every start of a controller that is in the recording; one that ha
 or before ticks that are missing, has a past that nobody knows.
 """
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from itertools import islice
+from typing import Any, TypeVar
 
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
@@ -24,6 +25,8 @@ from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
 from fishd.recording.summary import Tally
 
+T = TypeVar("T")
+Messages = Iterable[Event | Status | Tick]
 ESTIMATES = ("fy_rate", "fin_velocity", "frequency")
 """What the estimator adds to a measurement, and ticks tell; their thrust is that of the filter."""
 
@@ -91,14 +94,14 @@ def rerun(
             f"{run.path}: remote asks a program for its commands, which cannot be asked again"
         )
     again = _Rerun(run, name, dict(parameters or {}), tuple(overrides))
-    upcoming: list[Event | Status | Tick] = list(run.messages())
+    messages = list(run.messages())
     tally = Tally()
-    for index, message in enumerate(upcoming):
+    for index, message in enumerate(messages):
         tally.add(message)
         if isinstance(message, Event):
             again.event(message)
         elif isinstance(message, Tick):
-            again.tick(message, tally.restarts, upcoming[index:])
+            again.tick(message, tally.restarts, islice(messages, index, None))
     return Rerun(again.stretches, again.estimates)
 
 
@@ -125,16 +128,18 @@ class _Rerun:
 
     def event(self, event: Event) -> None:
         """Take note of what changes from the next tick on."""
-        data = event.data
         if event.kind in ("controller", "fallback"):
-            self._started = data["controller"], data["parameters"]
+            self._started = (
+                self._read_data(event, "controller", str),
+                self._read_data(event, "parameters", dict),
+            )
             self._retunes = []
         elif event.kind == "parameters":
             if self._started is not None:
-                self._retunes.append(data["parameters"])
+                self._retunes.append(self._read_data(event, "parameters", dict))
             elif self._swims is not None:
-                self._retune(data["parameters"])
-        elif event.kind in ("mode", "fault") and data.get("mode") != "running":
+                self._retune(self._read_data(event, "parameters", dict))
+        elif event.kind in ("mode", "fault") and event.data.get("mode") != "running":
             self._swims = None
             if self._last is not None:
                 self._estimator.rest()
@@ -145,7 +150,16 @@ class _Rerun:
         ):
             self._estimator.forget_zero()
 
-    def tick(self, tick: Tick, number: int, upcoming: list[Event | Status | Tick]) -> None:
+    def _read_data(self, event: Event, name: str, kind: type[T]) -> T:
+        """What the data of an event say; raises `RecordingError` where they do not."""
+        value = event.data.get(name)
+        if not isinstance(value, kind):
+            raise RecordingError(
+                f"{self._run.path}: an event '{text.quoted(event.kind)}' does not say its {name}"
+            )
+        return value
+
+    def tick(self, tick: Tick, number: int, upcoming: Messages) -> None:
         """Choose again in one tick; number: of its fishd, as the recorder has counted."""
         last = self._last
         if number != self._number:
@@ -173,7 +187,7 @@ class _Rerun:
         self._before = 0.0
         self._believed = Measurement(0.0, 0.0, 0.0, 0)
         recorded = self._run.config_of(self._number)
-        self._config: Config = adopt(self._run.configs[self._number], self._overrides)
+        self._config: Config = adopt(self._run.settings_of(self._number), self._overrides)
         modelled = self._config.estimator.kind == "observer"
         self._estimates_again = self._config.estimator != recorded.estimator or (
             modelled and self._config.plant != recorded.plant
@@ -185,10 +199,16 @@ class _Rerun:
             config.amplitude_limit, config.tick, config.slew_limit, config.fade_time
         )
         about = next(
-            (each for each in self._run.daemons if each["number"] == str(self._number)), {}
+            (each for each in self._run.daemons if each.get("number") == str(self._number)), {}
         )
         if "lowest" in about:
-            self._guard.restrict(float(about["lowest"]), float(about["highest"]))
+            try:
+                self._guard.restrict(float(about["lowest"]), float(about["highest"]))
+            except (KeyError, ValueError):
+                raise RecordingError(
+                    f"{self._run.path}: the angles that fishd {self._number} permits are not "
+                    "numbers"
+                ) from None
 
     def _observe(self, tick: Tick, applied: float, dt: float) -> Observation:
         """What the controller sees in this tick."""
@@ -229,7 +249,7 @@ class _Rerun:
         tick: Tick,
         seen: Observation,
         applied: float,
-        upcoming: list[Event | Status | Tick],
+        upcoming: Messages,
     ) -> None:
         started, self._started = self._started, None
         if started is not None or self._swims is None:
@@ -243,22 +263,27 @@ class _Rerun:
                 self._retune(values)
             self._retunes = []
             assert self._swims
-            contained(self._swims.activate, seen)
+            self._call(tick, self._swims.activate, seen)
         assert self._swims
         stretch = self.stretches[-1]
-        try:
-            angle = contained(self._guard.apply, contained(self._swims.update, seen), applied)
-        except Exception as error:
-            raise RecordingError(
-                f"{self._run.path}: in tick {tick.seq}, {stretch.controller} failed: "
-                f"{text.named(error)}"
-            ) from error
+        update = self._swims.update
+        angle = self._call(tick, lambda seen: self._guard.apply(update(seen), applied), seen)
         stretch.ticks += 1
         if angle == tick.phi_c:
             stretch.equal += 1
         else:
             stretch.largest = max(stretch.largest, abs(angle - tick.phi_c))
             stretch.differs_last = tick.seq
+
+    def _call(self, tick: Tick, method: Callable[[Observation], T], seen: Observation) -> T:
+        """Call a method of the controller; raises `RecordingError` where that fails."""
+        try:
+            return contained(method, seen)
+        except Exception as error:
+            raise RecordingError(
+                f"{self._run.path}: in tick {tick.seq}, {self.stretches[-1].controller} failed: "
+                f"{text.named(error)}"
+            ) from error
 
     def _begin(
         self, tick: Tick, recorded: str, parameters: dict[str, Any], *, from_start: bool
@@ -278,7 +303,7 @@ class _Rerun:
             values = {**parameters, **self._parameters}
             contained(swims.retune, registry.check(stretch.controller, values, swims.limits))
 
-    def _parameters_of(self, tick: Tick, upcoming: list[Event | Status | Tick]) -> dict[str, Any]:
+    def _parameters_of(self, tick: Tick, upcoming: Messages) -> dict[str, Any]:
         """Those of a controller whose start is not in the recording: as the next status says."""
         for message in upcoming:
             if isinstance(message, Status) and message.controller == tick.controller:

@@ -1,10 +1,11 @@
 """What a recording amounts to: how long, who swam, how much thrust, and what is missing."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
+from fishd.core.decoding import decoder
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.images import FrameHead
 
@@ -219,11 +220,14 @@ def to_metadata(summary: Summary) -> dict[str, str]:
     }
 
 
+_decode = decoder(Any)
+
+
 def from_metadata(data: dict[str, str]) -> Summary | None:
     """The summary in the metadata of a recording; None if it was never written."""
     known = {name: data[name] for name in Summary.__struct_fields__ if name in data}
     try:
-        raw = {name: msgspec.json.decode(value) for name, value in known.items()}
+        raw = {name: _decode(value.encode()) for name, value in known.items()}
         return msgspec.convert(raw, Summary) if raw else None
     except msgspec.MsgspecError:
         return None

@@ -271,7 +271,7 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["virtual_pi.channel_y=A0-A1"], "virtual_pi.channel_y", "channel_x"),
         (["state_folder=~nobody-here/fish"], "state_folder", "no user here is 'nobody-here'"),
         (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
-        (['state_folder="/var/\\ud800"'], "state_folder", "a path has no"),
+        (['state_folder="/var/\\ud800"'], "state_folder", "half of a character"),
     ],
 )
 def test_hardware_that_is_at_odds_is_refused_by_key(

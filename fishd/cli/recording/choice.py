@@ -23,10 +23,10 @@ def opened(name: str, folder: Path | None) -> Run:
     """
     run = open_run(find(name, folder))
     if run.is_damaged:
-        echo(f"fishctl: {run.path}: {damage(run.damaged)}", err=True)
+        echo(f"fishctl: {run.path}: {damage(run.damaged, run.damage_reason)}", err=True)
     return run
 
 
-def damage(ticks: int) -> str:
-    """What a damaged file has cost: `damaged: 10 ticks lost`."""
-    return f"damaged: {counted(ticks, 'tick')} lost"
+def damage(ticks: int, reason: str = "") -> str:
+    """Return what a damaged file has cost: `damaged: 10 ticks lost`, and why, where known."""
+    return f"damaged: {counted(ticks, 'tick')} lost" + (f" ({reason})" if reason else "")

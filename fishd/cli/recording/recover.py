@@ -25,7 +25,7 @@ def recover(file: str, folder: Path | None) -> None:
     run = finish(path)
     summary = run.summary
     frames = f", {counted(summary.frames, 'frame')}" if summary.frames else ""
-    what = f"; {damage(damaged.damaged)}" if damaged.is_damaged else ""
+    what = f"; {damage(damaged.damaged, damaged.damage_reason)}" if damaged.is_damaged else ""
     echo(
         f"{run.path}: {summary.duration:.1f} s, {counted(summary.ticks, 'tick')}, "
         f"{summary.lost} lost, {counted(summary.events, 'event')}{frames}{what}"
