@@ -33,7 +33,7 @@ OPTIONS: Options = {
 
 def measure(options: Namespace) -> Report:
     """Every trial; raises `BrokenPromise`, and SystemExit when nothing can be tried here."""
-    check_machine()
+    check_machine(options.base)
     with _work_folder(options.keep) as work, Container(build(work, options.base)) as container:
         return _try_all(container)
 

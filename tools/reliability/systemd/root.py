@@ -15,11 +15,17 @@ _TOOLS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container", "
 _PACKAGES = "systemd,systemd-sysv,dbus,make,python3,python3-venv"
 
 
-def check_machine() -> None:
-    """Raises SystemExit when a root folder could not be made or booted here."""
+def check_machine(base: Path | None) -> None:
+    """Raise SystemExit when a root folder could not be made or booted here.
+
+    base: as for `build`; what makes it is not needed where it is there
+    """
     if os.geteuid() != 0:
         raise SystemExit("to boot a root folder needs root: sudo make trial-systemd")
+    has_base = base is not None and base.exists()
     for tool, package in _TOOLS.items():
+        if tool == "debootstrap" and has_base:
+            continue
         if shutil.which(tool) is None:
             raise SystemExit(f"{tool} is missing: sudo apt install {package}")
     if sys.version_info[:2] not in _SUITES:
