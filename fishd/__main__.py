@@ -1,5 +1,8 @@
 """Where the commands begin: a Ctrl-C while they are still being loaded ends them quietly."""
 
+from fishd.core import safe_path
+
+safe_path.leave_working_directory_out()
 try:
     import gc
     import signal

@@ -14,6 +14,7 @@ import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from fishd.core.errors import FishdError
+from fishd.core.safe_path import SafeChildren
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -122,7 +123,7 @@ def workers(stop: Path, jobs: int | None = None, cluster: str | None = None) -> 
 
     Raises `FishdError` where there is no scheduler.
     """
-    with _scheduler(cluster) as event:
+    with _scheduler(cluster) as event, SafeChildren():
         asks = Stop(event.name, True) if event else Stop(str(stop), False)
         stop.unlink(missing_ok=True)
         try:

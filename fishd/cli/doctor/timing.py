@@ -4,9 +4,9 @@ import ctypes
 import getpass
 import resource
 import subprocess
-import sys
 
 from fishd.cli.doctor.base import Context
+from fishd.core import safe_path
 from fishd.daemon.realtime import limit_for
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
@@ -33,7 +33,7 @@ def realtime(context: Context) -> Result:
             return ok("the running fishd has real-time scheduling")
         return warning("the running fishd has no real-time scheduling", _permit_priority(priority))
     tried = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", _TRY, str(priority)], capture_output=True, check=False
+        safe_path.python("-I", "-S", "-c", _TRY, str(priority)), capture_output=True, check=False
     )
     if tried.returncode == 0:
         return ok(f"SCHED_FIFO {priority} is permitted")

@@ -18,7 +18,7 @@ from functools import partial
 import msgspec
 
 from fishd.control.reporting import Reporter
-from fishd.core import addresses
+from fishd.core import addresses, safe_path
 from fishd.core.errors import StartupError
 from fishd.core.signals import Event, Status, Tick
 from fishd.daemon.control_server import ControlServer
@@ -178,8 +178,7 @@ class ForkServer(_Peer):
         with theirs, ExitStack() as stack:
             stack.callback(ours.close)
             self._process = subprocess.Popen(
-                # -P: not what lies in the working directory.
-                [sys.executable, "-P", "-m", "fishd.daemon.gateway", str(theirs.fileno())],
+                safe_path.python("-m", "fishd.daemon.gateway", str(theirs.fileno())),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

@@ -3,7 +3,6 @@
 Needs root, a network and Debian's packages debootstrap and systemd-container; some minutes.
 """
 
-import platform
 import resource
 import shutil
 import subprocess
@@ -130,12 +129,13 @@ def _work_folder(keep: bool) -> Iterator[Path]:
 
 def _text(container: Container, rows: list[Row], limits: bool) -> str:
     version = container.run("systemctl", "--version").split()[1]
+    python = container.run("python3", "--version")
     cells = (
         (row.what, *("" if t is None else f"{t:.2f}" for t in row[1:4]), row.outcome)
         for row in rows
     )
     text = (
-        f"systemd {version}, Python {platform.python_version()}, fishd from `make install-pi` with "
+        f"systemd {version}, {python}, fishd from `make install-pi` with "
         "the virtual Pi; times in seconds from what was done to the daemon.\n\n"
         + table("what | servo neutral | pulses off | ready (again) | outcome", cells)
     )

@@ -1,0 +1,102 @@
+"""Files of the working directory are never executed: another user may have put them there."""
+
+import importlib.metadata
+import re
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from rigs.documents import ROOT
+from rigs.processes import FISHCTL, FISHD, Process, addresses, call, wait_until
+
+from fishd.client import Fish, NoDaemon
+
+NAMES = sorted({*sys.stdlib_module_names, *importlib.metadata.packages_distributions(), "fishd"})
+TRAINING = "steps: 64\nppo: {n_steps: 64, n_epochs: 1}\nevaluation: {seconds: 4.0, settle: 2.0}\n"
+
+
+class Trap:
+    """A folder with a module of every name that there is, each of which leaves a mark."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "trap"
+        self.folder.mkdir()
+        self._mark = folder / "executed"
+        code = f"open({str(self._mark)!r}, 'a').write(__name__ + ' ')\nraise ImportError(__name__)"
+        for name in filter(str.isidentifier, NAMES):
+            (self.folder / f"{name}.py").write_text(code)
+
+    @property
+    def executed(self) -> list[str]:
+        """Names of the modules that a process has executed."""
+        return self._mark.read_text().split() if self._mark.exists() else []
+
+
+@pytest.fixture
+def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Trap:
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    return Trap(tmp_path)
+
+
+def test_the_trap_works(trap: Trap) -> None:
+    call(sys.executable, "-m", "joblib", cwd=trap.folder)
+    assert trap.executed
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "sweep square --frequency 1,2 --periods 2 --settle 1 --jobs 2 --folder {folder}/sweep",
+        "learn ppo --seeds 2 --jobs 2 --settings {folder}/training.yaml --folder {folder}/run",
+        "doctor --set realtime.priority=1",
+    ],
+)
+def test_no_verb_executes_files_of_the_working_directory(words: str, trap: Trap) -> None:
+    if words.startswith("learn"):
+        pytest.importorskip("torch")
+    folder = trap.folder.parent
+    (folder / "training.yaml").write_text(TRAINING)
+    done = call(FISHCTL, *words.format(folder=folder).split(), cwd=trap.folder, timeout=200)
+    assert trap.executed == []
+    assert done.returncode in ((0, 1) if words.startswith("doctor") else (0,)), done.stderr
+
+
+def test_fishd_and_its_gateways_do_not_execute_them(trap: Trap) -> None:
+    with Process(FISHD, *addresses(trap.folder.parent), cwd=trap.folder) as process:
+        endpoint = f"ipc://{trap.folder.parent}/control"
+        wait_until(lambda: process.process.poll() is not None or answers(endpoint))
+        assert answers(endpoint)
+        status, _, log = process.end(signal.SIGTERM)
+    assert trap.executed == []
+    assert status == 0, log
+
+
+def answers(endpoint: str) -> bool:
+    try:
+        with Fish(endpoint, timeout=1.0) as fish:
+            return bool(fish.status())
+    except NoDaemon:
+        return False
+
+
+def test_as_a_module_fishd_executes_none_but_those_that_python_itself_loads_before(
+    trap: Trap,
+) -> None:
+    loaded = call(sys.executable, "-I", "-c", "import runpy, sys; print(*sys.modules)").stdout
+    for name in {"fishd", *loaded.split()}:
+        (trap.folder / f"{name}.py").unlink(missing_ok=True)
+    done = call(sys.executable, "-m", "fishd", "--set", "tik=1", cwd=trap.folder)
+    assert "did you mean 'tick'?" in done.stderr
+    assert trap.executed == []
+
+
+def test_python_is_started_in_one_way() -> None:
+    """By `safe_path`, or by a library within `SafeChildren`."""
+    for path in (ROOT / "fishd").rglob("*.py"):
+        code = path.read_text(encoding="utf-8")
+        name = str(path.relative_to(ROOT))
+        if name != "fishd/core/safe_path.py":
+            assert not re.search(r"\[\s*sys\.executable|\(sys\.executable,", code), name
+        if re.search(r"^(import|from) (joblib|multiprocessing|concurrent)\b", code, re.MULTILINE):
+            assert "SafeChildren()" in code, name
