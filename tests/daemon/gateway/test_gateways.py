@@ -462,7 +462,7 @@ def test_gateways_that_hang_are_waited_for_together(
             made = Gateways(*addresses, stack)
             while not (made.telemetry._serves and made._server.serves):
                 await asyncio.sleep(0.01)
-            (server,) = children(os.getpid())
+            server = made._server._process.pid
             hung.extend([server, *children(server)])
             for pid in hung[1:]:
                 os.kill(pid, signal.SIGSTOP)
