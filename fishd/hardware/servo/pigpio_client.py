@@ -23,7 +23,7 @@ SCRIPTS, PARAMETERS = 32, 10
 _LOOK = 5e-3
 """How often somebody who waits in virtual time looks whether pigpiod stands still [s]."""
 
-_UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
+UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
 _TAKEN_AWAY = "somebody else took fishd's script away, as 'fishctl release' does"
 _SCRIPT_STATUS = 45
 _ANSWER = struct.Struct("<3Ii")
@@ -186,7 +186,7 @@ def reason(error: BaseException, limit: float) -> str:
     if isinstance(error, TimeoutError):
         return f"no answer within {limit * 1e3:g} ms"
     if isinstance(error, pigpio.error):
-        return _TAKEN_AWAY if error.value == _UNKNOWN_SCRIPT else str(error.value)
+        return _TAKEN_AWAY if error.value == UNKNOWN_SCRIPT else str(error.value)
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 

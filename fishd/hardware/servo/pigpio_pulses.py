@@ -7,13 +7,20 @@ client dies at, a running script is armed, or there are no pulses. Armed with OF
 
 import math
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pigpio
 
 from fishd.core.errors import ServoError
-from fishd.hardware.servo.pigpio_client import ANSWER, PARAMETERS, SCRIPTS, Client, opened
+from fishd.hardware.servo.pigpio_client import (
+    ANSWER,
+    PARAMETERS,
+    SCRIPTS,
+    UNKNOWN_SCRIPT,
+    Client,
+    opened,
+)
 from fishd.hardware.servo.pulses import REST
 
 OFF = 0
@@ -40,6 +47,8 @@ _GUARD = 60
 
 _PWM_MODES = {12: 4, 13: 4, 18: 2, 19: 2}
 """GPIO → the mode in which the PWM peripheral drives it."""
+_READ_BACKS, _READ_BACK_S = 10, 0.1
+"""How often it is read back at the end whether there are pulses, and the time before each [s]."""
 _LOOKS, _LOOK = 130, 4e-4
 """How often a pin's level is looked at, and how long is waited between [s]: two frames, densely."""
 
@@ -87,7 +96,18 @@ def remove(client: Client, scripts: list[int]) -> None:
     """Delete countdowns, which must not be needed any more."""
     for script in scripts:
         client.within(ANSWER)  # one that holds the servo at neutral ends its hold first
-        client.delete_script(script)
+        with _may_be_gone():
+            client.delete_script(script)
+
+
+@contextmanager
+def _may_be_gone() -> Iterator[None]:
+    """Permit that another program, such as a fishd that connects again, has deleted a script."""
+    try:
+        yield
+    except pigpio.error as error:
+        if error.value != UNKNOWN_SCRIPT:
+            raise
 
 
 def pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
@@ -121,27 +141,31 @@ def neutralise(
     """Last resort, from another process than fishd: neutral [µs] for 0.3 s, then off.
 
     False if there are no pulses: then nothing moves. Removes fishd's scripts, so that a fishd that
-    still lives gets a fault. Raises `ServoError` when a step fails; the pulses are stopped all the
-    same, if they can be.
+    still lives gets a fault. Raises `ServoError` unless pigpiod says at the end that there are no
+    pulses. When a step fails, the pulses are stopped all the same, if they can be.
     """
     try:
         with opened(host, port) as client:
-            return _neutralise(client, gpio, neutral, sleep)
-    except BaseException:
-        with suppress(ServoError), opened(host, port) as client:
-            client.set_servo_pulsewidth(gpio, OFF)
-            remove(client, countdowns(client, gpio, ANSWER))
+            energised = _neutralise(client, gpio, neutral, sleep)
+            if energised:
+                _check_off(client, gpio, sleep)
+            return energised
+    except BaseException as failure:
+        try:
+            with opened(host, port) as client:
+                client.set_servo_pulsewidth(gpio, OFF)
+                remove(client, countdowns(client, gpio, ANSWER))
+                _check_off(client, gpio, sleep)
+        except ServoError:
+            raise failure from None
+        if isinstance(failure, ServoError):
+            return True
         raise
 
 
 def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool:
-    def look(seconds: float) -> None:
-        sleep(seconds)
-        client.within(ANSWER)  # each of many looks has its own time
-
     scripts = countdowns(client, gpio, ANSWER)
-    client.within(ANSWER)
-    energised = pulses_on(client, gpio, look)
+    energised = _pulses_on(client, gpio, sleep)
     if energised:
         client.within(ANSWER)
         # First a script of its own: this process may be killed, too.
@@ -149,7 +173,8 @@ def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool
         remove(client, scripts)
         scripts = [guard]
         client.within(ANSWER)
-        client.update_script(guard, armed(gpio, _GUARD, OFF))
+        with _may_be_gone():
+            client.update_script(guard, armed(gpio, _GUARD, OFF))
         # This takes the pin from the PWM peripheral as well.
         client.set_servo_pulsewidth(gpio, round(neutral))
         sleep(REST)
@@ -157,3 +182,27 @@ def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool
         client.set_servo_pulsewidth(gpio, OFF)
     remove(client, scripts)
     return energised
+
+
+def _check_off(client: Client, gpio: int, sleep: Sleep) -> None:
+    """Read back that there are no pulses; raises `ServoError`.
+
+    A program that drives the pin has a tick in which to write again. A fishd that connects again
+    may hold the servo at neutral for half a second.
+    """
+    for _ in range(_READ_BACKS):
+        sleep(_READ_BACK_S)
+        if not _pulses_on(client, gpio, sleep):
+            return
+    raise ServoError(f"GPIO {gpio} has pulses again: another program drives it")
+
+
+def _pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
+    """Do as `pulses_on`, where each of many looks has its own time."""
+
+    def look(seconds: float) -> None:
+        sleep(seconds)
+        client.within(ANSWER)
+
+    client.within(ANSWER)
+    return pulses_on(client, gpio, look)

@@ -16,6 +16,8 @@ from fishd.hardware.servo.pwm_channel import Clock, Files, PwmChannel, Wires
 
 PATIENCE = 2.0
 """How long udev may take to hand over the files of a new channel [s]; ticks do not wait for it."""
+READ_BACK_S = 0.1
+"""Time in which a program that drives the channel writes again [s]."""
 
 
 def nanoseconds(width: float) -> int:
@@ -92,4 +94,7 @@ def _neutralise(
             channel.write("duty_cycle", 0)
         finally:
             switch_off(channel, period, sleep)
+    sleep(READ_BACK_S)
+    if on(channel):
+        raise ServoError(f"{channel.path}: has pulses again: another program drives it")
     return True
