@@ -14,10 +14,12 @@ from fishd.cli.output import (
     criterion_words,
     echo,
     echo_rows,
+    format_reason,
     made_printable,
     measured,
     print_json,
     spelled,
+    state_line,
 )
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.client import Fish
@@ -27,7 +29,7 @@ from fishd.core.console import power_words, thrust_words
 from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
 from fishd.core.schema import Field, format_values, nearest
-from fishd.core.signals import Percentiles, Reason, Status
+from fishd.core.signals import Percentiles, Status
 
 T = TypeVar("T")
 _HELP = "docs/troubleshooting.md"
@@ -160,14 +162,6 @@ def stop(endpoint: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("message", default="requested with fishctl")
-@daemon_options
-def estop(message: str, endpoint: str | None, as_json: bool) -> None:
-    """Emergency stop: no more pulses, at once, until 'fishctl clear-fault'."""
-    _change(endpoint, as_json, lambda fish: fish.estop(message))
-
-
-@click.command()
 @daemon_options
 def clear_fault(endpoint: str | None, as_json: bool) -> None:
     """Leave mode fault or estop; the servo gets pulses again and goes to neutral."""
@@ -194,9 +188,7 @@ def _change(endpoint: str | None, as_json: bool, change: Callable[[Fish], State]
     if as_json:
         print_json(state)
         return
-    state = made_printable(state)
-    why = f" ({_why(state.reason)})" if state.reason else ""
-    echo(f"{state.mode}{why}: {spelled(state.controller, state.parameters)}")
+    echo(state_line(state))
 
 
 def _status_rows(status: Status) -> list[tuple[str, str]]:
@@ -205,7 +197,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
     if reason := status.reason:
         remedy = f"{reason.remedy or 'mend the cause'} ({_HELP}, {reason.code})"
         mode = [
-            ("mode", f"{status.mode} ({_why(reason)})"),
+            ("mode", f"{status.mode} ({format_reason(reason)})"),
             ("to do", f"{remedy}; then: fishctl clear-fault"),
         ]
     uptime = datetime.timedelta(seconds=int(status.uptime))
@@ -215,7 +207,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ("fish", f"{status.name}, {status.robot}"),
         *mode,
         ("controller", spelled(status.controller, status.parameters)),
-        *([("", f"took over: {_why(status.fallback)}")] if status.fallback else []),
+        *([("", f"took over: {format_reason(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
         *_swum(status),
         *([("leak", f"{status.leak:.3g} s, found")] if status.leak is not None else []),
@@ -286,10 +278,6 @@ def _range(status: Status) -> str:
         f"within {status.lowest:+.4g} to {status.highest:+.4g} rad, less than ±{limit:g} rad of "
         "amplitude_limit"
     )
-
-
-def _why(reason: Reason) -> str:
-    return reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
 
 
 def _percentiles(times: Percentiles) -> str:

@@ -48,7 +48,7 @@ def _release(recipe: dict[str, Any]) -> int:
             print(f"fishctl: {error}; {release_recipe.NOT_RELEASED}", file=sys.stderr)
         return 1
     with suppress(OSError):
-        print(why + ("pulses were on: neutral, then off" if done else "there were no pulses"))
+        print(why + release_recipe.outcome(done))
     return 0
 
 

@@ -19,7 +19,7 @@ VERBS = {
         "set-controller": Verb("control", "set_controller", "Let another controller swim."),
         "set-parameter": Verb("control", "set_parameter", "Change parameters while it swims."),
         "stop": Verb("control", "stop", "Fade to neutral and stay there."),
-        "estop": Verb("control", "estop", "Emergency stop: no more pulses, at once."),
+        "estop": Verb("estop", "estop", "Emergency stop: no more pulses, at once."),
         "clear-fault": Verb("control", "clear_fault", "Leave mode fault or estop."),
         "release": Verb(
             "release", "release", "Last resort without the daemon: neutral, then no pulses."

@@ -10,7 +10,9 @@ import msgspec
 
 from fishd.controllers import registry
 from fishd.core import text
+from fishd.core.protocol import State
 from fishd.core.schema import format_values
+from fishd.core.signals import Reason
 
 T = TypeVar("T")
 
@@ -49,6 +51,18 @@ def spelled(controller: str, parameters: dict[str, Any]) -> str:
     return text.line(
         f"{controller} {format_values(parameters, registry.units(controller))}".rstrip()
     )
+
+
+def state_line(state: State) -> str:
+    """Return mode, reason and controller."""
+    state = made_printable(state)
+    why = f" ({format_reason(state.reason)})" if state.reason else ""
+    return f"{state.mode}{why}: {spelled(state.controller, state.parameters)}"
+
+
+def format_reason(reason: Reason) -> str:
+    """Return the reason of a mode, with its code where that says more."""
+    return reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
 
 
 def measured(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[str, str]]:

@@ -91,10 +91,15 @@ class Fish(Connection):
         """Fade to neutral and stay there."""
         return self._call(State, "stop")
 
-    def estop(self, message: str = "requested by a client") -> State:
+    def estop(
+        self, message: str = "requested by a client", *, timeout: float | None = None
+    ) -> State:
         """Stop the servo's pulses at once.
 
         Where the control socket does not answer at once, fishd's own socket is asked as well.
+
+        timeout: how long to wait for an answer, up to 0.5 s for these two not counted [s]; None: as
+            for other requests
         """
         try:
             state = self._call(
@@ -105,7 +110,8 @@ class Fish(Connection):
         except NoDaemon:
             if answer := self.estop_without_gateway(message):
                 return answer
-            state = self._call(State, "estop", message=message)
+            patience = 0.0 if timeout is None else timeout - self.timeout
+            state = self._call(State, "estop", patience=patience, message=message)
         self.estop_taken_by = "control"
         return state
 

@@ -52,14 +52,30 @@ START_LIMIT = 1.0
 """How long the force sensor may take for its first sample [s]."""
 
 
-def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None = None) -> Robot:
+def open_robot(
+    config: Config,
+    clock: Clock,
+    stack: ExitStack,
+    file: Path | None = None,
+    control: Path | None = None,
+) -> Robot:
     """The robot, in real time; leaving `stack` releases its servo first, then lets go of the rest.
 
     file: the configuration file, by which `fishd-release` will ask for this servo
+    control: the control socket, by which `fishctl estop` will ask for it
     A sensor or servo that does not answer is no error here: the loop will say so, and recovers
     when it comes back. Raises `StartupError` when a package is missing, no virtual Pi is running or
     another fishd drives this robot, `ConfigError` when a calibration file is broken.
     """
+    if control:
+
+        def forget(kind: object, error: object, trace: object) -> None:
+            if error is None:  # else there may be pulses
+                release_recipe.remove(str(control))
+
+        stack.push(forget)
+        if not config.has_hardware:
+            release_recipe.write_without_servo(str(control))
     if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
             release_recipe.remove(str(file))  # of what the file said before
@@ -69,11 +85,12 @@ def open_robot(config: Config, clock: Clock, stack: ExitStack, file: Path | None
         swimmer.compile()
         return swimmer.robot()
     stack.enter_context(ownership.owned(parts_of(config)))
-    if file:
-        release_recipe.remove(str(file))  # of an earlier fishd
+    names = tuple(str(path) for path in (file, control) if path)
+    for name in names:
+        release_recipe.remove(name)  # of an earlier fishd
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
-    return assemble(config, clock, stack, threaded=True, file=file)
+    return assemble(config, clock, stack, threaded=True, recipes=names)
 
 
 def simulated_fish(config: Config) -> SimulatedFish:
@@ -215,6 +232,15 @@ def end_pulses(config: Config) -> bool:
     return False
 
 
+def read_pulses(config: Config) -> bool | None:
+    """Read back whether the servo has pulses; None where its driver cannot tell.
+
+    Raises `ServoError`, and `StartupError` when a package is missing.
+    """
+    with driver_packages(config.servo.driver):
+        return SERVOS.find(config.servo.driver).read_pulses(config.servo)
+
+
 def _servo_calibration(config: Config) -> ServoCalibration:
     found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
     return found[0] if found else config.servo.calibration
@@ -226,13 +252,14 @@ def assemble(
     stack: ExitStack,
     *,
     threaded: bool,
-    file: Path | None = None,
+    recipes: tuple[str, ...] = (),
     truth: Callable[[], Truth] | None = None,
     servo_driver: Callable[..., ServoDriver[Any]] | None = None,
 ) -> Robot:
     """The robot on the buses and pins that this process has now; as `open_robot` without claims.
 
     threaded: False for a clock in virtual time
+    recipes: the names of `release_recipe` by which others will ask for this servo
     servo_driver: what opens the servo; by default the class that the configuration names
     """
     panel = _open_panel(config, clock, stack)
@@ -257,8 +284,9 @@ def assemble(
 
     def tell_release(calibration: ServoCalibration) -> None:
         """Leave what `fishd-release` needs to end these pulses quickly, whatever happens."""
-        if file and (resort := servo.driver.last_resort(settings)):
-            release_recipe.write(str(file), resort.function, servo.driver.neutral, resort.arguments)
+        if recipes and (resort := servo.driver.last_resort(settings)):
+            for name in recipes:
+                release_recipe.write(name, resort.function, servo.driver.neutral, resort.arguments)
 
     tell_release(servo.calibration)
     if threaded:

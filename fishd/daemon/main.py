@@ -89,7 +89,9 @@ class Daemon:
             controllers = registry.describe_all()  # imports what other packages offer
             if not self._virtual:
                 preload()  # which would hold up the ticks later
-            robot = assembly.open_robot(config, self._clock, stack, self._file)
+            robot = assembly.open_robot(
+                config, self._clock, stack, self._file, addresses.socket_path(address)
+            )
             if self._slow:
                 robot = _slowed(robot, self._slow)
             self._loop = assembly.build_loop(

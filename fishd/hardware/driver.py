@@ -279,3 +279,11 @@ class ServoDriver(Driver[V]):
     def last_resort(cls, settings: V) -> LastResort | None:
         """How another process ends pulses that outlive this one; None where `off` does."""
         return None
+
+    @classmethod
+    def read_pulses(cls, settings: V) -> bool | None:
+        """Read back, from any process, whether there are pulses; None where that cannot be told.
+
+        Raises `ServoError`.
+        """
+        return None

@@ -71,11 +71,16 @@ def owned(parts: Iterable[Part]) -> Iterator[None]:
 
 
 def owner(parts: Iterable[Part]) -> str:
-    """Which fishd drives one of these parts, and which; empty where none is known to."""
+    """Return which fishd drives one of these parts, in words; empty where none is known to."""
     for part in parts:
         if pid := holder(part.path):
             return f"a fishd (pid {pid}) drives {part.what}"
     return ""
+
+
+def owner_pid(parts: Iterable[Part]) -> str:
+    """Return the pid of a fishd that drives one of these parts; empty where none is known to."""
+    return next(filter(None, (holder(part.path) for part in parts)), "")
 
 
 def _claim(part: Part, stack: ExitStack) -> None:

@@ -1,7 +1,8 @@
-"""What `fishd-release` needs to let go of the servo without the configuration: a small file.
+"""What another process needs to release the servo without the configuration: a small file.
 
-fishd writes it when it opens a servo and at each calibration. Needs nothing but the standard
-library, and of that not pathlib, which takes longer to load than all of this.
+fishd writes it when it opens a servo and at each calibration, for its configuration file and for
+its control socket: `fishd-release` asks by the first, `fishctl estop` by the second. Needs nothing
+but the standard library, and of that not pathlib, which takes longer to load than all of this.
 """
 
 import json
@@ -37,11 +38,16 @@ def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
         raise ServoError(f"{function}: {type(error).__name__}: {error}") from error
 
 
-def write(config: str, function: str, neutral: float, arguments: dict[str, Any]) -> None:
-    """Leave the recipe for the fishd that runs with a configuration file; atomic.
+def outcome(done: bool) -> str:
+    """Return what a release has seen and done, in words."""
+    return "pulses were on: neutral, then off" if done else "there were no pulses"
 
-    The rest is for `carry_out`. If it cannot be written, `fishd-release` does without it, and
-    takes its time.
+
+def write(config: str, function: str, neutral: float, arguments: dict[str, Any]) -> None:
+    """Leave the recipe for the fishd that runs with a configuration file, or a socket; atomic.
+
+    The rest is for `carry_out`; without a function, the robot has no servo. If it cannot be
+    written, `fishd-release` does without it, and takes its time.
     """
     recipe = {"function": function, "neutral": neutral, "arguments": arguments}
     path = _path(config)
@@ -61,14 +67,19 @@ def write(config: str, function: str, neutral: float, arguments: dict[str, Any])
         os.replace(temporary, path)
 
 
+def write_without_servo(control: str) -> None:
+    """Leave a recipe that says that the fishd at a control socket has no servo."""
+    write(control, "", 1500.0, {})
+
+
 def remove(config: str) -> None:
-    """There is nothing to release for this configuration file, or nothing that is done quickly."""
+    """Remove the recipe: there is nothing to release, or nothing that is done quickly."""
     with suppress(OSError):
         os.unlink(_path(config))
 
 
 def read(config: str) -> dict[str, Any] | None:
-    """The recipe of the latest fishd that ran with a configuration file; None if it left none.
+    """Return the recipe of the latest fishd with a configuration file, or a socket, if it left one.
 
     Its key `fresh` says whether the file has not changed since. One that somebody else may have
     written, or that is not whole, is none.

@@ -81,6 +81,33 @@ def test_the_last_resort_works_while_a_fishd_hangs(pi: Bench) -> None:
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
+def test_a_fishd_that_drives_the_servo_is_asked_for_an_emergency_stop(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        daemon.fishctl("set-controller", "hold", "--angle", "0.2")
+        pi.wait_for_pulse(1600, 1700)
+        ended = release(*pi.settings, "--set", f"control.address={daemon.endpoint}")
+        assert (ended.returncode, ended.stderr) == (0, "")
+        assert ended.stdout == (
+            f"fishd (pid {daemon.process.pid}) was asked: mode estop, there are no pulses\n"
+        )
+        pi.wait_for_pulse(0, 0)  # at the end of the pulse that has begun
+        assert daemon.status().mode == "estop"
+        assert daemon.status().counters["servo_reconnects"] == 0
+
+
+def test_a_fishd_that_does_not_answer_where_it_should_be_is_named(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        daemon.fishctl("set-controller", "hold", "--angle", "0.2")
+        pi.wait_for_pulse(1600, 1700)
+        ended = release(*pi.settings, "--set", f"control.address=ipc://{pi.folder}/elsewhere")
+        assert ended.returncode == 0
+        assert ended.stdout == (
+            f"fishd (pid {daemon.process.pid}) drives the servo and did not answer at "
+            f"ipc://{pi.folder}/elsewhere: pulses were on: neutral, then off\n"
+        )
+        assert pi.pi.pulse() == 0
+
+
 @pytest.mark.parametrize("restarted", [False, True])
 def test_pulses_of_the_pwm_peripheral_that_pigpiod_may_not_know_of_end_too(
     pi: Bench, restarted: bool

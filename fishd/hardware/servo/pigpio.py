@@ -162,6 +162,15 @@ class Pigpio(ServoDriver[PigpioSettings]):
             {"gpio": settings.gpio, "host": settings.host, "port": settings.port},
         )
 
+    @classmethod
+    def read_pulses(cls, settings: PigpioSettings) -> bool:
+        """Ask pigpiod."""
+        from fishd.hardware.servo.pigpio_client import opened
+        from fishd.hardware.servo.pigpio_pulses import pulses_on
+
+        with opened(settings.host, settings.port) as client:
+            return pulses_on(client, settings.gpio, time.sleep)
+
     def _has_time(self) -> bool:
         """Whether the countdown leaves time for another tick."""
         silence = self.clock.monotonic() - self._armed

@@ -148,6 +148,18 @@ class SysfsPwm(ServoDriver[SysfsPwmSettings]):
             {"frequency": settings.frequency, **settings.wires._asdict()},
         )
 
+    @classmethod
+    def read_pulses(cls, settings: SysfsPwmSettings) -> bool:
+        """Ask the kernel."""
+        channel = PwmChannel(settings.wires, SystemClock(), os)
+        try:
+            channel.open(PATIENCE)
+            return pwm_pulses.on(channel)
+        finally:
+            channel.close()
+            if channel.exported:
+                channel.unexport()
+
     def _begin(self, width: float) -> None:
         self._owned = True
         pwm_pulses.begin(self._channel, width, self._period)

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from rigs.documents import ROOT
+from rigs.gateway_processes import children, fork_server, gateways, gone
 from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
 from fishd.client import Fish
@@ -48,40 +49,6 @@ def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 def restarts(daemon: Daemon, kind: str) -> float:
     return daemon.status().counters.get(f"{kind}_restarts", 0)
-
-
-def children(pid: int) -> list[int]:
-    try:
-        listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return []
-    return [int(child) for child in listed.split()]
-
-
-def fork_server(daemon: Daemon) -> int:
-    """The process that forks the gateways."""
-    (pid,) = children(daemon.process.pid)
-    return pid
-
-
-def gateways(daemon: Daemon) -> dict[str, int]:
-    """The processes of the gateways, by what they are for."""
-    found = {}
-    for server in children(daemon.process.pid):
-        for pid in children(server):
-            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-                name = Path(f"/proc/{pid}/comm").read_text().strip()
-                if not gone(pid) and name != "fishd-gateways":  # one that is being forked
-                    found[name.removeprefix("fishd-")] = pid
-    return found
-
-
-def gone(pid: int) -> bool:
-    """Has a process ended? One that nobody has waited for yet has."""
-    try:
-        return "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return True
 
 
 @pytest.mark.realtime

@@ -1,0 +1,97 @@
+"""`fishctl estop`: the pulses end by whichever way there is, and it says which."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from rigs.gateway_processes import fork_server, gateways
+from rigs.operator_rig import Bench
+from rigs.processes import Daemon, fishctl, one_line, running
+
+
+def swim(pi: Bench, daemon: Daemon) -> None:
+    assert daemon.fishctl("set-controller", "hold", "--angle", "0.2").returncode == 0
+    pi.wait_for_pulse(1600, 1700)
+
+
+def test_the_control_socket_is_asked_first(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        swim(pi, daemon)
+        ended = daemon.fishctl("estop", "from a test")
+        assert (ended.returncode, ended.stderr) == (0, "")
+        assert ended.stdout.startswith("estop (from a test): hold")
+        assert ended.stdout.endswith("\nway: control socket\n")
+        pi.wait_for_pulse(0, 0)
+        state = json.loads(daemon.fishctl("estop", "--json").stdout)
+    assert (state["way"], state["mode"]) == ("control socket", "estop")
+
+
+def test_gateways_that_are_stopped_do_not_keep_the_pulses_on(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        swim(pi, daemon)
+        for pid in (fork_server(daemon), *gateways(daemon).values()):
+            os.kill(pid, signal.SIGSTOP)
+        ended = daemon.fishctl("estop")
+        assert (ended.returncode, ended.stderr) == (0, "")
+        assert f"\nway: fishd's own socket, {pi.folder}/control.estop, as the" in ended.stdout
+        pi.wait_for_pulse(0, 0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_fishd_that_hangs_or_is_dead_does_not_keep_the_pulses_on(
+    pi: Bench, number: signal.Signals
+) -> None:
+    with pi.daemon() as daemon:
+        swim(pi, daemon)
+        daemon.process.send_signal(number)
+        try:
+            ended = daemon.fishctl("estop")
+            assert pi.pi.pulse() == 0
+        finally:
+            daemon.process.send_signal(signal.SIGCONT)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout in (
+        "pulses were on: neutral, then off\nway: last resort\n",
+        "there were no pulses\nway: last resort\n",  # their countdown was faster
+    )
+
+
+def test_pulses_that_cannot_be_ended_are_no_success(pi: Bench) -> None:
+    with pi.daemon() as daemon:
+        swim(pi, daemon)
+        daemon.kill()
+        pi.pi.inject("pigpiod-frozen")
+        said = one_line(daemon.fishctl("estop"))
+    assert "the servo was not released and may still have pulses: cut its power" in said
+
+
+def test_a_simulated_fish_that_hangs_has_no_pulses(tmp_path: Path) -> None:
+    with running(tmp_path) as daemon:
+        daemon.process.send_signal(signal.SIGSTOP)
+        try:
+            ended = daemon.fishctl("estop")
+        finally:
+            daemon.process.send_signal(signal.SIGCONT)
+    assert ended.returncode == 0
+    assert ended.stdout.startswith(
+        "no pulses: the fish is simulated, and its fishd does not answer"
+    )
+
+
+def test_without_a_fishd_and_without_a_servo_it_says_that_it_did_nothing(tmp_path: Path) -> None:
+    said = one_line(fishctl("--endpoint", f"ipc://{tmp_path}/control", "estop"))
+    assert "nothing was released" in said
+    assert "fishctl estop --config FILE" in said
+
+
+def test_a_configuration_names_the_servo_of_a_fishd_that_has_left_nothing(pi: Bench) -> None:
+    file = pi.folder / "fish.yaml"
+    file.write_text(
+        f"robot: virtual-pi\nstate_folder: {pi.folder}/state\n"
+        f"virtual_pi: {{socket: {pi.folder}/virtual-pi}}\nservo: {{port: {pi.pi.port()}}}\n"
+    )
+    ended = fishctl("--endpoint", f"ipc://{pi.folder}/nowhere", "estop", "--config", str(file))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout == "there were no pulses\nway: last resort\n"
