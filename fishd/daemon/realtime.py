@@ -65,8 +65,33 @@ def leave() -> None:
         os.sched_setscheduler(0, policy, os.sched_param(0))
 
 
+def outrank(thread: int, priority: int) -> None:
+    """Let the thread that ends fishd where it hangs preempt a loop of this priority.
+
+    A loop that computes for ever would keep its processor to itself. Where that is not permitted,
+    one warning says what would be right.
+    """
+    needed = limit_for(priority)
+    remedy = ""
+    if needed == priority:
+        remedy = f"set realtime.priority: {priority - 1}"
+    try:
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(needed))
+    except OSError:
+        remedy = (
+            f"let LimitRTPRIO= of its service be {needed}, or set realtime.priority: {priority - 1}"
+        )
+    if remedy:
+        log.warning(
+            "realtime.priority: %d is the highest that is permitted: a loop that hangs would keep "
+            "the thread that ends fishd from running; %s",
+            priority,
+            remedy,
+        )
+
+
 def limit_for(priority: int) -> int:
-    """The RLIMIT_RTPRIO that it takes: a thread one above the loop ends it where it hangs."""
+    """Return the RLIMIT_RTPRIO that fishd needs: a thread one above the loop ends one that hangs."""
     return min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO))
 
 

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import NoReturn
 
 from fishd.core import text
-from fishd.daemon.realtime import limit_for
+from fishd.daemon import realtime
 
 log = logging.getLogger(__name__)
 
@@ -54,14 +54,9 @@ class Shutdown:
         self._thread.start()
 
     def outrank(self, priority: int) -> None:
-        """Let its thread preempt a loop of this SCHED_FIFO priority, where that is permitted.
-
-        A loop that computes for ever would keep its processor to itself.
-        """
+        """Let its thread preempt a loop of this SCHED_FIFO priority, where that is permitted."""
         assert self._thread.native_id
-        with suppress(OSError):
-            above = os.sched_param(limit_for(priority))
-            os.sched_setscheduler(self._thread.native_id, os.SCHED_FIFO, above)
+        realtime.outrank(self._thread.native_id, priority)
 
     def when_asked(self, tell: Callable[[], object]) -> None:
         """Call `tell` from the waiting thread at the first signal; at once if there was one."""

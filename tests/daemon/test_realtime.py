@@ -4,6 +4,8 @@ import sys
 
 import pytest
 
+from fishd.daemon import realtime
+
 ENTER_THEN_LEAVE_AS_ANOTHER_USER = """
 import os
 from fishd.daemon import realtime
@@ -28,3 +30,36 @@ def test_a_user_without_privileges_can_give_the_real_time_priority_back() -> Non
     if done.stdout.startswith("False"):
         pytest.skip("no real-time priority is permitted here")
     assert done.stdout.split() == ["True", "True"]
+
+
+@pytest.mark.parametrize(
+    ("priority", "permitted", "remedy"),
+    [
+        (50, 51, ""),
+        (50, 50, "let LimitRTPRIO= of its service be 51, or set realtime.priority: 49"),
+        (99, 99, "set realtime.priority: 98"),
+    ],
+)
+def test_a_limit_that_leaves_nothing_above_the_loop_is_one_warning_with_the_right_one(
+    priority: int,
+    permitted: int,
+    remedy: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def schedule(thread: int, policy: int, parameters: os.sched_param) -> None:
+        assert (thread, policy) == (7, os.SCHED_FIFO)
+        if parameters.sched_priority > permitted:
+            raise PermissionError(1, "Operation not permitted")
+        granted.append(parameters.sched_priority)
+
+    granted: list[int] = []
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    realtime.outrank(7, priority)
+    lines = [record.getMessage() for record in caplog.records]
+    if not remedy:
+        assert (granted, lines) == ([51], [])
+        return
+    assert len(lines) == 1
+    assert lines[0].startswith(f"realtime.priority: {priority} is the highest that is permitted: ")
+    assert lines[0].endswith(f"; {remedy}")

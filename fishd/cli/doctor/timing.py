@@ -32,15 +32,24 @@ def realtime(context: Context) -> Result:
         if context.running.status.realtime:
             return ok("the running fishd has real-time scheduling")
         return warning("the running fishd has no real-time scheduling", _permit_priority(priority))
-    tried = subprocess.run(
-        safe_path.python("-I", "-S", "-c", _TRY, str(priority)), capture_output=True, check=False
-    )
-    if tried.returncode == 0:
-        return ok(f"SCHED_FIFO {priority} is permitted")
+    if _is_permitted(priority):
+        above = limit_for(priority)
+        if _is_permitted(above):
+            return ok(f"SCHED_FIFO {priority} is permitted")
+        return warning(
+            f"SCHED_FIFO {priority} is permitted, but not {above}, which the thread needs that "
+            "ends a fishd that hangs",
+            _permit_priority(priority),
+        )
     return warning(
         f"user {getpass.getuser()} may not use SCHED_FIFO {priority}: ticks come late under load",
         _permit_priority(priority),
     )
+
+
+def _is_permitted(priority: int) -> bool:
+    command = safe_path.python("-I", "-S", "-c", _TRY, str(priority))
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def memory(context: Context) -> Result:
