@@ -37,6 +37,6 @@ def test_a_fishd_that_does_not_answer_keeps_nobody_waiting_for_frames(
                 longest = max(longest, time.monotonic() - begun)
         finally:
             os.kill(daemon.process.pid, signal.SIGCONT)
-    assert longest < 10.0  # not for as long as an answer may take otherwise
+    assert longest < 30.0  # not for as long as an answer may take otherwise
     assert longest > 0.5 * QUICK  # it was asked
     assert all(abs(frame.time - ends) < PATIENCE for frame in frames)

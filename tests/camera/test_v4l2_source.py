@@ -41,8 +41,8 @@ def test_frames_come_with_the_times_of_the_kernel(good: V4l2Rig) -> None:
     with good.client() as client:
         frames = [each.header for each in published(client, 10)]
         state = client.status()
-    assert all(0.0 < b.time - a.time < 5.0 for a, b in pairwise(frames))
-    assert 0.0 < time.monotonic() - frames[-1].time < 5.0
+    assert all(0.0 < b.time - a.time < 30.0 for a, b in pairwise(frames))
+    assert 0.0 < time.monotonic() - frames[-1].time < 30.0
     assert state.degraded == ()
     assert (state.picture_width, state.picture_height, state.width) == (640, 480, 84)
     assert (state.source, state.device) == ("v4l2", "/dev/video7")
@@ -163,7 +163,7 @@ def test_time_stamps_of_another_clock_are_replaced_by_those_of_arrival(good: V4l
     assert "times are those of arrival" in state.degraded[0]
     with good.client() as client:
         header = published(client, 1)[0].header
-    assert abs(time.monotonic() - header.time) < 5.0
+    assert abs(time.monotonic() - header.time) < 30.0
     good.set()
     good.until(lambda state: not state.degraded)
 

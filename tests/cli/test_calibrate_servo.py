@@ -67,7 +67,7 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_what_was_in_force(
     rig.wait_for_pulse(1584, 1586)
     if how is not None:
         dialogue.process.send_signal(how)
-        dialogue.process.wait(20)
+        dialogue.process.wait(PATIENCE)
     assert dialogue.finish() == 130
     assert "the servo is at neutral; its calibration is as before\n" in dialogue.text
     assert "Traceback" not in dialogue.text

@@ -10,11 +10,11 @@ from rigs.processes import fishctl, one_line
 
 @pytest.fixture(scope="module")
 def swum(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what a second of swimming leaves."""
+    """A folder with what 0.8 s of swimming leave."""
     folder = tmp_path_factory.mktemp("swum")
     files = ["--checkpoint", "end.npz", "--save", "swim.npz", "--film", "wake.webp"]
     paths = [str(folder / each) if "." in each else each for each in files]
-    lengths = ("--seconds", "1", "--settle", "0.4")
+    lengths = ("--seconds", "0.8", "--settle", "0.2")
     done = fishctl("simulate", "square", "--frequency", "4", *lengths, *OPTIONS, *paths)
     assert (done.returncode, done.stderr) == (0, "")
     return folder
@@ -23,7 +23,7 @@ def swum(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_a_film_is_painted_while_it_swims(swum: Path) -> None:
     with Image.open(swum / "wake.webp") as film:
-        assert film.n_frames == 51  # the first and the last among them
+        assert film.n_frames == 41  # the first and the last among them
         assert film.width == 600
 
 
@@ -42,11 +42,11 @@ def test_the_wake_is_drawn_from_a_checkpoint(swum: Path, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> None:
     words = ("swimmer", "midlines", str(swum / "swim.npz"), "--to", str(tmp_path))
-    done = fishctl(*words, "--settle", "0.4", "--form", "svg")
+    done = fishctl(*words, "--settle", "0.2", "--form", "svg")
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "swim-midlines.svg").stat().st_size > 10_000
     assert " Hz, tail ±0." in done.stdout
-    assert "does not beat once" in one_line(fishctl(*words, "--settle", "0.9"))
+    assert "does not beat once" in one_line(fishctl(*words, "--settle", "0.65"))
 
 
 @pytest.mark.parametrize(

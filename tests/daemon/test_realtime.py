@@ -28,7 +28,7 @@ def test_a_user_without_privileges_can_give_the_real_time_priority_back() -> Non
         timeout=60,
     )
     if done.stdout.startswith("False"):
-        pytest.skip("no real-time priority is permitted here")
+        pytest.skip("no real-time priority is permitted here: run as root, or raise RLIMIT_RTPRIO")
     assert done.stdout.split() == ["True", "True"]
 
 

@@ -43,7 +43,7 @@ def test_events_arrive_as_they_happen(daemon: Daemon) -> None:
             target=lambda: seen.append(next(e.message for e in events if e.kind == "mark"))
         )
         reader.start()
-        for _ in range(100):  # until the subscription is through
+        for _ in range(1000):  # until the subscription is through
             other.mark("a wave in the tank")
             next(other.ticks())
             if seen:

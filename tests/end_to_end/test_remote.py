@@ -56,6 +56,7 @@ def address(tmp_path: Path) -> str:
     return f"ipc://{tmp_path}/agent"
 
 
+@pytest.mark.realtime
 def test_an_agent_that_dies_leaves_a_fault_and_its_successor_swims_on(
     daemon: Daemon, address: str
 ) -> None:
@@ -91,7 +92,7 @@ def test_no_late_action_reaches_the_servo(daemon: Daemon, tmp_path: Path) -> Non
         Subscriber(daemon.telemetry, b"tick") as telemetry,
     ):
         telemetry.connected()
-        fish.set_controller("remote", agent=agent.address, misses=1000)
+        fish.set_controller("remote", agent=agent.address, misses=1000, first_action=PATIENCE)
         for _ in range(20):
             over = agent.next()["seq"]
             agent.next()  # that tick is over, however slow this machine is
@@ -107,7 +108,7 @@ def test_no_late_action_reaches_the_servo(daemon: Daemon, tmp_path: Path) -> Non
 
 def test_an_agent_learns_for_seconds_and_then_swims_on(daemon: Daemon, address: str) -> None:
     with Agent(address) as agent, Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        fish.set_controller("remote", agent=address, misses=1000)
+        fish.set_controller("remote", agent=address, misses=1000, first_action=PATIENCE)
         agent.observe()
         agent.act(0.2)
         agent.observe()
@@ -227,15 +228,15 @@ def test_in_lockstep_a_signal_ends_the_wait(tmp_path: Path, address: str) -> Non
 
 
 def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(
-    daemon: Daemon,
+    tmp_path: Path,
 ) -> None:
     document = text_of(ROOT / "docs" / "remote.md")
     example = next(block for kind, block in FENCE.findall(document) if kind == "python")
     assert "400" in example
     assert "agent=agent.address" in example
     brief = example.replace("400", "60")
-    brief = brief.replace("agent=agent.address", "agent=agent.address, misses=100")
     with (
+        running(tmp_path, *sets("lockstep=true")) as daemon,
         Subscriber(daemon.telemetry, b"tick") as ticks,
         subprocess.Popen(
             [sys.executable, "-c", brief], env={"FISHD_ENDPOINT": daemon.endpoint}
@@ -247,7 +248,7 @@ def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(
             assert process.wait(PATIENCE) == 0
         finally:
             process.kill()
-    assert daemon.status().mode == "idle"
+        assert daemon.status().mode == "idle"
 
 
 def test_a_fishd_does_not_take_the_socket_of_an_agent(daemon: Daemon, address: str) -> None:

@@ -46,9 +46,9 @@ def body(*names: str) -> Any:
 
 def test_an_endless_loop_is_refused_with_what_is_permitted() -> None:
     loop = make("Loop", ["endless", "true", "observation"], ["action"], body=body())
-    began = time.monotonic()
+    began = time.process_time()
     message = refusal(of_nodes([loop], [ENDLESS, TRUE]))
-    assert time.monotonic() - began < 5.0
+    assert time.process_time() - began < 5.0
     assert message.startswith("its operator Loop is not permitted; what is: Abs, Add, And, ")
     assert message.endswith(", Tanh, ThresholdedRelu, Transpose, Unsqueeze, Where")
 
@@ -156,9 +156,9 @@ def test_more_operators_than_a_policy_needs_are_refused() -> None:
 def test_a_network_that_would_take_all_memory_or_hours_is_refused_at_once(
     nodes: list[Any], weights: list[Any], message: str
 ) -> None:
-    began = time.monotonic()
+    began = time.process_time()
     assert re.match(message, refusal(of_nodes(nodes, weights)))
-    assert time.monotonic() - began < 5.0
+    assert time.process_time() - began < 5.0
 
 
 def test_a_size_that_the_file_only_claims_does_not_count() -> None:

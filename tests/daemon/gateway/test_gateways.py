@@ -340,6 +340,7 @@ def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path
         assert daemon.status().counters["control_restarts"] == 1
 
 
+@pytest.mark.realtime
 def test_fishd_waits_for_the_end_of_its_gateways_without_a_real_time_priority(
     daemon: Daemon,
 ) -> None:
@@ -347,7 +348,7 @@ def test_fishd_waits_for_the_end_of_its_gateways_without_a_real_time_priority(
         return os.sched_getscheduler(daemon.process.pid) & ~os.SCHED_RESET_ON_FORK
 
     if policy() != os.SCHED_FIFO:
-        pytest.skip("no real-time priority is permitted here")
+        pytest.skip("no real-time priority is permitted here: run as root, or raise RLIMIT_RTPRIO")
     for pid in gateways(daemon).values():
         os.kill(pid, signal.SIGSTOP)
     daemon.process.send_signal(signal.SIGTERM)

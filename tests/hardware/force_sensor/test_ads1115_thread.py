@@ -6,7 +6,7 @@ import time
 
 import pytest
 from rigs.force_rig import TICK, ForceRig
-from rigs.processes import wait_until
+from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import SystemClock
@@ -24,7 +24,7 @@ def threaded() -> SampledSensor:
 
 
 def wait_for_pair(sensor: SampledSensor) -> Measurement:
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         try:
             measured = sensor.read(time.monotonic())
@@ -88,18 +88,18 @@ def test_closing_does_not_wait_for_a_transfer_that_hangs() -> None:
 
         def hanging(address: int, messages: object) -> list[bytes]:
             entered.set()
-            released.wait(30.0)
+            released.wait(PATIENCE)
             raise TimeoutError(110, "Connection timed out")
 
         rig.device.transfer = hanging
         sensor = threaded()
-        assert entered.wait(10.0)
+        assert entered.wait(PATIENCE)
         with pytest.raises(SensorError, match="has not delivered yet"):
             sensor.read(time.monotonic())
         begun = time.monotonic()
         sensor.close()
-        assert CLOSE_LIMIT <= time.monotonic() - begun < 10.0
+        assert CLOSE_LIMIT <= time.monotonic() - begun < 30.0
         (thread,) = sampler_threads()
         released.set()
-        thread.join(10.0)
+        thread.join(PATIENCE)
         assert not thread.is_alive()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rigs.coarse_swimmer import OPTIONS, coarse
-from rigs.processes import FISHCTL, fishctl, one_line, sets
+from rigs.processes import FISHCTL, PATIENCE, fishctl, one_line, sets
 
 from fishd.simulation.free_swim import swim
 from fishd.virtual.swimmer import checkpoint
@@ -342,7 +342,7 @@ def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) 
     command = (FISHCTL, "simulate", "swing", "--seconds", "500", *OPTIONS, *files)
     swimming = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs)
     os.close(theirs)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not kept.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     swimming.send_signal(signal.SIGINT)
@@ -353,7 +353,7 @@ def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) 
     except OSError:  # nobody writes there any more
         pass
     os.close(ours)
-    assert swimming.wait(20) == 130
+    assert swimming.wait(PATIENCE) == 130
     assert "mm/s" in seen.decode()
     assert "interrupted; its last checkpoint is of" in seen.decode()
     rows = len(saved.read_text().splitlines()) - 1

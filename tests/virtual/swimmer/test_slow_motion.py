@@ -82,7 +82,7 @@ def test_what_only_a_tethered_fish_can_do_is_refused(
 
 
 def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> None:
-    slow = ("--set", "swimmer.slow_motion=100")  # a tick a second
+    slow = ("--set", "swimmer.slow_motion=1000")  # a tick in ten seconds
     with (
         running(tmp_path, *OPTIONS, *slow) as daemon,
         Fish(daemon.endpoint, timeout=PATIENCE) as fish,
@@ -94,7 +94,7 @@ def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> No
             agent.act(0.2)
             last = agent.observe()
     assert last.seq - first.seq == 40
-    assert time.monotonic() - begun < 20.0
+    assert time.monotonic() - begun < 200.0
     assert agent.lost == 0
 
 
