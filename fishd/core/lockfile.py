@@ -12,11 +12,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+_LOCKS = Path("/proc/locks")
+"""File of the kernel that lists the locks and the processes that hold them."""
 _CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
 class Taken(Exception):
-    """Somebody holds the lock; `pid` is the number of that process, or `unknown`."""
+    """Another process holds the lock; `pid` is its number, or `unknown`."""
 
     def __init__(self, pid: str) -> None:
         super().__init__(f"held by process {pid}")
@@ -39,7 +41,7 @@ def lock_path(path: Path) -> Path:
 def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterator[None]:
     """Hold the lock file of `path`, and make it if it does not exist.
 
-    shared: every user of this machine may lock it, and may have made it
+    shared: the group of the file may lock it, too, and another user may have made it
     remove: take the lock file away at the end, where that is permitted
     Raises `Taken` when somebody holds it, this process included, OSError when it cannot be made,
     and `NotALock`, an OSError, where it is something else.
@@ -101,16 +103,19 @@ def _opened(path: Path, flags: int, *, shared: bool) -> int:
     except FileNotFoundError:
         if flags & os.O_ACCMODE == os.O_RDONLY:
             raise
-        lock = os.open(path, flags | os.O_CREAT, 0o666)
-        if shared and os.fstat(lock).st_uid == os.geteuid():
-            os.fchmod(lock, 0o666)  # whatever the umask
+        lock = os.open(path, flags | os.O_CREAT, 0o600)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise NotALock(path, "a symbolic link") from None
         raise
-    if what := _strange(os.fstat(lock), path.parent, shared):
+    found = os.fstat(lock)
+    if what := _strange(found, path.parent, shared):
         os.close(lock)
         raise NotALock(path, what)
+    # A user who can only open a file for reading can lock it.
+    mode = 0o660 if shared else 0o600
+    if found.st_uid == os.geteuid() and stat.S_IMODE(found.st_mode) != mode:
+        os.fchmod(lock, mode)
     return lock
 
 
@@ -127,5 +132,15 @@ def _strange(found: os.stat_result, folder: Path, shared: bool) -> str:
 
 
 def _pid_in(lock: int) -> str:
-    text = os.pread(lock, 20, 0).strip()
-    return text.decode() if text.isdigit() else "unknown"
+    """Return the pid of the process that holds the lock, by the kernel; else the one written there.
+
+    What is written there may be old, or not true.
+    """
+    inode = str(os.fstat(lock).st_ino)
+    with suppress(OSError):
+        for line in _LOCKS.read_text(encoding="ascii").splitlines():
+            fields = line.split()  # 1: FLOCK ADVISORY WRITE 4711 08:02:131090 0 EOF
+            if fields[1] == "FLOCK" and fields[5].rpartition(":")[2] == inode:
+                return fields[4]
+    written = os.pread(lock, 20, 0).strip()
+    return written.decode() if written.isdigit() else "unknown"

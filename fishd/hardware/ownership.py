@@ -12,12 +12,17 @@ from typing import NamedTuple
 
 from fishd.core.errors import StartupError
 from fishd.core.lockfile import Taken, holder, lock_path, locked
+from fishd.core.runtime_folder import runtime_folder
+from fishd.core.unix_sockets import stranger
 from fishd.hardware.driver import Claim
 
 log = logging.getLogger(__name__)
 
-FOLDER = Path("/run/lock")
-"""Where every user of the machine may make lock files."""
+FOLDER = Path("/run/fishd-locks")
+"""Folder of the lock files, which `make install-pi` makes: only root and the group fishd may enter.
+
+Elsewhere another user could hold a lock, or make the file of one, and so keep fishd from starting.
+"""
 TRIES, PAUSE = 50, 0.02
 """How often a claim is tried, as somebody may only be asking; and the time between [s]."""
 
@@ -33,12 +38,18 @@ class Part(NamedTuple):
     """The configuration key that names another one."""
 
 
+def lock_folder() -> Path:
+    """Return the folder of all users who may drive the hardware; else one of this user alone."""
+    return FOLDER if FOLDER.is_dir() else Path(runtime_folder())
+
+
 def parts_of_pi(claims: Mapping[str, Iterable[Claim]]) -> tuple[Part, ...]:
     """What robot pi drives: all that its drivers claim, by the section of each."""
+    folder = lock_folder()
     parts: dict[Path, Part] = {}
     for section, found in claims.items():
         for claim in found:
-            path = FOLDER / f"fishd-{claim.name.replace('/', '_')}"
+            path = folder / f"fishd-{claim.name.replace('/', '_')}"
             parts.setdefault(path, Part(path, claim.what, f"{section}.{claim.key}"))
     return tuple(parts.values())
 
@@ -59,8 +70,16 @@ def owned(parts: Iterable[Part]) -> Iterator[None]:
     with ExitStack() as stack:
         for part in parts:
             try:
+                if part.path.parent == Path(runtime_folder()):
+                    _make_private(part.path.parent)
                 _claim(part, stack)
             except OSError as error:
+                if isinstance(error, PermissionError) and part.path.parent == FOLDER:
+                    raise StartupError(
+                        f"{lock_path(part.path)}: {error.strerror}, so whether another fishd "
+                        f"drives {part.what} cannot be told; join the group of {FOLDER} "
+                        "('sudo usermod -aG fishd USER'), log in again, then try again"
+                    ) from None
                 log.warning(
                     "%s: cannot be used: %s; nothing keeps a second fishd from driving %s",
                     lock_path(part.path),
@@ -81,6 +100,13 @@ def owner(parts: Iterable[Part]) -> str:
 def owner_pid(parts: Iterable[Part]) -> str:
     """Return the pid of a fishd that drives one of these parts; empty where none is known to."""
     return next(filter(None, (holder(part.path) for part in parts)), "")
+
+
+def _make_private(folder: Path) -> None:
+    """Make the folder of this user; raises `StartupError` where another user may write to it."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if why := stranger(folder / "fishd"):
+        raise StartupError(f"no place for lock files: {why}; remove that folder")
 
 
 def _claim(part: Part, stack: ExitStack) -> None:

@@ -16,6 +16,7 @@ from rigs.operator_rig import Bench
 from rigs.processes import FISHD, Daemon, running
 from rigs.spare_bus import ANOTHER, spare_bus
 
+from fishd.core.errors import StartupError
 from fishd.core.lockfile import lock_path
 from fishd.hardware import ownership
 
@@ -36,7 +37,7 @@ def folders() -> Iterator[tuple[Path, Path]]:
         folder.chmod(0o777)
     yield parent / "one", parent / "other"
     shutil.rmtree(parent)
-    for lock in ownership.FOLDER.glob("fishd-*"):
+    for lock in ownership.lock_folder().glob("fishd-*"):
         if lock.name.startswith((f"fishd-i2c-{BUS}.", f"fishd-127.0.0.2:{20000 + BUS}-")):
             lock.unlink()
 
@@ -79,23 +80,89 @@ def test_a_second_fishd_on_the_same_bus_is_refused_and_told_the_pid(
         said = refusal(other, *elsewhere)
         assert f"another fishd (pid {first.process.pid}) drives the servo on GPIO 18" in said
         assert first.fishctl("status").returncode == 0
-    (ownership.FOLDER / f"fishd-i2c-{BUS + ANOTHER}.lock").unlink()
+    (ownership.lock_folder() / f"fishd-i2c-{BUS + ANOTHER}.lock").unlink()
+
+
+GROUP = 65534
+IN_FOLDER = """
+import sys
+from pathlib import Path
+from fishd.hardware import ownership
+ownership.FOLDER = Path({folder!r})
+from fishd.daemon.main import main
+main()
+"""
+
+
+@pytest.fixture
+def locks(tmp_path: Path) -> Iterator[Path]:
+    """A folder of lock files as `make install-pi` makes it, for the group of user nobody."""
+    if os.geteuid() != 0:
+        pytest.skip("needs root: one fishd runs as another user")
+    parent = Path(tempfile.mkdtemp())
+    parent.chmod(0o755)
+    folder = parent / "locks"
+    folder.mkdir()
+    os.chown(folder, 0, GROUP)
+    folder.chmod(0o3770)
+    yield folder
+    shutil.rmtree(parent)
 
 
 def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
-    folders: tuple[Path, Path],
+    folders: tuple[Path, Path], locks: Path
 ) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("needs root: one fishd runs as another user")
     nobody = as_nobody()
+    start = ("-c", IN_FOLDER.format(folder=str(locks)))
+    mine = (sys.executable, "-P", *start)
     one, other = folders
     private = ("sh", "-c", 'umask 077; exec "$@"', "sh", *nobody)
-    with running(one, *pi_settings(one), under=private, start=(FISHD,)) as killed:
-        assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other))
+    with running(one, *pi_settings(one), under=private, start=start) as killed:
+        assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other), start=mine)
+        assert {lock.stat().st_mode & 0o777 for lock in locks.iterdir()} == {0o660}
         killed.kill()
-    with running(other, *pi_settings(other)) as mine:  # whose lock files are somebody else's
-        said = refusal(one, *pi_settings(one), under=nobody, start=(FISHD,))
-        assert f"(pid {mine.process.pid})" in said
+    with running(other, *pi_settings(other), start=mine) as first:  # by lock files of the other
+        said = refusal(one, *pi_settings(one), under=nobody, start=start)
+        assert f"(pid {first.process.pid})" in said
+
+
+def test_a_user_who_may_not_know_the_locks_does_not_start_and_cannot_take_one(
+    folders: tuple[Path, Path], locks: Path
+) -> None:
+    one, other = folders
+    outsider = [word.replace("regid=65534", "regid=65533") for word in as_nobody()]
+    start = ("-c", IN_FOLDER.format(folder=str(locks)))
+    mine = (sys.executable, "-P", *start)
+    said = refusal(one, *pi_settings(one), under=tuple(outsider), start=start)
+    assert "Permission denied, so whether another fishd drives " in said
+    assert f"join the group of {locks} ('sudo usermod -aG fishd USER')" in said
+    with running(other, *pi_settings(other), start=mine):
+        (lock, *_) = sorted(locks.iterdir())
+        take = ("-c", "import os, sys; os.open(sys.argv[1], os.O_RDONLY)", str(lock))
+        attempt = subprocess.run([*outsider, *take], capture_output=True, text=True, check=False)
+    assert "PermissionError" in attempt.stderr
+
+
+def test_a_folder_of_lock_files_that_another_user_made_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "fishd"
+    folder.mkdir()
+    folder.chmod(0o777)
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(folder))
+    part = ownership.Part(folder / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
+    with (
+        pytest.raises(StartupError, match=f"others may write to {folder}"),
+        ownership.owned([part]),
+    ):
+        pass
+
+
+def test_the_kernel_tells_who_holds_a_lock_whatever_is_written_into_it(tmp_path: Path) -> None:
+    part = ownership.Part(tmp_path / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
+    with ownership.owned([part]):
+        lock_path(part.path).write_text("1\n")
+        assert ownership.owner_pid([part]) == str(os.getpid())
 
 
 def test_one_virtual_pi_takes_one_fishd_by_any_name_of_its_socket_even_one_that_hangs(
