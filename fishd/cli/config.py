@@ -1,5 +1,7 @@
 """Verbs about the configuration: check a file, show it, print its schema."""
 
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,14 @@ from fishd.config import (
     Config,
     json_schema,
     load,
+    mistakes,
     service_file,
     to_yaml,
 )
+from fishd.core.console import MAX_COMPLAINT
 from fishd.core.errors import ConfigError
 from fishd.core.schema import fields_of
+from fishd.core.text import line
 from fishd.hardware.servo import pulses
 
 
@@ -85,10 +90,14 @@ def config() -> None:
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @set_option
 def check(file: Path, overrides: tuple[str, ...]) -> None:
-    """Check a configuration file.
+    """Check a configuration file, and list all its mistakes.
 
     Exit status 78 when fishd would refuse it.
     """
+    if wrong := mistakes.find(file, overrides):
+        for mistake in wrong:
+            echo(f"fishctl: {line(' '.join(mistake.split()), MAX_COMPLAINT)}", err=True)
+        sys.exit(os.EX_CONFIG)
     loaded = load(file, overrides)
     echo(f"{file}: good")
     left = pulses.cut(loaded.servo, loaded.amplitude_limit)

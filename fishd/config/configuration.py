@@ -6,14 +6,14 @@ Each section is a struct of the part that it configures; this module only puts t
 import logging
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
-from fishd.config import consistency as config_checks
+from fishd.config import consistency as checks
 from fishd.config import drivers
 from fishd.config.overrides import apply_overrides
 from fishd.control.estimators.base import EstimatorSettings
@@ -265,17 +265,27 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = 
     Without a path the defaults apply. Raises `ConfigError` with one line that names the file, the
     line, the key and what is permitted.
     """
-    data, sources = (
-        strict_yaml.read(path, "a configuration", "tick: 0.05") if path is not None else ({}, {})
-    )
+    data, sources = read(path) if path is not None else ({}, {})
     sources |= apply_overrides(data, overrides)
     try:
-        config = _convert(without_empty_sections(data, Config))
-        _check(config)
+        config = convert_sections(without_empty_sections(data, Config))
+        for check in CHECKS:
+            check(config)
     except Problem as problem:
         raise ConfigError(problem.located(sources)) from None
     _warn_of_values(config, sources)
     return config
+
+
+def read(
+    path: str | os.PathLike[str], mistakes: list[str] | None = None
+) -> tuple[dict[str, Any], dict[tuple[str, ...], str]]:
+    """Return what stands in a configuration file, and the place of each key.
+
+    mistakes: takes what is wrong with single values, which are left out then
+    Raises `ConfigError`.
+    """
+    return strict_yaml.read(path, "a configuration", "tick: 0.05", mistakes)
 
 
 def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> None:
@@ -301,24 +311,24 @@ def check_tethered(robot: str, what: str) -> None:
         )
 
 
-def _check(config: Config) -> None:
-    """Validate keys against each other; raises `Problem`."""
-    checks = config_checks
-    checks.check_start(config.start.controller, config.start.parameters, config.limits)
-    checks.check_addresses(config.telemetry.address, config.control.address)
-    checks.check_state_folder(config.state_folder)
-    servo = config.servo
-    drivers.check_drivers(config.robot, config.tick, config.driver_settings)
-    checks.check_neutral(servo)
-    drivers.check_plant(config.plant)
-    checks.check_pulses(servo, config.amplitude_limit)
-    checks.check_i2c_addresses(config.driver_settings.sections())
-    checks.check_pins(drivers.claims_of(config.driver_settings), config.panel)
-    checks.check_lockstep(config.robot, config.lockstep)
-    checks.check_estimator(config.robot, config.estimator.kind, config.plant)
-    checks.check_virtual_pi(config.virtual_pi)
-    if config.robot == "swimmer":
-        checks.check_swimmer(config.swimmer, config.tick)
+Check = Callable[[Config], None]
+
+CHECKS: tuple[Check, ...] = (
+    lambda c: checks.check_start(c.start.controller, c.start.parameters, c.limits),
+    lambda c: checks.check_addresses(c.telemetry.address, c.control.address),
+    lambda c: checks.check_state_folder(c.state_folder),
+    lambda c: drivers.check_drivers(c.robot, c.tick, c.driver_settings),
+    lambda c: checks.check_neutral(c.servo),
+    lambda c: drivers.check_plant(c.plant),
+    lambda c: checks.check_pulses(c.servo, c.amplitude_limit),
+    lambda c: checks.check_i2c_addresses(c.driver_settings.sections()),
+    lambda c: checks.check_pins(drivers.claims_of(c.driver_settings), c.panel),
+    lambda c: checks.check_lockstep(c.robot, c.lockstep),
+    lambda c: checks.check_estimator(c.robot, c.estimator.kind, c.plant),
+    lambda c: checks.check_virtual_pi(c.virtual_pi),
+    lambda c: checks.check_swimmer(c.swimmer, c.tick) if c.robot == "swimmer" else None,
+)
+"""Checks of keys against each other, in their order; each raises `Problem`."""
 
 
 def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
@@ -328,14 +338,14 @@ def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
     """
     sources = apply_overrides(data, overrides)
     try:
-        return _convert(data)
+        return convert_sections(data)
     except Problem as problem:
         where = sources.get(problem.path, "the configuration of the fishd that runs")
         raise ConfigError(problem.located({problem.path: where})) from None
 
 
-def _convert(data: Mapping[str, Any]) -> Config:
-    """Each section on its own; raises `Problem`."""
+def convert_sections(data: Mapping[str, Any]) -> Config:
+    """Validate each section on its own; raises `Problem`."""
     rest = {key: value for key, value in data.items() if key not in drivers.CHOICES}
     config = convert(rest, Config, elsewhere=drivers.keys)
     return msgspec.structs.replace(config, **drivers.convert_sections(data, keys))

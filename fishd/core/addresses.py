@@ -226,7 +226,7 @@ def listen(address: str, key: str, *, group: bool = False, in_use: str = IN_USE)
         if server:
             server.close()
         raise StartupError(
-            f"{key}: cannot listen on {address}: {_why(address, error, in_use)}"
+            f"{key}: cannot listen on {address}: {_why(address, error, key, in_use)}"
         ) from None
     return server
 
@@ -250,12 +250,19 @@ def served(address: str, server: socket.socket) -> str:
     return f"{address.rpartition(':')[0].replace('*', '0.0.0.0')}:{server.getsockname()[1]}"
 
 
-def _why(address: str, error: Exception, in_use: str) -> str:
+def _next(address: Tcp) -> str:
+    """Return the same address with the next port."""
+    host = f"[{address.host}]" if ":" in address.host else address.host
+    return f"tcp://{host}:{int(address.port) % 65535 + 1}"
+
+
+def _why(address: str, error: Exception, key: str, in_use: str) -> str:
     """Why an address cannot be bound, and what would be right."""
     if not isinstance(error, OSError):
         return str(error)
     if error.errno == errno.EADDRINUSE:
-        return in_use
+        where = parse(address)
+        return f"{in_use}: --set {key}={_next(where)}" if isinstance(where, Tcp) else in_use
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     if unknown and isinstance(where := parse(address), Tcp):
         return (

@@ -12,8 +12,8 @@ from fishd.core.signals import Status
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells give it: 128 and the number of SIGINT."""
-_LONGEST = 5000
-"""A complaint may list all keys of the configuration, but no more [characters]."""
+MAX_COMPLAINT = 5000
+"""Length of the longest complaint, which lists all keys of the configuration [characters]."""
 
 
 def status_line(status: Status) -> str:
@@ -75,5 +75,5 @@ def run(command: click.Command, name: str) -> int:
 
 def complain(name: str, message: str, status: int) -> NoReturn:
     """Say one line on standard error and exit."""
-    click.echo(f"{name}: " + text.line(" ".join(message.split()), _LONGEST), err=True)
+    click.echo(f"{name}: " + text.line(" ".join(message.split()), MAX_COMPLAINT), err=True)
     sys.exit(status)

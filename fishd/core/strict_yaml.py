@@ -33,6 +33,10 @@ class YamlProblem(Exception):
         self.line = line
 
 
+class ValueProblem(YamlProblem):
+    """What is wrong with one value; the rest of the document can be read."""
+
+
 _WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
 _BARE_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?")
@@ -45,15 +49,18 @@ _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
 def read(
-    file: str | os.PathLike[str], reader: str, example: str
+    file: str | os.PathLike[str], reader: str, example: str, mistakes: list[str] | None = None
 ) -> tuple[dict[str, Any], dict[Path, str]]:
     """The mapping in a file, and the place of each key, such as `fish.yaml:3`.
 
     reader: what the file is for, such as `a configuration`; example: a line that would be right
+    mistakes: takes what is wrong with single values, which are left out then
     Raises `ConfigError` that names file and line.
     """
+    problems: list[ValueProblem] | None = None if mistakes is None else []
     try:
-        data, lines = parse(files.read_text(pathlib.Path(file), files.SETTINGS, reader))
+        text = files.read_text(pathlib.Path(file), files.SETTINGS, reader)
+        data, lines = parse(text, problems=problems)
     except YamlProblem as problem:
         raise ConfigError(f"{file}:{problem.line}: {problem}") from None
     except files.NoFile as problem:
@@ -62,11 +69,18 @@ def read(
         raise ConfigError(f"{file}: {problem}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{file}:1: keys and values are needed, such as '{example}'")
+    if mistakes is not None:
+        mistakes += [f"{file}:{problem.line}: {problem}" for problem in problems or ()]
     return data, {key: f"{file}:{line}" for key, line in lines.items()}
 
 
-def parse(text: str, name: str = "the document") -> Document:
-    """Parse `text`; raises `YamlProblem`, which calls a value outside of any key `name`."""
+def parse(
+    text: str, name: str = "the document", problems: list[ValueProblem] | None = None
+) -> Document:
+    """Parse `text`; raises `YamlProblem`, which calls a value outside of any key `name`.
+
+    problems: takes what is wrong with the value of a key, which is left out then
+    """
     if len(text) > files.SETTINGS:
         raise YamlProblem(1, f"longer than {files.SETTINGS // 2**10} kB")
     try:
@@ -79,7 +93,7 @@ def parse(text: str, name: str = "the document") -> Document:
         raise YamlProblem(1, f"not valid YAML: {' '.join(str(error).split())}") from None
     except (ValueError, OverflowError):  # an escape such as "\\U00110000"
         raise YamlProblem(1, "not valid YAML: a character that does not exist") from None
-    builder = _Builder(name)
+    builder = _Builder(name, problems)
     return Document({} if root is None else builder.build(root, ()), builder.lines)
 
 
@@ -106,9 +120,10 @@ class _Loader(yaml.SafeLoader):
 class _Builder:
     """Converts the nodes of a document to plain values."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, problems: list[ValueProblem] | None) -> None:
         self.lines: dict[Path, int] = {}
         self._name = name
+        self._problems = problems
         self._count = 0
         self._constructor = yaml.constructor.SafeConstructor()
 
@@ -136,32 +151,37 @@ class _Builder:
             key = str(key_node.value)
             _check_characters(key, "a key", line)
             here = (*path, key)
-            if key in mapping:
-                raise YamlProblem(
-                    line,
-                    f"{'.'.join(here)}: duplicate key, first given on line {self.lines[here]}; "
-                    "keep one",
-                )
-            self.lines[here] = line
-            mapping[key] = self.build(value_node, here)
+            try:
+                if key in mapping:
+                    raise ValueProblem(
+                        line,
+                        f"{'.'.join(here)}: duplicate key, first given on line {self.lines[here]}; "
+                        "keep one",
+                    )
+                self.lines[here] = line
+                mapping[key] = self.build(value_node, here)
+            except ValueProblem as problem:
+                if self._problems is None:
+                    raise
+                self._problems.append(problem)
         return mapping
 
     def _scalar(self, node: yaml.ScalarNode, name: str, line: int) -> Any:
         length = len(node.value)
         if length > _LONGEST_NUMBER and node.tag.endswith((":int", ":float")):
-            raise YamlProblem(line, f"{name}: a number of {length} letters")
+            raise ValueProblem(line, f"{name}: a number of {length} letters")
         if length <= _LONGEST_NUMBER and node.style is None:  # plain, not quoted
             surprise = _surprise(str(node.value), node.tag)
             if surprise:
-                raise YamlProblem(line, f"{name}: '{node.value}' {surprise}")
+                raise ValueProblem(line, f"{name}: '{node.value}' {surprise}")
         _check_characters(str(node.value), name, line)
         try:
             return self._constructor.construct_object(node, deep=True)
         except (yaml.YAMLError, ValueError) as error:
-            raise YamlProblem(line, f"{name}: {' '.join(str(error).split())}") from None
+            raise ValueProblem(line, f"{name}: {' '.join(str(error).split())}") from None
         except (LookupError, AttributeError):  # PyYAML's, of an explicit tag
             tag = node.tag.rpartition(":")[2]
-            raise YamlProblem(line, f"{name}: a value that is not of the tag '{tag}'") from None
+            raise ValueProblem(line, f"{name}: a value that is not of the tag '{tag}'") from None
 
 
 def _check_characters(text: str, name: str, line: int) -> None:
@@ -169,7 +189,7 @@ def _check_characters(text: str, name: str, line: int) -> None:
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise YamlProblem(line, f"{name}: half of a character (\\ud800…\\udfff)") from None
+        raise ValueProblem(line, f"{name}: half of a character (\\ud800…\\udfff)") from None
 
 
 def _check_count(count: int, line: int) -> None:

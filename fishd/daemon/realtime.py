@@ -91,7 +91,7 @@ def outrank(thread: int, priority: int) -> None:
 
 
 def limit_for(priority: int) -> int:
-    """Return the RLIMIT_RTPRIO that fishd needs: a thread one above the loop ends one that hangs."""
+    """Return the RLIMIT_RTPRIO that fishd needs: one above the loop is the thread that ends it."""
     return min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO))
 
 

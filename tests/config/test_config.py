@@ -1,14 +1,16 @@
 """The configuration: what is accepted, and what is said about what is not."""
 
 import json
+import os
 import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.processes import fishctl
 
-from fishd.config import SERVICE_FILE, Config, load, to_yaml
+from fishd.config import SERVICE_FILE, Config, load, mistakes, to_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.strict_yaml import YamlProblem, parse
 
@@ -25,7 +27,64 @@ def complaint(text: str, tmp_path: Path) -> str:
         load(file)
     message = str(caught.value)
     assert "\n" not in message
+    assert message in mistakes.find(file)
     return message.replace(str(tmp_path) + "/", "")
+
+
+MANY = """\
+tik: 0.05
+tick: 3
+plant:
+  omega: 3
+  xi: on
+servo:
+  centre: abc
+  trim: 9000
+start:
+  controller: swing
+  parameters: {c: 1}
+telemetry: {address: foo}
+control: {address: 'tcp://0.0.0.0:5000'}
+robot: pi
+lockstep: true
+panel: {estop_gpio: 18, led_gpio: 18}
+tick: 4
+force_sensor: {driver: ads1116}
+"""
+KEYS = {
+    1: "tik", 2: "tick", 4: "plant.omega", 5: "plant.xi", 7: "servo.centre", 8: "servo.trim",
+    11: "start.parameters.c", 12: "telemetry.address", 13: "control.address", 15: "lockstep",
+    16: "panel.estop_gpio", 17: "tick", 18: "force_sensor.driver",
+}  # fmt: skip
+"""The key at fault in each wrong line."""
+
+
+def test_all_mistakes_of_a_file_are_found_in_the_order_of_its_lines(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text(MANY)
+    listed = mistakes.find(file, ["plant.B=soft", "tick"])
+    wrong = [mistake.removeprefix(f"{file}:") for mistake in listed if str(file) in mistake]
+    found = {int(line.partition(":")[0]): line.split(": ")[1] for line in reversed(wrong)}
+    assert found == KEYS
+    assert [int(line.partition(":")[0]) for line in wrong] == sorted([*KEYS, 16])  # both its pins
+    assert {mistake.partition(": ")[0] for mistake in listed[len(wrong) :]} == {
+        "--set plant.B=soft",
+        "--set tick",
+    }
+
+
+def test_a_good_file_has_no_mistakes() -> None:
+    for file in (Path(__file__).parents[2] / "config").glob("*.yaml"):
+        if not file.name.startswith(("camera", "learning")):
+            assert mistakes.find(file) == []
+
+
+def test_config_check_prints_each_mistake_in_a_line_of_its_own(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("tik: 1\ntick: 3\n")
+    done = fishctl("config", "check", str(file))
+    assert (done.returncode, done.stdout) == (os.EX_CONFIG, "")
+    assert [line.split(": ")[2] for line in done.stderr.splitlines()] == ["tik", "tick"]
 
 
 def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:

@@ -137,8 +137,10 @@ def test_a_second_daemon_on_the_same_address_says_so_and_exits(
     assert not (tmp_path / "telemetry").exists()
     assert not (tmp_path / "control").exists()
     tcp = daemon.telemetry
-    in_use = f"telemetry.address: cannot listen on {tcp}: it is in use"
-    assert in_use in refused(tmp_path, f"telemetry.address={tcp}")
+    host, _, port = tcp.rpartition(":")
+    line = refused(tmp_path, f"telemetry.address={tcp}")
+    assert f"telemetry.address: cannot listen on {tcp}: it is in use" in line
+    assert line.endswith(f" --set telemetry.address={host}:{int(port) + 1}\n")
 
 
 @pytest.mark.parametrize("host", ["nohost.invalid", "192.0.2.1"])  # which is nobody's
