@@ -262,7 +262,8 @@ def _why(address: str, error: Exception, key: str, in_use: str) -> str:
         return str(error)
     if error.errno == errno.EADDRINUSE:
         where = parse(address)
-        return f"{in_use}: --set {key}={_next(where)}" if isinstance(where, Tcp) else in_use
+        hint = f"; for example --set {key}={_next(where)}" if isinstance(where, Tcp) else ""
+        return in_use + hint
     unknown = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
     if unknown and isinstance(where := parse(address), Tcp):
         return (
