@@ -11,6 +11,15 @@ if __name__ == "__main__":
     sys.exit(
         run(
             "reliability",
-            ("deaths", "kills", "misbehaviour", "attacks", "soak", "systemd", "recording"),
+            (
+                "deaths",
+                "kills",
+                "misbehaviour",
+                "attacks",
+                "gateways",
+                "soak",
+                "systemd",
+                "recording",
+            ),
         )
     )
