@@ -20,7 +20,6 @@ from fishd.control.loop import SETTLING
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
-from fishd.controllers.remote import wire
 from fishd.core import addresses
 from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import run, status_line
@@ -83,7 +82,6 @@ class Daemon:
             stack.enter_context(addresses.claimed(config.telemetry.address))
             self._gateways = Gateways(address, config.telemetry.address, stack)
             stack.callback(realtime.leave)  # before they end, after the servo is released
-            wire.start_context(stack)
             self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._mock_ticks = None if self._virtual else mock_ticks(config)
             controllers = registry.describe_all()  # imports what other packages offer

@@ -85,7 +85,7 @@ class Remote(Controller[RemoteParameters]):
 
     def __init__(self, parameters: RemoteParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
-        self._wire = Wire(parameters.agent, counted=limits.virtual)
+        self._wire = Wire(parameters.agent)
         self._limit = DwellLimit(parameters.dwell, limits, limits.amplitude)
         self._session = secrets.token_hex(8)
         self._observation: Observation | None = None
@@ -255,6 +255,8 @@ class Remote(Controller[RemoteParameters]):
             )
         elif message.seq == self._open:
             self.action = message.phi_c
+            # Another program may listen there once this agent has ended.
+            self._wire.bound = not self.limits.virtual
         else:
             self._late += 1
 
@@ -292,7 +294,8 @@ class Remote(Controller[RemoteParameters]):
         """What the agent sent instead of actions in time."""
         late = f"{self._late} answers came too late" if self._late else ""
         foreign = f"{self._foreign} named another session" if self._foreign else ""
-        return ", ".join(filter(None, (late, foreign))) or "it has sent nothing since"
+        lost = "its connection was lost: select remote again" if self._wire.lost else ""
+        return ", ".join(filter(None, (late, foreign, lost))) or "it has sent nothing since"
 
 
 def _silence(what: str) -> ControllerFault:

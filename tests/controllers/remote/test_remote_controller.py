@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zmq
 from rigs.harness import LIMITS, Rig
 from rigs.processes import wait_until
 from rigs.scripted_agent import (
@@ -183,7 +182,6 @@ def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> No
 def test_in_virtual_time_an_agent_that_comes_unseen_is_asked_as_well(
     still: Rig, agent: ScriptedAgent, tmp_path: Path
 ) -> None:
-    """The ticking thread looks before the connection is lost, and when the next one is there."""
     still.start("remote", agent=agent.address)
     controller = remote(still)
     turn = still.loop.observe(Slot(0, 0.0, 0.0, 0))
@@ -191,8 +189,6 @@ def test_in_virtual_time_an_agent_that_comes_unseen_is_asked_as_well(
     asked = agent.next()
     agent.close()
     with closing(ScriptedAgent(tmp_path)) as successor:
-        successor.wait_for_fishd()
-        time.sleep(0.05)  # until fishd's side knows it as well
         wait_until(lambda: controller.ready(turn.observation) or successor.has_message())
         assert successor.next() == asked
         successor.send(successor.action(0.1))
@@ -264,20 +260,43 @@ def test_parameters_that_cannot_work_are_refused(values: dict[str, Any], complai
     ["tcp://127.0.0.1:9873", "tcp://my-pi_4.local:1", "tcp://[::1]:65535", "ipc:///" + 106 * "a"],
 )
 def test_what_passes_as_an_address_can_be_connected_to(
-    address: str, monkeypatch: pytest.MonkeyPatch
+    address: str,
 ) -> None:
-    own: zmq.Context[zmq.Socket[bytes]] = zmq.Context()  # a name may be looked up for long
-    monkeypatch.setattr(zmq.Context, "instance", lambda: own)
     registry.create("remote", {"agent": address}, LIMITS).close()
-    own.destroy(linger=0)
 
 
-def test_what_only_zeromq_refuses_is_a_parameter_error() -> None:
+def test_what_is_no_address_is_a_parameter_error() -> None:
     with pytest.raises(
         ParameterError, match=r"agent: cannot connect to 'udp://host:1': "
     ) as caught:
         Wire("udp://host:1")
     assert caught.value.path == ("agent",)
+
+
+def test_another_program_that_listens_there_after_the_agent_has_ended_is_not_asked(
+    rig: Rig, agent: ScriptedAgent, tmp_path: Path
+) -> None:
+    connect(rig, agent)
+    swim(rig, agent)
+    agent.close()
+    with closing(ScriptedAgent(tmp_path)) as stranger:
+        rig.run(5)
+        time.sleep(0.15)  # in which another connection would be made
+        rig.run()
+        assert not stranger.has_message()
+    assert rig.reason == "remote-silent"
+    assert "(its connection was lost: select remote again)" in reason(rig)
+
+
+def test_before_the_first_action_an_agent_that_was_started_again_is_asked(
+    rig: Rig, agent: ScriptedAgent, tmp_path: Path
+) -> None:
+    connect(rig, agent)
+    agent.close()
+    with closing(ScriptedAgent(tmp_path)) as successor:
+        connected(rig)
+        rig.run()
+        assert successor.next()["answered"] == 0
 
 
 @pytest.mark.parametrize("address", ["tcp://*:1", "tcp://user@host:90", "ipc:///" + 119 * "a"])

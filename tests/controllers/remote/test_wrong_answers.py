@@ -1,10 +1,39 @@
 """Agents that do what they should not: answers that are none, and reversals in every tick."""
 
+import socket
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rigs.harness import Rig
-from rigs.scripted_agent import ScriptedAgent, answered, arrived, connect, reason, swim
+from rigs.processes import PATIENCE, wait_until
+from rigs.scripted_agent import (
+    ScriptedAgent,
+    answered,
+    arrived,
+    connect,
+    connected,
+    reason,
+    remote,
+    swim,
+)
+
+from fishd.controllers.remote.messages import Pause
+
+GREETING_OF_2 = b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"
+PLAIN = b"\xff" + bytes(8) + b"\x7f\x03\x01PLAIN" + bytes(47)
+
+
+def _ended(connection: socket.socket) -> bool:
+    """Whether fishd has closed its end."""
+    connection.setblocking(False)
+    with suppress(BlockingIOError):
+        while connection.recv(4096):
+            pass
+        return True
+    return False
 
 
 def spoiled(**changes: Any) -> dict[str, Any]:
@@ -45,7 +74,102 @@ def test_more_frames_than_one_are_rubbish(rig: Rig, agent: ScriptedAgent) -> Non
     agent.send(b"", agent.action(0.1))
     arrived(rig)
     rig.run()
-    assert "a message of 2 frames; one frame of JSON is needed" in reason(rig)
+    assert "a message of several frames; one frame of JSON is needed" in reason(rig)
+
+
+class RawAgent:
+    """An agent without ZeroMQ, which sends whatever bytes a test wants."""
+
+    GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01NULL" + bytes(48)
+    READY = b"\x04\x29\x05READY\x0bSocket-Type\0\0\0\x06ROUTER\x08Identity\0\0\0\0"
+
+    def __init__(self, folder: Path) -> None:
+        self.address = f"ipc://{folder}/raw"
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(f"{folder}/raw")
+        self._listener.listen()
+        self._listener.settimeout(PATIENCE)
+        self._connection: socket.socket | None = None
+
+    def accept(self) -> socket.socket:
+        self._connection, _ = self._listener.accept()
+        self._connection.settimeout(PATIENCE)
+        return self._connection
+
+    def close(self) -> None:
+        for each in (self._connection, self._listener):
+            if each:
+                each.close()
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Iterator[RawAgent]:
+    agent = RawAgent(tmp_path)
+    yield agent
+    agent.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "complaint"),
+    [
+        (100 * (b"\x01\xff" + bytes(255)), "a message of several frames; one frame of JSON"),
+        (b"\x02" + (2**33).to_bytes(8, "big"), "a message of 8589934592 bytes; at most 65536"),
+        (b"\x03" + (2**33).to_bytes(8, "big"), "a message of 8589934592 bytes; at most 65536"),
+        (b"\x06" + (2**40).to_bytes(8, "big"), "a message of 1099511627776 bytes; at most 65536"),
+    ],
+)
+def test_frames_without_end_are_a_fault_and_nothing_of_them_is_kept(
+    rig: Rig, raw: RawAgent, sent: bytes, complaint: str
+) -> None:
+    rig.start("remote", agent=raw.address)
+    connection = raw.accept()
+    connection.sendall(raw.GREETING + raw.READY)
+    connected(rig)
+    connection.sendall(sent)
+    arrived(rig)
+    assert len(remote(rig)._wire._received) <= 2 * 65536
+    rig.run()
+    assert rig.reason == "remote-error"
+    assert complaint in reason(rig)
+
+
+@pytest.mark.parametrize(
+    "greeting", [b"HTTP/1.1 200 OK\r\n\r\n", GREETING_OF_2, PLAIN, bytes(64), b""]
+)
+def test_what_does_not_greet_as_zeromq_does_is_no_agent(
+    rig: Rig, raw: RawAgent, greeting: bytes
+) -> None:
+    rig.start("remote", agent=raw.address, deadline=0.001)
+    connection = raw.accept()
+    connection.sendall(greeting)
+    connection.shutdown(socket.SHUT_WR)
+    wait_until(lambda: not remote(rig)._wire.state()[0] and _ended(connection))
+    rig.run(3)
+    assert rig.mode == "running"  # and waits for one
+    assert remote(rig)._wire.connections == 0
+
+
+def test_a_heartbeat_of_the_agent_is_answered(rig: Rig, raw: RawAgent) -> None:
+    rig.start("remote", agent=raw.address)
+    connection = raw.accept()
+    connection.sendall(raw.GREETING + raw.READY)
+    connected(rig)
+    connection.sendall(b"\x04\x09\x04PING\x00\x10ab")
+    received = b""
+    while not received.endswith(b"\x04\x07\x04PONGab"):
+        remote(rig)._wire.state()
+        received += connection.recv(4096)
+
+
+def test_messages_that_come_byte_by_byte_are_put_together(rig: Rig, raw: RawAgent) -> None:
+    rig.start("remote", agent=raw.address)
+    connection = raw.accept()
+    payload = b'{"kind":"pause","v":1,"session":"s","seconds":1}'
+    for byte in raw.GREETING + raw.READY + b"\x00" + bytes([len(payload)]) + payload:
+        connection.sendall(bytes([byte]))
+        remote(rig)._wire.state()
+    arrived(rig)
+    assert remote(rig)._wire.receive() == Pause(session="s", seconds=1.0)
 
 
 @pytest.mark.parametrize(
