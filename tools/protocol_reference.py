@@ -40,6 +40,8 @@ STRUCTS: dict[str, type[Struct]] = {
     "request": protocol.Request,
     "reply": protocol.Reply,
     "state": protocol.State,
+    "lease": protocol.Grant,
+    "lease holder": signals.LeaseHolder,
     "calibrations": protocol.Calibrations,
 }
 """By the name of their markers."""

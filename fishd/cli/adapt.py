@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from fishd.cli.config import set_option
 from fishd.cli.lab_progress import showing
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.sweep import ON, refuse_other
@@ -68,6 +69,7 @@ STEPS = 6400
 )
 @set_option
 @endpoint_option
+@take_option
 @json_option
 def adapt(
     on: str,
@@ -154,7 +156,7 @@ def _fish(
         yield VirtualRig(config), config, msgspec.to_builtins(config), None
         return
     with Fish(endpoint) as fish:
-        rig = LiveRig(fish)
+        rig = LiveRig(fish, *verb_lease())
         data = fish.config()
         yield rig, adopt(fish.config()), data, fish
 

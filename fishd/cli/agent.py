@@ -11,6 +11,7 @@ import click
 import msgspec
 
 from fishd.cli.completion import complete_policy
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import FiniteRange, endpoint_option
 from fishd.cli.output import echo
 from fishd.client import Fish
@@ -53,6 +54,7 @@ REPORT = 1.0
     help="End by itself after this time; by default Ctrl-C ends it.",
 )
 @endpoint_option
+@take_option
 def agent(
     policy: str,
     camera: str | None,
@@ -88,7 +90,7 @@ def agent(
                 sight.await_frames()
         elif camera:
             raise click.UsageError("--camera cannot be given here: this policy sees no pictures")
-        link = stack.enter_context(closing(FishdLink(endpoint, address=address)))
+        link = stack.enter_context(closing(FishdLink(endpoint, *verb_lease(), address=address)))
         swim = _Swim(link, pilot, sight, unit)
         echo(f"{policy} swims; it sees {pilot.card.sees}; Ctrl-C ends it")
         try:

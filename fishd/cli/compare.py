@@ -11,6 +11,7 @@ from msgspec import to_builtins
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
 from fishd.cli.lab_progress import showing
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.sweep import ON, refuse_other
@@ -71,6 +72,7 @@ class _Outcome(NamedTuple):
 )
 @fish_options
 @endpoint_option
+@take_option
 @click.option(
     "--camera",
     metavar="FILE|ENDPOINT",
@@ -199,7 +201,7 @@ def _on_robot(
         _check_seen(camera, chosen)
         unit = fish.status().force_unit
         with (
-            PilotedRig(fish, camera, agent) as rig,
+            PilotedRig(fish, *verb_lease(), camera=camera, agent=agent) as rig,
             showing(len(chosen) * runs * seconds, "s") as bar,
         ):
             live = LiveComparison(rig, chosen)

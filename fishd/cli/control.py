@@ -189,6 +189,9 @@ def _change(endpoint: str | None, as_json: bool, change: Callable[[Fish], State]
         print_json(state)
         return
     echo(state_line(state))
+    if holder := state.took_from:
+        taken = made_printable(holder)
+        echo(f"fishctl: took the fish from {taken}, which had it for {holder.age:.0f} s", err=True)
 
 
 def _status_rows(status: Status) -> list[tuple[str, str]]:
@@ -200,6 +203,10 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
             ("mode", f"{status.mode} ({format_reason(reason)})"),
             ("to do", f"{remedy}; then: fishctl clear-fault"),
         ]
+    if holder := status.lease:
+        mode.append(("held by", f"{holder}, for {holder.age:.0f} s"))
+    if expired := status.lease_expired:
+        mode.append(("rests, as", f"{expired.message} ({_HELP}, {expired.code})"))
     uptime = datetime.timedelta(seconds=int(status.uptime))
     survived = {name: count for name, count in status.counters.items() if count}
     missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import set_option
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.recording.choice import folder_option
@@ -82,6 +83,7 @@ if TYPE_CHECKING:
     help="Draw forces, fit and residual into this file (.png, .svg, .pdf).",
 )
 @endpoint_option
+@take_option
 @json_option
 def identify(
     runs: tuple[str, ...],
@@ -193,7 +195,8 @@ def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None
 
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())
-        rig: Rig = LiveRig(stack.enter_context(fish)) if fish else VirtualRig(config)
+        rig: Rig
+        rig = LiveRig(stack.enter_context(fish), *verb_lease()) if fish else VirtualRig(config)
         stack.enter_context(rig)
         if rig.unit != "N":
             raise FishdError(

@@ -9,6 +9,7 @@ import click
 
 from fishd.cli.config import fish_options
 from fishd.cli.lab_progress import showing
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
@@ -25,6 +26,7 @@ def measure_options(function: Any) -> Any:
     for option in (
         json_option,
         endpoint_option,
+        take_option,
         fish_options,
         click.option(
             "--plot",
@@ -102,7 +104,7 @@ def _measure(
             found = run(rig, name, parameters, seconds, settle=settle)
         else:
             fish = stack.enter_context(Fish(endpoint))
-            rig = stack.enter_context(LiveRig(fish))
+            rig = stack.enter_context(LiveRig(fish, *verb_lease()))
             try:
                 with showing(seconds, "s") as bar:
                     found = run(rig, name, parameters, seconds, bar.at, settle)

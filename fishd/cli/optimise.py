@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from fishd.cli.config import set_option
 from fishd.cli.lab_progress import showing
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.optimise_output import optimum_of, say, told
 from fishd.cli.options import (
     ControllerGroup,
@@ -49,6 +50,7 @@ def optimise_options(function: Any) -> Any:
     for option in (
         json_option,
         endpoint_option,
+        take_option,
         click.option(
             "--folder",
             type=click.Path(path_type=Path),
@@ -302,7 +304,7 @@ def _fish(
         yield VirtualRig(config), msgspec.to_builtins(config)
         return
     with Fish(endpoint) as fish:
-        yield LiveRig(fish), fish.config()
+        yield LiveRig(fish, *verb_lease()), fish.config()
 
 
 def _fields() -> dict[str, Field]:

@@ -11,6 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fishd.cli.config import set_option
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, json_option
 from fishd.cli.sweep_output import again, conclude, telling
 from fishd.client import Fish
@@ -37,6 +38,7 @@ def sweep_options(function: Any) -> Any:
     for option in (
         json_option,
         endpoint_option,
+        take_option,
         click.option(
             "--cluster", metavar="ADDRESS", help="In simulation: Dask scheduler that swims them."
         ),
@@ -226,7 +228,7 @@ def _on_robot(
         ):
             try:
                 whole = running.on_robot(
-                    folder, found, LiveRig(fish), seconds, count.done, count.at
+                    folder, found, LiveRig(fish, *verb_lease()), seconds, count.done, count.at
                 )
             except (Disturbed, NoDaemon) as error:
                 raise FishdError(f"{error}; to go on: {again(path)}") from None

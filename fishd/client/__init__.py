@@ -5,20 +5,21 @@
         for tick in fish.ticks():
             print(tick.t, tick.thrust)
 
-`AsyncFish` offers the same to asyncio. A socket belongs to one thread, and so does a `Fish`.
-`Agent` chooses the instruction angle itself, tick by tick.
+An experiment holds the fish, `with fish.lease("my experiment"):`, and fishd brings it to rest when
+the program dies. `AsyncFish` offers the same to asyncio. A socket belongs to one thread, and so
+does a `Fish`. `Agent` chooses the instruction angle itself, tick by tick.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from fishd.client.synchronous import Fish
-from fishd.core.errors import FishError, NoDaemon, Refused
+from fishd.core.errors import FishError, LeaseLost, NoDaemon, Refused
 
 if TYPE_CHECKING:
     from fishd.client.agent import Agent
     from fishd.client.asynchronous import AsyncFish
 
-__all__ = ["Agent", "AsyncFish", "Fish", "FishError", "NoDaemon", "Refused"]
+__all__ = ["Agent", "AsyncFish", "Fish", "FishError", "LeaseLost", "NoDaemon", "Refused"]
 
 
 def __getattr__(name: str) -> Any:

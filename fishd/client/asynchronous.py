@@ -1,8 +1,10 @@
 """`AsyncFish`: the client for asyncio programs."""
 
 import asyncio
+import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import closing
+from contextlib import asynccontextmanager, closing
+from functools import partial
 from typing import Any, Self, TypeVar
 
 import zmq.asyncio
@@ -17,10 +19,12 @@ from fishd.client.connection import (
     milliseconds_until,
     subscriber,
 )
+from fishd.client.lease import IDLE_LIMIT, LeaseRenewal, lease_arguments, report_unreturned
+from fishd.client.synchronous import Fish
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
-from fishd.core.errors import NoDaemon, Untrusted
-from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
+from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
+from fishd.core.protocol import LOADING, Calibrations, Grant, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -123,9 +127,7 @@ class AsyncFish(Connection):
         """As `Fish.calibrate_thrust`."""
         return await self._call(State, "calibrate-thrust", factor=factor, error=error)
 
-    async def calibrate_servo(
-        self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
-    ) -> Calibrations:
+    async def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
         """Apply another calibration of the servo, and save it or not."""
         return await self._call(
             Calibrations,
@@ -133,16 +135,32 @@ class AsyncFish(Connection):
             patience=LOADING if save else 0.0,
             calibration=calibration,
             save=save,
-            lease=lease,
         )
 
-    async def renew_lease(self, lease: str) -> Calibrations:
-        """Let a calibration of the servo that is not saved last for another while."""
-        return await self._call(Calibrations, "renew-lease", lease=lease)
-
-    async def end_lease(self, lease: str) -> Calibrations:
-        """Begin to end a lease: neutral, then the previous calibration is used again."""
-        return await self._call(Calibrations, "end-lease", lease=lease)
+    @asynccontextmanager
+    async def lease(
+        self,
+        name: str,
+        take: bool = False,
+        *,
+        seconds: float | None = None,
+        idle_limit: float | None = IDLE_LIMIT,
+    ) -> AsyncIterator[LeaseRenewal]:
+        """As `Fish.lease`."""
+        grant = await self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
+        self.held = renewal = LeaseRenewal(partial(Fish, self.endpoint), grant, idle_limit)
+        try:
+            yield renewal
+        finally:
+            pending, self.held = sys.exception(), None
+            await asyncio.to_thread(renewal.stop)
+            try:
+                if not renewal.returned:
+                    await self._call(State, "end-lease", lease=renewal.token)
+            except LeaseLost:
+                pass
+            except FishError as error:
+                report_unreturned(error, pending)
 
     def ticks(self) -> AsyncIterator[Tick]:
         """Every tick from the first iteration on; raises `NoDaemon` when none comes in time."""
@@ -183,5 +201,6 @@ class AsyncFish(Connection):
         decode: Callable[[bytes], T] = decoder(kind)
         with closing(subscriber(self._context, address, topic)) as socket:
             while await socket.poll(patience) or await socket.poll(SECOND_LOOK):
+                self.check_lease()
                 yield self.read(decode, await socket.recv_multipart())
         raise self.telemetry_silent()

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 import msgspec
 import zmq
 
+from fishd.client.lease import LeaseRenewal
 from fishd.core import protocol, text
 from fishd.core.addresses import (
     ENDPOINT_VARIABLE,
@@ -20,7 +21,14 @@ from fishd.core.addresses import (
     socket_path,
 )
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, NoDaemon, ParameterError, Refused, Untrusted
+from fishd.core.errors import (
+    FishError,
+    LeaseLost,
+    NoDaemon,
+    ParameterError,
+    Refused,
+    Untrusted,
+)
 from fishd.core.protocol import State
 from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
 
@@ -49,6 +57,8 @@ class Connection:
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.timeout = timeout
         self.telemetry_address = telemetry
+        self.held: LeaseRenewal | None = None
+        """The lease of the fish, inside `with fish.lease(...)`."""
         self._ids = itertools.count(1)
         self.estop_taken_by = ""
         """Which socket answered the latest emergency stop: `control` or `estop`."""
@@ -100,6 +110,9 @@ class Connection:
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
         """A new id, and the request as JSON; raises `ParameterError` for NaN and infinity."""
         identity = next(self._ids)
+        arguments = protocol.OPERATIONS[op].arguments
+        if self.held and "lease" in arguments.__struct_fields__:
+            args = {"lease": self.held.token, **args}
         for name, value in args.get("parameters", {}).items():
             if isinstance(value, float) and not math.isfinite(value):  # JSON would make it null
                 raise ParameterError(f"{name}: {value} is not a number that can be sent")
@@ -133,11 +146,14 @@ class Connection:
         if reply.id != identity:
             return None
         if reply.error:
-            raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
+            kind_of_error = LeaseLost if reply.error.code == "no-lease" else Refused
+            raise kind_of_error(text.quoted(reply.error.code), text.line(reply.error.message))
         return cast(T, self.read(decoder(kind), (reply.result or b"",)))
 
     def read(self, decode: Callable[[bytes], T], frames: Sequence[bytes]) -> T:
         """What the last frame of a message says; raises `FishError` where that is nothing known."""
+        if self.held:
+            self.held.used = time.monotonic()
         try:
             return decode(frames[-1])
         except msgspec.DecodeError as error:
@@ -145,6 +161,11 @@ class Connection:
             raise FishError(
                 f"what answers at {self.endpoint} is no fishd of this version: {why}"
             ) from None
+
+    def check_lease(self) -> None:
+        """Raise `LeaseLost` where the fish was leased, and is not any more."""
+        if self.held and self.held.lost:
+            raise self.held.lost
 
     def telemetry_silent(self) -> NoDaemon:
         """What to raise when no telemetry comes in time."""

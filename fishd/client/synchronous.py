@@ -1,7 +1,9 @@
 """`Fish`: the client for ordinary programs."""
 
+import sys
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
+from functools import partial
 from typing import Any, Self, TypeVar
 
 import zmq
@@ -16,10 +18,11 @@ from fishd.client.connection import (
     milliseconds_until,
     subscriber,
 )
+from fishd.client.lease import IDLE_LIMIT, LeaseRenewal, lease_arguments, report_unreturned
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
-from fishd.core.errors import NoDaemon, Untrusted
-from fishd.core.protocol import LOADING, Calibrations, PolicyInfo, State
+from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
+from fishd.core.protocol import LOADING, Calibrations, Grant, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -145,13 +148,10 @@ class Fish(Connection):
             Calibrations, "calibrate-force", patience=LOADING, calibration=calibration
         )
 
-    def calibrate_servo(
-        self, calibration: ServoCalibration, *, save: bool, lease: str | None = None
-    ) -> Calibrations:
+    def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
         """Apply another calibration of the servo, and save it or not.
 
-        One that is not saved is a lease, the `lease` of the answer: it ends after `protocol.LEASE`
-        seconds unless it is renewed. Name it in further changes, and to save.
+        One that is not saved needs a `lease`, and is used until that ends.
         """
         return self._call(
             Calibrations,
@@ -159,19 +159,53 @@ class Fish(Connection):
             patience=LOADING if save else 0.0,
             calibration=calibration,
             save=save,
-            lease=lease,
         )
 
-    def renew_lease(self, lease: str) -> Calibrations:
-        """Let a calibration of the servo that is not saved last for another while."""
-        return self._call(Calibrations, "renew-lease", lease=lease)
+    @contextmanager
+    def lease(
+        self,
+        name: str,
+        take: bool = False,
+        *,
+        seconds: float | None = None,
+        idle_limit: float | None = IDLE_LIMIT,
+    ) -> Iterator[LeaseRenewal]:
+        """Hold the fish, as an experiment: nobody else drives it, and it rests when this ends.
 
-    def end_lease(self, lease: str) -> Calibrations:
-        """Begin to end a lease: neutral, then the previous calibration is used again.
+        Inside, requests of this object name the lease. fishd fades the fish to neutral when this
+        process is killed, hangs or loses its connection. `Refused` says who has the fish already;
+        `LeaseLost`, from a request or a tick, that another request has taken it meanwhile.
 
-        That is done when `calibrations` says no `lease` any more.
+        name: of the experiment, as `fishctl status` shows it
+        take: take the fish from an experiment that has it
+        seconds: time that the lease lasts without a renewal; None: `control.lease` of fishd
+        idle_limit: time without a request or a tick, while the fish swims and this thread does not
+            compute, after which the program counts as hung [s]; None for no limit
         """
-        return self._call(Calibrations, "end-lease", lease=lease)
+        grant = self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
+        connect = partial(Fish, self.endpoint)
+        self.held = renewal = LeaseRenewal(connect, grant, idle_limit)
+        try:
+            yield renewal
+        finally:
+            pending, self.held = sys.exception(), None
+            renewal.stop()
+            try:
+                if not renewal.returned:
+                    self.end_lease(renewal.token)
+            except LeaseLost:
+                pass  # another request has the fish, or it rests already
+            except FishError as error:
+                report_unreturned(error, pending)
+
+    def renew_lease(self, lease: str) -> State:
+        """Let a lease last for its full time again, as `lease` does by itself."""
+        hurry = -1e-3  # no second look: the next renewal is soon
+        return self._call(State, "renew-lease", patience=hurry, lease=lease)
+
+    def end_lease(self, lease: str) -> State:
+        """Give the fish back: it fades to neutral."""
+        return self._call(State, "end-lease", lease=lease)
 
     def calibrate_thrust(self, factor: float, error: float) -> State:
         """Let the thrust be shown as this factor times the mean square of `fin_velocity`.
@@ -227,6 +261,7 @@ class Fish(Connection):
         def messages() -> Iterator[T]:
             with closing(socket):
                 while socket.poll(patience) or socket.poll(SECOND_LOOK):
+                    self.check_lease()
                     frames = socket.recv_multipart()
                     if decode := decoders.get(frames[0]):
                         yield self.read(decode, frames)

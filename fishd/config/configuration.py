@@ -20,6 +20,7 @@ from fishd.control.estimators.base import EstimatorSettings
 from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
+from fishd.core.protocol import LEASE, LONGEST_LEASE, SHORTEST_LEASE
 from fishd.core.schema import (
     Problem,
     convert,
@@ -101,6 +102,16 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             "private folder under /tmp. From another machine, use an ssh tunnel."
         ),
     ] = None
+    lease: Annotated[
+        float,
+        unit(
+            "s",
+            "An experiment that does not renew its lease for so long is over, and the fish fades "
+            "to neutral; longer for slow links.",
+            ge=SHORTEST_LEASE,
+            le=LONGEST_LEASE,
+        ),
+    ] = LEASE
 
 
 class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -16,6 +16,7 @@ from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
+from fishd.control.lease import Lease
 from fishd.control.reporting import Publisher, Reporter
 from fishd.control.servo_output import ServoOutput
 from fishd.control.servo_power import ServoPower
@@ -78,6 +79,7 @@ class ControlLoop:
         self.statistics = Statistics(limits.tick)
         self.reporter = Reporter(clock, publisher)
         self.active = ActiveController(limits, self.reporter)
+        self.lease = Lease(clock.monotonic)
         self.servo = ServoOutput(robot, clock.monotonic)
         self.power = ServoPower(robot, self.reporter, limits.tick)
         self.seq = 0
@@ -133,6 +135,8 @@ class ControlLoop:
             self._begin_awaited(*self._awaited)
         if self.robot.panel:
             self._attend_panel(self.robot.panel, slot)
+        if self.lease.active:
+            self.expire_lease()
         measurement = self._read(slot)
         power = self.power.read(slot.deadline) if self.power.metered else None
         read = self._now()
@@ -208,6 +212,18 @@ class ControlLoop:
         self._await_nobody()
         self.supervisor.stop()
 
+    def expire_lease(self) -> None:
+        """Where the lease, which is active, has run out: fade to neutral what its holder began."""
+        swims = self.supervisor.mode is Mode.RUNNING and self.lease.drives
+        former = self.lease.run_out(moving=swims)
+        if former and self.lease.expired:
+            does = "the fish fades to neutral" if swims else "nothing that it began swims"
+            message = f"{self.lease.expired.message}: {does}"
+            name, host, pid = former.name, former.host, former.pid
+            self.reporter.event("lease-expired", message, "warning", name=name, host=host, pid=pid)
+            if swims:
+                self.stop()
+
     def clear_fault(self) -> None:
         """Leave mode fault or estop for idle: the servo gets pulses again."""
         self.supervisor.clear()
@@ -251,6 +267,8 @@ class ControlLoop:
         if mode is Mode.ESTOP:
             self._write(neutral=False)  # first of all
         self._await_nobody()
+        if reason := self.supervisor.reason:
+            self.lease.end(f"{mode}: {reason.message}")
         if mode is not Mode.RUNNING:
             self.active.rest()
             self._estimator.rest()

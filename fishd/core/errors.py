@@ -100,5 +100,9 @@ class Refused(FishError, RuntimeError):
         self.code = code
 
 
+class LeaseLost(Refused):
+    """The program no longer holds the lease of the fish; the message says why."""
+
+
 class Escaped(Exception):
     """Code that is not fishd's raised what is no Exception, such as SystemExit: its cause."""

@@ -15,14 +15,18 @@ from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import Refused
 from fishd.core.schema import PRINTABLE, note, unit
-from fishd.core.signals import MODES, Reason
+from fishd.core.signals import MODES, LeaseHolder, Reason
 
 VERSION = 1
 MAX_MESSAGE = 16384
 """Longer messages are not even received [bytes]."""
 
-LEASE = 5.0
-"""How long a servo calibration that is not saved is used without being renewed [s]."""
+LEASE = 2.0
+"""Time for which a lease of the fish lasts without being renewed, by default [s]."""
+SHORTEST_LEASE = 0.5
+"""[s]"""
+LONGEST_LEASE = 60.0
+"""[s]"""
 FRESH = 10.0
 """How long after it was taken a force sample is good for a tare [s]."""
 
@@ -82,6 +86,20 @@ class State(Struct, frozen=True):
     reason: Annotated[Reason | None, note("Why, in mode fault and estop.")]
     controller: Annotated[str, note("The active controller.")]
     parameters: Annotated[dict[str, Any], note("All its parameters.")]
+    took_from: Annotated[
+        LeaseHolder | None,
+        note("The experiment whose [lease](#leases) this request has ended; null where none did."),
+    ] = None
+
+
+class Grant(Struct, frozen=True):
+    """The answer to take-lease."""
+
+    lease: Annotated[str, note("Names the lease in the requests of its holder.")]
+    seconds: Annotated[float, unit("s", "Time that it lasts from each renewal on.")]
+    took_from: Annotated[
+        LeaseHolder | None, note("The holder before, from whom the fish was taken; else null.")
+    ] = None
 
 
 class PolicyInfo(Struct, frozen=True, kw_only=True):
@@ -107,12 +125,20 @@ class SetController(Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     parameters: dict[str, Any] = {}
+    lease: str | None = None
 
 
 class SetParameter(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of set-parameter."""
 
     parameters: dict[str, Any]
+    lease: str | None = None
+
+
+class Stop(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of stop."""
+
+    lease: str | None = None
 
 
 class Estop(Struct, frozen=True, forbid_unknown_fields=True):
@@ -131,19 +157,18 @@ class Tare(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of tare: the `number` of a sample that is at most `FRESH` seconds old."""
 
     sample: int
+    lease: str | None = None
 
 
 class CalibrateForce(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of calibrate-force."""
 
     calibration: ForceCalibration
+    lease: str | None = None
 
 
 class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of calibrate-servo.
-
-    A lease ends unless it is renewed; whoever has it names it in each change, and to save.
-    """
+    """Arguments of calibrate-servo; without `save`, the calibration ends with the lease."""
 
     calibration: ServoCalibration
     save: bool = False
@@ -158,7 +183,22 @@ class CalibrateThrust(Struct, frozen=True, forbid_unknown_fields=True):
     """Half of its 95 % interval."""
 
 
-class ServoLease(Struct, frozen=True, forbid_unknown_fields=True):
+class TakeLease(Struct, frozen=True, forbid_unknown_fields=True):
+    """Arguments of take-lease."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=60, pattern=PRINTABLE)]
+    """What the experiment is called in messages, such as `measure`."""
+    host: Annotated[str, Meta(max_length=64, pattern=PRINTABLE)] = ""
+    """The machine on which it runs."""
+    pid: int = 0
+    """Its process."""
+    seconds: Annotated[float, Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)] | None = None
+    """Time that the lease lasts without a renewal [s]; None: as configured."""
+    take: bool = False
+    """Whether to take the fish from another holder."""
+
+
+class HeldLease(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of renew-lease and end-lease."""
 
     lease: str
@@ -177,9 +217,9 @@ class Calibrations(Struct, frozen=True):
     force_limit: Annotated[
         float, unit("N", "A force beyond ± this is not believed: `force_sensor.force_limit`.")
     ]
-    lease: Annotated[
-        str | None, note("The lease for which that of the servo is tried; null where it is saved.")
-    ] = None
+    on_trial: Annotated[
+        bool, note("True while that of the servo is only tried, under a [lease](#leases).")
+    ] = False
 
 
 class Mark(Struct, frozen=True, forbid_unknown_fields=True):
@@ -214,12 +254,19 @@ OPERATIONS = {
     "set-parameter": Operation(
         SetParameter, _STATE, "changes these parameters of the active controller, all or none"
     ),
-    "stop": Operation(
-        NoArguments, _STATE, "fades to neutral; mode idle. In fault and estop: nothing"
-    ),
+    "stop": Operation(Stop, _STATE, "fades to neutral; mode idle. In fault and estop: nothing"),
     "estop": Operation(Estop, _STATE, "stops the pulses at once; mode estop"),
     "clear-fault": Operation(
         NoArguments, _STATE, "leaves mode fault or estop for idle. Otherwise: nothing"
+    ),
+    "take-lease": Operation(
+        TakeLease,
+        "[lease](#leases)",
+        "gives the client the fish for as long as it renews the lease; moves nothing",
+    ),
+    "renew-lease": Operation(HeldLease, _STATE, "lets the lease last again for its full time"),
+    "end-lease": Operation(
+        HeldLease, _STATE, "ends the lease, and fades to neutral what was set under it"
     ),
     "mark": Operation(Mark, _STATE, "publishes an event `mark`"),
     "calibrations": Operation(NoArguments, _CALIBRATIONS, "nothing"),
@@ -239,13 +286,7 @@ OPERATIONS = {
     "calibrate-servo": Operation(
         CalibrateServo,
         _CALIBRATIONS,
-        "uses it from the next tick on: saved, or else for a [lease](#leases)",
-    ),
-    "renew-lease": Operation(
-        ServoLease, _CALIBRATIONS, f"lets the lease last for {LEASE:g} s from now"
-    ),
-    "end-lease": Operation(
-        ServoLease, _CALIBRATIONS, "begins to end it: neutral, then the previous calibration"
+        "uses it from the next tick on: saved, or else until the [lease](#leases) ends",
     ),
     "calibrate-thrust": Operation(
         CalibrateThrust,

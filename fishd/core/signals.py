@@ -231,6 +231,8 @@ EventKind = Literal[
     "power",
     "calibration",
     "gateway",
+    "lease",
+    "lease-expired",
     "mark",
 ]
 EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
@@ -267,7 +269,7 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
     ("calibration", "info", "another calibration was saved and is used now", "`file`"),
     (
         "calibration",
-        "info; warning where it was not renewed",
+        "info; warning where it was not given up",
         "a trial of a calibration ended, and the one before it is used again",
         "empty",
     ),
@@ -283,6 +285,18 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "warning",
         "the process behind a socket was started again; messages were lost",
         "`gateway`: `telemetry` or `control`",
+    ),
+    (
+        "lease",
+        "info",
+        "an experiment took the fish, gave it back, or lost it to another request",
+        "`lease`: `taken`, `returned` or `lost`; `name`, `host`, `pid`",
+    ),
+    (
+        "lease-expired",
+        "warning",
+        "an experiment did not renew its lease: the fish fades to neutral",
+        "`name`, `host`, `pid`",
     ),
     ("mark", "info", "a client asked for a mark", "empty"),
 )
@@ -324,6 +338,20 @@ class Reason(Struct, frozen=True):
     code: Annotated[str, note("Short name, such as `sensor-stale`.")]
     message: Annotated[str, note("One line that says what happened.")]
     remedy: Annotated[str, note("What to do about it, before `fishctl clear-fault`.")] = ""
+
+
+class LeaseHolder(Struct, frozen=True):
+    """The experiment that holds the lease of the fish, in its own words."""
+
+    name: Annotated[str, note("What it calls itself, such as `measure`.")]
+    host: Annotated[str, note("The machine on which it runs.")]
+    pid: Annotated[int, note("Its process there.")]
+    age: Annotated[float, unit("s", "Time since it took the fish.")]
+
+    def __str__(self) -> str:
+        """Return it in words, without the age."""
+        where = [f"pid {self.pid}"] * bool(self.pid) + [f"on {self.host}"] * bool(self.host)
+        return f"{self.name} ({' '.join(where)})" if where else self.name
 
 
 class Percentiles(Struct, frozen=True):
@@ -437,4 +465,12 @@ class Status(Struct, frozen=True):
     ] = None
     leak: Annotated[
         float | None, unit("s", "As in `tick`; null where `estimator.leak` is a number.")
+    ] = None
+    lease: Annotated[
+        LeaseHolder | None,
+        note("The experiment that drives the fish under a [lease](#leases); null without one."),
+    ] = None
+    lease_expired: Annotated[
+        Reason | None,
+        note("Why the fish rests, where the latest lease was not renewed; null otherwise."),
     ] = None

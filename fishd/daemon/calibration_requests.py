@@ -24,7 +24,6 @@ from fishd.core.protocol import (
     Calibrations,
     NoArguments,
     SampleForce,
-    ServoLease,
     Tare,
 )
 from fishd.core.schema import Problem
@@ -59,7 +58,7 @@ class CalibrationRequests:
         self._sensor = config.force_sensor
         self._changing = asyncio.Lock()
         """Held while a calibration is replaced: the newest file must be the one that is used."""
-        self._servo = TrialCalibration(loop, clock, config.servo, self._changing)
+        self._servo = TrialCalibration(loop, config.servo, self._changing)
         self._samples: dict[int, tuple[float, ForceSample]] = {}
         """When each fresh sample was taken, and what it says, by its number."""
         self._sampled = 0
@@ -73,16 +72,14 @@ class CalibrationRequests:
             "tare": self._tare,
             "calibrate-force": self._calibrate_force,
             "calibrate-servo": self._calibrate_servo,
-            "renew-lease": self._renew_lease,
-            "end-lease": self._end_lease,
         }
         self.check_startable = self._servo.check_startable
-        """Raises `Refused` while a controller of that name must not take over."""
+        """Raises `Refused` while a controller of that name must not take over, under a lease."""
 
     @property
     def calibrating(self) -> bool:
-        """True while a client has the servo on lease."""
-        return self._servo.lease is not None
+        """True while a client tries a calibration of the servo."""
+        return self._servo.active
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
         calibrated_parts(self._loop)
@@ -95,7 +92,7 @@ class CalibrationRequests:
             force_file=self._force_file,
             servo=robot.calibrated.servo.calibration if robot.calibrated else ServoCalibration(),
             servo_file=self._servo_file,
-            lease=self._servo.lease,
+            on_trial=self._servo.active,
             force_limit=self._sensor.force_limit,
         )
 
@@ -132,6 +129,7 @@ class CalibrationRequests:
 
     async def _tare(self, wanted: Tare) -> Calibrations:
         # Of a sample that is there already: who gives up while measuring changes nothing.
+        self._loop.lease.check_free(wanted.lease)
         self._forget_old_samples()
         if wanted.sample not in self._samples:
             raise Refused(
@@ -171,6 +169,7 @@ class CalibrationRequests:
 
     async def _calibrate_force(self, wanted: CalibrateForce) -> Calibrations:
         calibration = _sensible(wanted.calibration)
+        self._loop.lease.check_free(wanted.lease)
         async with self._changing:
             await self._check_present_force(calibration)
             return await self._adopt_force(calibration)
@@ -220,16 +219,9 @@ class CalibrationRequests:
                 self._servo_file = str(path)
                 self._announce("servo", path)
             else:
-                self._servo.try_out(calibration)
+                assert wanted.lease
+                self._servo.try_out(calibration, wanted.lease)
             return self._used()
-
-    async def _renew_lease(self, wanted: ServoLease) -> Calibrations:
-        self._servo.renew(wanted.lease)
-        return self._used()
-
-    async def _end_lease(self, wanted: ServoLease) -> Calibrations:
-        self._servo.end(wanted.lease)
-        return self._used()
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:

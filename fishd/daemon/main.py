@@ -16,6 +16,7 @@ import click
 
 from fishd import __version__
 from fishd.config import Config, assembly, load
+from fishd.control.lease import Lease
 from fishd.control.loop import SETTLING
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
@@ -95,6 +96,8 @@ class Daemon:
             self._loop = assembly.build_loop(
                 config, robot, self._clock, self._telemetry, self._ticked
             )
+            if self._virtual:  # programs that hold a lease live in real time
+                self._loop.lease = Lease(time.monotonic)
             stack.callback(self._loop.close)
             stack.callback(self._release)
             stack.callback(self._come_to_rest)
@@ -195,6 +198,8 @@ class Daemon:
         now = time.monotonic()
         if self._virtual:  # a tick may be waited for, until an agent answers or in slow motion
             self._notifier.ticked(now)
+            if self._loop.lease.active:
+                self._loop.expire_lease()
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + STATUS_PERIOD / 2
             next(self._housekeeping)()

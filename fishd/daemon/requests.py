@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from fishd import __version__
 from fishd.config import Config
+from fishd.control.lease import RETURNED
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
@@ -21,9 +22,9 @@ from fishd.core import protocol, text
 from fishd.core.clock import Clock, SlowClock, boot_id
 from fishd.core.errors import ParameterError, Refused, UnknownController
 from fishd.core.foreign_code import contained
-from fishd.core.protocol import PolicyInfo, State
+from fishd.core.protocol import Grant, PolicyInfo, State
 from fishd.core.schema import Problem, convert, fields_of, nearest
-from fishd.core.signals import ControllerInfo, Status
+from fishd.core.signals import ControllerInfo, LeaseHolder, Status
 from fishd.daemon.background_calls import BackgroundCalls
 from fishd.daemon.calibration_requests import CalibrationRequests, Handlers
 
@@ -80,6 +81,9 @@ class Operations:
             "estop": self._estop,
             "clear-fault": self._clear_fault,
             "mark": self._mark,
+            "take-lease": self._take_lease,
+            "renew-lease": self._renew_lease,
+            "end-lease": self._end_lease,
             **calibration_requests.handlers,
             "calibrate-thrust": self._calibrate_thrust,
         }
@@ -142,6 +146,8 @@ class Operations:
             power=loop.power.mean,
             fy_reversed=loop.lateral_sign.reversed,
             leak=loop.found_leak,
+            lease=loop.lease.holder,
+            lease_expired=loop.lease.expired,
         )
 
     def _degraded(self) -> tuple[str, ...]:
@@ -173,7 +179,8 @@ class Operations:
 
     async def _set_controller(self, wanted: protocol.SetController) -> State:
         self._loop.supervisor.check_startable()  # before it is loaded in vain
-        self._calibrations.check_startable(wanted.name)
+        self._calibrations.check_startable(wanted.name, wanted.lease)
+        self._renew(wanted.lease)
         self._calls.check_busy()
         arrival = self._arrive()
         controller = await self._load(wanted)
@@ -183,12 +190,60 @@ class Operations:
                 "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
             )
         try:
-            self._calibrations.check_startable(wanted.name)
+            self._calibrations.check_startable(wanted.name, wanted.lease)
+            self._renew(wanted.lease)
             self._loop.set_controller(wanted.name, controller)
         except Exception as error:  # a fault since, a calibration, or parameters that it has lost
             self._dispose(controller)
             raise _refusal(wanted.name, "cannot start", error) from error
         self._carried_out = arrival
+        self._loop.lease.drives = True
+        return self._state(self._end_unless(wanted.lease, f"{wanted.name} was set by hand"))
+
+    def _renew(self, lease: str | None) -> None:
+        """Renew the lease that a request names; raises `Refused` where it has ended."""
+        if lease is not None:
+            self._loop.lease.renew(lease)
+
+    def _end_unless(self, lease: str | None, why: str) -> LeaseHolder | None:
+        """End the lease that there is, where a request by hand names none; returns its holder."""
+        if lease is not None:
+            return None
+        former = self._loop.lease.end(why)
+        if former:
+            self._announce("lost", former, f"{former} has lost the fish: {why}")
+        return former
+
+    def _announce(self, what: str, holder: LeaseHolder, message: str) -> None:
+        name, host, pid = holder.name, holder.host, holder.pid
+        self._loop.reporter.event("lease", message, lease=what, name=name, host=host, pid=pid)
+
+    async def _take_lease(self, wanted: protocol.TakeLease) -> Grant:
+        loop = self._loop
+        loop.supervisor.check_startable()
+        if not wanted.take:
+            loop.lease.check_free()
+        former = self._end_unless(None, f"{wanted.name} took the fish")
+        if former and loop.lease.drives:
+            loop.stop()
+        seconds = wanted.seconds or self._config.control.lease
+        token = loop.lease.take(wanted.name, wanted.host, wanted.pid, seconds)
+        if holder := loop.lease.holder:
+            self._announce("taken", holder, f"{holder} takes the fish")
+        return Grant(token, seconds, former)
+
+    async def _renew_lease(self, wanted: protocol.HeldLease) -> State:
+        self._loop.lease.renew(wanted.lease)
+        return self._state()
+
+    async def _end_lease(self, wanted: protocol.HeldLease) -> State:
+        self._loop.lease.renew(wanted.lease)
+        self._carried_out = self._arrive()
+        former = self._loop.lease.end(RETURNED)
+        if self._loop.lease.drives:
+            self._loop.stop()
+        if former:
+            self._announce("returned", former, f"{former} gives the fish back")
         return self._state()
 
     async def _load(self, wanted: protocol.SetController) -> Controller[Any]:
@@ -208,6 +263,8 @@ class Operations:
     async def _set_parameter(self, wanted: protocol.SetParameter) -> State:
         loop = self._loop
         loop.supervisor.check_startable()
+        self._calibrations.check_startable(loop.active.name, wanted.lease)
+        self._renew(wanted.lease)
         if loop.supervisor.mode is not Mode.RUNNING:
             raise Refused(
                 "not-running",
@@ -231,10 +288,12 @@ class Operations:
                 )
         return registry.merged(loop.active.controller, loop.active.name, values)
 
-    async def _stop(self, _: protocol.NoArguments) -> State:
+    async def _stop(self, wanted: protocol.Stop) -> State:
+        self._renew(wanted.lease)
         self._carried_out = self._arrive()
+        former = self._end_unless(wanted.lease, "the fish was stopped by hand")
         self._loop.stop()
-        return self._state()
+        return self._state(former)
 
     async def _estop(self, wanted: protocol.Estop) -> State:
         self._carried_out = self._arrive()
@@ -263,7 +322,7 @@ class Operations:
         self._arrivals += 1
         return self._arrivals
 
-    def _state(self) -> State:
+    def _state(self, took_from: LeaseHolder | None = None) -> State:
         loop = self._loop
         return State(
             seq=loop.seq + 1,
@@ -271,6 +330,7 @@ class Operations:
             reason=loop.supervisor.reason,
             controller=loop.active.name,
             parameters=loop.active.parameters,
+            took_from=took_from,
         )
 
 

@@ -1,18 +1,16 @@
-"""Which calibration of the servo applies: the saved one, or a trial calibration for a lease.
+"""Which calibration of the servo applies: the saved one, or one that is tried under a lease.
 
-A lease ends by itself when whoever has it no longer renews it.
+When the lease ends, for whatever reason, the previous calibration is used again.
 """
 
 import asyncio
-import secrets
 
 from fishd.config.consistency import check_neutral, check_pulses
+from fishd.control.lease import RETURNED
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.core.calibration import ServoCalibration
-from fishd.core.clock import Clock
 from fishd.core.errors import Refused
-from fishd.core.protocol import LEASE
 from fishd.core.schema import Problem
 from fishd.hardware.base import CalibratedParts, TaredSensor
 from fishd.hardware.servo import pulses
@@ -54,60 +52,55 @@ def _check_rest(loop: ControlLoop) -> None:
         )
 
 
-class _Lease:
-    """A trial calibration: its holder, its end, and the previous calibration."""
+class _Trial:
+    """A trial calibration: the lease that it needs, and the previous calibration."""
 
-    def __init__(self, before: ServoCalibration, now: float) -> None:
-        self.identity = secrets.token_hex(8)  # that of a daemon before this one is another
+    def __init__(self, lease: str, before: ServoCalibration) -> None:
+        self.lease = lease
         self.before = before
-        self.until = now + LEASE
-        self.ending = ""
-        """Why it ends, once it does."""
 
 
 class TrialCalibration:
-    """Applies calibrations of the servo, and takes a lease back."""
+    """Applies calibrations of the servo, and undoes a trial when its lease has ended."""
 
-    def __init__(
-        self, loop: ControlLoop, clock: Clock, settings: ServoSettings, changing: asyncio.Lock
-    ) -> None:
-        """changing: held by whoever replaces a calibration"""
+    def __init__(self, loop: ControlLoop, settings: ServoSettings, changing: asyncio.Lock) -> None:
+        """changing: held while a calibration is replaced"""
         self._loop = loop
-        self._now = clock.monotonic
         self._settings = settings
         self._changing = changing
-        self._lease: _Lease | None = None
+        self._trial: _Trial | None = None
         self._watcher: asyncio.Task[None] | None = None
 
     @property
-    def lease(self) -> str | None:
-        """The identity of the lease that lasts; None without one."""
-        return self._lease.identity if self._lease else None
+    def active(self) -> bool:
+        """True while a calibration that is not saved is used."""
+        return self._trial is not None
 
-    def check_startable(self, controller: str) -> None:
-        """Raises `Refused` for all but `hold` while a lease lasts, and for any while it ends."""
-        lease = self._lease
-        if lease and (controller != "hold" or lease.ending):
+    def check_startable(self, controller: str, lease: str | None) -> None:
+        """Raise `Refused` during a trial for all but `hold` under its lease."""
+        trial = self._trial
+        if trial and not (
+            controller == "hold" and lease == trial.lease and self._why_over(trial) is None
+        ):
             raise Refused(
                 "calibrating",
-                f"the servo is being calibrated, {controller} cannot take over; wait for its end, "
-                f"or for {LEASE:g} s after it was given up",
+                f"the servo is being calibrated, {controller} cannot take over; wait for the end "
+                "of the calibration, or end it with 'fishctl stop'",
             )
 
     def check(self, calibration: ServoCalibration, lease: str | None, *, keep: bool) -> None:
-        """Raises `Refused` unless whoever has this lease may apply that just now.
+        """Raise `Refused` unless a client with this lease may apply that just now.
 
         keep: to save it, so that its pulses must do what a configuration's must
         """
         parts = calibrated_parts_at_rest(self._loop)
         if lease is not None:
-            self._mine(lease)
-        elif self._lease:
-            raise Refused(
-                "calibrating",
-                "the servo is being calibrated by another client; wait for its end, or for "
-                f"{LEASE:g} s after it was given up",
-            )
+            self._loop.lease.renew(lease)
+        elif not keep:
+            raise Refused("no-lease", "a calibration that is not saved needs a lease: take-lease")
+        self._loop.lease.check_free(lease)
+        if self._trial and self._trial.lease != lease:
+            raise Refused("calibrating", "the trial of another calibration is ending; try again")
         servo = self._settings.calibrated(calibration)
         try:
             check_neutral(servo)
@@ -125,59 +118,39 @@ class TrialCalibration:
                 "'fishctl stop'",
             )
 
-    def try_out(self, calibration: ServoCalibration) -> None:
-        """Apply a calibration that `check` lets pass; begins a lease, or renews it."""
-        if self._lease is None:
-            self._lease = _Lease(
-                calibrated_parts_at_rest(self._loop).servo.calibration, self._now()
-            )
-            self._watcher = asyncio.create_task(self._watch(self._lease))
-        self._lease.until = self._now() + LEASE
+    def try_out(self, calibration: ServoCalibration, lease: str) -> None:
+        """Apply a calibration that `check` lets pass, until the lease ends."""
+        if self._trial is None:
+            self._trial = _Trial(lease, calibrated_parts_at_rest(self._loop).servo.calibration)
+            self._watcher = asyncio.create_task(self._watch(self._trial))
+        self._loop.lease.drives = True
         self._put(calibration)
 
     def keep(self, calibration: ServoCalibration) -> None:
-        """Apply a calibration that `check` lets pass, without a lease from now on."""
-        self._lease = None
+        """Apply a calibration that `check` lets pass, whatever becomes of a lease."""
+        self._trial = None
         self._put(calibration)
 
-    def renew(self, lease: str) -> None:
-        """Let a lease last for another `LEASE` seconds; raises `Refused` where it has ended."""
-        self._mine(lease).until = self._now() + LEASE
+    def _why_over(self, trial: _Trial) -> str | None:
+        return self._loop.lease.why_ended(trial.lease)
 
-    def end(self, lease: str) -> None:
-        """Begin to end a lease: neutral, then the previous calibration. Raises `Refused`."""
-        self._end(self._mine(lease), "given back")
-
-    def _mine(self, identity: str) -> _Lease:
-        lease = self._lease
-        if lease is None or lease.identity != identity or lease.ending:
-            raise Refused(
-                "no-lease",
-                f"this lease has ended: it was given back, or not renewed for {LEASE:g} s, or "
-                "fishd was restarted; the previous calibration is used again",
-            )
-        return lease
-
-    def _end(self, lease: _Lease, why: str) -> None:
-        lease.ending = why
-        self._loop.stop()
-
-    async def _watch(self, lease: _Lease) -> None:
-        """Until a lease is over: end it when its time is up, and put back what was before."""
+    async def _watch(self, trial: _Trial) -> None:
+        """Use the previous calibration again once the lease of a trial is over, at neutral."""
         while True:
             await asyncio.sleep(_WATCH)
             async with self._changing:  # it must not end while what it led to is being saved
-                if self._lease is not lease:
+                if self._trial is not trial:
                     return
-                if not lease.ending and self._now() > lease.until:
-                    self._end(lease, f"not renewed for {LEASE:g} s")
-                if lease.ending and self._at_rest(lease.before):
-                    self._lease = None
-                    self._put(lease.before)
+                why = self._why_over(trial)
+                if why is not None:
+                    self._loop.lease.forget(trial.lease)
+                if why is not None and self._at_rest(trial.before):
+                    self._trial = None
+                    self._put(trial.before)
                     self._loop.reporter.event(
                         "calibration",
-                        f"servo: that of before is used again, the lease was {lease.ending}",
-                        "info" if lease.ending == "given back" else "warning",
+                        f"servo: that of before is used again, as the lease has ended: {why}",
+                        "info" if why == RETURNED else "warning",
                     )
                     return
 

@@ -1,17 +1,18 @@
 """A fish that an experiment tells to swim and to rest: of a running fishd, or in virtual time."""
 
-import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from fishd.client import Fish
+from fishd.client.lease import LeaseRenewal
 from fishd.config import Config, check_tethered
 from fishd.control.reporting import Publisher
 from fishd.core import text
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.core.errors import (
     FishdError,
-    FishError,
+    LeaseLost,
     ParameterError,
     PolicyError,
     Refused,
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from fishd.recording.provenance import Source
     from fishd.recording.writer import RunWriter
 
-log = logging.getLogger(__name__)
-
+IDLE_LIMIT = 5.0
+"""Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""
 LOST = 0.02
 """A measurement may miss this share of its ticks."""
 
@@ -160,13 +161,18 @@ class VirtualRig:
 
 
 class LiveRig:
-    """The fish of a running fishd; its controller is ours until somebody else takes it.
+    """The fish of a running fishd; while the rig is entered, it holds the lease of the fish.
 
     A few ticks that are lost on their way are missing in what it returns.
     """
 
-    def __init__(self, fish: Fish) -> None:
-        """Raises `NoDaemon`, and `ConfigError` where the fish swims freely."""
+    def __init__(self, fish: Fish, experiment: str = "experiment", take: bool = False) -> None:
+        """
+        experiment: what the lease is called, as `fishctl status` shows it
+        take: take the fish from an experiment that has it
+
+        Raises `NoDaemon`, and `ConfigError` where the fish swims freely.
+        """
         status = fish.status()
         check_tethered(status.robot, "a measurement of thrust")
         self.name = status.robot
@@ -182,9 +188,8 @@ class LiveRig:
         self._pid = status.pid
         self._latest = 0
         """Number of the latest tick that came."""
-        self._controller: str | None = None
-        self._asked = False
-        """Was a controller asked for, and nothing heard of it since?"""
+        self._lease = fish.lease(experiment, take=take, idle_limit=IDLE_LIMIT)
+        self._held: LeaseRenewal
 
     def describe(self, writer: "RunWriter") -> None:
         """As `Rig.describe`; raises `NoDaemon`, too."""
@@ -193,38 +198,24 @@ class LiveRig:
         description(self._fish).write(writer)
 
     def __enter__(self) -> Self:
+        """Raises `Refused` while another experiment holds the fish."""
+        self._held = self._lease.__enter__()
         return self
 
-    def __exit__(self, *exception: object) -> None:
-        """Stop what was begun here; what somebody else has begun since swims on."""
-        try:
-            if self._asked:  # it may be loading still, and swim later
-                self._fish.stop()
-            elif self._controller is not None:
-                status = self._fish.status()
-                ours = status.controller == self._controller or status.fallback
-                if status.mode == "running" and ours:
-                    self._fish.stop()
-        except FishError as error:
-            if not any(isinstance(known, FishError) for known in exception):
-                log.warning("the fish could not be stopped and may swim on: %s", error)
+    def __exit__(self, *exception: Any) -> None:
+        """Give the fish back, at rest; one that was taken by another request swims on."""
+        self._lease.__exit__(*exception)
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         """As `Rig.swim`; raises `NoDaemon` where fishd goes away."""
-        self._asked = True
-        try:
+        with _disturbed():
             state = self._fish.set_controller(controller, **parameters)
-        except Refused:
-            self._asked = False
-            raise
-        self._controller, self._asked = controller, False
-        return self._pass(state.seq, seconds, controller)
+            return self._pass(state.seq, seconds, controller)
 
     def rest(self, seconds: float) -> list[Tick]:
         """As `Rig.rest`; raises `NoDaemon` where fishd goes away."""
-        state = self._fish.stop()
-        self._controller = None
-        return self._pass(state.seq, seconds, None)
+        with _disturbed():
+            return self._pass(self._fish.stop().seq, seconds, None)
 
     def _pass(self, first: int, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
@@ -235,8 +226,9 @@ class LiveRig:
             _hand_on(tick, self.listener)
             if not isinstance(tick, Tick):
                 if ticks and controller and tick.kind in ("parameters", "controller"):
+                    self._fish.renew_lease(self._held.token)  # raises why it has ended
                     raise Disturbed(
-                        f"somebody else changed what swims: {text.line(tick.message)}: this "
+                        f"another client changed what swims: {text.line(tick.message)}: this "
                         "measurement is lost"
                     )
                 continue
@@ -245,6 +237,8 @@ class LiveRig:
                 continue
             if not _as_told(tick, controller):
                 status = self._fish.status()
+                if not (status.reason or status.fallback):
+                    self._fish.renew_lease(self._held.token)  # raises why it has ended
                 _check(tick, controller, status.reason, status.fallback)
             if tick.seq < end:
                 ticks.append(tick)
@@ -262,6 +256,15 @@ class LiveRig:
         # One that was restarted soon after its start may have got further meanwhile.
         if before and tick.seq > before + 1 and self._fish.status().pid != self._pid:
             raise _restarted()
+
+
+@contextmanager
+def _disturbed() -> Iterator[None]:
+    """Turn the loss of the lease into `Disturbed`."""
+    try:
+        yield
+    except LeaseLost as error:
+        raise Disturbed(f"{text.said(error)}: this measurement is lost") from None
 
 
 def _restarted() -> Disturbed:

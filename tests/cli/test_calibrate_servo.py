@@ -4,18 +4,16 @@ import re
 import signal
 import time
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from rigs.operator_rig import Bench, Dialogue, Talk, calibrations
 from rigs.processes import PATIENCE, Daemon, Subscriber
 from rigs.virtual_daemon import VirtualDaemon
 
-from fishd.cli.calibrate import servo, servo_lease
+from fishd.cli.calibrate import servo
 from fishd.client import Fish
 from fishd.core.calibration import ServoCalibration
-from fishd.core.errors import FishError, NoDaemon, Refused
 from fishd.core.protocol import LEASE
 from fishd.core.signals import Tick
 
@@ -103,10 +101,10 @@ def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
     time.sleep(LEASE + 2.0)  # which is not renewed but by fishctl
     assert "\ncalibrating the servo, by a client\n" in daemon.fishctl("status").stdout
     swim, second = daemon.fishctl("set-controller", "swing"), daemon.fishctl("calibrate", "servo")
-    for ended in (swim, second):
-        assert re.fullmatch(
-            r"fishctl: the servo is being calibrated[^\n]* \[calibrating\]\n", ended.stderr
-        )
+    assert re.fullmatch(
+        r"fishctl: the servo is being calibrated[^\n]* \[calibrating\]\n", swim.stderr
+    )
+    assert re.fullmatch(r"fishctl: the fish is taken[^\n]* \[leased\]\n", second.stderr)
     dialogue.answer("", "-")
     dialogue.expect("trim +20 µs> ")
     assert dialogue.finish() == 130
@@ -167,7 +165,7 @@ def says_that_its_lease_has_ended(stopped: Dialogue) -> None:
     stopped.process.send_signal(signal.SIGCONT)
     said = stopped.expect("[no-lease]\n")
     assert "the servo is at neutral; its calibration is as before\n" in said
-    assert re.search(r"\nfishctl: this lease has ended[^\n]+\n$", said)
+    assert re.search(r"\nfishctl: this program no longer holds the fish[^\n]+\n$", said)
     assert stopped.process.wait(PATIENCE) == 1
 
 
@@ -241,48 +239,3 @@ def test_a_tick_from_before_a_request_is_not_taken_for_a_tail_that_stands_still(
     assert (tail.angle, daemon.run.loop.applied) == (pytest.approx(0.1), pytest.approx(0.1))
     tail.neutral()
     assert (tail.angle, daemon.run.loop.applied) == (0.0, 0.0)
-
-
-class Asked:
-    """A fishd for a `Renewal`: it does not answer at times, which takes a while."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *takes: float) -> None:
-        """takes: how long each silence is waited for [s]; then it answers that the lease is over"""
-        self.asked = 0
-        self._takes = list(takes)
-        self._now = 0.0
-        clock = SimpleNamespace(monotonic=lambda: self._now)
-        monkeypatch.setattr(servo_lease, "time", clock)
-        monkeypatch.setattr(servo_lease, "Fish", lambda *_, **__: self)
-        monkeypatch.setattr(servo_lease, "_EVERY", 0.0)
-        monkeypatch.setattr(signal, "pthread_kill", lambda *_: None)
-
-    def __enter__(self) -> "Asked":
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        pass
-
-    def renew_lease(self, lease: str) -> None:
-        self.asked += 1
-        if not self._takes:
-            raise Refused("no-lease", "over")
-        self._now += self._takes.pop(0)
-        raise NoDaemon("it hangs")
-
-
-@pytest.mark.parametrize(
-    ("takes", "asked", "problem"),
-    [((60.0,), 2, Refused), ((1.5,) * 9, 4, NoDaemon), ((60.0, 1.5, 1.5), 2, NoDaemon)],
-    ids=["fishctl was held up", "fishd hangs", "both"],
-)
-def test_a_silence_while_fishctl_was_held_up_says_nothing_of_fishd(
-    monkeypatch: pytest.MonkeyPatch,
-    takes: tuple[float, ...],
-    asked: int,
-    problem: type[FishError],
-) -> None:
-    fishd = Asked(monkeypatch, *takes)
-    renewal = servo_lease.Renewal(None, "a lease")
-    renewal.run()
-    assert (fishd.asked, type(renewal.problem)) == (asked, problem)

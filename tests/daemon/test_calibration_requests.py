@@ -35,6 +35,12 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
         yield rig
 
 
+def on_trial(rig: LockstepRig, calibration: ServoCalibration) -> tuple[str, CalibrateServo]:
+    """The request of a client that tries a calibration under a lease which it has just taken."""
+    lease = rig.loop.lease.take("calibrate", "", 0, 60.0)
+    return "calibrate-servo", CalibrateServo(calibration, lease=lease)
+
+
 def perform(rig: LockstepRig, asked: CalibrationRequests, *requests: tuple[str, Any]) -> list[Any]:
     """Answers to requests that are made at the same time, while the loop ticks, five times as fast
     as in real time at most.
@@ -192,7 +198,7 @@ def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path
 def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
     rig: LockstepRig, tmp_path: Path
 ) -> None:
-    perform(rig, subject(rig), ("calibrate-servo", CalibrateServo(ServoCalibration(trim=30.0))))
+    perform(rig, subject(rig), on_trial(rig, ServoCalibration(trim=30.0)))
     rig.run_for(0.2)
     assert rig.pulse == pytest.approx(1530.0)
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
@@ -202,7 +208,7 @@ def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
 
 def test_new_soft_limits_hold_for_the_next_command(rig: LockstepRig) -> None:
     calibration = ServoCalibration(lowest=-0.1, highest=0.2)
-    perform(rig, subject(rig), ("calibrate-servo", CalibrateServo(calibration)))
+    perform(rig, subject(rig), on_trial(rig, calibration))
     rig.start("square")
     angles = [tick.phi_c for tick in rig.run_for(3.0)]
     assert (min(angles), max(angles)) == (-0.1, 0.2)
@@ -217,9 +223,9 @@ def test_a_calibration_that_would_make_the_tail_jump_is_refused(
 ) -> None:
     rig.start("hold", angle=0.3)
     rig.run_for(1.0)
-    wanted = CalibrateServo(replace(ServoCalibration(), **change))
+    wanted = on_trial(rig, replace(ServoCalibration(), **change))
     with pytest.raises(Refused) as refusal:
-        perform(rig, subject(rig), ("calibrate-servo", wanted))
+        perform(rig, subject(rig), wanted)
     assert refusal.value.code == "not-neutral"
     rig.run_for(0.5)
     assert rig.mode == "running"

@@ -1,4 +1,4 @@
-"""A servo calibration that is not saved is a lease: who has it, and how fishd takes it back."""
+"""A servo calibration that is not saved needs a lease, and fishd undoes it when that ends."""
 
 import asyncio
 import threading
@@ -43,6 +43,12 @@ class Client:
         values = asdict(calibration)
         return await self.ask("calibrate-servo", calibration=values, save=save, lease=lease)
 
+    async def begin_trial(self, calibration: ServoCalibration) -> str:
+        """Take the fish and try a calibration; the lease."""
+        lease: str = (await self.ask("take-lease", name="calibrate")).lease
+        await self.calibrate(calibration, lease=lease)
+        return lease
+
     async def refused(self, op: str, **args: Any) -> str:
         """The code with which a request is refused."""
         with pytest.raises(Refused) as refusal:
@@ -50,9 +56,9 @@ class Client:
         return refusal.value.code
 
     async def until_over(self, limit: float = 20.0) -> None:
-        """Tick until there is no lease any more, for so long of virtual time [s]."""
+        """Tick until no calibration is tried any more, for so long of virtual time [s]."""
         deadline = self.rig.now + limit
-        while (await self.ask("calibrations")).lease:
+        while (await self.ask("calibrations")).on_trial:
             assert self.rig.now < deadline
             self.rig.run_for(self.rig.config.tick)
             await asyncio.sleep(0.005)
@@ -98,7 +104,7 @@ def test_a_calibration_whose_lease_ends_while_it_is_saved_is_not_used_at_the_nex
     async def story(client: Client) -> None:
         lease = None
         if ended == "end-lease":
-            lease = (await client.calibrate(NARROW)).lease
+            lease = await client.begin_trial(NARROW)
         task = asyncio.create_task(client.calibrate(NARROW, save=True, lease=lease))
         await asyncio.to_thread(saving.wait, PATIENCE)
         if lease:
@@ -106,7 +112,7 @@ def test_a_calibration_whose_lease_ends_while_it_is_saved_is_not_used_at_the_nex
         else:
             rig.start("swing")
         going_on.set()
-        with pytest.raises(Refused, match=r"this lease has ended|is the active controller"):
+        with pytest.raises(Refused, match=r"no longer holds the fish|is the active controller"):
             await task
         assert not list(state_folder(rig.config).glob("servo-*"))
         assert (await client.ask("calibrations")).servo_file is None
@@ -123,8 +129,8 @@ def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_befo
 ) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo
-        await client.calibrate(WIDE)
-        await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
+        lease = await client.begin_trial(WIDE)
+        await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(2.0)
         assert rig.pulse == pytest.approx(1530 + 240)
         await client.until_over()
@@ -141,20 +147,20 @@ def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_befo
 
 def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = (await client.calibrate(WIDE)).lease
-        rig.run_for(LEASE - 1.0)
+        lease = await client.begin_trial(WIDE)
+        rig.run_for(0.5 * LEASE)
         await client.ask("renew-lease", lease=lease)
-        rig.run_for(LEASE - 1.0)
+        rig.run_for(0.5 * LEASE)
         await client.calibrate(WIDE, lease=lease)
-        rig.run_for(LEASE - 1.0)
+        rig.run_for(0.5 * LEASE)
         await watched()
-        assert (await client.ask("calibrations")).lease == lease
-        rig.run_for(2.0)
+        assert (await client.ask("calibrations")).on_trial
+        rig.run_for(LEASE)
         await watched()
-        assert (await client.ask("calibrations")).lease is None
+        assert not (await client.ask("calibrations")).on_trial
         for op in ("renew-lease", "end-lease"):
             assert await client.refused(op, lease=lease) == "no-lease"
-        with pytest.raises(Refused, match="previous calibration is used again"):
+        with pytest.raises(Refused, match="it was not renewed for 2 s"):
             await client.calibrate(WIDE, lease=lease)
 
     tell(rig, story)
@@ -163,7 +169,7 @@ def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> 
 def test_status_tells_that_the_servo_is_leased(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         assert not (await client.ask("status")).calibrating
-        lease = (await client.calibrate(WIDE)).lease
+        lease = await client.begin_trial(WIDE)
         assert (await client.ask("status")).calibrating
         await client.calibrate(WIDE, save=True, lease=lease)
         assert not (await client.ask("status")).calibrating
@@ -174,14 +180,14 @@ def test_status_tells_that_the_servo_is_leased(rig: LockstepRig) -> None:
 def test_a_lease_that_is_given_back_ends_at_once_and_without_a_warning(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo
-        lease = (await client.calibrate(WIDE)).lease
-        await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
+        lease = await client.begin_trial(WIDE)
+        await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         await client.ask("end-lease", lease=lease)
         assert await client.refused("renew-lease", lease=lease) == "no-lease"
         for name in ("swing", "hold"):  # the tail has to come to neutral first
             assert await client.refused("set-controller", name=name) == "calibrating"
-        await client.until_over(LEASE - 2.0)
+        await client.until_over(1.0)
         assert (await client.ask("calibrations")).servo == before
 
     tell(rig, story)
@@ -190,9 +196,10 @@ def test_a_lease_that_is_given_back_ends_at_once_and_without_a_warning(rig: Lock
 
 def test_nothing_but_hold_takes_over_while_a_lease_lasts(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = (await client.calibrate(WIDE)).lease
-        assert await client.refused("set-controller", name="swing") == "calibrating"
-        assert (await client.ask("set-controller", name="hold")).mode == "running"
+        lease = await client.begin_trial(WIDE)
+        for given in ({"name": "swing", "lease": lease}, {"name": "swing"}, {"name": "hold"}):
+            assert await client.refused("set-controller", **given) == "calibrating"
+        assert (await client.ask("set-controller", name="hold", lease=lease)).mode == "running"
         await client.ask("end-lease", lease=lease)
         await client.until_over()
         assert (await client.ask("set-controller", name="swing")).controller == "swing"
@@ -206,7 +213,7 @@ def test_a_controller_that_was_loading_when_a_lease_began_does_not_take_over(
     async def story(client: Client) -> None:
         swimming = asyncio.create_task(client.ask("set-controller", name="swing"))
         await asyncio.sleep(0)  # it is being loaded, in a thread
-        await client.calibrate(WIDE)
+        await client.begin_trial(WIDE)
         with pytest.raises(Refused) as refusal:
             await swimming
         assert refusal.value.code == "calibrating"
@@ -223,7 +230,7 @@ def test_a_controller_that_was_to_begin_after_a_rest_does_not_begin_in_a_lease_o
         square = registry.create("square", {}, rig.config.limits)
         rig.loop.set_controller_after(3.0, "square", square)
         rig.run_for(1.0)
-        lease = (await client.calibrate(WIDE)).lease
+        lease = await client.begin_trial(WIDE)
         rig.run_for(0.1)
         if given_back:
             await client.ask("end-lease", lease=lease)
@@ -231,23 +238,24 @@ def test_a_controller_that_was_to_begin_after_a_rest_does_not_begin_in_a_lease_o
         assert {tick.mode for tick in rig.run_for(4.0)} == {"idle"}
 
     tell(rig, story)
-    assert [event.message for event in rig.recorder.events if event.level == "warning"] == [
+    warnings = [event for event in rig.recorder.events if event.level == "warning"]
+    assert [event.message for event in warnings if event.kind == "calibration"] == [
         "square does not begin by itself any more: the servo has another calibration"
     ]
 
 
 def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = (await client.calibrate(WIDE)).lease
+        lease = await client.begin_trial(WIDE)
         for save in (False, True):
             with pytest.raises(Refused) as refusal:
                 await client.calibrate(ServoCalibration(), save=save)
-            assert refusal.value.code == "calibrating"
+            assert refusal.value.code == ("leased" if save else "no-lease")
             with pytest.raises(Refused) as refusal:
                 await client.calibrate(ServoCalibration(), save=save, lease="another")
             assert refusal.value.code == "no-lease"
         saved = await client.calibrate(WIDE, save=True, lease=lease)
-        assert (saved.lease, saved.servo.trim) == (None, 30.0)
+        assert (saved.on_trial, saved.servo.trim) == (False, 30.0)
         rig.run_for(LEASE + 1.0)
         await watched()
         found = await client.ask("calibrations")
@@ -261,15 +269,15 @@ def test_after_an_emergency_stop_a_lease_ends_before_the_tail_is_driven_again(
     rig: LockstepRig,
 ) -> None:
     async def story(client: Client) -> None:
-        lease = (await client.calibrate(WIDE)).lease
-        await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
+        lease = await client.begin_trial(WIDE)
+        await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         await client.ask("estop")
-        await client.ask("end-lease", lease=lease)
+        assert await client.refused("end-lease", lease=lease) == "no-lease"
         rig.run_for(0.5)
         await watched()
         # The limits of before would not permit the angle that the pulses begin with again.
-        assert (await client.ask("calibrations")).lease == lease
+        assert (await client.ask("calibrations")).on_trial
         await client.ask("clear-fault")
         assert await client.refused("set-controller", name="swing") == "calibrating"
         await client.until_over()
@@ -281,8 +289,8 @@ def test_after_an_emergency_stop_a_lease_ends_before_the_tail_is_driven_again(
 
 def test_a_fault_meanwhile_does_not_keep_a_lease_from_ending(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        await client.calibrate(WIDE)
-        await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
+        lease = await client.begin_trial(WIDE)
+        await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         rig.pi.faults.inject("unplugged")
         rig.run_until_fault(3.0)

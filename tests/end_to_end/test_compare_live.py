@@ -33,7 +33,7 @@ def test_nobody_swims_on_where_somebody_stops_the_fish(daemon: Daemon) -> None:
     out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out) == (1, "")
     assert re.fullmatch(
-        r"fishctl: [^\n]*told to let swing swim, but it is in mode idle[^\n]*\n", err
+        r"fishctl: this program no longer holds the fish: the fish was stopped by hand[^\n]*\n", err
     )
     assert daemon.status().mode == "idle"
 

@@ -8,7 +8,7 @@ from rigs.virtual_daemon import VirtualDaemon, VirtualStatus
 
 from fishd.client import Fish
 from fishd.core.calibration import ForceCalibration, ServoCalibration
-from fishd.core.errors import NoDaemon, Refused
+from fishd.core.errors import NoDaemon
 from fishd.core.protocol import Calibrations, State
 from fishd.lab.measurement import measure
 from fishd.lab.optimise.search import Range, Search
@@ -53,13 +53,30 @@ def test_a_controller_whose_start_was_not_heard_of_is_stopped(
     assert daemon.status().mode == "idle"
 
 
-def test_what_somebody_else_has_begun_swims_on_after_a_refusal() -> None:
+def test_a_controller_that_was_set_by_hand_swims_on_and_the_experiment_says_so() -> None:
     daemon = VirtualDaemon()
     with rig_of(daemon) as rig:
         rig.rest(1.0)
-        daemon.set_controller("sine")
-        with pytest.raises(Refused):
-            rig.swim("swing", {"C": 7.0}, 1.0)
+        daemon.set_by_hand("sine")
+        with pytest.raises(Disturbed, match="no longer holds the fish: sine was set by hand"):
+            rig.swim("swing", {}, 1.0)
+    assert daemon.status().controller == "sine"
+
+
+def test_a_swim_that_is_ended_by_hand_says_who_ended_it() -> None:
+    class Ended(VirtualDaemon):
+        def ticks(self):  # type: ignore[no-untyped-def]
+            for tick in super().ticks():
+                if tick.seq == 30:
+                    self.set_by_hand("sine")
+                yield tick
+
+    daemon = Ended()
+    with (
+        rig_of(daemon) as rig,
+        pytest.raises(Disturbed, match="no longer holds the fish: sine was set by hand"),
+    ):
+        rig.swim("swing", {}, 5.0)
     assert daemon.status().controller == "sine"
 
 
@@ -127,26 +144,6 @@ def test_a_swim_of_which_nothing_came_is_told() -> None:
     daemon.lost = set(range(1, 30))
     with rig_of(daemon) as rig, pytest.raises(Disturbed, match="20 of 20 ticks were lost"):
         rig.swim("swing", {}, 1.0)
-
-
-class Unstoppable(Late):
-    """It swims, and does not answer to `stop` either."""
-
-    def __init__(self, ended_by: type[BaseException]) -> None:
-        super().__init__(ended_by, loads=False)
-
-    def stop(self) -> State:
-        raise NoDaemon("no answer")
-
-
-@pytest.mark.parametrize(("ended_by", "lines"), [(KeyboardInterrupt, 1), (NoDaemon, 0)])
-def test_a_fish_that_could_not_be_stopped_may_swim_on_and_that_is_said_once(
-    caplog: pytest.LogCaptureFixture, ended_by: type[BaseException], lines: int
-) -> None:
-    with pytest.raises(ended_by), rig_of(Unstoppable(ended_by)) as rig:
-        rig.swim("swing", {}, 1.0)
-    said = "the fish could not be stopped and may swim on: no answer"
-    assert caplog.messages == [said] * lines
 
 
 class Calibrated(VirtualDaemon):

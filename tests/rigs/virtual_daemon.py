@@ -1,10 +1,12 @@
 """A fishd in virtual time behind the methods of a client, for a test to disturb."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 from fishd.config import Config
-from fishd.core.errors import ParameterError, Refused
+from fishd.core.errors import LeaseLost, ParameterError, Refused
 from fishd.core.protocol import State
 from fishd.core.signals import Event, Tick
 from fishd.simulation import KeepingPublisher, VirtualRun
@@ -35,13 +37,38 @@ class VirtualDaemon:
     def restart(self) -> None:
         """As a service manager would."""
         self.pid += 1
+        self._token = ""
         self._kept = KeepingPublisher()
         self.run = VirtualRun(self.config_of_run, self._kept)
 
     def status(self) -> VirtualStatus:
         return VirtualStatus(self.run, self.pid)
 
+    @contextmanager
+    def lease(self, name: str, take: bool = False, **_: Any) -> Iterator[SimpleNamespace]:
+        self._token = token = self.run.loop.lease.take(name, "", 0, 2.0)
+        try:
+            yield SimpleNamespace(token=token)
+        finally:
+            self._token = ""
+            if self.run.loop.lease.end("it was given back"):
+                self.stop()
+
+    def renew_lease(self, lease: str) -> State:
+        try:
+            self.run.loop.lease.renew(lease)
+        except Refused as error:
+            raise LeaseLost(error.code, str(error)) from None
+        return self._state()
+
+    def set_by_hand(self, name: str) -> None:
+        """Let a client without the lease set a controller."""
+        self.run.set_controller(name, {})
+        self.run.loop.lease.end(f"{name} was set by hand")
+
     def set_controller(self, name: str, /, **parameters: Any) -> State:
+        if self._token:
+            self.renew_lease(self._token)
         try:
             self.run.set_controller(name, parameters)
         except ParameterError as error:
@@ -57,6 +84,8 @@ class VirtualDaemon:
 
     def ticks(self) -> Iterator[Tick]:
         while True:
+            if self.run.loop.lease.active:
+                self.renew_lease(self._token)
             self.run.tick()
             if self._kept.ticks[-1].seq not in self.lost:
                 yield self._kept.ticks[-1]

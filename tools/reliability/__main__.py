@@ -14,6 +14,7 @@ if __name__ == "__main__":
             (
                 "deaths",
                 "kills",
+                "leases",
                 "misbehaviour",
                 "attacks",
                 "gateways",

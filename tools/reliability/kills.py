@@ -19,8 +19,10 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from msgspec import Struct
 
@@ -252,27 +254,37 @@ def situations(kills: int, seed: int) -> list[str]:
     return names
 
 
-def serve_forks(requests: Connection, log: Path) -> None:
-    """Fork a fishd for each list of settings that comes in; tells its process number."""
+def serve_forks(
+    requests: Connection, log: Path, prepare: Callable[[list[str]], Callable[[], None]]
+) -> None:
+    """Fork a process for each list of words that comes in, and answer with its number.
+
+    prepare: makes of the words what the new process runs, which never returns
+    """
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(output, 1)
     os.dup2(output, 2)
     while True:
         try:
-            config = load(None, requests.recv())
+            run = prepare(requests.recv())
         except EOFError:
             os._exit(0)
         pid = os.fork()
         if pid == 0:
             requests.close()
-            be_fishd(config)
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            run()
         requests.send(pid)
+
+
+def fishd_of(settings: list[str]) -> Callable[[], None]:
+    """Return what a fishd with these settings runs."""
+    return partial(be_fishd, load(None, settings))
 
 
 def be_fishd(config: Config) -> None:
     """Never returns."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     try:
         asyncio.run(swim(config, False, Shutdown()))
     except BaseException as error:
@@ -287,7 +299,7 @@ def lane(folder: Path, seed: int) -> Iterator[Lane]:
     ours, theirs = multiprocessing.Pipe()
     if os.fork() == 0:
         ours.close()
-        serve_forks(theirs, folder / "log")
+        serve_forks(theirs, folder / "log", fishd_of)
     theirs.close()
     try:
         with virtual_pi(folder) as (pi, on_it):
@@ -314,8 +326,17 @@ def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Con
     results.close()
 
 
-def run(kills: list[tuple[str, bool]], lanes: int, seed: int, limit: float) -> Iterator[Kill]:
-    """The kills as they come in; those that do not fit into `limit` [s] are left out."""
+def run(
+    kills: list[tuple[str, bool]],
+    lanes: int,
+    seed: int,
+    limit: float,
+    work: Callable[[list[tuple[str, bool]], int, float, Connection], None] = work,
+) -> Iterator[Any]:
+    """The kills as they come in; those that do not fit into `limit` [s] are left out.
+
+    work: does the kills of one lane, in a process of its own, and sends what it saw
+    """
     deadline = time.monotonic() + limit
     waiting: dict[Connection, int] = {}
     for number in range(lanes):

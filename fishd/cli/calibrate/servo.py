@@ -1,7 +1,7 @@
 """`fishctl calibrate servo`: trim, direction and limits by small steps.
 
-A calibration that is tried out is used for as long as a lease is renewed. Without the operator's
-yes at the end the previous calibration is used again, whatever happens.
+A calibration that is tried out is used for as long as fishctl holds the lease of the fish. Without
+the operator's yes at the end the previous calibration is used again, whatever happens.
 """
 
 import math
@@ -11,7 +11,8 @@ from typing import Any
 import click
 from msgspec.structs import replace
 
-from fishd.cli.calibrate.servo_lease import renewed
+from fishd.cli.calibrate.servo_lease import leased
+from fishd.cli.lease_options import take_option
 from fishd.cli.options import endpoint_option
 from fishd.cli.output import echo
 from fishd.cli.prompts import choose, input_interrupted
@@ -41,7 +42,7 @@ _REACHED = 1e-6
 class Tail:
     """The tail of a fish at rest, and the calibration of its servo that is being found.
 
-    fishd uses it for as long as the lease is renewed; see `fishd.cli.calibrate.servo_lease`.
+    fishd uses it for as long as the lease lasts; see `fishd.cli.calibrate.servo_lease`.
     """
 
     def __init__(self, fish: Fish, calibration: ServoCalibration) -> None:
@@ -51,14 +52,11 @@ class Tail:
         """Where the tail is [rad]."""
         self.amplitude = fish.status().amplitude_limit
         """Φ [rad]"""
-        self._lease: str | None = None
         self._fish = fish
 
-    def begin_lease(self) -> str:
-        """Nobody else calibrates the servo, or makes the fish swim, meanwhile; its name."""
+    def begin_trial(self) -> None:
+        """Let no other controller than `hold` become active from now on."""
         self._try(self.calibration)
-        assert self._lease
-        return self._lease
 
     def adjust(self, **changes: Any) -> None:
         """Try out a changed calibration, not saved; one that fishd refuses is reported."""
@@ -101,8 +99,8 @@ class Tail:
                 f"fishd is in {status.mode}: {status.reason.message}; mend the cause, then clear "
                 "it with 'fishctl clear-fault'"
             )
-        found = self._fish.calibrate_servo(calibration, save=False, lease=self._lease)
-        self._lease, self.calibration = found.lease, calibration
+        self._fish.calibrate_servo(calibration, save=False)
+        self.calibration = calibration
 
     def _settled(self, target: float, first: int) -> float:
         """Wait until the instruction angle is `target`, or stands still elsewhere; returns it.
@@ -122,6 +120,7 @@ class Tail:
 
 @click.command()
 @endpoint_option
+@take_option
 def servo(endpoint: str | None) -> None:
     """Find the servo's trim, direction and limits by small steps.
 
@@ -132,8 +131,7 @@ def servo(endpoint: str | None) -> None:
     with Fish(endpoint) as fish, input_interrupted():
         before = fish.calibrations().servo
         tail = Tail(fish, before)
-        lease = tail.begin_lease()
-        with renewed(endpoint, lease, before) as renewal:
+        with leased(fish, before, tail.begin_trial) as lease:
             echo("Keep hands and cables clear of the tail. Ctrl-C stops it at any prompt.")
             _find_trim(tail)
             _find_direction(tail)
@@ -142,8 +140,8 @@ def servo(endpoint: str | None) -> None:
             _show(before, tail.calibration)
             if not click.confirm("Save it?"):
                 raise click.ClickException("not saved")
-            renewal.stop()
-            saved = fish.calibrate_servo(tail.calibration, save=True, lease=lease)
+            lease.when_lost = lambda: None
+            saved = fish.calibrate_servo(tail.calibration, save=True)
     echo(text.line(f"in use, and saved in {saved.servo_file}"))
 
 

@@ -20,6 +20,7 @@ from fishd.cli.camera.options import (
     yaml_of,
 )
 from fishd.cli.lab_progress import showing
+from fishd.cli.lease_options import take_option
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, echo_rows, print_json
 from fishd.core.console import INTERRUPTED
@@ -37,6 +38,7 @@ LET_IT_SWIM = "let it swim, with 'fishctl set-controller swing', or add --swim"
 @click.command()
 @camera_option
 @endpoint_option
+@take_option
 @png_option
 @click.option(
     "--for",

@@ -7,6 +7,7 @@ import click
 
 from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of, yaml_of
 from fishd.cli.lab_progress import showing
+from fishd.cli.lease_options import take_option
 from fishd.cli.options import FiniteRange, endpoint_option, json_option
 from fishd.cli.output import echo, echo_rows, print_json
 from fishd.client import Fish
@@ -27,6 +28,7 @@ _GAP = 1.5
 @click.command()
 @camera_option
 @endpoint_option
+@take_option
 @click.option(
     "--for",
     "seconds",

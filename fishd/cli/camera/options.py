@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import yaml
 
+from fishd.cli.lease_options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core.errors import FishdError, NoDaemon
@@ -85,7 +86,7 @@ def rig_of(fish: Fish, seconds: float) -> Iterator["LiveRig"]:
 
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())
-        rig = stack.enter_context(LiveRig(fish))
+        rig = stack.enter_context(LiveRig(fish, *verb_lease()))
         echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
         yield rig
 

@@ -10,6 +10,7 @@ import click
 from msgspec.structs import replace
 
 from fishd.cli.config import set_option
+from fishd.cli.lease_options import take_option, verb_lease
 from fishd.cli.options import endpoint_option
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
@@ -84,6 +85,7 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
     "to fine-tune on the robot what was trained in simulation.",
 )
 @endpoint_option
+@take_option
 @click.option(
     "--agent",
     metavar="ADDRESS",
@@ -192,6 +194,7 @@ def _job(
         folder=resume or folder or runs.default_folder(),
         on=on or "simulation",
         endpoint=endpoint,
+        take=verb_lease().take,
         resume=resume is not None,
         parent=checkpoints.find(parent) if parent else None,
     )

@@ -28,21 +28,30 @@ _PATIENCE = 0.1
 class PilotedRig(LiveRig):
     """As `LiveRig`; a policy that sees pictures swims as the agent of fishd's `remote`."""
 
-    def __init__(self, fish: Fish, camera: str | None = None, agent: str | None = None) -> None:
+    def __init__(
+        self,
+        fish: Fish,
+        experiment: str = "experiment",
+        take: bool = False,
+        *,
+        camera: str | None = None,
+        agent: str | None = None,
+    ) -> None:
         """
+        experiment, take: as for `LiveRig`
         camera: where fishd-camera takes requests; None: as for `CameraClient`
         agent: where fishd reaches this program; None: any free port, for a fishd on this machine
 
         Raises `FishError`.
         """
-        super().__init__(fish)
+        super().__init__(fish, experiment, take)
         self._endpoint, self._camera, self._address = fish.endpoint, camera, agent
         self._limits = adopt(fish.config()).limits
         self._stack = ExitStack()
         self._policy = ""
         self._agent: _PilotThread
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
         self._stack.close()
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import time
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
@@ -13,7 +14,7 @@ from fishd.client import Fish
 from fishd.client.agent import Agent
 from fishd.config import Config
 from fishd.controllers.remote.messages import Observed
-from fishd.core.errors import FishError, NoDaemon, PolicyError, Refused
+from fishd.core.errors import FishError, LeaseLost, NoDaemon, PolicyError, Refused
 from fishd.core.signals import Observation, Reason, Status
 from fishd.learning.env.link import LinkLost, StepResult
 
@@ -54,6 +55,8 @@ class FishdLink:
     def __init__(
         self,
         endpoint: str | None = None,
+        experiment: str = "agent",
+        take: bool = False,
         *,
         address: str | None = None,
         deadline: float | None = None,
@@ -62,18 +65,21 @@ class FishdLink:
     ) -> None:
         """
         endpoint: control socket of the fishd; None looks for that of this machine
+        experiment: what the lease of the fish is called, as `fishctl status` shows it
+        take: take the fish from an experiment that holds it
         address: where that fishd can reach this program, as for `Agent`; None: where fishd waits
             for an agent already, else any free port of this machine
         deadline: how long a tick waits for an action [s]; None for fishd's default
         stack: which frames of a camera are wanted; None: none
         camera: where that camera takes requests; None: as for `CameraClient`
 
-        Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop,
-        `CameraLost` when no camera answers, `PolicyError` where its frames do not suit `stack`, and
-        `FishError` when the address cannot be bound.
+        Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop or
+        another experiment holds the fish, `CameraLost` when no camera answers, `PolicyError` where
+        its frames do not suit `stack`, and `FishError` when the address cannot be bound.
         """
         self._fish = Fish(endpoint)
         self._sight: LiveSight | None = None
+        self._experiment, self._lease = experiment, ExitStack()
         try:
             status = self._fish.status()
             if status.reason:
@@ -81,8 +87,10 @@ class FishdLink:
             if stack:
                 self._sight = LiveSight(camera, self._fish, stack)
                 self._sight.await_frames()
+            self._take_lease(take)
             self._agent = _agent(address, status)
         except BaseException:
+            self._lease.close()
             self._close_sight()
             self._fish.close()
             raise
@@ -117,6 +125,7 @@ class FishdLink:
             if not self._is_ours(status):
                 if self._begun and status.mode == "running":
                     raise LinkLost(f"{self._lost(status)}; 'fishctl stop' frees the fish")
+                self._take_lease()
                 self._fish.set_controller(
                     "remote", agent=self._agent.address, deadline=self._deadline
                 )
@@ -182,9 +191,20 @@ class FishdLink:
                     self._agent.pause(PATIENCE)  # what follows may take longer than fishd waits
                 if self._is_ours(self._fish.status()):
                     self._fish.stop()
+        self._lease.close()
         self._agent.close()
         self._close_sight()
         self._fish.close()
+
+    def _take_lease(self, take: bool = False) -> None:
+        """Take the lease of the fish, unless this link has it; raises `Refused` and `NoDaemon`."""
+        if self._fish.held:
+            try:
+                self._fish.renew_lease(self._fish.held.token)
+                return
+            except LeaseLost:
+                self._lease.close()
+        self._lease.enter_context(self._fish.lease(self._experiment, take=take, idle_limit=None))
 
     def _close_sight(self) -> None:
         if self._sight:
@@ -270,6 +290,8 @@ class FishdLink:
             return LinkLost(f"another agent has taken command: {status.parameters['agent']}")
         if status.mode == "running":
             return LinkLost(f"another controller has taken command: {status.controller}")
+        if status.lease_expired:
+            return LinkLost(status.lease_expired.message)
         return LinkLost("fishd was told to stop")
 
 

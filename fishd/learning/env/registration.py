@@ -62,8 +62,10 @@ def swim_on_daemon(
     overrides: Iterable[str] = (),
     agent: str | None = None,
     camera: str | None = None,
+    experiment: str = "environment",
+    take: bool = False,
 ) -> "SwimEnv":
-    """The fish of a running fishd; this process acquires control of it when an episode begins.
+    """The fish of a running fishd, whose lease this process holds until the environment is closed.
 
     endpoint: control socket of the daemon; None looks for the one on this machine
     config, overrides: the configuration that the scales are made for; without a file, that of the
@@ -71,6 +73,8 @@ def swim_on_daemon(
     agent: where the daemon can reach this process, as for `Agent`; None: any free port of this
         machine
     camera: where its camera takes requests, where the settings say `see: camera` or `both`
+    experiment: what the lease is called, as `fishctl status` shows it
+    take: take the fish from an experiment that holds it
 
     Raises `ConfigError`, also where tick or Φ are not the daemon's, and `FishError`.
     """
@@ -82,7 +86,7 @@ def swim_on_daemon(
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)
     eye = make(chosen)
     stack = chosen.camera.stack if eye else None
-    link = FishdLink(endpoint, address=agent, stack=stack, camera=camera)
+    link = FishdLink(endpoint, experiment, take, address=agent, stack=stack, camera=camera)
     try:
         env = SwimEnv(link, fish, chosen.seen, eye)
         if eye and not eye.is_fitted:

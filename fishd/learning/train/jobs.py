@@ -29,6 +29,8 @@ class Job(Struct, frozen=True, kw_only=True):
     """A fish in this process on the virtual clock, or that of a running fishd."""
     endpoint: str | None = None
     """Control socket of that fishd; None looks for the one on this machine."""
+    take: bool = False
+    """Take that fish from an experiment that holds it."""
     agent: str | None = None
     """Where that fishd reaches this program; None: any free port, for a fishd on this machine."""
     resume: bool = False

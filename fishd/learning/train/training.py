@@ -64,7 +64,14 @@ def train(
     link: Link
     if job.on == "robot":
         stack = job.settings.camera.stack if job.settings.see != "force" else None
-        link = FishdLink(job.endpoint, address=job.agent, stack=stack, camera=job.camera_endpoint)
+        link = FishdLink(
+            job.endpoint,
+            "learn ppo",
+            job.take,
+            address=job.agent,
+            stack=stack,
+            camera=job.camera_endpoint,
+        )
     else:
         link = SimulatedLink(job.config, job.settings.randomisation, job.simulated_camera)
     try:

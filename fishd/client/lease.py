@@ -1,0 +1,115 @@
+"""The renewal of a lease of the fish, in a thread: shared by `Fish`, `AsyncFish` and fishctl."""
+
+import logging
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from fishd.core import text
+from fishd.core.errors import FishError, LeaseLost
+from fishd.core.protocol import Grant, State
+
+if TYPE_CHECKING:
+    from fishd.client.synchronous import Fish
+
+log = logging.getLogger(__name__)
+
+RENEWALS = 5
+"""Renewals in the time that a lease lasts without any."""
+IDLE_LIMIT = 30.0
+"""Time after which a program that does nothing while the fish swims counts as hung [s]."""
+BUSY_FRACTION = 0.02
+"""A thread that takes more than this share of the time of a processor computes."""
+
+
+class LeaseRenewal(threading.Thread):
+    """Renews a lease on a connection of its own until it is stopped, or the lease is lost.
+
+    A process that is killed, stopped by a signal or cut off from fishd renews nothing. One that
+    computes does, for as long as it lives; only while the fish swims does the thread that took the
+    lease count as hung when it neither computes nor uses the fish for `idle_limit` seconds.
+    """
+
+    def __init__(
+        self, connect: Callable[..., "Fish"], grant: Grant, idle_limit: float | None
+    ) -> None:
+        """connect: makes a connection, given its time-out [s]; idle_limit: None for no limit"""
+        super().__init__(name="lease", daemon=True)
+        self.token = grant.lease
+        self.lost: LeaseLost | None = None
+        """Why the lease ended before the program gave it back."""
+        self.when_lost: Callable[[], object] = lambda: None
+        """Called in this thread once `lost` is set."""
+        self.returned = False
+        """Whether the lease was given back by other means than leaving its `with`."""
+        self.used = time.monotonic()
+        """When the program last used the fish [s, monotonic]."""
+        self._connect = connect
+        self._every = grant.seconds / RENEWALS
+        self._idle_limit = idle_limit
+        self._stopping = threading.Event()
+        self._owner = time.pthread_getcpuclockid(threading.get_ident())
+        self._computed = self._looked = 0.0
+        self.start()
+
+    def run(self) -> None:
+        """Renew until stopped."""
+        with self._connect(timeout=self._every) as fish:
+            while self.lost is None and not self._stopping.wait(self._every):
+                try:
+                    self._judge(fish, fish.renew_lease(self.token))
+                except LeaseLost as error:
+                    self.lost = error
+                except FishError:  # not in time, or fishd is away: the next one may get through
+                    continue
+        if self.lost and not self._stopping.is_set():
+            self.when_lost()
+
+    def stop(self) -> None:
+        """Renew no more, and wait for a renewal that is on its way; may be called twice."""
+        self._stopping.set()
+        self.join()
+
+    def _judge(self, fish: "Fish", state: State) -> None:
+        """Give the fish back where the program has it swim and does nothing."""
+        now, computed = time.monotonic(), self._cpu_seconds()
+        busy = computed - self._computed > BUSY_FRACTION * (now - self._looked)
+        self._computed, self._looked = computed, now
+        if busy or state.mode != "running":
+            self.used = now
+        if self._idle_limit is not None and now - self.used > self._idle_limit:
+            fish.end_lease(self.token)
+            raise LeaseLost(
+                "no-lease",
+                f"this program did nothing with the fish for {self._idle_limit:g} s while it swam, "
+                "and gave it back; read ticks meanwhile, or set idle_limit",
+            )
+
+    def _cpu_seconds(self) -> float:
+        try:
+            return time.clock_gettime(self._owner)
+        except OSError:  # the thread has ended
+            return self._computed
+
+
+def lease_arguments(name: str, take: bool, seconds: float | None) -> dict[str, Any]:
+    """Return the arguments of take-lease for this process."""
+    host = text.line(socket.gethostname(), 64)
+    return {
+        "name": text.line(name, 60),
+        "host": host,
+        "pid": os.getpid(),
+        "seconds": seconds,
+        "take": take,
+    }
+
+
+def report_unreturned(error: FishError, exception: BaseException | None) -> None:
+    """Log that the fish could not be given back, unless `exception` says so already."""
+    if not isinstance(exception, FishError):
+        log.warning(
+            "the fish could not be given back, and rests once its lease has run out: %s", error
+        )

@@ -1,0 +1,261 @@
+"""Kills experiments on a running fishd at random instants, and measures when its fish is at rest.
+
+In each lane a real fishd swims the simulated fish, and the verbs of fishctl run on it, one after
+another, forked from a process that has loaded everything. From 0 to `WINDOW` seconds after a verb
+took the lease of the fish it is killed, or stopped. The exit status is 1 if a fish was not at rest
+within the lease and `GRACE` seconds more, its fade to neutral included.
+"""
+
+import multiprocessing
+import os
+import random
+import select
+import signal
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from msgspec import Struct
+
+from common.daemon import Fishd
+from common.report import Options, Report, progress, table
+from fishd.cli import main as fishctl
+from fishd.client import Fish
+from reliability.kills import PATIENCE, run, serve_forks
+
+DOCUMENT = "reliability.md"
+LEASE = 2.0
+"""That of the configuration, by default [s]."""
+GRACE = 0.5
+"""[s]"""
+WINDOW = 6.0
+"""An experiment rests for about 3 s at first, and swims then [s]."""
+STOPPED = 0.15
+"""Fraction of the kills that are a SIGSTOP instead."""
+QUIET = 0.3
+"""A fish that was at neutral for so long after a lease has ended is at rest [s]."""
+
+FREE = ("--folder", "{folder}")
+VERBS: dict[str, tuple[str, ...]] = {
+    "measure": ("measure", "swing", "--for", "60"),
+    "optimise": ("optimise", "square", "--over", "frequency=1:3", "--on", "robot", *FREE),
+    "sweep": ("sweep", "square", "--frequency", "1,1.5,2", "--on", "robot", *FREE),
+    "compare": ("compare", "swing", "sine", "--on", "robot"),
+    "identify": ("identify", "--experiment", "--on", "robot"),
+    "adapt": ("adapt", "--on", "robot", *FREE),
+}
+MODULES = (
+    "fishd.cli.adapt",
+    "fishd.cli.compare",
+    "fishd.cli.identify",
+    "fishd.cli.measure",
+    "fishd.cli.optimise",
+    "fishd.cli.sweep",
+    "fishd.lab.compare.piloted_rig",
+    "fishd.lab.drawing",
+    "fishd.lab.identification",
+    "fishd.lab.optimise.trials",
+    "fishd.lab.sweep.running",
+    "fishd.learning.adapt.adaptation",
+    "fishd.learning.adapt.report",
+    "onnxruntime",
+    "tensorboard",
+)
+"""What the verbs import, so that each of them starts in a fraction of a second."""
+
+
+class Kill(Struct):
+    """One kill, and what the fish did."""
+
+    verb: str
+    stopped: bool
+    """SIGSTOP instead of SIGKILL."""
+    after: float
+    """From the start of the lease to the kill [s]."""
+    swimming: bool
+    """Whether a controller was active at that moment."""
+    idle: float
+    """When fishd was in mode idle for good, from the kill on [s]."""
+    rest: float
+    """When the fish was at neutral for good, from the kill on [s]; infinite where it never was."""
+
+
+class Lane:
+    """A fishd, and the experiments on it."""
+
+    def __init__(self, folder: Path, seed: int, zygote: Connection) -> None:
+        """zygote: forks a fishctl for a command line, and answers with its process number"""
+        self.folder = folder
+        self.random = random.Random(seed)
+        self._zygote = zygote
+        self._count = 0
+        self._daemon = Fishd("start.controller=null", "realtime.priority=0")
+        self._daemon.next_tick()
+
+    def close(self) -> None:
+        """End fishd."""
+        self._daemon.__exit__()
+
+    def kill(self, verb: str, stop: bool) -> Kill:
+        """Begin an experiment, kill or stop it, and watch its fish."""
+        daemon = self._daemon
+        self._count += 1
+        words = [word.format(folder=self.folder / f"{verb}{self._count}") for word in VERBS[verb]]
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+            process = self._begin(words)
+            try:
+                self._await_lease(fish)
+                after = self.random.uniform(0.0, WINDOW)
+                time.sleep(after)
+                daemon.waiting_messages()
+                swimming = fish.status().mode == "running"
+                number = signal.SIGSTOP if stop else signal.SIGKILL
+                try:
+                    signal.pidfd_send_signal(process, number)
+                except ProcessLookupError:
+                    raise SystemExit(self._log()) from None
+                idle, rest = self._watch(fish, time.monotonic())
+            finally:
+                with suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(process, signal.SIGKILL)
+                select.select([process], [], [], PATIENCE)
+                os.close(process)
+            fish.stop()
+        return Kill(verb, stop, after, swimming, idle, rest)
+
+    def _begin(self, words: list[str]) -> int:
+        self._zygote.send(["fishctl", "--endpoint", self._daemon.endpoint, *words])
+        try:
+            return os.pidfd_open(self._zygote.recv())
+        except ProcessLookupError:
+            raise SystemExit(self._log()) from None
+
+    def _log(self) -> str:
+        return f"no experiment: {(self.folder / 'log').read_text(encoding='utf-8')[-2000:]}"
+
+    def _await_lease(self, fish: Fish) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while fish.status().lease is None:
+            if time.monotonic() > deadline:
+                raise SystemExit(self._log())
+            time.sleep(0.01)
+
+    def _watch(self, fish: Fish, killed: float) -> tuple[float, float]:
+        """Return when the fish was idle, and at neutral, for good, from the kill on [s]."""
+        idle = rest = killed
+        limit = killed + LEASE + GRACE + 3.0
+        while True:
+            tick = self._daemon.next_tick()
+            if tick.time > killed:
+                idle = tick.time if tick.mode == "running" else idle
+                rest = tick.time if tick.phi_c != 0.0 else rest
+            if tick.time > limit and tick.time - rest < QUIET:
+                return idle - killed, float("inf")
+            if tick.time - max(idle, rest, killed) > QUIET and fish.status().lease is None:
+                return idle - killed, rest - killed
+
+
+def fishctl_of(words: list[str]) -> Callable[[], None]:
+    """Return what a fishctl with this command line runs."""
+
+    def run() -> None:
+        sys.argv = words
+        try:
+            fishctl.main()
+        except SystemExit as ended:
+            print(f"{words}: exit status {ended.code}", flush=True)
+        os._exit(0)
+
+    return run
+
+
+def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Connection) -> None:
+    """Do these kills, one after another, and send what was seen."""
+    with tempfile.TemporaryDirectory(prefix="fishd-") as name:
+        folder = Path(name)
+        ours, theirs = multiprocessing.Pipe()
+        if os.fork() == 0:
+            ours.close()
+            os.chdir(folder)
+            serve_forks(theirs, folder / "log", fishctl_of)
+        theirs.close()
+        lane = Lane(folder, seed, ours)
+        try:
+            for verb, stop in kills:
+                if time.monotonic() > deadline:
+                    break
+                results.send(lane.kill(verb, stop))
+        finally:
+            lane.close()
+            ours.close()
+            os.wait()
+    results.close()
+
+
+def in_time(kill: Kill) -> bool:
+    """Return whether the fish was at rest in time, its fade included."""
+    return kill.rest <= LEASE + GRACE
+
+
+def summary(kills: list[Kill], seed: int) -> str:
+    """One row for each verb, and one for all."""
+    rows = []
+    for verb in [*VERBS, "all"]:
+        of_it = [kill for kill in kills if verb in (kill.verb, "all")]
+        if not of_it:
+            continue
+        swam = [kill for kill in of_it if kill.swimming]
+        idle, rest = (
+            max((getattr(k, name) for k in of_it), default=0.0) for name in ("idle", "rest")
+        )
+        rows.append(
+            [
+                f"`fishctl {verb}`" if verb != "all" else "all",
+                f"{len(of_it)}, {sum(kill.stopped for kill in of_it)}",
+                str(len(swam)),
+                f"{idle:.2f}",
+                f"{rest:.2f}",
+                f"{sum(map(in_time, of_it))} of {len(of_it)}",
+            ]
+        )
+    head = (
+        "experiment | kills, of them SIGSTOP | while it swam | idle after, at most [s] | "
+        f"at neutral after, at most [s] | within {LEASE + GRACE:g} s"
+    )
+    return f"{table(head, rows)}\n\nSeed {seed}; kills from 0 to {WINDOW:g} s after the start."
+
+
+OPTIONS: Options = {
+    "--kills": {"type": int, "default": 100, "help": "of each verb; default 100"},
+    "--lanes": {"type": int, "default": 2, "help": "fishds side by side; default 2"},
+    "--seed": {"type": int, "default": 1, "help": "of the instants; default 1"},
+    "--limit": {"type": float, "default": 7200.0, "help": "no longer than so many seconds"},
+    "--verb": {"choices": list(VERBS), "help": "this one only"},
+}
+
+
+def measure(options: Namespace) -> Report:
+    """Kill, and make the table."""
+    for module in MODULES:
+        import_module(module)
+    verbs = [options.verb] if options.verb else list(VERBS)
+    shuffled = random.Random(options.seed)
+    planned = [
+        (verb, number < round(STOPPED * options.kills))
+        for verb in verbs
+        for number in range(options.kills)
+    ]
+    shuffled.shuffle(planned)
+    kills: list[Kill] = []
+    for kill in run(planned, options.lanes, options.seed, options.limit, work):
+        kills.append(kill)
+        what = "SIGSTOP" if kill.stopped else "SIGKILL"
+        progress(str(len(kills)), kill.verb, what, f"{kill.after:.2f} s", f"{kill.rest:.2f} s")
+    broken = not all(map(in_time, kills))
+    return Report({"reliability leases": summary(kills, options.seed)}, kills, broken)
