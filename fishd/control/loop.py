@@ -7,8 +7,9 @@ Everything else here is called between two ticks, by the thread that ticks.
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, told
@@ -42,7 +43,7 @@ STALE = 2.0
 """A newest sample older than this many periods counts as a failed read."""
 
 
-class Turn(NamedTuple):
+class Turn(Struct, frozen=True, gc=False):
     """The first half of a tick: what was read, and times at the start and after each phase [s]."""
 
     slot: Slot
@@ -151,7 +152,8 @@ class ControlLoop:
 
     def act(self, turn: Turn) -> None:
         """Second half of a tick: let the controller choose, drive the servo, publish."""
-        slot, _, observation, (started, read, estimated), _ = turn
+        slot, observation = turn.slot, turn.observation
+        started, read, estimated = turn.marks
         before, self.applied = self.applied, self._update(observation, estimated)
         moved = before or self.applied
         self.neutral_for = 0.0 if moved else self.neutral_for + observation.dt
@@ -422,7 +424,7 @@ class ControlLoop:
 
     def _write(self, neutral: bool) -> None:
         """Send the applied angle, or release the servo, as the mode demands."""
-        if problem := self.servo.why_at_rest():
+        if self.servo.counts_down and (problem := self.servo.why_at_rest()):
             self.applied = 0.0  # where the servo is: to begin elsewhere would make it jump
             neutral = True
             self.supervisor.fail("overrun", problem)

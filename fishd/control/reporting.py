@@ -39,6 +39,7 @@ class Reporter:
         self._clock = clock
         self._publisher = publisher
         self._latest_problem = ""
+        self._mode = Mode.IDLE.value
 
     def event(self, kind: EventKind, message: str, level: Level = "info", **data: Any) -> None:
         """Publish and log an event; never raises, since bad news must not make things worse."""
@@ -87,6 +88,7 @@ class Reporter:
 
     def mode(self, before: Mode, mode: Mode, reason: Reason | None) -> None:
         """Tell of a change of mode, and why; that to mode fault is an event of its own kind."""
+        self._mode = mode.value
         if mode is Mode.FAULT:
             assert reason is not None
             message = f"{reason.code}: {reason.message}"
@@ -111,7 +113,12 @@ class Reporter:
         now: the time after the servo was driven [s, monotonic]
         """
         assert self._publisher
-        slot, measurement, observation, marks, power = turn
+        slot, measurement, observation, power = (
+            turn.slot,
+            turn.measurement,
+            turn.observation,
+            turn.power,
+        )
         thrust, error = loop.known_thrust
         extremes = measurement.extremes
         swims = loop.supervisor.mode is Mode.RUNNING
@@ -124,7 +131,7 @@ class Reporter:
             Tick(
                 t=self._clock.wall(),
                 seq=loop.seq,
-                mode=loop.supervisor.mode.value,
+                mode=self._mode,
                 controller=loop.active.name,
                 fx=measurement.fx,
                 fy=measurement.fy,
@@ -142,7 +149,7 @@ class Reporter:
                 fy_max=extremes.fy_max if extremes else UNSET,
                 age_ms=(slot.now - measurement.time) * 1e3,
                 lateness_us=(slot.now - slot.deadline) * 1e6,
-                busy_us=(now - marks[0]) * 1e6,
+                busy_us=(now - turn.marks[0]) * 1e6,
                 missed=loop.statistics.missed,
                 alpha=truth.alpha if truth else UNSET,
                 alpha_rate=truth.alpha_rate if truth else UNSET,

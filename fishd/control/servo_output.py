@@ -18,7 +18,8 @@ class ServoOutput:
         """True while the servo cannot be reached: if it was on, it may still have pulses."""
         self._servo = robot.servo
         self._countdown = robot.countdown
-        self._counts_down = robot.countdown < math.inf
+        self.counts_down = robot.countdown < math.inf
+        """Whether the servo goes to rest by itself where writes do not come."""
         self._now = now
         self._written = now()
 
@@ -31,7 +32,7 @@ class ServoOutput:
 
     def why_silent(self) -> str:
         """One line if the latest write began longer ago than the countdown lasts; else empty."""
-        if not self._counts_down:
+        if not self.counts_down:
             return ""
         silence = self._now() - self._written
         if silence <= self._countdown:
@@ -54,7 +55,7 @@ class ServoOutput:
                 self._servo.release()  # in every tick: so a servo that is lost is noticed
                 self.on = False
             else:
-                if self._counts_down:
+                if self.counts_down:
                     self._written = self._now()
                 self._servo.write(angle)
                 self.on = True

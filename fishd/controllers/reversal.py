@@ -24,22 +24,18 @@ class Reversal:
         """C times that."""
         self.since_reversal = 0.0
         """[s]"""
+        self.direction = 1.0
+        """1 or -1."""
         self._tick = limits.tick
-        self._direction = 1.0
         self._first = False
         """Has it begun from neutral, and not reversed yet?"""
         self._top_speed = 0.0  # since the last reversal
         ticks = max(1, round(SLOPE_OVER / limits.tick))
         self._velocities: deque[float] = deque(maxlen=ticks + 1)
 
-    @property
-    def direction(self) -> float:
-        """1 or -1."""
-        return self._direction
-
     def begin(self, angle: float) -> None:
         """Push on towards the side of this angle; from 0, towards plus."""
-        self._direction = 1.0 if angle >= 0 else -1.0
+        self.direction = 1.0 if angle >= 0 else -1.0
         self._first = angle == 0.0
 
     def update(self, observation: Observation, C: float, lead: float, longest: float) -> None:
@@ -50,12 +46,18 @@ class Reversal:
         longest: half period after which it reverses in any case [s]
         """
         self.since_reversal += observation.dt
-        speed = self._direction * self._ahead(observation, lead)
+        velocities = self._velocities
+        velocities.append(observation.fin_velocity)
+        speed = self.direction * observation.fin_velocity
+        if lead and len(velocities) > 1:  # the speed ahead, if it goes on changing as it does
+            elapsed = observation.dt * (len(velocities) - 1)
+            speed += self.direction * lead * (velocities[-1] - velocities[0]) / elapsed
         slowed = self._top_speed > 0.0 and speed <= C * self._top_speed
-        self._top_speed = max(self._top_speed, speed)
+        if speed > self._top_speed:
+            self._top_speed = speed
         # Half a tick early is nearer to the longest half period than half a tick late.
         nearly = self.since_reversal + 0.5 * self._tick
-        settled = self.since_reversal > REFRACTORY * min(longest, 1.0)
+        settled = self.since_reversal > REFRACTORY * (longest if longest < 1.0 else 1.0)
         if self._first:
             settled = settled and nearly > FIRST_PUSH
         overdue = nearly > longest
@@ -63,14 +65,7 @@ class Reversal:
         if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
             self.top_speed = self._top_speed
         if reverses:
-            self._direction, self._first = -self._direction, False
+            self.direction, self._first = -self.direction, False
             self._top_speed = 0.0
             self.since_reversal = 0.0
         self.reversal_speed = C * self.top_speed
-
-    def _ahead(self, observation: Observation, lead: float) -> float:
-        """The fin velocity `lead` s from now, if it goes on changing as it does."""
-        self._velocities.append(observation.fin_velocity)
-        change = self._velocities[-1] - self._velocities[0]
-        elapsed = observation.dt * max(1, len(self._velocities) - 1)
-        return observation.fin_velocity + lead * change / elapsed

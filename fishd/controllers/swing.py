@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import Meta, Struct
 
 from fishd.controllers.base import Amplitude, Controller, Likeness, Limits, amplitude_of
-from fishd.controllers.criterion_search import BEGIN, LADDER, CriterionSearch, Phase, Rung
+from fishd.controllers.criterion_search import BEGIN, LADDER, CriterionSearch, Phase
 from fishd.controllers.quantities import quantity
 from fishd.controllers.reversal import Reversal
 from fishd.core.errors import ParameterError
@@ -84,7 +84,7 @@ class Swing(Controller[SwingParameters]):
         super().__init__(parameters, limits)
         self._reversal = Reversal(limits)
         self._reversals = 0 if parameters.lead else BLIND
-        self._show()
+        self.top_speed = self.reversal_speed = self.since_reversal = 0.0
         self._search: CriterionSearch | None = None
         self.retune(parameters)
 
@@ -117,6 +117,7 @@ class Swing(Controller[SwingParameters]):
     def retune(self, parameters: SwingParameters) -> None:
         """Take new parameters; to set C to auto begins a search, to set anything else keeps it."""
         super().retune(parameters)
+        self._amplitude = amplitude_of(parameters, self.limits)
         if parameters.C != "auto":
             self._search = None
             self.criterion = self.lead = self.halfway = self.searching = self.ripple = None
@@ -129,31 +130,26 @@ class Swing(Controller[SwingParameters]):
 
     def update(self, observation: Observation) -> float:
         """Plus or minus the amplitude [rad]."""
-        rung = self._rung(observation)
-        longest = self.parameters.longest_half_period
-        before = self._reversal.direction
-        self._reversal.update(observation, rung.C, rung.lead, longest)
-        self._reversals += self._reversal.direction != before
-        self._show()
-        return self._reversal.direction * amplitude_of(self.parameters, self.limits)
+        C, lead = self._rung(observation)
+        reversal = self._reversal
+        before = reversal.direction
+        reversal.update(observation, C, lead, self.parameters.longest_half_period)
+        if reversal.direction != before:
+            self._reversals += 1
+        self.top_speed = reversal.top_speed
+        self.reversal_speed = reversal.reversal_speed
+        self.since_reversal = reversal.since_reversal
+        return reversal.direction * self._amplitude
 
-    def _show(self) -> None:
-        self.top_speed = self._reversal.top_speed
-        self.reversal_speed = self._reversal.reversal_speed
-        self.since_reversal = self._reversal.since_reversal
-
-    def _rung(self, observation: Observation) -> Rung:
-        """When to reverse: as the parameter says, or as the search has found."""
-        if self.parameters.C != "auto":
-            foresees = self._reversals >= BLIND
-            return Rung(self.parameters.C, self.parameters.lead) if foresees else LADDER[BEGIN]
-        assert self._search
-        self._search.update(
-            observation.fx, observation.fy, observation.dt, self._reversal.direction
-        )
-        rung = self._search.rung
-        self.criterion, self.lead = rung
-        self.halfway = float(self._search.halfway)
-        self.searching = float(self._search.phase is not Phase.WATCH)
-        self.ripple = self._search.ripple
+    def _rung(self, observation: Observation) -> tuple[float, float]:
+        """Return C and the lead [s] of this tick: the parameters, or those of the search."""
+        parameters, search = self.parameters, self._search
+        if parameters.C != "auto":
+            return (parameters.C, parameters.lead) if self._reversals >= BLIND else LADDER[BEGIN]
+        assert search
+        search.update(observation.fx, observation.fy, observation.dt, self._reversal.direction)
+        self.criterion, self.lead = rung = search.rung
+        self.halfway = float(search.halfway)
+        self.searching = float(search.phase is not Phase.WATCH)
+        self.ripple = search.ripple
         return rung

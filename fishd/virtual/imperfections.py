@@ -133,7 +133,6 @@ class Imperfections:
         self._cos = math.cos(settings.rotation)
         self._sin = math.sin(settings.rotation)
         self._walk_x = self._walk_y = 0.0
-        self._noise = self._random.gauss if settings.noise_freedom is None else self._student
         disturbed = settings.hum or settings.spike_rate or settings.quantum
         self._electronics = [Electronics(settings, axis) for axis in "xy"] if disturbed else None
 
@@ -148,12 +147,12 @@ class Imperfections:
         Noise of a longer window averages out as white noise does.
         """
         settings = self._settings
-        gauss, random_noise = self._random.gauss, self._noise
         noise = settings.noise * math.sqrt(self._tick / duration)
         if settings.drift_walk:
             step = settings.drift_walk * math.sqrt(duration)
-            self._walk_x += gauss(0.0, step)
-            self._walk_y += gauss(0.0, step)
+            x, y = self._normal_pair()
+            self._walk_x += step * x
+            self._walk_y += step * y
         drift_x = drift_y = settings.drift_rate * time
         if settings.drift:
             angle = math.tau * time / settings.drift_period
@@ -163,21 +162,35 @@ class Imperfections:
         drift_y += self._walk_y
         shown_x = self._cos * fx - self._sin * fy + settings.offset_x + drift_x
         shown_y = self._sin * fx + self._cos * fy + settings.offset_y + drift_y
-        shown_x += random_noise(0.0, noise)
-        shown_y += random_noise(0.0, noise)
+        x, y = self._normal_pair() if settings.noise_freedom is None else self._student_pair()
+        shown_x += noise * x
+        shown_y += noise * y
         if self._electronics:
-            x, y = self._electronics
-            shown_x = x.read(shown_x, time, duration, samples)
-            shown_y = y.read(shown_y, time, duration, samples)
+            along, across = self._electronics
+            shown_x = along.read(shown_x, time, duration, samples)
+            shown_y = across.read(shown_y, time, duration, samples)
         return shown_x, shown_y
 
-    def _student(self, mean: float, deviation: float) -> float:
-        """As `gauss`, with heavier tails: a Gaussian over the root of a chi-square per degree."""
+    def _normal_pair(self) -> tuple[float, float]:
+        """Return two normal deviates of variance 1, by the method of Box and Muller."""
+        angle = math.tau * self._random.random()
+        radius = math.sqrt(-2.0 * math.log(1.0 - self._random.random()))
+        return math.cos(angle) * radius, math.sin(angle) * radius
+
+    def _student_pair(self) -> tuple[float, float]:
+        """Return two of Student's deviates of variance 1.
+
+        Each is a normal one over the root of a chi-square per degree of freedom.
+        """
         freedom = self._settings.noise_freedom
         assert freedom is not None
         chi_square = self._random.gammavariate(0.5 * freedom, 2.0)
-        spread = self._random.gauss(0.0, 1.0) * math.sqrt((freedom - 2.0) / chi_square)
-        return mean + deviation * spread
+        x, y = self._normal_pair()
+        other_chi_square = self._random.gammavariate(0.5 * freedom, 2.0)
+        return (
+            x * math.sqrt((freedom - 2.0) / chi_square),
+            y * math.sqrt((freedom - 2.0) / other_chi_square),
+        )
 
 
 class Electronics:

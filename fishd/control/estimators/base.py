@@ -94,6 +94,8 @@ class Estimator(ABC):
     def __init__(self) -> None:
         self.fy_corrected = False
         """Whether F_y is taken with the other sign than it is measured with."""
+        self.found_leak: float | None = None
+        """The leak in use [s], where that is for the estimator to find; else None."""
         self._fy: float | None = None
         self._angle: float | None = None
         self._beat = TailBeat()
@@ -143,11 +145,6 @@ class Estimator(ABC):
             frequency=self._beat.frequency,
             side_time=self._beat.side_time,
         )
-
-    @property
-    def found_leak(self) -> float | None:
-        """The leak in use [s], where that is for the estimator to find; else None."""
-        return None
 
     @abstractmethod
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:

@@ -20,13 +20,12 @@ class LateralForceEstimator(Estimator):
         self._settings = settings
         self._leak = LEAK if settings.leak == "auto" else settings.leak
         self._search = LeakSearch(LEAK, settings.bias_time) if settings.leak == "auto" else None
+        self.found_leak = self._leak if self._search else None
+        self._dt = self._kept = self._share = 0.0
+        """Length of the latest window [s], and the fractions of the integral that it keeps and of
+        the offset that it replaces."""
         self._bias: float | None = None
         self._fin_velocity = 0.0
-
-    @property
-    def found_leak(self) -> float | None:
-        """As `Estimator.found_leak`."""
-        return self._search.leak if self._search else None
 
     def forget_zero(self) -> None:
         """As `Estimator.forget_zero`."""
@@ -49,10 +48,15 @@ class LateralForceEstimator(Estimator):
             if not measurement.samples:
                 return 0.0
             self._bias = fy
-        self._bias -= math.expm1(-dt / self._settings.bias_time) * (fy - self._bias)
+        if dt != self._dt:
+            self._dt = dt
+            self._kept = math.exp(-dt / self._leak)
+            self._share = -math.expm1(-dt / self._settings.bias_time)
+        self._bias += self._share * (fy - self._bias)
         if self._search:
             self._search.update(measurement.fx, fy, self._bias, dt)
-            self._leak = self._search.leak
-        self._fin_velocity *= math.exp(-dt / self._leak)
+            self.found_leak = self._leak = self._search.leak
+            self._kept = math.exp(-dt / self._leak)
+        self._fin_velocity *= self._kept
         self._fin_velocity -= (fy - self._bias) * dt
         return self._fin_velocity

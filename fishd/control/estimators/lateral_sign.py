@@ -89,12 +89,13 @@ class LateralSign:
 
         fy: F_y as it is measured [N]; that of the observation may be corrected
         """
-        if self._push is None and seen.instruction_angle == 0.0:
-            self._at_rest(seen, fy)
-            return False
         if self._push is None:
+            if seen.instruction_angle == 0.0:
+                self._at_rest(seen, fy)
+                return False
             if self._rested < LEAST_REST:
-                self.rest()
+                if self._still:
+                    self.rest()
                 return False
             self._push = _Push(seen.instruction_angle, *self._level())
         size = abs(seen.instruction_angle)

@@ -14,7 +14,7 @@ between two changes its variance only grows. docs/measuring.md has the argument 
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from fishd.control.estimators.thrust_factor import DRIFT_LAG, Drift, Factor, Level, Wave
 from fishd.core.signals import Observation
@@ -77,8 +77,9 @@ class LiveThrust:
         None while the half-width is larger than the factor."""
         self._factor = Factor()
         self._drift = Drift(zero_drift**2)
-        self._noises = {True: _Noise(), False: _Noise()}
-        """Noise of swims and of rests."""
+        self._swim_noise, self._rest_noise = _Noise(), _Noise()
+        self._noise = self._rest_noise
+        """Noise of a swim while it swims, else of a rest."""
         self._swims = self._recording = False
         self._wave: Wave = ("", {})
         self._now = self._phase = self._still = self._angle = self._side = 0.0
@@ -170,6 +171,7 @@ class LiveThrust:
         """Begin a rest, a swim, or a swim of another controller."""
         goes_on = swims and self._swims and wave[0] == self._wave[0]
         self._swims, self._wave = swims, wave
+        self._noise = self._swim_noise if swims else self._rest_noise
         if goes_on:  # in another phase, or with other parameters: their effect shows in the beats
             if self._now - self._settling_since > RETUNE_PAUSE:
                 self._settling_since = self._now
@@ -190,7 +192,7 @@ class LiveThrust:
         """Take in a block of whole beats, or a piece of a rest."""
         if self._swims:
             self._shown.append(block)
-            while len(self._shown) > 1 and sum(each.duration for each in self._shown) > SPAN:
+            while len(self._shown) > 1 and _duration(self._shown) > SPAN:
                 self._shown.popleft()
         if not self._resizes(block) and not self._jumps(block):
             self._append(block)
@@ -204,10 +206,6 @@ class LiveThrust:
             self._show_beats()
         else:
             self._show_rest(block)
-
-    @property
-    def _noise(self) -> "_Noise":
-        return self._noises[self._swims]
 
     def _count(self, duration: float) -> int:
         """Return how many blocks of that duration [s] give the most certain mean.
@@ -415,6 +413,14 @@ class _Run:
         """The latest block, where its force jumped."""
         self.doubt = self.jumped = 0.0
         """Variances of the level now, and of the change before the run, by jumps [N²]."""
+
+
+def _duration(blocks: Iterable[_Block]) -> float:
+    """Return the time that some blocks take together [s]."""
+    duration = 0.0
+    for each in blocks:
+        duration += each.duration
+    return duration
 
 
 def _level(blocks: Sequence[_Block], noise: "_Noise") -> Level:

@@ -1,7 +1,6 @@
 """Tail-beat frequency and thrust over whole beats, from the reversals of the instruction angle."""
 
 import math
-from collections import deque
 
 
 class TailBeat:
@@ -24,7 +23,7 @@ class TailBeat:
 
     def rest(self) -> None:
         """Forget all beats, but not the mean force."""
-        self._halves: deque[tuple[float, float]] = deque()  # (duration [s], impulse [N s])
+        self._halves: list[tuple[float, float]] = []  # (duration [s], impulse [N s])
         self._side = 0.0
         self.side_time = 0.0
         """How long the angle has been on its side of neutral, signed as it is; up to 2 s [s]."""
@@ -40,14 +39,19 @@ class TailBeat:
         force: mean longitudinal force of the window [N]
         duration: its length [s]
         """
-        side = math.copysign(1.0, angle) if angle else self._side
+        side = self._side
+        if angle:
+            side = 1.0 if angle > 0.0 else -1.0
+            elapsed = duration
+            if side * self.side_time > 0.0:
+                elapsed += side * self.side_time
+            self.side_time = side * (elapsed if elapsed < self._LONGEST else self._LONGEST)
+        else:
+            self.side_time = 0.0
         if side != self._side:
             if self._side:
                 self._reverse()
             self._side = side
-        before = abs(self.side_time) if self.side_time * angle > 0.0 else 0.0
-        elapsed = min(before + duration, self._LONGEST)
-        self.side_time = math.copysign(elapsed, angle) if angle else 0.0
         if self._open is not None:
             elapsed, impulse = self._open
             self._open = (elapsed + duration, impulse + force * duration)
@@ -61,15 +65,25 @@ class TailBeat:
 
     def _reverse(self) -> None:
         """Close the open half beat; one that began before the first reversal is no whole one."""
+        halves = self._halves
         if self._open is not None:
-            self._halves.append(self._open)
+            halves.append(self._open)
         self._open = (0.0, 0.0)
-        while len(self._halves) > 3 and sum(half[0] for half in self._halves) > self._span:
-            self._halves.popleft()
-        if len(self._halves) < 2:
+        while len(halves) > 3 and _total(halves)[0] > self._span:
+            del halves[0]
+        if len(halves) < 2:
             return
-        whole = list(self._halves)[len(self._halves) % 2 :]
-        self._longest = max(half[0] for half in whole)
-        time = sum(half[0] for half in whole)
+        whole = halves[len(halves) % 2 :]
+        self._longest = max(whole)[0]
+        time, impulse = _total(whole)
         self.frequency = 0.5 * len(whole) / time
-        self.thrust = sum(half[1] for half in whole) / time
+        self.thrust = impulse / time
+
+
+def _total(halves: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return the sums of some half beats: durations [s] and impulses [N s]."""
+    duration = impulse = 0.0
+    for lasts, push in halves:
+        duration += lasts
+        impulse += push
+    return duration, impulse

@@ -103,7 +103,9 @@ class TetheredFish(Plant[PlantParameters]):
         """lag/Δ at the end of the latest window; 0 where the servo had no pulses."""
         self._pulls = True
         """Did the wheel move the tail in the latest segment?"""
+        self._dead_zone = parameters.servo_dead_zone
         self._side_inertia = parameters.lateral_inertia
+        self._graded_from = _GRADED_FROM * self._servo_time
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> FinWindow:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
@@ -147,9 +149,13 @@ class TetheredFish(Plant[PlantParameters]):
         p = self.parameters
         duration = part[1] - part[0]
         phi, alpha, rate = start = self.state
-        command = phi if angle is None else self._reached(angle, phi)
+        command = phi if angle is None else angle
+        if self._dead_zone:
+            command = self._reached(command, phi)
         begin = lag = (command - phi) / p.servo_lag
-        cuts = self._cuts(command, phi, lag, duration) if lag else ()
+        cuts: Sequence[float] = ()
+        if lag and (duration > self._graded_from or not self.cables.taut):
+            cuts = self._cuts(command, phi, lag, duration)
         segments: Sequence[Segment] = (
             self._segments(whole, samples, part, cuts)
             if cuts
@@ -242,9 +248,7 @@ class TetheredFish(Plant[PlantParameters]):
 
     def _reached(self, angle: float, phi: float) -> float:
         """Where the wheel goes: the angle itself, or the edge of its dead zone."""
-        dead = self.parameters.servo_dead_zone
-        if not dead:
-            return angle
+        dead = self._dead_zone
         return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
     def _drive(self, segment: Segment, command: float, lag: float) -> tuple[Vector, float]:
@@ -294,7 +298,7 @@ class TetheredFish(Plant[PlantParameters]):
         """Return the times (s) within the part at which no segment may go on."""
         p, unit = self.parameters, self._servo_time
         cuts = []
-        if duration > _GRADED_FROM * unit:
+        if duration > self._graded_from:
             transition = log_sinh(lag)
             cuts = [unit * (transition + time) for time in _TRANSITION]
         if not self.cables.taut:
@@ -309,7 +313,7 @@ class TetheredFish(Plant[PlantParameters]):
         """Return the segments of a part of a window, each with the sample instants in it."""
         duration = part[1] - part[0]
         longest = self._fin_segment
-        if duration <= _GRADED_FROM * self._servo_time:
+        if duration <= self._graded_from:
             longest = min(longest, self._servo_time)
         if self.parameters.servo_reaction:
             longest = min(longest, 5.0 * REACTION_TIME)
