@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from fishd.core.foreign_code import real_number
+from fishd.core.foreign_code import contained, real_number
 
 
 class Guard:
@@ -41,7 +41,8 @@ class Guard:
         previous: the angle that is applied now [rad]
         Raises ValueError when the command is no number, or not finite.
         """
-        angle = command if type(command) is float else real_number(command, "the command")
+        known = type(command) is float
+        angle = command if known else contained(real_number, command, "the command")
         if not math.isfinite(angle):
             raise ValueError(f"the command is {angle}, not an angle")
         if angle > self.highest:

@@ -386,7 +386,8 @@ class ControlLoop:
             return self.guard.fade(self.applied)
         name = self.active.name
         try:
-            applied = contained(self._command, observation)
+            command = contained(self.active.update, observation)
+            applied = self.guard.apply(command, self.applied)
         except ControllerFault as error:
             code, successor = told(error)
             if successor and may_succeed:
@@ -401,10 +402,6 @@ class ControlLoop:
                 self._check_budget(name, seconds)
             return applied
         return self._update(observation, self._now(), may_succeed=False)
-
-    def _command(self, observation: Observation) -> float:
-        """The angle that the controller chooses, after the guard [rad]; raises what it raises."""
-        return self.guard.apply(self.active.update(observation), self.applied)
 
     def _succeed(self, error: ControllerFault, code: str, successor: Successor) -> None:
         before = self.active.name

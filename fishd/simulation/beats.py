@@ -31,7 +31,9 @@ class Beats:
 
     def add(self, angle: float, window: TrueWindow) -> None:
         """Add a window; angle: the instruction angle during it [rad]."""
-        side = math.copysign(1.0, angle) if angle else self._side
+        side = self._side
+        if angle:
+            side = 1.0 if angle > 0.0 else -1.0
         if side != self._side and self._side:
             self._open.close_half()
             self.reversals += 1
@@ -105,12 +107,14 @@ class _Sums:
         self._ticks = 0
 
     def add(self, angle: float, window: TrueWindow) -> None:
-        self.duration += window.duration
-        self.impulse += window.thrust * window.duration
-        self.energy += window.power * window.duration
-        self.angle += abs(angle) * window.duration
-        self.angle_squared += angle**2 * window.duration
-        self._peak = max(self._peak, window.fin_peak)
+        duration = window.duration
+        self.duration += duration
+        self.impulse += window.thrust * duration
+        self.energy += window.power * duration
+        self.angle += (angle if angle > 0.0 else -angle) * duration
+        self.angle_squared += angle**2 * duration
+        if window.fin_peak > self._peak:
+            self._peak = window.fin_peak
         self._ticks += 1
 
     def close_half(self) -> None:
@@ -122,9 +126,13 @@ class _Sums:
         self._ticks = 0
 
     def __iadd__(self, other: "_Sums") -> "_Sums":
-        sums = ("duration", "impulse", "energy", "peaks", "angle", "angle_squared", "halves")
-        for name in sums:
-            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.duration += other.duration
+        self.impulse += other.impulse
+        self.energy += other.energy
+        self.peaks += other.peaks
+        self.angle += other.angle
+        self.angle_squared += other.angle_squared
+        self.halves += other.halves
         self.shortest = min(self.shortest, other.shortest)
         self.longest = max(self.longest, other.longest)
         return self

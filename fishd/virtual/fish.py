@@ -77,7 +77,8 @@ class SimulatedFish:
         self._fin_speed = state.alpha_rate
         # Where the fin has not turned, it is at the end that it has gone furthest.
         peak = window.fin_peak if turned else abs(state.alpha)
-        return TrueWindow(window.duration, window.thrust, peak, self.power())
+        # It is mostly known: the loop has read it.
+        return TrueWindow(window.duration, window.thrust, peak, self._power or self.power())
 
     def power(self, now: float = 0.0) -> float:
         """Mean electrical power of the servo over the latest window, which ended `now` [W]."""

@@ -80,7 +80,7 @@ class PlantWindow(Struct, frozen=True):
     power: float = math.nan
 
 
-class TrueWindow(NamedTuple):
+class TrueWindow(Struct, frozen=True, gc=False):
     """What truly happened during a window, for those who judge a run."""
 
     duration: float

@@ -103,8 +103,6 @@ class TetheredFish(Plant[PlantParameters]):
         """lag/Δ at the end of the latest window; 0 where the servo had no pulses."""
         self._pulls = True
         """Did the wheel move the tail in the latest segment?"""
-        self._dead_zone = parameters.servo_dead_zone
-        self._side_inertia = parameters.lateral_inertia
         self._graded_from = _GRADED_FROM * self._servo_time
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> FinWindow:
@@ -150,7 +148,7 @@ class TetheredFish(Plant[PlantParameters]):
         duration = part[1] - part[0]
         phi, alpha, rate = start = self.state
         command = phi if angle is None else angle
-        if self._dead_zone:
+        if p.servo_dead_zone:
             command = self._reached(command, phi)
         begin = lag = (command - phi) / p.servo_lag
         cuts: Sequence[float] = ()
@@ -192,7 +190,8 @@ class TetheredFish(Plant[PlantParameters]):
         drives = ((self._lag, begin, course),) if pulsed else ()
         self._lag = lag if pulsed else 0.0
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
-        inertia, side_inertia, drag = p.thrust_coefficient, self._side_inertia, p.lateral_drag
+        inertia, drag = p.thrust_coefficient, p.lateral_drag
+        side_inertia = p.lateral_inertia_ratio * inertia
         reaction = self._momentum - momentum
         braking, sampled_braking = self._side_drag * braking, self._side_drag * sampled_braking
         return FinWindow(
@@ -247,8 +246,8 @@ class TetheredFish(Plant[PlantParameters]):
         return pieces, responses
 
     def _reached(self, angle: float, phi: float) -> float:
-        """Where the wheel goes: the angle itself, or the edge of its dead zone."""
-        dead = self._dead_zone
+        """Return where the wheel goes [rad]: the edge of its dead zone."""
+        dead = self.parameters.servo_dead_zone
         return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
     def _drive(self, segment: Segment, command: float, lag: float) -> tuple[Vector, float]:
