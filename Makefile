@@ -67,6 +67,8 @@ $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --constraint tools/constraints.txt --editable '.[$(EXTRAS)]'
 	@# Tests run it on a stand-in for lgpio, which has no wheel for every Python.
 	$(BIN)/python -m pip install --quiet --no-deps 'rpi-lgpio>=0.6,<1'
+	@# Compiled here once, the tests need not be compiled by each of those that run at a time.
+	@$(BIN)/python -m pytest --collect-only -qq >/dev/null 2>&1 || true
 	@touch $@ $(VENV)/installed
 
 .PHONY: install-pi uninstall-pi trial-systemd trial-arm64 release-check

@@ -11,7 +11,7 @@ from rigs.processes import wait_until
 from fishd.core.errors import Refused
 from fishd.daemon.background_calls import MOST_AT_ONCE, MOST_GIVEN_UP, BackgroundCalls
 
-PATIENCE = 10.0
+PATIENCE = 60.0
 
 
 class Stuck:
