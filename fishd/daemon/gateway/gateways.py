@@ -40,13 +40,13 @@ from fishd.daemon.gateway.link import (
 
 BEAT_S = 0.08
 """Time between two heartbeats [s]."""
-MAX_UNANSWERED = {CONTROL: 4, TELEMETRY: 10}
+MAX_UNANSWERED = {CONTROL: 4, TELEMETRY: 8}
 """Heartbeats in a row that a gateway may leave unanswered; then it hangs."""
 MAX_STARTING = 25
 """Heartbeats during which a gateway may start; then it hangs."""
 MAX_SERVER_STARTING = 750
 """Heartbeats during which the fork server may start: a busy Pi may take long to load Python."""
-MIN_PERIOD_S = 0.1
+MIN_PERIOD_S = 0.05
 """Shortest time between two starts of a gateway [s]."""
 MIN_FAILED_PERIOD_S = 0.25
 """The same where the one before has never served [s]."""
@@ -207,7 +207,7 @@ class ForkServer(_Peer):
         """Start it, once the one before has ended."""
         try:
             if self._process.poll() is None:
-                self._timer = self._events.call_later(0.1 * MIN_PERIOD_S, self._start_again)
+                self._timer = self._events.call_later(0.2 * MIN_PERIOD_S, self._start_again)
                 return
             self._start()
         except OSError:  # Python is being upgraded, perhaps

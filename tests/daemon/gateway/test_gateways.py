@@ -22,7 +22,9 @@ from fishd.daemon.gateway import link
 from fishd.daemon.gateway.gateways import (
     FAREWELL,
     MAX_UNANSWERED,
+    MIN_FAILED_PERIOD_S,
     RETURN,
+    Gateway,
     Gateways,
     _Peer,
 )
@@ -473,3 +475,33 @@ def test_only_heartbeats_that_are_left_unanswered_count(answers: bool) -> None:
 
     asyncio.run(beat())
     assert lost == ([] if answers else ["it left 4 heartbeats unanswered"])
+
+
+def test_a_gateway_that_ends_at_once_is_started_again_and_again_but_not_in_a_spin() -> None:
+    starts = 0
+
+    class FailingServer:
+        """A fork server whose gateways end before they serve."""
+
+        serves = True
+
+        def __init__(self) -> None:
+            self.gateways: dict[str, Gateway] = {}
+
+        def fork(self, *arguments: object) -> None:
+            nonlocal starts
+            starts += 1  # the other end of the link closes on return
+
+    async def watch() -> tuple[float, int]:
+        begun = asyncio.get_running_loop().time()
+        gateway = Gateway(link.TELEMETRY, None, "", FailingServer())  # type: ignore[arg-type]
+        while starts < 5:
+            await asyncio.sleep(0.01)
+        took = asyncio.get_running_loop().time() - begun
+        gateway.end()
+        gateway.close()
+        return took, gateway.restarts
+
+    took, restarts = asyncio.run(watch())
+    assert took >= 4 * MIN_FAILED_PERIOD_S - 0.01
+    assert restarts == 4
