@@ -10,6 +10,7 @@ so fish like the configured one are.
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from fishd.learning.env.simulated_link import SimulatedLink, drawn
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.settings import ImitationSettings, Randomisation, TrainingSettings
 from fishd.virtual.plant.optimum import square_wave
+from fishd.virtual.plant.parameters import PlantParameters
 
 LONGEST_HALF = 1.2
 """Half beats up to this long are compared [s]."""
@@ -62,9 +64,13 @@ def narrowed(spread: Randomisation, share: float, rig_share: float = 1.0) -> Ran
 
 def half_beats(config: Config) -> NDArray[np.float64]:
     """Thrust of square waves by the ticks of half a beat, over the best of them; of 0 ticks, 0."""
-    plant, tick = config.plant, config.tick
+    return _half_beats(config.plant, config.amplitude_limit, config.tick)
+
+
+@lru_cache(maxsize=64)  # a fish of a list is drawn again and again
+def _half_beats(plant: PlantParameters, amplitude: float, tick: float) -> NDArray[np.float64]:
     ticks = range(1, math.ceil(LONGEST_HALF / tick) + 1)
-    thrusts = [square_wave(plant, config.amplitude_limit, 0.5 / (n * tick)).thrust for n in ticks]
+    thrusts = [square_wave(plant, amplitude, 0.5 / (n * tick)).thrust for n in ticks]
     return np.array([0.0, *thrusts]) / max(thrusts)
 
 

@@ -13,6 +13,7 @@ from fishd.learning.export import export
 from fishd.learning.settings import (
     EnvironmentSettings,
     EvaluationSettings,
+    ImitationSettings,
     PpoSettings,
     Randomisation,
     TrainingSettings,
@@ -28,6 +29,9 @@ NOISE = 0.3
 """More noise of a tick than this share of the best thrust would drown the reward."""
 GOOD, TRIES = 0.97, 3
 """A policy is good enough that reaches this share of the best square wave on its worst fish."""
+IMITATION_ROUNDS, IMITATION_FISH = 2, 64
+"""Before PPO it imitates the best square waves of so many draws from the cloud in each round; PPO
+alone may stay at a wave of one tick too few or too many."""
 EVERY, OTHERS = 5, 3
 """Evaluations after so many updates, on the identified fish and so many others of the cloud."""
 
@@ -40,6 +44,7 @@ def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
         checkpoint_every=max(1, steps),
         environment=EnvironmentSettings(episode=EPISODE),
         randomisation=Randomisation(fish=fitted.cloud, offset=min(10.0, fitted.offset)),
+        imitation=ImitationSettings(rounds=IMITATION_ROUNDS, fish=IMITATION_FISH),
         ppo=PpoSettings(decay_steps=max(1, steps)),
         evaluation=EvaluationSettings(every=EVERY, others=OTHERS),
     )
