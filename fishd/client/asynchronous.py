@@ -49,6 +49,8 @@ class AsyncFish(Connection):
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
+        if self.held:
+            self.held.stop()
         self._context.destroy(linger=0)
 
     async def status(self) -> Status:

@@ -55,6 +55,8 @@ class Fish(Connection):
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
+        if self.held:
+            self.held.stop()
         self._context.destroy(linger=0)
 
     def status(self, timeout: float | None = None) -> Status:

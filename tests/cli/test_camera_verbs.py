@@ -45,7 +45,8 @@ CAMERA = (
 
 @pytest.fixture(scope="module")
 def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with running(tmp_path_factory.mktemp("fishd")) as daemon:
+    # A lease that outlasts a program which is held up for 3 s.
+    with running(tmp_path_factory.mktemp("fishd"), "--set", "control.lease=10") as daemon:
         yield daemon
 
 

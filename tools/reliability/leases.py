@@ -38,6 +38,8 @@ WINDOW = 6.0
 """An experiment rests for about 3 s at first, and swims then [s]."""
 STOPPED = 0.15
 """Fraction of the kills that are a SIGSTOP instead."""
+ATTEMPTS = 5
+"""Attempts at one kill; see `Lane.kill`."""
 QUIET = 0.3
 """A fish that was at neutral for so long after a lease has ended is at rest [s]."""
 
@@ -84,6 +86,10 @@ class Kill(Struct):
     """When fishd was in mode idle for good, from the kill on [s]."""
     rest: float
     """When the fish was at neutral for good, from the kill on [s]; infinite where it never was."""
+    faults: int = 0
+    """Attempts before this one in which fishd was held up until that was a fault."""
+    losses: int = 0
+    """Attempts before this one in which the experiment was held up until it lost its lease."""
 
 
 class Lane:
@@ -95,7 +101,7 @@ class Lane:
         self.random = random.Random(seed)
         self._zygote = zygote
         self._count = 0
-        self._daemon = Fishd("start.controller=null", "realtime.priority=0")
+        self._daemon = Fishd("start.controller=null")
         self._daemon.next_tick()
 
     def close(self) -> None:
@@ -103,31 +109,46 @@ class Lane:
         self._daemon.__exit__()
 
     def kill(self, verb: str, stop: bool) -> Kill:
-        """Begin an experiment, kill or stop it, and watch its fish."""
-        daemon = self._daemon
+        """Begin an experiment, kill or stop it, and watch its fish; again where that is void.
+
+        It is void where a busy machine has held up fishd or the experiment before the kill.
+        """
+        voids: list[str] = []
+        while len(voids) < ATTEMPTS:
+            with Fish(self._daemon.endpoint, timeout=PATIENCE) as fish:
+                kill = self._try(fish, verb, stop)
+                fault = fish.status().reason is not None
+                fish.clear_fault()
+                fish.stop()
+            if kill and not fault:
+                kill.faults, kill.losses = voids.count("fault"), voids.count("loss")
+                return kill
+            voids.append("fault" if fault else "loss")
+        raise SystemExit(self._log())
+
+    def _try(self, fish: Fish, verb: str, stop: bool) -> Kill | None:
+        """Return what was seen; None where there was no experiment to be killed."""
         self._count += 1
         words = [word.format(folder=self.folder / f"{verb}{self._count}") for word in VERBS[verb]]
-        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-            process = self._begin(words)
+        process = self._begin(words)
+        try:
+            if not self._await_lease(fish):
+                return None
+            after = self.random.uniform(0.0, WINDOW)
+            time.sleep(after)
+            self._daemon.waiting_messages()
+            swimming = fish.status().mode == "running"
             try:
-                self._await_lease(fish)
-                after = self.random.uniform(0.0, WINDOW)
-                time.sleep(after)
-                daemon.waiting_messages()
-                swimming = fish.status().mode == "running"
-                number = signal.SIGSTOP if stop else signal.SIGKILL
-                try:
-                    signal.pidfd_send_signal(process, number)
-                except ProcessLookupError:
-                    raise SystemExit(self._log()) from None
-                idle, rest = self._watch(fish, time.monotonic())
-            finally:
-                with suppress(ProcessLookupError):
-                    signal.pidfd_send_signal(process, signal.SIGKILL)
-                select.select([process], [], [], PATIENCE)
-                os.close(process)
-            fish.stop()
-        return Kill(verb, stop, after, swimming, idle, rest)
+                signal.pidfd_send_signal(process, signal.SIGSTOP if stop else signal.SIGKILL)
+            except ProcessLookupError:
+                return None
+            idle, rest = self._watch(fish, time.monotonic())
+            return Kill(verb, stop, after, swimming, idle, rest)
+        finally:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process, signal.SIGKILL)
+            select.select([process], [], [], PATIENCE)
+            os.close(process)
 
     def _begin(self, words: list[str]) -> int:
         self._zygote.send(["fishctl", "--endpoint", self._daemon.endpoint, *words])
@@ -139,12 +160,15 @@ class Lane:
     def _log(self) -> str:
         return f"no experiment: {(self.folder / 'log').read_text(encoding='utf-8')[-2000:]}"
 
-    def _await_lease(self, fish: Fish) -> None:
+    def _await_lease(self, fish: Fish) -> bool:
+        """Wait until an experiment holds the fish; False where fishd is in mode fault."""
         deadline = time.monotonic() + PATIENCE
-        while fish.status().lease is None:
-            if time.monotonic() > deadline:
-                raise SystemExit(self._log())
-            time.sleep(0.01)
+        while time.monotonic() < deadline:
+            status = fish.status()
+            if status.reason or status.lease:
+                return status.reason is None
+            time.sleep(0.02)
+        raise SystemExit(self._log())
 
     def _watch(self, fish: Fish, killed: float) -> tuple[float, float]:
         """Return when the fish was idle, and at neutral, for good, from the kill on [s]."""
@@ -228,7 +252,14 @@ def summary(kills: list[Kill], seed: int) -> str:
         "experiment | kills, of them SIGSTOP | while it swam | idle after, at most [s] | "
         f"at neutral after, at most [s] | within {LEASE + GRACE:g} s"
     )
-    return f"{table(head, rows)}\n\nSeed {seed}; kills from 0 to {WINDOW:g} s after the start."
+    faults, losses = (sum(getattr(kill, name) for kill in kills) for name in ("faults", "losses"))
+    about = f"Seed {seed}; kills from 0 to {WINDOW:g} s after an experiment took the fish."
+    if faults or losses:
+        about += (
+            f" Void, since the machine was too busy: {faults} in which fishd was in mode fault, "
+            f"{losses} in which the experiment had lost its lease before."
+        )
+    return f"{table(head, rows)}\n\n{about}"
 
 
 OPTIONS: Options = {
@@ -256,6 +287,7 @@ def measure(options: Namespace) -> Report:
     for kill in run(planned, options.lanes, options.seed, options.limit, work):
         kills.append(kill)
         what = "SIGSTOP" if kill.stopped else "SIGKILL"
-        progress(str(len(kills)), kill.verb, what, f"{kill.after:.2f} s", f"{kill.rest:.2f} s")
+        times = f"{kill.after:.2f} s | {kill.idle:.2f} s | {kill.rest:.2f} s"
+        progress(str(len(kills)), kill.verb, what, times, f"void {kill.faults + kill.losses}")
     broken = not all(map(in_time, kills))
     return Report({"reliability leases": summary(kills, options.seed)}, kills, broken)
