@@ -221,15 +221,14 @@ def _on_robot(
         status = fish.status()
         check_tethered(status.robot, "sweep --on robot")
         grid.check_remote(found, Limits(status.amplitude_limit, status.tick))
+        rig = LiveRig(fish, *verb_lease())
         begun = Begun("robot", fish.config(), {"seconds": seconds}, status.force_unit)
         with (
             _opened(path, begun, found) as folder,
             telling(folder, found, "s", seconds, err) as count,
         ):
             try:
-                whole = running.on_robot(
-                    folder, found, LiveRig(fish, *verb_lease()), seconds, count.done, count.at
-                )
+                whole = running.on_robot(folder, found, rig, seconds, count.done, count.at)
             except (Disturbed, NoDaemon) as error:
                 raise FishdError(f"{error}; to go on: {again(path)}") from None
     return whole, folder

@@ -50,13 +50,9 @@ class Lease:
 
     def check_free(self, token: str | None = None) -> None:
         """Raise `Refused` while an experiment holds the fish with a lease other than `token`."""
-        if self.active and token != self._token:
-            raise Refused(
-                "leased",
-                f"the fish is taken, for {self._now() - self._taken:.0f} s: by {self.holder}; "
-                "wait for its end, or take the fish from it: with --take, or by hand with "
-                "'fishctl stop'",
-            )
+        holder = self.holder
+        if holder and token != self._token:
+            raise Refused("leased", holder.refusal())
 
     def take(self, name: str, host: str, pid: int, seconds: float) -> str:
         """Begin a lease, and return its token. seconds: that it lasts without a renewal"""

@@ -353,6 +353,13 @@ class LeaseHolder(Struct, frozen=True):
         where = [f"pid {self.pid}"] * bool(self.pid) + [f"on {self.host}"] * bool(self.host)
         return f"{self.name} ({' '.join(where)})" if where else self.name
 
+    def refusal(self) -> str:
+        """Return why another experiment cannot have the fish."""
+        return (
+            f"the fish is taken, for {self.age:.0f} s: by {self}; wait for its end, or take the "
+            "fish from it: with --take, or by hand with 'fishctl stop'"
+        )
+
 
 class Percentiles(Struct, frozen=True):
     """Distribution of a duration since start."""

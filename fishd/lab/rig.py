@@ -171,9 +171,12 @@ class LiveRig:
         experiment: what the lease is called, as `fishctl status` shows it
         take: take the fish from an experiment that has it
 
-        Raises `NoDaemon`, and `ConfigError` where the fish swims freely.
+        Raises `NoDaemon`, `Refused` while another experiment holds the fish, and `ConfigError`
+        where it swims freely.
         """
         status = fish.status()
+        if status.lease and not take:
+            raise Refused("leased", status.lease.refusal())
         check_tethered(status.robot, "a measurement of thrust")
         self.name = status.robot
         self.unit = status.force_unit

@@ -19,6 +19,7 @@ class VirtualStatus:
         loop = run.loop
         self.pid, self.robot, self.tick = pid, "simulated", run.config.tick
         self.force_unit = "N"
+        self.lease = None
         self.amplitude_limit = run.config.amplitude_limit
         self.mode, self.controller = loop.supervisor.mode.value, loop.active.name
         self.reason, self.fallback = loop.supervisor.reason, loop.active.fallback
