@@ -124,12 +124,13 @@ def judge(
     controller: Controller[Any],
     seconds: float,
     settle: float,
-    publisher: Publisher,
+    publisher: Publisher | None,
     begun: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
     """As `simulate`, with a controller that is ready-made.
 
-    publisher, begun: as for `simulate`
+    publisher: gets the record of every tick; with None, no record is made
+    begun: as for `simulate`
     Raises `ParameterError` where the lengths do not fit one another, and `ConfigError` where the
     fish swims freely.
     """

@@ -53,8 +53,8 @@ class KeepingPublisher:
 class VirtualRun:
     """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
 
-    def __init__(self, config: Config, publisher: Publisher) -> None:
-        """publisher: gets the record of every tick, and every event
+    def __init__(self, config: Config, publisher: Publisher | None) -> None:
+        """publisher: gets the record of every tick, and every event; with None, no record is made
 
         Raises `MissingPackage`.
         """

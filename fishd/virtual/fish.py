@@ -30,6 +30,8 @@ class SimulatedFish:
         self._tick = tick
         self._time: float | None = None
         self._start = 0.0
+        self._duration, self._samples = 0.0, 1
+        """Length of the latest window [s], and its number of samples."""
         self._angle: float | None = None
         self._fin_speed = 0.0
         self.calibration = ForceCalibration()
@@ -43,7 +45,9 @@ class SimulatedFish:
             self._start = self._time = now - self._tick
         duration = round(now - self._time, 9)
         self._time = now
-        samples = round(self._sample_rate * duration) or 1
+        if duration != self._duration:
+            self._duration, self._samples = duration, round(self._sample_rate * duration) or 1
+        samples = self._samples
         self.window = window = self.fish.advance(self._angle, duration, samples)
         self._power = None
         fx, fy = self._imperfections.apply(
@@ -103,13 +107,13 @@ class SimulatedFish:
         state = self.fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
-    def robot(self) -> Robot:
-        """This fish as the loop sees it."""
+    def robot(self, *, metered: bool = True) -> Robot:
+        """Return this fish as the loop sees it; metered: with a power meter, if it has a motor."""
         return Robot(
             name="simulated",
             sensor=self,
             servo=self,
             truth=self.truth,
             tared=self,
-            power=self.power if self.fish.parameters.model == TETHERED else None,
+            power=self.power if metered and self.fish.parameters.model == TETHERED else None,
         )

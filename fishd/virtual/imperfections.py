@@ -133,6 +133,8 @@ class Imperfections:
         self._cos = math.cos(settings.rotation)
         self._sin = math.sin(settings.rotation)
         self._walk_x = self._walk_y = 0.0
+        self._duration = self._deviation = 0.0
+        """Length of the latest window [s], and the standard deviation of its noise [N]."""
         disturbed = settings.hum or settings.spike_rate or settings.quantum
         self._electronics = [Electronics(settings, axis) for axis in "xy"] if disturbed else None
 
@@ -147,7 +149,9 @@ class Imperfections:
         Noise of a longer window averages out as white noise does.
         """
         settings = self._settings
-        noise = settings.noise * math.sqrt(self._tick / duration)
+        if duration != self._duration:
+            self._duration = duration
+            self._deviation = settings.noise * math.sqrt(self._tick / duration)
         if settings.drift_walk:
             step = settings.drift_walk * math.sqrt(duration)
             x, y = self._normal_pair()
@@ -163,8 +167,8 @@ class Imperfections:
         shown_x = self._cos * fx - self._sin * fy + settings.offset_x + drift_x
         shown_y = self._sin * fx + self._cos * fy + settings.offset_y + drift_y
         x, y = self._normal_pair() if settings.noise_freedom is None else self._student_pair()
-        shown_x += noise * x
-        shown_y += noise * y
+        shown_x += self._deviation * x
+        shown_y += self._deviation * y
         if self._electronics:
             along, across = self._electronics
             shown_x = along.read(shown_x, time, duration, samples)

@@ -17,7 +17,6 @@ from fishd.core.signals import Observation
 from fishd.learning.env.simulated_link import (
     Camera,
     FunctionController,
-    NullPublisher,
     at_edge,
     drawn,
 )
@@ -98,7 +97,7 @@ def judge(
         return decide(seen, sights[0].look(seen.time) if sights else None)
 
     controller = FunctionController(config, decided)
-    return simulation.judge(config, "policy", controller, seconds, settle, NullPublisher(), begun)
+    return simulation.judge(config, "policy", controller, seconds, settle, None, begun)
 
 
 def in_simulation(

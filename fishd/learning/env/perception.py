@@ -38,8 +38,9 @@ class Perception:
         self._history.forget()
 
     def note(self, observation: Observation) -> None:
-        """Take a tick into the history; `vector` does that, too, and once more does no harm."""
-        self._history.push(observation)
+        """Take a tick into the history, where there is one; `vector` does that, too."""
+        if self.window.ticks > 1:
+            self._history.push(observation)
 
     def vector(self, observation: Observation, stack: Stack | None = None) -> NDArray[np.float32]:
         """The input, shape (inputs,); stack: needed where there is an eye."""

@@ -48,7 +48,9 @@ def swim(
     chosen = training.load(settings)
     eye = make(chosen)
     sight = Camera(cameras.simulated(camera), chosen.camera.stack) if eye else None
-    env = SwimEnv(SimulatedLink(fish, chosen.randomisation, sight), fish, chosen.seen, eye)
+    metered = bool(chosen.seen.power_price)
+    link = SimulatedLink(fish, chosen.randomisation, sight, metered=metered)
+    env = SwimEnv(link, fish, chosen.seen, eye)
     if eye and not eye.is_fitted:
         env.reset(seed=0)
         env.babble(chosen.seed, chosen.camera.babble)

@@ -15,7 +15,7 @@ from fishd.config.assembly import build_loop, simulated_fish
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
-from fishd.core.signals import Event, Observation, Tick, Truth
+from fishd.core.signals import Observation, Truth
 from fishd.learning.env.link import LinkLost, StepResult
 from fishd.learning.settings import Randomisation
 
@@ -88,16 +88,6 @@ class FunctionController(Controller[_NoParameters]):
         return self._decide(observation)
 
 
-class NullPublisher:
-    """Publishes nothing."""
-
-    def tick(self, tick: Tick) -> None:
-        """Drop it."""
-
-    def event(self, event: Event) -> None:
-        """Drop it."""
-
-
 class Camera(Struct, frozen=True):
     """A simulated camera, and which of its frames an agent is shown."""
 
@@ -121,11 +111,14 @@ class SimulatedLink:
         config: Config,
         randomisation: Randomisation | None = None,
         camera: Camera | None = None,
+        *,
+        metered: bool = True,
     ) -> None:
         """
         config: fish, rig, tick and limits; its robot and start are ignored
         randomisation: how much the fish and rig of each episode vary; by default not at all
         camera: what looks at the fish, if anything does
+        metered: False where the power of the servo has no reader, which is quicker
 
         Raises `ConfigError` for a fish that swims freely.
         """
@@ -138,6 +131,7 @@ class SimulatedLink:
         self._randomisation = randomisation or Randomisation()
         self._varies = self._randomisation != Randomisation()
         self._camera = camera
+        self._metered = metered
         self._sight: SimulatedSight | None = None
         self._angle = 0.0
         self._loop: ControlLoop
@@ -181,7 +175,8 @@ class SimulatedLink:
     def _begin(self) -> None:
         config, clock = self.config, VirtualClock()
         fish = simulated_fish(config)
-        self._loop = build_loop(config, fish.robot(), clock, NullPublisher())
+        robot = fish.robot(metered=self._metered)
+        self._loop = build_loop(config, robot, clock, None)
         self._loop.set_controller("agent", FunctionController(config, lambda _: self._angle))
         self._slots = virtual_slots(clock, config.tick)
         if self._camera:

@@ -73,7 +73,12 @@ def train(
             camera=job.camera_endpoint,
         )
     else:
-        link = SimulatedLink(job.config, job.settings.randomisation, job.simulated_camera)
+        link = SimulatedLink(
+            job.config,
+            job.settings.randomisation,
+            job.simulated_camera,
+            metered=bool(job.settings.environment.power_price),
+        )
     try:
         return Training(job, link, display or Display(), stop).run()
     except OSError as error:

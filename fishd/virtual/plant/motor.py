@@ -63,7 +63,9 @@ class Motor:
         """
         speed = self._speed
         rate = speed * math.tanh(after)
-        energy = max(0.0, self._jump * rate * (rate - speed * math.tanh(before)))
+        energy = self._jump * rate * (rate - speed * math.tanh(before))
+        if energy < 0.0:
+            energy = 0.0
         braking, moving, emf = self._braking, self._moving, self._emf
         for stretch in course:
             tail, drag = (self._tail, self._drag) if stretch.pulls else (0.0, 0.0)

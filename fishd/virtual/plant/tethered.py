@@ -254,7 +254,7 @@ class TetheredFish(Plant[PlantParameters]):
         """Put what drives the fin into the cause; return lag/Δ at the nodes and at the end."""
         p = self.parameters
         cause = self._cause
-        if abs(lag) < _LINEAR_LAG:
+        if -_LINEAR_LAG < lag < _LINEAR_LAG:
             sinh = math.sinh(lag)
             lags = np.arcsinh(segment.node_decay * sinh)
             later = math.asinh(segment.decay * sinh)
