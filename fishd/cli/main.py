@@ -89,9 +89,3 @@ def main() -> None:
         complain("fishctl", str(error), 1)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # the reader, `head` say, has seen enough
-        sys.stderr.close()
-        sys.exit(0)
-    except OSError as error:
-        what = error.filename or "the output cannot be written"
-        complain("fishctl", f"{what}: {error.strerror or error}", 1)

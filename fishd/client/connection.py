@@ -117,7 +117,11 @@ class Connection:
             if isinstance(value, float) and not math.isfinite(value):  # JSON would make it null
                 raise ParameterError(f"{name}: {value} is not a number that can be sent")
         request = protocol.Request(v=protocol.VERSION, id=identity, op=op, args=dict(args))
-        payload = protocol.encode(request)
+        try:
+            payload = protocol.encode(request)
+        except UnicodeEncodeError:  # bytes of a command line that are not UTF-8
+            request = msgspec.structs.replace(request, args=_encodable(request.args))
+            payload = protocol.encode(request)
         if len(payload) > protocol.MAX_MESSAGE:
             raise ParameterError(f"{op}: the request is longer than {protocol.MAX_MESSAGE} bytes")
         return identity, payload
@@ -173,6 +177,17 @@ class Connection:
 
 
 S = TypeVar("S", bound="zmq.Socket[Any]")
+
+
+def _encodable(value: Any) -> Any:
+    """Return a value without bytes of the command line that are not UTF-8: `?` instead."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "replace").decode()
+    if isinstance(value, dict):
+        return {_encodable(key): _encodable(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_encodable(part) for part in value]
+    return value
 
 
 def dealer(context: "zmq.Context[S]", endpoint: str) -> S:

@@ -1,7 +1,9 @@
 """What `fishd` and `fishctl` say in a terminal: one line a second, and one line for a mistake."""
 
 import os
+import resource
 import sys
+from contextlib import suppress
 from typing import NoReturn
 
 import click
@@ -55,7 +57,9 @@ def power_words(power: float) -> str:
 def run(command: click.Command, name: str) -> int:
     """Run a command and return its exit status.
 
-    One line, and exit status 2 for a wrong use, 78 for a wrong configuration."""
+    One line, and exit status 2 for a wrong use, 78 for a wrong configuration, 1 for an output that
+    cannot be written.
+    """
     try:
         status = command(prog_name=name, standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -70,7 +74,37 @@ def run(command: click.Command, name: str) -> int:
         complain(name, str(error), os.EX_CONFIG)
     except click.Abort:
         complain(name, "interrupted", INTERRUPTED)
+    except MemoryError:
+        complain(name, f"there is not enough memory{_memory_limit()}", 1)
+    except BrokenPipeError:  # the reader, `head` say, has seen enough
+        lose_output()
+        sys.exit(0)
+    except OSError as error:
+        if not error.filename:
+            lose_output()
+        complain(name, why_not_written(error), 1)
     return status if isinstance(status, int) else 0
+
+
+def _memory_limit() -> str:
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return ""
+    return f": at most {limit / 2**20:.0f} MB of address space are permitted (ulimit -v)"
+
+
+def why_not_written(error: OSError) -> str:
+    """Return what to say of an error of a file, or else of the output."""
+    what = error.filename or "the output cannot be written"
+    return f"{what}: {error.strerror or error}"
+
+
+def lose_output() -> None:
+    """Lose what waits for standard output, which takes nothing: else its last flush fails."""
+    with suppress(OSError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.close(null)
 
 
 def complain(name: str, message: str, status: int) -> NoReturn:

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from fishd import __version__
 from fishd.core import files
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.core.lockfile import NotALock, Taken, locked
 
@@ -20,14 +20,16 @@ OTHERS = ("control", "name", "panel", "realtime", "start", "state_folder", "tele
 
 @contextmanager
 def owned(path: Path, what: str) -> Iterator[None]:
-    """While this lasts, no other experiment of this kind uses the folder; raises `ConfigError`.
+    """While this lasts, no other experiment of this kind uses the folder.
+
+    Raises `ConfigError` where another one does, `FishdError` where it cannot be made.
 
     what: such as `sweep`
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
+        raise FishdError(f"{path}: cannot be made a folder: {error.strerror}") from None
     try:
         with locked(path / what, remove=True):
             yield

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 from uuid import uuid4
 
 import joblib
+from joblib._multiprocessing_helpers import mp as multiprocessing
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from fishd.core.errors import FishdError
@@ -123,6 +124,11 @@ def workers(stop: Path, jobs: int | None = None, cluster: str | None = None) -> 
 
     Raises `FishdError` where there is no scheduler.
     """
+    if cluster is None and multiprocessing is None:
+        raise FishdError(
+            "processes that compute need semaphores, which cannot be made here: /dev/shm is "
+            "missing or not writable; mount it: sudo mount -t tmpfs shm /dev/shm"
+        )
     with _scheduler(cluster) as event, SafeChildren():
         asks = Stop(event.name, True) if event else Stop(str(stop), False)
         stop.unlink(missing_ok=True)

@@ -4,9 +4,7 @@ import errno
 
 import click
 import pytest
-from rigs.processes import fishctl, one_line
 
-from fishd.cli import main
 from fishd.core import console
 
 
@@ -27,9 +25,27 @@ def test_a_command_that_is_interrupted_says_so(
     assert capsys.readouterr().err.strip() == "fishctl: interrupted"
 
 
-def test_a_file_that_makes_trouble_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device", "track.csv")
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "track.csv"), "track.csv: No space"),
+        (MemoryError(), "there is not enough memory"),
+    ],
+)
+def test_a_file_or_memory_that_makes_trouble_is_one_line(
+    error: Exception,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    @click.command()
+    def computes() -> None:
+        raise error
 
-    monkeypatch.setattr(main, "run", fail)
-    assert one_line(fishctl("status")) == "fishctl: track.csv: No space left on device\n"
+    monkeypatch.setattr("sys.argv", ["fishctl"])
+    with pytest.raises(SystemExit) as ended:
+        console.run(computes, "fishctl")
+    assert ended.value.code == 1
+    line = capsys.readouterr().err
+    assert line.startswith(f"fishctl: {said}")
+    assert line.count("\n") == 1

@@ -8,7 +8,9 @@ from typing import Any
 import joblib
 import pytest
 
+from fishd.core.errors import FishdError
 from fishd.core.interruption import on_signal
+from fishd.lab import parallel
 from fishd.lab.parallel import workers
 
 
@@ -70,3 +72,14 @@ def test_a_signal_while_its_processes_are_being_started_is_heard(
     ):
         assert sorted(crew.run(abs, [-1, -2])) == [(0, 1), (1, 2)]
     assert heard == [number]
+
+
+def test_without_semaphores_one_line_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parallel, "multiprocessing", None)  # as where /dev/shm cannot be written
+    with (
+        pytest.raises(FishdError, match=r"/dev/shm is missing or not writable; mount it: "),
+        workers(tmp_path / "stop"),
+    ):
+        pass

@@ -233,7 +233,7 @@ def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
 
     folder = opened(tmp_path)
     monkeypatch.setattr("fishd.lab.tables.Table.add", full)
-    with pytest.raises(ConfigError, match="No space left on device; what was measured before is k"):
+    with pytest.raises(FishdError, match="No space left on device; what was measured before is k"):
         folder.keep(SQUARES[0], Result(), b"a recording")
 
 
@@ -309,7 +309,7 @@ def test_a_fin_that_swings_further_than_the_equations_hold_is_told(
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for folder, named in (("file", "File exists"), ("file/run", "Not a directory")):
-        with pytest.raises(ConfigError, match=f"cannot be made a folder: {named}"):
+        with pytest.raises(FishdError, match=f"cannot be made a folder: {named}"):
             owned(tmp_path / folder, "search").__enter__()
 
 

@@ -21,6 +21,7 @@ if __name__ == "__main__":
                 "soak",
                 "systemd",
                 "recording",
+                "odd_conditions",
             ),
         )
     )

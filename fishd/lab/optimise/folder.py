@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from fishd import __version__
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.lab import tables
 from fishd.lab.begun import begin
@@ -74,16 +74,16 @@ class SearchFolder:
         return recorded(rig, path, "a search")
 
     def keep(self, trial: Trial) -> None:
-        """Keep a candidate; raises `ConfigError`."""
+        """Keep a candidate; raises `FishdError`."""
         values = {name: getattr(trial, name) for name in _COLUMNS}
         try:
             self._table.add({**trial.parameters, **values})
         except OSError as error:
             raise self._unwritable(error) from None
 
-    def _unwritable(self, error: OSError) -> ConfigError:
+    def _unwritable(self, error: OSError) -> FishdError:
         where = error.filename or self.path
-        return ConfigError(
+        return FishdError(
             f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
         )
 

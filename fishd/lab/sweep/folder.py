@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Struct
 
 from fishd import __version__
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.lab import tables
 from fishd.lab.begun import begin
@@ -69,7 +69,7 @@ class SweepFolder:
         return tuple(str(values.get(name, "")) for name in self._columns)
 
     def keep(self, point: Point, result: Found, recording: bytes | Path) -> None:
-        """Keep what was measured, its recording first; raises `ConfigError` when it cannot be.
+        """Keep what was measured, its recording first; raises `FishdError` when it cannot be.
 
         recording: its content, or a file in `RECORDINGS`
         """
@@ -139,9 +139,9 @@ class SweepFolder:
         except FileProblem as problem:
             raise ConfigError(f"{self.path / POINTS}: {problem}") from None
 
-    def _unwritable(self, error: OSError) -> ConfigError:
+    def _unwritable(self, error: OSError) -> FishdError:
         where = error.filename or self.path
-        return ConfigError(
+        return FishdError(
             f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
         )
 

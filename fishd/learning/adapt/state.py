@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from fishd import __version__
 from fishd.core import files
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.lab.begun import begin
 from fishd.virtual.imperfections import SimulationSettings
@@ -203,9 +203,9 @@ class AdaptFolder:
             path = path.with_stem(f"{step}-{number}")
         return path
 
-    def _unwritable(self, error: OSError) -> ConfigError:
+    def _unwritable(self, error: OSError) -> FishdError:
         where = error.filename or self.path
-        return ConfigError(
+        return FishdError(
             f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
         )
 
