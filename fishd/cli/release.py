@@ -35,22 +35,22 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     systemd runs this when the service has ended (ExecStopPost). A servo without pulses is not
     touched. Exit status 1 when the servo cannot be reached or has pulses at the end, and when no
     configuration says where a servo is: the defaults are those of a simulated fish. One that a file
-    says is simulated has nothing to release, and that is no error. Once it has begun, neither a
+    says is simulated has nothing to release, which is a success. Once it has begun, neither a
     lost session nor Ctrl-C ends it halfway.
     """
-    config, found = _loaded(file, overrides)
+    config, source = _loaded(file, overrides)
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
     if config.has_hardware:
         click.echo(why + _release(config))
         return 0
-    if found is None:
+    if source is None:
         raise click.ClickException(
             f"{why}nothing was released: without a configuration file (${FILE_VARIABLE}, else "
             f"{SERVICE_FILE}) the robot is simulated; name the one that fishd runs with: "
             "fishctl release --config FILE"
         )
-    click.echo(f"{why}a simulated fish, by {found}, has nothing to release")
+    click.echo(f"{why}a simulated fish, by {source}, has nothing to release")
     return 0
 
 
@@ -59,15 +59,15 @@ def release_by_config(silence: NoDaemon, file: Path | None) -> str:
 
     silence: what is said where no configuration names a servo
     """
-    config, found = _loaded(file, ())
+    config, source = _loaded(file, ())
     if config.has_hardware:
         return _release(config)
-    if found is None:
+    if source is None:
         raise click.ClickException(
             f"{silence}; nothing was released: without a configuration file (${FILE_VARIABLE}, "
             f"else {SERVICE_FILE}) no servo is known; fishctl estop --config FILE names one"
         )
-    return f"a simulated fish, by {found}, has no pulses, and its fishd does not answer ({silence})"
+    return f"a simulated fish, by {source}, has no pulses; its fishd does not answer ({silence})"
 
 
 def _release(config: Config) -> str:
@@ -120,7 +120,7 @@ def _ask(config: Config, driver: str) -> str:
 
 
 def _loaded(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path | None]:
-    """As `load_service`; a configuration that is wrong in its state folder alone goes without."""
+    """Do as `load_service`, but leave out a state folder that alone is wrong."""
     try:
         return load_service(file, overrides)
     except ConfigError as error:
@@ -134,9 +134,7 @@ def _loaded(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path
 
 
 def _end_pulses(config: Config) -> bool:
-    """True where there were any; whatever is wrong with the calibration or its folder: neutral may
-    then be off by the trim.
-    """
+    """Return whether there were any; with an unreadable calibration, neutral lacks its trim."""
     from fishd.config.assembly import end_pulses
 
     try:

@@ -1,6 +1,6 @@
-"""A lock file beside what only one process may use, which names that process.
+"""Lock files, each beside what only one process may use; it names that process.
 
-The lock ends with its process, however that ends; a socket file stays. What somebody else has put
+The lock ends with its process, however that ends; a socket file stays. What another user has put
 in place of the lock file, such as a link to another file, is left alone.
 """
 
@@ -43,7 +43,7 @@ def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterato
 
     shared: the group of the file may lock it, too, and another user may have made it
     remove: take the lock file away at the end, where that is permitted
-    Raises `Taken` when somebody holds it, this process included, OSError when it cannot be made,
+    Raises `Taken` when a process holds it, this one included, OSError when it cannot be made,
     and `NotALock`, an OSError, where it is something else.
     """
     lock = _held(path, shared)
@@ -65,7 +65,7 @@ def holder(path: Path) -> str:
     """
     try:
         lock = _opened(lock_path(path), os.O_RDONLY, shared=True)
-    except OSError:  # nobody has ever held it, or this user may not know
+    except OSError:  # it was never held, or this user may not know
         return ""
     try:
         fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -112,7 +112,7 @@ def _opened(path: Path, flags: int, *, shared: bool) -> int:
     if what := _strange(found, path.parent, shared):
         os.close(lock)
         raise NotALock(path, what)
-    # A user who can only open a file for reading can lock it.
+    # To open a file for reading is enough to lock it.
     mode = 0o660 if shared else 0o600
     if found.st_uid == os.geteuid() and stat.S_IMODE(found.st_mode) != mode:
         os.fchmod(lock, mode)

@@ -24,7 +24,7 @@ FOLDER = Path("/run/fishd-locks")
 Elsewhere another user could hold a lock, or make the file of one, and so keep fishd from starting.
 """
 TRIES, PAUSE = 50, 0.02
-"""How often a claim is tried, as somebody may only be asking; and the time between [s]."""
+"""How often a claim is tried, as a process may hold it for a look; and the time between [s]."""
 
 
 class Part(NamedTuple):
@@ -39,12 +39,12 @@ class Part(NamedTuple):
 
 
 def lock_folder() -> Path:
-    """Return the folder of all users who may drive the hardware; else one of this user alone."""
+    """Return the folder for all users of the hardware, else one for this user."""
     return FOLDER if FOLDER.is_dir() else Path(runtime_folder())
 
 
 def parts_of_pi(claims: Mapping[str, Iterable[Claim]]) -> tuple[Part, ...]:
-    """What robot pi drives: all that its drivers claim, by the section of each."""
+    """Return what robot pi drives: all that its drivers claim, by the section of each."""
     folder = lock_folder()
     parts: dict[Path, Part] = {}
     for section, found in claims.items():
@@ -55,7 +55,7 @@ def parts_of_pi(claims: Mapping[str, Iterable[Claim]]) -> tuple[Part, ...]:
 
 
 def parts_of_virtual_pi(socket: Path) -> tuple[Part, ...]:
-    """What robot virtual-pi drives: the virtual Pi that listens on `socket`."""
+    """Return what robot virtual-pi drives: the virtual Pi that listens on `socket`."""
     real = socket.resolve()  # it may have several names
     path = real.with_name(f"{real.name}.fishd")
     return (Part(path, f"the virtual Pi on {socket}", "virtual_pi.socket"),)
@@ -77,7 +77,7 @@ def owned(parts: Iterable[Part]) -> Iterator[None]:
                 if isinstance(error, PermissionError) and part.path.parent == FOLDER:
                     raise StartupError(
                         f"{lock_path(part.path)}: {error.strerror}, so whether another fishd "
-                        f"drives {part.what} cannot be told; join the group of {FOLDER} "
+                        f"drives {part.what} is not known; join the group of {FOLDER} "
                         "('sudo usermod -aG fishd USER'), log in again, then try again"
                     ) from None
                 log.warning(

@@ -50,7 +50,7 @@ SINGLE = [name for name in FAILURES if name != "SIGSTOP of all three"]
 
 
 class Trials(Struct):
-    """What was measured of one failure [s]."""
+    """Times that were measured of one failure [s]."""
 
     new_client: list[float] = []
     """Times to the answer to an emergency stop, for clients that connected after the failure."""
@@ -103,7 +103,7 @@ def swim_again(fishd: Fishd) -> None:
 
 
 def try_failure(fishd: Fishd, name: str, times: int) -> Trials:
-    """Measure one failure; each quantity so many times."""
+    """Measure one failure `times` times, each quantity as often."""
     trials = Trials()
     for _ in range(times):
         with Fish(fishd.endpoint) as connected:
@@ -126,15 +126,15 @@ def try_failure(fishd: Fishd, name: str, times: int) -> Trials:
 
 def kill_in_a_row(fishd: Fishd) -> list[float]:
     """Kill the control gateway again and again; the times to the answer to `status` [s]."""
-    found = []
+    times = []
     for _ in range(KILLS_IN_A_ROW):
         os.kill(fishd.gateway("control"), signal.SIGKILL)
-        found.append(time_answer(fishd, time.monotonic()))
-    return found
+        times.append(time_answer(fishd, time.monotonic()))
+    return times
 
 
 class LastResort(Struct):
-    """What `fishctl estop` did for a fishd that could not [s]."""
+    """Trials of `fishctl estop` on a fishd that does not answer."""
 
     off: list[float] = []
     """Times from its start to the end of the pulses."""

@@ -31,7 +31,7 @@ _CHUNK = 65536
 _SHOWN = 200
 """How much of a bad message is shown [bytes]."""
 
-_MORE, _LONG, _COMMAND = 1, 2, 4
+_MORE_FLAG, _LONG_FLAG, _COMMAND_FLAG = 1, 2, 4
 """Flags of a frame: others follow, its size has 8 bytes, it is a command."""
 _GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 
@@ -43,12 +43,12 @@ def _property(name: bytes, value: bytes) -> bytes:
 def _frame(flags: int, payload: bytes) -> bytes:
     size = len(payload)
     if size > 255:
-        return bytes([flags | _LONG]) + size.to_bytes(8, "big") + payload
+        return bytes([flags | _LONG_FLAG]) + size.to_bytes(8, "big") + payload
     return bytes([flags, size]) + payload
 
 
 _READY = _frame(
-    _COMMAND, b"\x05READY" + _property(b"Socket-Type", b"DEALER") + _property(b"Identity", b"")
+    _COMMAND_FLAG, b"\x05READY" + _property(b"Socket-Type", b"DEALER") + _property(b"Identity", b"")
 )
 
 
@@ -102,7 +102,7 @@ class Wire:
         return self._poll.fileno()
 
     def state(self) -> tuple[bool, bool]:
-        """Can a message be sent, and is there one to receive?"""
+        """Return whether a message can be sent, and whether there is one to receive."""
         if not self._closed:
             self._advance()
         return self._ready and not self._unsent, bool(self._inbox)
@@ -115,7 +115,7 @@ class Wire:
             self._drop()
 
     def receive(self) -> FromAgent:
-        """A message, where `state` says that there is one.
+        """Return a message, where `state` says that there is one.
 
         Raises `ControllerFault` when it is not a message that an agent may send.
         """
@@ -225,9 +225,9 @@ class Wire:
             return
         while frame := self._next_frame():
             flags, payload = frame
-            if flags & _COMMAND:
+            if flags & _COMMAND_FLAG:
                 self._obey(payload)
-            elif flags & _MORE:
+            elif flags & _MORE_FLAG:
                 self._refuse("a message of several frames; one frame of JSON is needed")
             else:
                 self._inbox.append(self._decode(payload))
@@ -250,7 +250,7 @@ class Wire:
         if len(self._received) < 2:
             return None
         flags = self._received[0]
-        begin = 9 if flags & _LONG else 2
+        begin = 9 if flags & _LONG_FLAG else 2
         if len(self._received) < begin:
             return None
         size = int.from_bytes(self._received[1:begin], "big")
@@ -269,7 +269,7 @@ class Wire:
             self._ready = True
             self.connections += 1
         elif name == b"PING":
-            self._write(_frame(_COMMAND, b"\x04PONG" + command[7:]))
+            self._write(_frame(_COMMAND_FLAG, b"\x04PONG" + command[7:]))
         elif name == b"ERROR":
             raise ConnectionError
 
@@ -303,8 +303,8 @@ class Wire:
 def _addresses(where: Tcp, flags: int) -> list[tuple[int, object]]:
     """Look a host up; raises OSError."""
     family = socket.AF_INET6 if ":" in where.host else socket.AF_INET
-    found = socket.getaddrinfo(where.host, int(where.port), family, socket.SOCK_STREAM, flags=flags)
-    return [(each[0], each[4]) for each in found]
+    hosts = socket.getaddrinfo(where.host, int(where.port), family, socket.SOCK_STREAM, flags=flags)
+    return [(host[0], host[4]) for host in hosts]
 
 
 def _why(payload: bytes, error: msgspec.DecodeError) -> str:
@@ -318,9 +318,9 @@ def _why(payload: bytes, error: msgspec.DecodeError) -> str:
 
 
 def _excerpt(payload: bytes, error: str) -> str:
-    """As much of a message as shows what is wrong: around the byte that the decoder names."""
-    found = re.search(r"\(byte (\d+)\)", error)
-    begin = max(0, int(found[1]) - _SHOWN // 2) if found and len(payload) > _SHOWN else 0
+    """Return the part of a message that is wrong: around the byte that the decoder names."""
+    match = re.search(r"\(byte (\d+)\)", error)
+    begin = max(0, int(match[1]) - _SHOWN // 2) if match and len(payload) > _SHOWN else 0
     shown = payload[begin : begin + _SHOWN]
     before, after = "…" * (begin > 0), "…" * (begin + len(shown) < len(payload))
     return f"{before}{shown.decode(errors='replace')}{after}"

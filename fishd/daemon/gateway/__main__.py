@@ -47,7 +47,7 @@ def main(number: str) -> int:
             elif message.startswith(link.START):
                 kind, address = link.kind_and_address(message)
                 former = children.pop(kind, None)
-                if former is not None:  # a child that nobody has waited for keeps its number
+                if former is not None:  # an ended child keeps its number until waitpid
                     os.kill(former, signal.SIGKILL)
                 try:
                     pid = os.fork()

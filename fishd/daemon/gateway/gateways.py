@@ -256,7 +256,7 @@ class Gateway(_Peer):
     def send(self, message: bytes) -> bool:
         """Send without waiting; False if the pipe is full: the message counts as lost.
 
-        What is sent while there is no process is lost as well: no client waits for it there.
+        Messages without a process to take them are lost as well: no client waits for them there.
         """
         try:
             if self._link is None:
@@ -426,7 +426,7 @@ def _tell_restart(reporter: Reporter, kind: str, why: str) -> None:
 
 
 class Telemetry:
-    """Publishes ticks, events and status: a topic and one JSON object each; waits for nobody."""
+    """Publishes ticks, events and status: a topic and one JSON object each, without waiting."""
 
     def __init__(self, send: Callable[[bytes], object]) -> None:
         """send: takes a message for the gateway, without waiting"""
