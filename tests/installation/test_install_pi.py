@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from rigs.documents import ROOT as CHECKOUT
+from rigs.once import once
 from rigs.processes import call
 
 CONFIG = "etc/fishd/fishd.yaml"
@@ -21,10 +22,13 @@ AS_INSTALLED = "opt/fishd/fishd.yaml.installed"
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    pip = [sys.executable, "-m", "pip", "--quiet", "wheel", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, f"--wheel-dir={folder}", CHECKOUT], check=True, capture_output=True)
-    return next(folder.glob("fishd-*.whl"))
+    def make(folder: Path) -> Path:
+        pip = [sys.executable, "-m", "pip", "--quiet", "wheel", "--no-deps"]
+        words = [*pip, "--no-build-isolation", f"--wheel-dir={folder}", CHECKOUT]
+        subprocess.run(words, check=True, capture_output=True)
+        return next(folder.glob("fishd-*.whl"))
+
+    return once(tmp_path_factory, "wheel", make)
 
 
 class Pi:
@@ -72,14 +76,18 @@ class Pi:
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pi:
     """An installation where the Python of an earlier one is gone."""
-    pi = Pi(tmp_path_factory.mktemp("pi"), wheel)
-    left = pi.disk / "opt/fishd"
-    for name in ("python", "python3", f"python3.{sys.version_info[1]}"):
-        (left / "bin").mkdir(parents=True, exist_ok=True)
-        (left / "bin" / name).symlink_to("/nowhere/python3")
-    (left / "lib/python3.9/site-packages/fishd").mkdir(parents=True)
-    assert pi.run("install_pi.sh")[0].startswith("/opt/fishd: made with Python 3.")
-    return pi
+
+    def make(folder: Path) -> Pi:
+        pi = Pi(folder / "disk", wheel)
+        left = pi.disk / "opt/fishd"
+        for name in ("python", "python3", f"python3.{sys.version_info[1]}"):
+            (left / "bin").mkdir(parents=True, exist_ok=True)
+            (left / "bin" / name).symlink_to("/nowhere/python3")
+        (left / "lib/python3.9/site-packages/fishd").mkdir(parents=True)
+        assert pi.run("install_pi.sh")[0].startswith("/opt/fishd: made with Python 3.")
+        return pi
+
+    return once(tmp_path_factory, "installed", make)
 
 
 @pytest.fixture

@@ -1,8 +1,5 @@
 """Without the extra 'learn', only tests that do not need it are collected; and what they share."""
 
-import fcntl
-import os
-import pickle
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from msgspec.structs import replace
+from rigs.once import once
 from rigs.processes import Daemon, running, sets
 
 if TYPE_CHECKING:
@@ -42,24 +40,17 @@ def daemon(shared_daemon: Daemon) -> Daemon:
     return shared_daemon.at_rest()
 
 
-def once(factory: pytest.TempPathFactory, name: str, **settings: Any) -> "Outcome":
-    """A training that takes seconds: the first of the workers does it, the others wait for it."""
+def trained_once(factory: pytest.TempPathFactory, name: str, **settings: Any) -> "Outcome":
+    """Train for seconds, in one of the test processes."""
     from rigs.swimming import brief_job
 
     from fishd.learning.settings import TrainingSettings
     from fishd.learning.train.training import train
 
-    base = factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
-    folder.mkdir(exist_ok=True)
-    kept = folder / "outcome"
-    with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not kept.exists():
-            job = replace(brief_job(folder / "run"), settings=TrainingSettings(**settings))
-            kept.write_bytes(pickle.dumps(train(job)))
-        found: Outcome = pickle.loads(kept.read_bytes())
-    return found
+    def make(folder: Path) -> "Outcome":
+        return train(replace(brief_job(folder / "run"), settings=TrainingSettings(**settings)))
+
+    return once(factory, name, make)
 
 
 @pytest.fixture(scope="session")
@@ -68,7 +59,7 @@ def by_force(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
     from fishd.learning.settings import EvaluationSettings
 
     evaluation = EvaluationSettings(seconds=10.0, settle=5.0)
-    return once(tmp_path_factory, "by-force", steps=1024, evaluation=evaluation)
+    return trained_once(tmp_path_factory, "by-force", steps=1024, evaluation=evaluation)
 
 
 @pytest.fixture(scope="session")
@@ -77,4 +68,6 @@ def by_sight(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
     from fishd.learning.settings import EvaluationSettings
 
     evaluation = EvaluationSettings(seconds=6.0, settle=2.0)
-    return once(tmp_path_factory, "by-sight", see="camera", steps=1024, evaluation=evaluation)
+    return trained_once(
+        tmp_path_factory, "by-sight", see="camera", steps=1024, evaluation=evaluation
+    )
