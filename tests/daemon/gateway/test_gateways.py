@@ -17,7 +17,7 @@ from rigs.documents import ROOT
 from rigs.gateway_processes import children, fork_server, gateways, gone
 from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
-from fishd.client import Fish
+from fishd.client import AsyncFish, Fish
 from fishd.daemon.gateway import link
 from fishd.daemon.gateway.gateways import (
     FAREWELL,
@@ -149,7 +149,19 @@ def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> 
         assert fish.status().reason.message == "from a test"  # type: ignore[union-attr]
 
 
+def test_an_asyncio_client_has_its_estop_answered_then_too(daemon: Daemon) -> None:
+    async def stop() -> str:
+        async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
+            return (await fish.estop()).mode
+
+    for pid in (fork_server(daemon), *gateways(daemon).values()):
+        os.kill(pid, signal.SIGSTOP)
+    assert asyncio.run(stop()) == "estop"
+
+
 def test_the_socket_for_an_estop_takes_nothing_else(lasting: Daemon) -> None:
+    path = Path(lasting.endpoint.removeprefix("ipc://") + ".estop")
+    assert path.stat().st_mode & 0o777 == 0o660
     with lasting.estop_socket() as client:
         for request, error in (
             (b'{"v":1,"id":1,"op":"clear-fault"}', "unknown-op"),
