@@ -8,10 +8,9 @@ import click
 import msgspec
 
 from fishd.cli.options import daemon_options
-from fishd.cli.output import echo, print_json, state_line
+from fishd.cli.output import echo, output_may_fail, print_json, state_line
 from fishd.client import Fish
 from fishd.core.addresses import socket_path
-from fishd.core.console import lose_output, why_not_written
 from fishd.core.errors import NoDaemon, StartupError, Untrusted
 from fishd.core.interruption import SIGNALS, handled
 from fishd.core.protocol import State
@@ -50,14 +49,11 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
         else:
             way, said = _way(fish, path), state_line(state)
             answer = _builtins(state)
-    try:
+    with output_may_fail(said):
         if as_json:
             print_json({"way": way, **answer})
         else:
             echo(f"{said}\nway: {way}")
-    except OSError as error:  # the pulses have ended all the same
-        lose_output()
-        echo(f"fishctl: {said}; {why_not_written(error)}", err=True)
     return 0
 
 

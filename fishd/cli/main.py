@@ -1,6 +1,7 @@
 """The `fishctl` command: its verbs, loaded when they are called, and how errors look."""
 
 import sys
+import warnings
 
 import click
 
@@ -81,6 +82,8 @@ def main() -> None:
 
     Exit status: 0, 1 when the daemon refused or does not answer, 2 for a wrong command line.
     """
+    # Where there are no semaphores; a verb that needs them says so itself.
+    warnings.filterwarnings("ignore", message=".*joblib will operate in serial mode")
     try:
         sys.exit(run(fishctl, "fishctl"))
     except Refused as error:

@@ -1,7 +1,8 @@
 """How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from typing import Any, TypeVar
 
@@ -10,6 +11,7 @@ import msgspec
 
 from fishd.controllers import registry
 from fishd.core import text
+from fishd.core.console import lose_output, why_not_written
 from fishd.core.protocol import State
 from fishd.core.schema import format_values
 from fishd.core.signals import Reason
@@ -23,6 +25,20 @@ _MOST = 1_000_000
 def echo(message: Any = "", *, err: bool = False, nl: bool = True) -> None:
     """Print lines without any control character in them, on standard error where wanted."""
     click.echo(text.block(str(message), _MOST), err=err, nl=nl)
+
+
+@contextmanager
+def output_may_fail(done: str) -> Iterator[None]:
+    """Let what is printed be lost where it cannot be written, and say so, with what was done.
+
+    For verbs whose exit status tells of the servo.
+    """
+    try:
+        yield
+    except OSError as error:
+        lose_output()
+        with suppress(OSError):
+            echo(f"fishctl: {done}; {why_not_written(error)}", err=True)
 
 
 def echo_rows(rows: Sequence[tuple[str, str]]) -> None:

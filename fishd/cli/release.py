@@ -9,6 +9,7 @@ import click
 from msgspec.structs import replace
 
 from fishd.cli.config import load_service, service_option, set_option
+from fishd.cli.output import echo, output_may_fail
 from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
 from fishd.core import text
@@ -42,7 +43,9 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     ended = os.environ.get("SERVICE_RESULT")
     why = f"the service ended with '{ended}': " if ended else ""
     if config.has_hardware:
-        click.echo(why + _release(config))
+        done = why + _release(config)
+        with output_may_fail(done):
+            echo(done)
         return 0
     if source is None:
         raise click.ClickException(

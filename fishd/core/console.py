@@ -9,7 +9,7 @@ from typing import NoReturn
 import click
 
 from fishd.core import text
-from fishd.core.errors import ConfigError
+from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Status
 
 INTERRUPTED = 130
@@ -74,6 +74,8 @@ def run(command: click.Command, name: str) -> int:
         complain(name, str(error), os.EX_CONFIG)
     except click.Abort:
         complain(name, "interrupted", INTERRUPTED)
+    except FishdError:  # of which some are an OSError, too
+        raise
     except MemoryError:
         complain(name, f"there is not enough memory{_memory_limit()}", 1)
     except BrokenPipeError:  # the reader, `head` say, has seen enough
@@ -109,5 +111,6 @@ def lose_output() -> None:
 
 def complain(name: str, message: str, status: int) -> NoReturn:
     """Say one line on standard error and exit."""
-    click.echo(f"{name}: " + text.line(" ".join(message.split()), MAX_COMPLAINT), err=True)
+    with suppress(OSError):  # standard error may be full, too
+        click.echo(f"{name}: " + text.line(" ".join(message.split()), MAX_COMPLAINT), err=True)
     sys.exit(status)

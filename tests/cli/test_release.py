@@ -1,6 +1,7 @@
 """`fishctl release` without a daemon: on pigpiod, on the kernel's PWM, where nothing is to do."""
 
 import datetime
+import os
 import re
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import pigpio
 import pytest
 from rigs.operator_rig import Bench
 from rigs.pigpiod_client import dispose
-from rigs.processes import fishctl
+from rigs.processes import FISHCTL, call, fishctl
 
 from fishd.core.calibration import ServoCalibration
 from fishd.hardware.calibration_files import CalibrationFolder
@@ -61,6 +62,18 @@ def test_the_file_of_the_service_is_used_where_none_is_named(
     ended = release(*pi.settings[2:], FISHD_CONFIG=str(file))
     assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
     assert ended.stderr == f"fishctl: using {file}; --config names another file\n"
+    assert pi.pi.widths()[-3:] == [1750, 1500, 0]
+
+
+def test_an_output_that_takes_nothing_is_no_failure_of_the_release(
+    pi: Bench, other_program: pigpio.pi
+) -> None:
+    command = ["sh", "-c", '"$@" >/dev/full', "sh", FISHCTL, "release", *pi.settings]
+    ended = call(*command, env=os.environ | {"FISHD_CONFIG": ""})
+    said = (
+        "pulses were on: neutral, then off; the output cannot be written: No space left on device"
+    )
+    assert (ended.returncode, ended.stderr) == (0, f"fishctl: {said}\n")
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 

@@ -6,6 +6,7 @@ import click
 import pytest
 
 from fishd.core import console
+from fishd.core.errors import NoDaemon, ServoError
 
 
 @pytest.mark.parametrize("how", [KeyboardInterrupt, EOFError])
@@ -49,3 +50,16 @@ def test_a_file_or_memory_that_makes_trouble_is_one_line(
     line = capsys.readouterr().err
     assert line.startswith(f"fishctl: {said}")
     assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize("error", [ServoError("no pulses"), NoDaemon("no fishd")])
+def test_an_error_of_fishd_is_no_error_of_the_output(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @click.command()
+    def fails() -> None:
+        raise error
+
+    monkeypatch.setattr("sys.argv", ["fishctl"])
+    with pytest.raises(type(error), match=str(error)):
+        console.run(fails, "fishctl")
