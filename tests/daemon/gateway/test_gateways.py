@@ -149,6 +149,28 @@ def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> 
         assert fish.status().reason.message == "from a test"  # type: ignore[union-attr]
 
 
+@pytest.mark.realtime
+@pytest.mark.parametrize("connected", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("what", ["control", "telemetry", "fork server"])
+def test_an_estop_is_answered_within_a_fifth_of_a_second_after_any_single_failure(
+    lasting: Daemon, what: str, number: signal.Signals, connected: bool
+) -> None:
+    wait_until(lambda: len(gateways(lasting)) == 2)
+    pid = fork_server(lasting) if what == "fork server" else gateways(lasting)[what]
+    with Fish(lasting.endpoint) as fish:
+        if connected:
+            fish.status()
+        os.kill(pid, number)
+        begun = time.monotonic()
+        fish.estop()
+        assert time.monotonic() - begun <= 0.2
+    wait_until(lambda: gone(pid))
+    with Fish(lasting.endpoint, timeout=PATIENCE) as fish:
+        fish.clear_fault()
+        fish.set_controller("swing")
+
+
 def test_an_asyncio_client_has_its_estop_answered_then_too(daemon: Daemon) -> None:
     async def stop() -> str:
         async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
