@@ -1,4 +1,4 @@
-"""What verbs that hold the fish share: the option `--take`, and what their lease is called."""
+"""The option `--take` of verbs that hold the fish, and the name of their lease."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class VerbLease(NamedTuple):
     """How the running verb takes the lease of a fish."""
 
     experiment: str
-    """Its name, such as `measure swing`."""
+    """Name of the lease, such as `measure swing`."""
     take: bool
 
 

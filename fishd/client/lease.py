@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RENEWALS = 5
-"""Renewals in the time that a lease lasts without any."""
+"""Renewals in the time for which a lease lasts."""
 IDLE_LIMIT = 30.0
 """Time after which a program that does nothing while the fish swims counts as hung [s]."""
 BUSY_FRACTION = 0.02
@@ -26,7 +26,7 @@ BUSY_FRACTION = 0.02
 
 
 class LeaseRenewal(threading.Thread):
-    """Renews a lease on a connection of its own until it is stopped, or the lease is lost.
+    """Renews a lease on a second connection until it is stopped, or the lease is lost.
 
     A process that is killed, stopped by a signal or cut off from fishd renews nothing. One that
     computes does, for as long as it lives; only while the fish swims does the thread that took the

@@ -1,4 +1,4 @@
-"""Who drives the fish: the lease of an experiment, which ends unless it is renewed.
+"""The lease of the experiment that drives the fish; it ends unless it is renewed.
 
 The loop asks once a tick whether it has run out; requests take it, renew it and end it.
 """
@@ -67,7 +67,8 @@ class Lease:
     def renew(self, token: str) -> None:
         """Let the lease last for its full time again; raise `Refused` where it has ended.
 
-        One that ran out while the fish was at rest goes on, if nobody has touched the fish since.
+        One that ran out while the fish was at rest goes on, if no other client has had the fish
+        since.
         """
         if token != self._token or not (self.active or self._dormant):
             why = self._ends.get(token, "fishd was restarted, or it is long ago")

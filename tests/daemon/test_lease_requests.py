@@ -14,7 +14,7 @@ from fishd.daemon.requests import Operations
 
 
 class Client:
-    """Asks a daemon, whose loop ticks only when it is told to."""
+    """Sends requests to a daemon whose loop ticks only when the test lets it."""
 
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
@@ -39,12 +39,13 @@ Story = Callable[[Client], Awaitable[None]]
 
 def tell(folder: Path, story: Story, *overrides: str) -> Rig:
     rig = Rig(*overrides)
-    asyncio.run(_told(story, Client(rig, folder)))
+    client = Client(rig, folder)
+
+    async def run() -> None:
+        await story(client)
+
+    asyncio.run(run())
     return rig
-
-
-async def _told(story: Story, client: Client) -> None:
-    await story(client)
 
 
 def test_a_lease_lasts_as_configured_or_as_asked_for_within_bounds(tmp_path: Path) -> None:

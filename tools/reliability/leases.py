@@ -31,9 +31,11 @@ from reliability.kills import PATIENCE, run, serve_forks
 
 DOCUMENT = "reliability.md"
 LEASE = 2.0
-"""That of the configuration, by default [s]."""
+"""Time that a lease lasts, by default [s]."""
 GRACE = 0.5
 """[s]"""
+TICK = 0.05
+"""Period of the loop, by default [s]."""
 WINDOW = 6.0
 """An experiment rests for about 3 s at first, and swims then [s]."""
 STOPPED = 0.15
@@ -41,7 +43,7 @@ STOPPED = 0.15
 ATTEMPTS = 5
 """Attempts at one kill; see `Lane.kill`."""
 QUIET = 0.3
-"""A fish that was at neutral for so long after a lease has ended is at rest [s]."""
+"""Time at neutral, after a lease has ended, from which on a fish is at rest [s]."""
 
 FREE = ("--folder", "{folder}")
 VERBS: dict[str, tuple[str, ...]] = {
@@ -69,7 +71,7 @@ MODULES = (
     "onnxruntime",
     "tensorboard",
 )
-"""What the verbs import, so that each of them starts in a fraction of a second."""
+"""Modules that the verbs import, so that each of them starts in a fraction of a second."""
 
 
 class Kill(Struct):
@@ -83,9 +85,9 @@ class Kill(Struct):
     swimming: bool
     """Whether a controller was active at that moment."""
     idle: float
-    """When fishd was in mode idle for good, from the kill on [s]."""
+    """Time from the kill until the last tick in mode running [s]."""
     rest: float
-    """When the fish was at neutral for good, from the kill on [s]; infinite where it never was."""
+    """Time from the kill until the last tick away from neutral [s]; infinite where it swims on."""
     faults: int = 0
     """Attempts before this one in which fishd was held up until that was a fault."""
     losses: int = 0
@@ -171,7 +173,7 @@ class Lane:
         raise SystemExit(self._log())
 
     def _watch(self, fish: Fish, killed: float) -> tuple[float, float]:
-        """Return when the fish was idle, and at neutral, for good, from the kill on [s]."""
+        """Return times from the kill to the last tick in mode running, and away from neutral."""
         idle = rest = killed
         limit = killed + LEASE + GRACE + 3.0
         while True:
@@ -224,7 +226,7 @@ def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Con
 
 def in_time(kill: Kill) -> bool:
     """Return whether the fish was at rest in time, its fade included."""
-    return kill.rest <= LEASE + GRACE
+    return kill.rest + TICK <= LEASE + GRACE
 
 
 def summary(kills: list[Kill], seed: int) -> str:
@@ -249,8 +251,8 @@ def summary(kills: list[Kill], seed: int) -> str:
             ]
         )
     head = (
-        "experiment | kills, of them SIGSTOP | while it swam | idle after, at most [s] | "
-        f"at neutral after, at most [s] | within {LEASE + GRACE:g} s"
+        "experiment | kills, of them SIGSTOP | while it swam | last tick in mode `running`, at "
+        f"most [s] | last tick away from neutral, at most [s] | at rest within {LEASE + GRACE:g} s"
     )
     faults, losses = (sum(getattr(kill, name) for kill in kills) for name in ("faults", "losses"))
     about = f"Seed {seed}; kills from 0 to {WINDOW:g} s after an experiment took the fish."
@@ -266,7 +268,7 @@ OPTIONS: Options = {
     "--kills": {"type": int, "default": 100, "help": "of each verb; default 100"},
     "--lanes": {"type": int, "default": 2, "help": "fishds side by side; default 2"},
     "--seed": {"type": int, "default": 1, "help": "of the instants; default 1"},
-    "--limit": {"type": float, "default": 7200.0, "help": "no longer than so many seconds"},
+    "--limit": {"type": float, "default": 7200.0, "help": "longest time [s]"},
     "--verb": {"choices": list(VERBS), "help": "this one only"},
 }
 
