@@ -81,8 +81,10 @@ class View:
         width, height = options.max_width, options.height or console.height
         header = [self._title()]
         reason, fallback = self.status.reason, self.status.fallback
-        if why := reason or fallback:
-            message = text.line(f"{'' if reason else 'took over: '}{why.code}: {why.message}")
+        if why := reason or fallback or self.status.lease_expired:
+            message = text.line(
+                f"{'took over: ' if why is fallback else ''}{why.code}: {why.message}"
+            )
             header += Text(message, "red" if reason else "yellow").wrap(console, width)
         yield from header
         own = self._quantities()

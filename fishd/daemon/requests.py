@@ -80,10 +80,10 @@ class Operations:
             "stop": self._stop,
             "estop": self._estop,
             "clear-fault": self._clear_fault,
-            "mark": self._mark,
             "take-lease": self._take_lease,
             "renew-lease": self._renew_lease,
             "end-lease": self._end_lease,
+            "mark": self._mark,
             **calibration_requests.handlers,
             "calibrate-thrust": self._calibrate_thrust,
         }

@@ -66,7 +66,9 @@ def test_of_one_that_gives_up_later_it_is_said_that_its_runs_before_stand_in_the
         return measure(rig, controller, *given)
 
     monkeypatch.setattr("fishd.cli.compare.Fish", lambda _: nullcontext(fish))
-    monkeypatch.setattr("fishd.lab.compare.piloted_rig.PilotedRig", lambda *_: VirtualRig(Config()))
+    monkeypatch.setattr(
+        "fishd.lab.compare.piloted_rig.PilotedRig", lambda *_, **__: VirtualRig(Config())
+    )
     monkeypatch.setattr("fishd.lab.compare.live.measure", tiring)
     done = run("swing", "sine", "--on", "robot", "--for", "25", "--runs", "2")
     assert done.stderr == (
