@@ -43,7 +43,8 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
             axis.set_ylim(*limits(LEAST_QUANTITY, values))
             axis.set_ylabel(name.replace(" (", "\n("))
         axes[-1].set_xlabel("time (s)")
-        axes[0].set_xlim(traces.time[0], max(traces.time[-1], traces.time[0] + 0.1))
+        first, last = traces.time.min(), traces.time.max()  # the clock may have been set
+        axes[0].set_xlim(first, max(last, first + 0.1))
         for axis in axes:
             _events(axis, traces, named=axis is axes[0])
         if traces.portrait:
@@ -111,12 +112,13 @@ def _headroom(axis: "Axes") -> None:
 
 def _events(axis: "Axes", traces: Traces, *, named: bool) -> None:
     labels = named and len(traces.events) <= MOST_LABELS
+    first, last = axis.get_xlim()
     where = axis.get_xaxis_transform()
     times = [event.time for event in traces.events]
     colours = [COLOURS.get(event.kind, GREY) for event in traces.events]
     axis.vlines(times, 0.0, 1.0, colors=colours, linewidth=0.7, linestyle="--", transform=where)
     for index, (event, colour) in enumerate(zip(traces.events, colours, strict=True)):
-        if labels:
+        if labels and first <= event.time <= last:
             axis.text(
                 event.time,
                 1.02 + 0.09 * (index % 2),  # neighbours do not cover one another

@@ -26,7 +26,9 @@ SHOWN = ("mark", "controller", "parameters", "fallback", "fault", "calibration")
 
 LONGEST_TEXT = 48
 """Of an event [characters]."""
-MAX_QUANTITIES = 24
+LONGEST_NAME, LONGEST_UNIT = 24, 8
+"""Of a quantity, and of the forces; longer ones leave a panel no room [characters]."""
+MAX_QUANTITIES = 12
 """Quantities of controllers in one figure; of more, the first are drawn."""
 MAX_EVENTS = 500
 """Events in one figure; of more, the first are drawn."""
@@ -112,7 +114,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     ]  # fmt: skip
     return Traces(
         title="; ".join((_title(run), *left_out)),
-        unit=f"m{text.quoted(run.summary.force_unit)}",
+        unit=f"m{text.line(run.summary.force_unit, LONGEST_UNIT)}",
         time=time,
         fx=1e3 * column("fx"),
         fy=1e3 * column("fy"),
@@ -124,7 +126,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         alpha=column("alpha") if simulated else None,
         alpha_rate=column("alpha_rate") if simulated else None,
         quantities={
-            f"{text.quoted(name)} ({units.get(name, '1')})": quantity(name)
+            f"{text.line(name, LONGEST_NAME)} ({units.get(name, '1')})": quantity(name)
             for name in list(names)[:MAX_QUANTITIES]
         },
         portrait=_portrait(time, swims),

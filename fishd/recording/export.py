@@ -57,7 +57,7 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
             if form == "csv":
                 write_atomically(path, _harmless(table).to_csv(index=False))
             else:
-                _write_parquet(path, table, about)
+                _write_parquet(path, table, about, run)
         except OSError as error:
             raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
     if run.frame_heads:
@@ -134,8 +134,13 @@ def _size(frame: RecordedFrame) -> str:
     return f"{width} x {height} px"
 
 
-def _write_parquet(path: Path, frame: pandas.DataFrame, about: bytes) -> None:
-    table = pyarrow.Table.from_pandas(frame, preserve_index=False)
+def _write_parquet(path: Path, frame: pandas.DataFrame, about: bytes, run: Run) -> None:
+    try:
+        table = pyarrow.Table.from_pandas(frame, preserve_index=False)
+    except (pyarrow.ArrowException, OverflowError) as error:
+        raise RecordingError(
+            f"{run.path} cannot be written as Parquet: {text.said(error)}; --csv takes any number"
+        ) from None
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), b"fishd": about})
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(table, sink)

@@ -33,6 +33,8 @@ T = TypeVar("T")
 TOPICS = dict(enumerate((*CHANNELS, images.TOPIC), start=1))
 """Topics of channels as `RunWriter` numbers them, for a file in which that part is damaged."""
 
+MAX_DIGITS = 9
+"""Digits of the number of a fishd in a recording."""
 MAX_COLUMNS = 100
 """Quantities of controllers in one table; each takes a number a tick."""
 
@@ -245,7 +247,7 @@ class Run:
             elif isinstance(record, Attachment):
                 try:
                     self._take_attachment(record.name, record.data)
-                except (ValueError, LookupError) as error:  # also msgspec.DecodeError
+                except ValueError as error:  # also msgspec.DecodeError
                     self._damages.append(ticks)
                     why = f"{text.quoted(record.name)}: {text.said(error)}"
                     self.damage_reason = self.damage_reason or why
@@ -271,7 +273,10 @@ class Run:
 
     def _take_attachment(self, name: str, data: bytes) -> None:
         if name == CONFIG:
-            self._yaml[int(self.daemons[-1]["number"])] = data
+            number = self.daemons[-1].get("number", "") if self.daemons else ""
+            if not (number.isdecimal() and len(number) <= MAX_DIGITS):
+                raise ValueError("the number of its fishd is not known")
+            self._yaml[int(number)] = data
         elif name == CALIBRATIONS:
             self.calibrations.append(decoder(Calibrations)(data))
 
@@ -282,7 +287,8 @@ class Run:
         except msgspec.DecodeError as error:
             made = self.about.get("version", "unknown")
             raise RecordingError(
-                f"{self.path}: a {topic} of fishd {made} cannot be read by this one: {error}"
+                f"{self.path}: a message '{topic}' of fishd {made} cannot be read by this one: "
+                f"{error}"
             ) from None
 
 

@@ -19,7 +19,7 @@ from fishd.control.guard import Guard
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
 from fishd.core import text
-from fishd.core.errors import RecordingError
+from fishd.core.errors import FishdError, RecordingError
 from fishd.core.foreign_code import contained
 from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
@@ -291,7 +291,12 @@ class _Rerun:
         name = self._name or recorded
         given = {**parameters, **self._parameters} if name == recorded else self._parameters
         limits = replace(self._config.limits, virtual=self._run.about.get("source") == "simulation")
-        self._swims = registry.create(name, given, limits)
+        try:
+            self._swims = registry.create(name, given, limits)
+        except FishdError as error:
+            if self._name or self._parameters:
+                raise
+            raise RecordingError(f"{self._run.path}: {error}") from None
         self.stretches.append(
             Stretch(recorded, parameters, name, tick.t, tick.seq, from_start=from_start)
         )
@@ -301,7 +306,11 @@ class _Rerun:
         stretch, swims = self.stretches[-1], self._swims
         if swims is not None and stretch.controller == stretch.recorded:
             values = {**parameters, **self._parameters}
-            contained(swims.retune, registry.check(stretch.controller, values, swims.limits))
+            try:
+                checked = registry.check(stretch.controller, values, swims.limits)
+            except FishdError as error:
+                raise RecordingError(f"{self._run.path}: {error}") from None
+            contained(swims.retune, checked)
 
     def _parameters_of(self, tick: Tick, upcoming: Messages) -> dict[str, Any]:
         """Those of a controller whose start is not in the recording: as the next status says."""

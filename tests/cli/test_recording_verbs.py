@@ -98,9 +98,10 @@ def test_what_is_recovered_is_said_with_its_frames(tmp_path: Path) -> None:
 def test_where_no_controller_swam_nothing_is_chosen_again(tmp_path: Path) -> None:
     rig = Rig()
     rig.run_for(0.5)
-    done = fishctl("rerun", str(recorded(rig, tmp_path / "run")))
+    path = recorded(rig, tmp_path / "run")
+    done = fishctl("rerun", str(path))
     assert done.returncode == 1
-    assert done.stderr == "fishctl: no controller swam: there is nothing to choose again\n"
+    assert done.stderr == f"fishctl: {path}: no controller swam, so none can choose again\n"
 
 
 @pytest.mark.parametrize("verb", ["export --csv", "plot", "replay", "rerun", "recover"])

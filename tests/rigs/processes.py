@@ -1,9 +1,7 @@
 """Starts and ends the real `fishd` and calls the real `fishctl`, as a user would."""
 
 import contextlib
-import io
 import os
-import signal
 import socket as sockets
 import subprocess
 import sys
@@ -15,10 +13,9 @@ from typing import Any, Self
 import msgspec
 import zmq
 
+from common.in_process import fishctl
 from common.processes import FISHCTL, FISHD, PATIENCE, Process, call, sets, wait_until
-from fishd.cli.main import main
 from fishd.client import Fish, NoDaemon
-from fishd.core.interruption import SIGNALS
 from fishd.core.signals import Status
 
 __all__ = [
@@ -27,27 +24,6 @@ __all__ = [
 ]  # fmt: skip
 
 UNHURRIED_FISHD = str(Path(__file__).with_name("unhurried_fishd.py"))
-
-
-def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """What a command says, and its exit status; it runs in this process, which saves its start.
-
-    Not for what a signal or a terminal is part of: `call(FISHCTL, ...)` is for that.
-    """
-    out, err = io.StringIO(), io.StringIO()
-    argv, sys.argv = sys.argv, ["fishctl", *arguments]
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            main()
-    except SystemExit as ended:
-        status = ended.code
-    finally:
-        sys.argv = argv
-        for number, handler in handlers.items():  # `watch` and `record` set some for good
-            signal.signal(number, handler)
-    assert isinstance(status, int)
-    return subprocess.CompletedProcess(arguments, status, out.getvalue(), err.getvalue())
 
 
 def one_line(done: subprocess.CompletedProcess[str]) -> str:

@@ -39,7 +39,8 @@ def rerun(
     fishctl rerun latest --controller swing C=0.4
     """
     given = _parameters(controller, parameters)
-    result = choose_again(opened(run, folder), controller, given, overrides)
+    recorded = opened(run, folder)
+    result = choose_again(recorded, controller, given, overrides)
     if as_json:
         print_json(result)
     else:
@@ -47,7 +48,7 @@ def rerun(
             _print(stretch)
         _print_estimates(result.estimates)
     if not result.stretches:
-        echo("fishctl: no controller swam: there is nothing to choose again", err=True)
+        echo(f"fishctl: {recorded.path}: no controller swam, so none can choose again", err=True)
         return 1
     same = controller is None and not given and not overrides
     wrong = [s for s in result.stretches if s.from_start and s.equal < s.ticks]

@@ -1,0 +1,74 @@
+"""The verbs that read recordings, run on files of any kind, and what is wrong with an answer."""
+
+import time
+import traceback
+from pathlib import Path
+
+from msgspec import Struct
+
+from common.in_process import fishctl
+from fishd.recording import replay
+
+VERBS = {
+    "runs": "runs --folder {parent}",
+    "runs --json": "runs --json --folder {parent}",
+    "export --csv": "export {file} --csv --to {out} --force",
+    "export --parquet": "export {file} --parquet --to {out} --force",
+    "plot --html": "plot {file} --html --to {out} --force",
+    "plot --png": "plot {file} --png --to {out} --force",
+    "rerun": "rerun {file}",
+    "replay": "replay {file} --speed 1000 --address ipc://{out}/t --control ipc://{out}/c",
+    "recover": "recover {file}",
+}
+"""Arguments of fishctl, by verb."""
+MAX_SECONDS, MAX_MEGABYTES = 10.0, 300.0
+"""A verb takes no longer, and no more memory, on a short file, whatever is in it."""
+
+
+class Outcome(Struct, frozen=True):
+    """How a verb ended."""
+
+    verb: str
+    file: str
+    status: int | None
+    """Exit status; None where an exception escaped."""
+    out: str
+    err: str
+    seconds: float
+
+
+def run_verb(verb: str, file: Path, out: Path) -> Outcome:
+    """Run a verb on a file in this process; out: a folder for what it writes."""
+    words = [word.format(file=file, parent=file.parent, out=out) for word in VERBS[verb].split()]
+    replay.JOINING = 0.0  # nobody subscribes
+    begun = time.monotonic()
+    try:
+        done = fishctl(*words)
+    except Exception:
+        return Outcome(verb, file.name, None, "", traceback.format_exc(), time.monotonic() - begun)
+    return Outcome(
+        verb, file.name, done.returncode, done.stdout, done.stderr, time.monotonic() - begun
+    )
+
+
+def find_mistakes(outcome: Outcome) -> list[str]:
+    """What is wrong with the way in which a verb ended."""
+    lines = outcome.err.splitlines()
+    mistakes = []
+    if outcome.status not in (0, 1):
+        mistakes.append(f"status {outcome.status}")
+    if outcome.status == 1 and not (lines or outcome.out):
+        mistakes.append("failed without a word")
+    if len(lines) > 2 or not all(outcome.file in line for line in lines):
+        mistakes.append("not one line that names the file")
+    if any(not letter.isprintable() for letter in (outcome.out + outcome.err).replace("\n", "")):
+        mistakes.append("control characters")
+    if outcome.seconds > MAX_SECONDS:
+        mistakes.append(f"took {outcome.seconds:.0f} s")
+    return mistakes
+
+
+def peak_memory() -> float:
+    """The most memory that this process has held [MB]."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
