@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import click
 
 from fishd.cli.completion import active_parameters, complete_pair
-from fishd.cli.options import ControllerGroup, ParameterType, daemon_options, describe
+from fishd.cli.options import ControllerGroup, ParameterType, Words, daemon_options, describe
 from fishd.cli.output import (
     criterion_words,
     echo,
@@ -169,7 +169,7 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("words", metavar="TEXT")
+@click.argument("words", metavar="TEXT", type=Words())
 @daemon_options
 def mark(words: str, endpoint: str | None, as_json: bool) -> None:
     """Put a mark in the event stream, such as what you just changed on the rig."""

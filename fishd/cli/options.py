@@ -1,6 +1,7 @@
 """Options that verbs share, and options that are generated from the parameters of controllers."""
 
 import math
+import os
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -13,7 +14,7 @@ from fishd.cli.output import made_printable
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.client import Fish
 from fishd.controllers import registry
-from fishd.core import files
+from fishd.core import files, text
 from fishd.core.errors import FishError, ParameterError, UnknownController
 from fishd.core.schema import Field, names_file, spelled, wanted
 from fishd.core.signals import ControllerInfo
@@ -54,6 +55,19 @@ class FiniteRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"'{value}' is not valid: a finite number is needed", param, ctx)
         return number
+
+
+class Words(click.ParamType[str]):
+    """Text for people, whatever encoding Python takes the command line for: it is UTF-8."""
+
+    name = "text"
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Bytes of the command line to text."""
+        try:
+            return value if value.isprintable() else os.fsencode(value).decode()
+        except UnicodeError:
+            self.fail(f"'{text.quoted(value)}' is not a text in UTF-8", param, ctx)
 
 
 class ParameterType(click.ParamType[Any]):

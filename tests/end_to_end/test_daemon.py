@@ -74,6 +74,18 @@ def test_the_three_topics_can_be_told_apart_by_prefix(daemon: Daemon) -> None:
         assert events.until(kind="mark")["message"] in ("first", "second")
 
 
+def test_a_mark_is_a_text_in_utf_8_whatever_the_locale(daemon: Daemon) -> None:
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    with Subscriber(daemon.telemetry, b"event") as events:
+        events.connected()
+        done = daemon.fishctl_apart("mark", "--json", "fin é", env=plain)
+        assert done.returncode == 0, done.stderr
+        assert events.until(kind="mark")["message"] == "fin é"
+    refused = daemon.fishctl_apart("mark", b"fin \xe9")  # type: ignore[arg-type]
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "'fin ?' is not a text in UTF-8" in refused.stderr
+
+
 def test_the_shipped_configuration_rests_swims_and_says_so_every_second(
     tmp_path: Path,
 ) -> None:

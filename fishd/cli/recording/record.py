@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from fishd.cli.options import FiniteRange, endpoint_option
+from fishd.cli.options import FiniteRange, Words, endpoint_option
 from fishd.cli.output import counted, echo
 from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
@@ -65,9 +65,11 @@ def recording_options(function: F) -> F:
             metavar="SECONDS",
             help="End by itself after this time; by default Ctrl-C ends it.",
         ),
-        click.option("--note", default="", help="What for."),
-        click.option("--subject", default="", help="Which fish, such as its number."),
-        click.option("--operator", default="", help="Who records; default: this user."),
+        click.option("--note", type=Words(), default="", help="What for."),
+        click.option("--subject", type=Words(), default="", help="Which fish, such as its number."),
+        click.option(
+            "--operator", type=Words(), default="", help="Who records; default: this user."
+        ),
         folder_option,
         endpoint_option,
         click.argument("run", required=False),
