@@ -1,5 +1,6 @@
 """Reads recordings, also one that was never finished: a kill leaves whole chunks."""
 
+import copy
 import os
 from collections.abc import Iterator
 from functools import cached_property
@@ -60,6 +61,8 @@ class Run:
         """Each fishd that was recorded: version, process, robot."""
         self._yaml: dict[int, bytes] = {}
         """The configuration of each, by its number, as it stands in the file."""
+        self._settings: dict[int, dict[str, Any]] = {}
+        """The same, as far as they were asked for."""
         self.calibrations: list[Calibrations] = []
         """The calibrations that were in use, one after the other."""
         self.finished = False
@@ -106,9 +109,14 @@ class Run:
         return number in self._yaml
 
     def settings_of(self, number: int) -> dict[str, Any]:
-        """The same as plain data; raises `RecordingError`."""
+        """The same as plain data, which the caller may change; raises `RecordingError`."""
         if not self.has_settings(number):
             raise RecordingError(f"{self.path}: the configuration of its fishd was not recorded")
+        if number not in self._settings:
+            self._settings[number] = self._parsed(number)
+        return copy.deepcopy(self._settings[number])
+
+    def _parsed(self, number: int) -> dict[str, Any]:
         name = f"{self.path}: {CONFIG} of fishd {number}"
         try:
             data = strict_yaml.parse(self._yaml[number].decode()).data

@@ -22,6 +22,7 @@ if __name__ == "__main__":
                 "systemd",
                 "recording",
                 "odd_conditions",
+                "mutations",
             ),
         )
     )
