@@ -14,6 +14,7 @@ from rigs.hostile_verbs import Result, write_all
 
 from common.processes import call
 from common.recording_verbs import MAX_MEGABYTES, VERBS, Outcome, find_mistakes
+from reliability.mutations import try_all
 
 GROUPS = (
     ("runs", "runs --json", "rerun", "replay", "recover"),
@@ -40,7 +41,7 @@ SAID = {
     ("rerun", "limits-that-are-no-numbers"): "",
     ("rerun", "events-that-do-not-say-what"): "an event 'controller' does not say its controller",
     ("rerun", "parameters-that-no-controller-has"): "swing",
-    ("plot --png", "numbers-that-no-fish-has"): "fx is 1e+308 somewhere, which cannot be drawn",
+    ("plot --png", "numbers-that-no-fish-has"): "is 1e+308 somewhere, which cannot be drawn",
 }
 """What a verb says of a file, in part."""
 
@@ -111,3 +112,10 @@ def test_no_text_of_a_file_is_a_command_for_terminal_page_or_spreadsheet(
     assert "\\x1b[31m" in ticks
     for formula in ("=HYPERLINK(0)", "@SUM(1)", "+1", "-1"):
         assert f",'{formula}," in events
+
+
+def test_random_mutations_of_a_recording_are_read_or_refused_in_one_line() -> None:
+    results, wrong = try_all(range(30), seed=11, draw=False)
+    assert wrong == []
+    assert sum(result.files for result in results) == 30
+    assert sum(result.readable for result in results) > 10
