@@ -258,7 +258,9 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
     elif standings:
         from rich.console import Console
 
-        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(standings, outcome.unit))
+        Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(
+            _table(standings, outcome.unit)
+        )
         if said := _of_simulated(standings):
             echo(said)
         if verdict:

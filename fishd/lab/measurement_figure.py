@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from fishd.core import text
-from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, drawn
+from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, drawn, plain
 from fishd.lab.measurement import Measured
 
 
@@ -34,7 +34,7 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
                     label=what if axes is above else None,
                 )
         above.plot(blocks.time, 1e3 * found.drift, color=BLACK, label="drift as fitted")
-        above.set_ylabel(f"F$_x$ as measured [m{found.unit}]")
+        above.set_ylabel(f"F$_x$ as measured [m{plain(found.unit)}]")
         outer = 1e3 * np.concatenate((blocks.force, found.drift))
         room = 0.35 * (outer.max() - outer.min()) + 1.0
         above.set_ylim(outer.min() - room, outer.max() + room)
@@ -44,8 +44,8 @@ def draw(found: Measured, tick: float, path: str | os.PathLike[str]) -> None:
         below.axhspan(level - error, level + error, color=BLUE, alpha=0.2, linewidth=0)
         below.axhline(level, color=BLUE, linewidth=0.8)
         below.axhline(0.0, color=GREY, linewidth=0.6)
-        below.set_ylabel(f"without drift [m{found.unit}]")
+        below.set_ylabel(f"without drift [m{plain(found.unit)}]")
         below.set_xlabel("time [s]")
         below.set_title(
-            f"{found.controller}: {text.format_measured(found.thrust, whole, found.unit)}"
+            plain(f"{found.controller}: {text.format_measured(found.thrust, whole, found.unit)}")
         )

@@ -87,7 +87,9 @@ def evaluate(
     else:
         from rich.console import Console
 
-        Console(width=None if sys.stdout.isatty() else WIDE).print(_table(found, singles))
+        Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(
+            _table(found, singles)
+        )
     faults = [(one, swum) for one in found for swum in one.fish if swum.fault]
     for one, swum in faults:
         echo(f"fishctl: {one.contestant}: {swum.fish}: ended in fault: {swum.fault}", err=True)

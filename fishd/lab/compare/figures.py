@@ -9,7 +9,7 @@ import numpy as np
 
 from fishd.core import text
 from fishd.lab.compare.comparison import TRACE, Standing, Trace
-from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn
+from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn, plain
 
 _SPREAD = "0.2"
 _FORCES = ("$F_x$, drift subtracted", "$F_x$ as measured")
@@ -30,6 +30,7 @@ def draw(
     amplitude: Φ [rad]; unit: of the forces
     Raises `FishdError` where the file cannot be made, and `MissingPackage`.
     """
+    unit = plain(unit)
     rows = len(standings)
     simulated = all(standing.runs for standing in standings)
     most = max(standing.thrust + (standing.error or 0.0) for standing in standings)
@@ -41,7 +42,7 @@ def draw(
         axes[0][2].set_title("relative thrust" if simulated else "thrust", fontweight="normal")
         for (left, middle, right), standing, trace in zip(axes, standings, traces, strict=True):
             shown = _from_upward_reversal(trace)
-            left.set_title(standing.contestant)
+            left.set_title(plain(standing.contestant))
             _draw_angles(left, shown, amplitude)
             _draw_force(middle, standing, shown, limits, unit)
             if simulated:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, save
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, plain, save
 from fishd.lab.sweep.curves import Curve
 from fishd.lab.sweep.results import Quantity
 
@@ -54,9 +54,9 @@ def draw(
                 _draw_points(axes, points, len(curves))
             axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
             unit = units.get(over, "")
-            axes.set_xlabel(f"{over} ({unit})" if unit not in ("", "1") else over)
+            axes.set_xlabel(plain(f"{over} ({unit})" if unit not in ("", "1") else over))
             axes.legend()
-        shown[0].set_ylabel(f"{quantity.name} (m{quantity.unit})")
+        shown[0].set_ylabel(plain(f"{quantity.name} (m{quantity.unit})"))
         note = f"bars: 95 % interval of {error_of}; cross: best, of the parabola drawn"
         shown[0].set_title(note, fontsize=8, fontweight="normal", color=GREY)
         save(figure, paths[1])
