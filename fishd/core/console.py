@@ -1,5 +1,6 @@
 """What `fishd` and `fishctl` say in a terminal: one line a second, and one line for a mistake."""
 
+import errno
 import os
 import resource
 import sys
@@ -14,6 +15,7 @@ from fishd.core.signals import Status
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells give it: 128 and the number of SIGINT."""
+_OUTPUT_ERRORS = {errno.ENOSPC, errno.EBADF, errno.EIO, errno.EFBIG, errno.EDQUOT, errno.EPIPE}
 MAX_COMPLAINT = 5000
 """Length of the longest complaint, which lists all keys of the configuration [characters]."""
 
@@ -96,9 +98,13 @@ def _memory_limit() -> str:
 
 
 def why_not_written(error: OSError) -> str:
-    """Return what to say of an error of a file, or else of the output."""
-    what = error.filename or "the output cannot be written"
-    return f"{what}: {error.strerror or error}"
+    """Return what to say of an error of a file, of the output, or of the working folder."""
+    why = error.strerror or str(error)
+    if error.filename:
+        return f"{error.filename}: {why}"
+    if error.errno == errno.ENOENT:
+        return "the working folder was deleted; change into another one"
+    return f"the output cannot be written: {why}" if error.errno in _OUTPUT_ERRORS else why
 
 
 def lose_output() -> None:

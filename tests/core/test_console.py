@@ -31,6 +31,8 @@ def test_a_command_that_is_interrupted_says_so(
     [
         (OSError(errno.ENOSPC, "No space left on device", "track.csv"), "track.csv: No space"),
         (MemoryError(), "there is not enough memory"),
+        (OSError(errno.ENOENT, "No such file or directory"), "the working folder was deleted; "),
+        (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
     ],
 )
 def test_a_file_or_memory_that_makes_trouble_is_one_line(
