@@ -17,7 +17,6 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Reason
 from fishd.simulation.beats import Beats
 from fishd.simulation.virtual_run import (
-    EncodingPublisher,
     VirtualRun,
     check_length,
 )
@@ -83,12 +82,11 @@ def simulate(
 ) -> Report:
     """Let a controller swim a simulated fish for `seconds`, and judge it after `settle` seconds.
 
-    publisher: gets the record of every tick, and every event
+    publisher: gets the record of every tick, and every event; with None, no record is made
     begun: called before the first of them
     Raises `UnknownController` and `ParameterError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
-    publisher = publisher or EncodingPublisher()
     return judge(config, name, controller, seconds, settle, publisher, begun)
 
 
