@@ -80,7 +80,8 @@ class Thrust(Controller[ThrustParameters]):
         self._missing = 0.0
         self._settled = 0
         """Half beats since it was far from the target."""
-        self.amplitude = BEGIN * amplitude_of(parameters, limits)
+        self._largest = amplitude_of(parameters, limits)
+        self.amplitude = BEGIN * self._largest
         self.held_thrust = self.held_error = None
         self.saturated = 0.0
 
@@ -106,6 +107,8 @@ class Thrust(Controller[ThrustParameters]):
     def retune(self, parameters: ThrustParameters) -> None:
         """Take new parameters, and settle anew."""
         super().retune(parameters)
+        self._largest = amplitude_of(parameters, self.limits)
+        self.amplitude = self._within(self.amplitude)
         self._settled = 0
 
     def update(self, observation: Observation) -> float:
@@ -114,7 +117,6 @@ class Thrust(Controller[ThrustParameters]):
         self._reversal.update(observation, parameters.C, 0.0, parameters.longest_half_period)
         if self._gauge.update(observation):
             self._regulate()
-        self.amplitude = self._within(self.amplitude)  # which a retune may change
         return self._reversal.direction * self.amplitude
 
     def _regulate(self) -> None:
@@ -137,5 +139,5 @@ class Thrust(Controller[ThrustParameters]):
         self.saturated = float(above - below)
 
     def _within(self, amplitude: float) -> float:
-        largest = amplitude_of(self.parameters, self.limits)
+        largest = self._largest
         return max(LEAST * largest, min(largest, amplitude))

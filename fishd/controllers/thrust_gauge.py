@@ -14,6 +14,7 @@ With F₂ and F₄ the complex Fourier coefficients of the ripple from a reversa
 import cmath
 import math
 from collections import deque
+from collections.abc import Iterable
 from functools import reduce
 from typing import NamedTuple
 
@@ -67,7 +68,9 @@ class ThrustGauge:
         self._coefficient = coefficient
         self._side = 0.0
         self._skip = SETTLES + 1  # the first one began before anybody looked
-        self._open = Half([], 0.0, 0.0)
+        self._forces: list[float] = []
+        self._energy = self._lasts = 0.0
+        """Of the open half beat, as in `Half`."""
         self._halves: deque[Half] = deque()
         self._ripples: deque[tuple[complex, complex, float]] = deque(maxlen=REMEMBERS)
         """F₂, F₄ and the mean square of the fin velocity."""
@@ -76,16 +79,17 @@ class ThrustGauge:
 
     def update(self, seen: Observation) -> bool:
         """Take in a tick; True where a half beat ended before it."""
-        side = math.copysign(1.0, seen.instruction_angle or self._side)
+        angle = seen.instruction_angle or self._side
+        side = -1.0 if angle < 0.0 else 1.0
         ended = side != self._side
         if ended:
             self._side = side
             self._close(seen)
-            self._open = Half([], 0.0, 0.0)
-        forces, energy, lasts = self._open
-        forces.append(seen.fx)
-        square = seen.fin_velocity**2 * seen.dt
-        self._open = Half(forces, energy + square, lasts + seen.dt)
+            self._forces = []
+            self._energy = self._lasts = 0.0
+        self._forces.append(seen.fx)
+        self._energy += seen.fin_velocity**2 * seen.dt
+        self._lasts += seen.dt
         return ended
 
     def _close(self, seen: Observation) -> None:
@@ -93,8 +97,8 @@ class ThrustGauge:
         if self._skip:
             self._skip -= 1
             return
-        self._halves.append(self._open)
-        while len(self._halves) > BEAT and sum(half.lasts for half in self._halves) > SHOWN:
+        self._halves.append(Half(self._forces, self._energy, self._lasts))
+        while len(self._halves) > BEAT and _totals(self._halves)[1] > SHOWN:
             self._halves.popleft()
         if len(self._halves) < BEAT:
             return
@@ -142,14 +146,19 @@ class ThrustGauge:
 
     def _of_ripple(self) -> tuple[float, float] | None:
         """Logarithm of the factor by the ripple, and its variance."""
-        power = sum(each for _, _, each in self._ripples)
-        f2 = sum(each for each, _, _ in self._ripples) / power
-        f4 = sum(each for _, each, _ in self._ripples) / power
+        f2, f4, power = 0j, 0j, 0.0
+        for second, fourth, square in self._ripples:
+            f2 += second
+            f4 += fourth
+            power += square
+        f2, f4 = f2 / power, f4 / power
         factor = mean_of_ripple(f2, f4)
         count = len(self._ripples)
         if factor is None or count < 2:
             return None
-        scatter = sum(abs(each - f2 * square) ** 2 for each, _, square in self._ripples)
+        scatter = 0.0
+        for second, _, square in self._ripples:
+            scatter += abs(second - f2 * square) ** 2
         noise = scatter * count / (count - 1) / (abs(f2) * power) ** 2
         return math.log(factor), (RIPPLE if f4 else COARSE) ** 2 + noise
 
@@ -170,8 +179,18 @@ def mean_of_ripple(f2: complex, f4: complex) -> float | None:
     return 2.0 * power + 0.18 * abs(f4) ** 2 / power if power > 0.3 * abs(f2) else None
 
 
-def _power(halves: list[Half]) -> float:
-    return sum(half.energy for half in halves) / sum(half.lasts for half in halves)
+def _totals(halves: Iterable[Half]) -> tuple[float, float]:
+    """Return the energy of some half beats, and how long they last [s]."""
+    energy = lasts = 0.0
+    for half in halves:
+        energy += half.energy
+        lasts += half.lasts
+    return energy, lasts
+
+
+def _power(halves: Iterable[Half]) -> float:
+    energy, lasts = _totals(halves)
+    return energy / lasts
 
 
 def _coefficient(forces: list[float], order: int) -> complex:
@@ -183,7 +202,9 @@ def _coefficient(forces: list[float], order: int) -> complex:
     if 2 * order >= len(forces):
         return 0j
     share = math.pi * order / len(forces)
-    total = sum(f * cmath.exp(-1j * share * (2 * k + 1)) for k, f in enumerate(forces))
+    total = 0j
+    for k, force in enumerate(forces):
+        total += force * cmath.exp(-1j * share * (2 * k + 1))
     return total / len(forces) * share / math.sin(share)
 
 
