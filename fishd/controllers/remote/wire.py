@@ -268,7 +268,7 @@ class Wire:
         if name == b"READY" and not self._ready:
             self._ready = True
             self.connections += 1
-        elif name == b"PING":
+        elif name == b"PING" and not self._unsent:  # else it does not read
             self._write(_frame(_COMMAND_FLAG, b"\x04PONG" + command[7:]))
         elif name == b"ERROR":
             raise ConnectionError

@@ -161,6 +161,19 @@ def test_a_heartbeat_of_the_agent_is_answered(rig: Rig, raw: RawAgent) -> None:
         received += connection.recv(4096)
 
 
+def test_heartbeats_of_an_agent_that_never_reads_take_no_memory(rig: Rig, raw: RawAgent) -> None:
+    rig.start("remote", agent=raw.address)
+    connection = raw.accept()
+    connection.sendall(raw.GREETING + raw.READY)
+    connected(rig)
+    wire, heartbeats = remote(rig)._wire, 1000 * b"\x04\x09\x04PING\x00\x10ab"
+    for _ in range(300):  # their answers are more than the kernel keeps
+        connection.sendall(heartbeats)
+        wire.state()
+    assert wire._unsent
+    assert len(wire._unsent) < 64
+
+
 def test_messages_that_come_byte_by_byte_are_put_together(rig: Rig, raw: RawAgent) -> None:
     rig.start("remote", agent=raw.address)
     connection = raw.accept()
