@@ -5,6 +5,7 @@ viewers pass over. PNG loses nothing, so that what was recorded can be learned f
 """
 
 import struct
+import zlib
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
@@ -23,8 +24,13 @@ _TYPES = {"number": "number", "integer": "integer", "text": "string", "boolean":
 """Viewers know no type that permits null: what is not known is left out of a message."""
 MAX_PIXELS = 2**24
 """Largest picture that is read; a few bytes can claim 4 GB."""
-_PNG_HEAD = struct.Struct(">8s4x4sII")
-"""Signature of a PNG, and the type, width and height of its first part."""
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_PART = struct.Struct(">I4s")
+"""Length and type, which every part of a PNG begins with."""
+_GREY = [8, 0, 0, 0, 0]
+"""Bit depth, colour type, compression, filter and interlace of the pictures of `encoded`."""
+_LAST_FILTER = 4
+"""Number of the last filter that a row of a PNG may begin with."""
 _COMPRESSION = 1
 """Of PNG: noise cannot be compressed further, however long one tries."""
 
@@ -124,11 +130,12 @@ def decoded(payload: bytes) -> RecordedFrame:
         message = _decode(payload)
     except msgspec.DecodeError as error:
         raise RecordingError(f"a frame that cannot be read: {error}") from None
-    _check_size(message)
     try:
-        pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        pixels = None
+        png = _intact_png(message.data)
+    except (ValueError, struct.error, zlib.error) as error:
+        why = str(error) if isinstance(error, _NoPicture) else "is damaged"
+        raise RecordingError(f"the picture of frame {message.seq} {why}") from None
+    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise RecordingError(f"the picture of frame {message.seq} cannot be read")
     return RecordedFrame(
@@ -142,19 +149,45 @@ def decoded(payload: bytes) -> RecordedFrame:
     )
 
 
-def _check_size(message: ImageMessage) -> None:
-    """Raise `RecordingError` for what is not a PNG, or is a larger one than any camera's."""
-    if len(message.data) < _PNG_HEAD.size:
-        size = f"has {len(message.data)} bytes" if message.data else "is empty"
-        raise RecordingError(f"the picture of frame {message.seq} {size}, and is no PNG")
-    signature, kind, width, height = _PNG_HEAD.unpack_from(message.data)
-    if (signature, kind) != (b"\x89PNG\r\n\x1a\n", b"IHDR"):
-        raise RecordingError(f"the picture of frame {message.seq} is no PNG")
-    if width * height > MAX_PIXELS:
-        raise RecordingError(
-            f"the picture of frame {message.seq} claims {width} x {height} px, {MAX_PIXELS} pixels "
-            "at most"
-        )
+class _NoPicture(ValueError):
+    """What a picture is instead."""
+
+
+def _intact_png(data: bytes) -> bytes:
+    """The parts of a grey PNG that its pixels are made of; raises ValueError and others.
+
+    For what is damaged, libpng would write to standard error, and what claims to be large it would
+    allocate.
+    """
+    if not data.startswith(_SIGNATURE):
+        raise _NoPicture("is no PNG" if data else "is empty")
+    kept, compressed, offset, kind = [_SIGNATURE], [], len(_SIGNATURE), b""
+    height = width = 0
+    while kind != b"IEND":
+        length, kind = _PNG_PART.unpack_from(data, offset)
+        end = offset + _PNG_PART.size + length
+        body = data[offset + _PNG_PART.size : end]
+        if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise ValueError("checksum")
+        if (kind == b"IHDR") != (len(kept) == 1):
+            raise ValueError("order")
+        if kind == b"IHDR":
+            width, height, *form = struct.unpack(">II5B", body)
+            if form != _GREY:
+                raise _NoPicture("is a PNG that is not of 8-bit grey levels")
+            if not 0 < width * height <= MAX_PIXELS:
+                raise _NoPicture(f"claims {width} x {height} px, {MAX_PIXELS} pixels at most")
+        if kind == b"IDAT":
+            compressed.append(body)
+        if kind in (b"IHDR", b"IDAT", b"IEND"):
+            kept.append(data[offset : end + 4])
+        offset = end + 4
+    size = height * (1 + width)
+    inflater = zlib.decompressobj()
+    rows = inflater.decompress(b"".join(compressed), size + 1)
+    if len(rows) != size or not inflater.eof or max(rows[:: 1 + width]) > _LAST_FILTER:
+        raise ValueError("content")
+    return b"".join(kept)
 
 
 def _cv2() -> Any:

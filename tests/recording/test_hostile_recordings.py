@@ -29,6 +29,7 @@ SAID = {
     ("export --csv", "lz4-frame-of-8-gb"): "20 ticks lost",
     ("export --csv", "chunks-of-zeros"): "more than 100 times the length of the file",
     ("export --csv", "frame-without-data"): "the picture of frame 9 is empty",
+    ("export --csv", "frame-with-damaged-pixels"): "the picture of frame 9 is damaged",
     ("export --csv", "frame-of-4-gb"): "claims 65535 x 65535 px, 16777216 pixels at most",
     ("export --csv", "ten-thousand-quantities"): "more than 100 quantities, too many for a table",
     ("export --parquet", "aliases"): "line 1: more than 2000 values and keys",

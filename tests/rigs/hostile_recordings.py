@@ -1,12 +1,16 @@
 """Files that claim to be recordings, made by code; none is large."""
 
+import base64
 import json
 import struct
+import zlib
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import cv2
 import lz4.frame
 import msgspec
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 
@@ -259,8 +263,15 @@ def frame_without_data(good: Good) -> bytes:
 @file
 def frame_of_4_gb(good: Good) -> bytes:
     size = struct.pack(">II", 65535, 65535)
-    png = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + size + b"\x08\x00\x00\x00\x00" + bytes(99)
-    return picture(good, msgspec.json.encode(png).decode().strip('"'))
+    head = b"IHDR" + size + b"\x08\x00\x00\x00\x00"
+    part = struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+    return picture(good, base64.b64encode(b"\x89PNG\r\n\x1a\n" + part + bytes(99)).decode())
+
+
+@file
+def frame_with_damaged_pixels(good: Good) -> bytes:
+    _, png = cv2.imencode(".png", np.arange(64, dtype=np.uint8).reshape(8, 8))
+    return picture(good, base64.b64encode(png.tobytes().replace(b"IDAT", b"IDAT\x00")).decode())
 
 
 @file
