@@ -1,6 +1,6 @@
 """All mistakes of a configuration, where `load` stops at the first.
 
-Each mistake is repaired, by leaving its key out, until none is found any more.
+Each mistake is repaired, by leaving its key out, until none is left.
 """
 
 import math
@@ -48,7 +48,7 @@ class _Repair:
         self._data = data
         if (config := self._converted()) is None:
             return
-        # What another key of the section should have been is not known.
+        # Another key of such a section may be right with the value that was meant.
         unsure = {problem.path[:1] for problem in self.problems}
         for check in configuration.CHECKS:
             while config is not None and (problem := _problem_of(check, config)):

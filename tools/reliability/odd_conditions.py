@@ -1,7 +1,7 @@
 """Runs fishctl and fishd under odd conditions: a full disk, few file descriptors, a closed output.
 
 Each command either does its work, or says in one line why not, with the exit status that belongs to
-it; an emergency stop passes whatever the condition. What needs a file system of its own is mounted
+it; an emergency stop passes whatever the condition. A condition that needs a file system mounts it
 in a mount namespace that ends with the command; where that is not permitted, the cell says so.
 """
 
@@ -37,7 +37,7 @@ OPTIONS: Options = {
 
 
 class Condition(NamedTuple):
-    """What is odd, as the beginning of a shell script in the folder of the trial."""
+    """An odd condition, as the beginning of a shell script in the folder of the trial."""
 
     setup: str
     """Commands that bring it about; `$FOLDER` is where the command is to write."""
@@ -47,6 +47,8 @@ class Condition(NamedTuple):
     """Variables to set, or to remove."""
     mounts: bool = False
     """Whether it mounts a file system."""
+    keeps_from_writing: bool = False
+    """Whether a command that writes files may fail."""
     loses_output: bool = False
     """Whether standard output takes nothing."""
 
@@ -61,18 +63,25 @@ CONDITIONS = {
     ),
     "closed stdout": Condition("", redirect=">&-", loses_output=True),
     "full stdout": Condition("", redirect=">/dev/full", loses_output=True),
-    "deleted folder": Condition('mkdir "$FOLDER/gone"; cd "$FOLDER/gone"; rmdir "$FOLDER/gone"'),
+    "deleted folder": Condition(
+        'mkdir "$FOLDER/gone"; cd "$FOLDER/gone"; rmdir "$FOLDER/gone"', keeps_from_writing=True
+    ),
     "no HOME": Condition(
         "", environment=(("HOME", None), ("XDG_DATA_HOME", None), ("XDG_STATE_HOME", None))
     ),
     "64 files": Condition("ulimit -n 64"),
     "512 MB": Condition("ulimit -v 524288"),
+    "files of 8 kB": Condition("ulimit -f 16", keeps_from_writing=True),
     "no /dev/shm": Condition("mount -t tmpfs -o ro none /dev/shm || exit 125", mounts=True),
     "read-only folder": Condition(
-        f'mount -t tmpfs -o ro none "$FOLDER" || exit 125; {_MOUNTED}', mounts=True
+        f'mount -t tmpfs -o ro none "$FOLDER" || exit 125; {_MOUNTED}',
+        mounts=True,
+        keeps_from_writing=True,
     ),
     "full disk": Condition(
-        f'mount -t tmpfs -o size=64k none "$FOLDER" || exit 125; {_MOUNTED}', mounts=True
+        f'mount -t tmpfs -o size=64k none "$FOLDER" || exit 125; {_MOUNTED}',
+        mounts=True,
+        keeps_from_writing=True,
     ),
 }
 _NOT_TRIED = 125
@@ -83,7 +92,7 @@ class Verb(NamedTuple):
     """One command of a group of verbs."""
 
     words: str
-    """Its command line; `FOLDER` is where it writes, `RUN` a recording that is there."""
+    """Words of its command line; `FOLDER` is where it writes, `RUN` a recording that is there."""
     statuses: tuple[int, ...] = (0,)
     """Exit statuses without an odd condition."""
     writes: bool = False
@@ -92,7 +101,7 @@ class Verb(NamedTuple):
     """Whether it starts processes or loads large libraries, and so may fail where either is short.
     """
     after: Callable[[Fish], bool] | None = None
-    """What must be true of the fish afterwards, whatever the exit status."""
+    """Condition that the fish must meet afterwards, whatever the exit status."""
 
 
 def _is_stopped(fish: Fish) -> bool:
@@ -134,7 +143,7 @@ class Cell(Struct, frozen=True):
     said: str
     """Standard error."""
     wrong: str
-    """What is wrong; empty where nothing is."""
+    """Fault of its result; empty where there is none."""
     tried: bool = True
 
 
@@ -160,7 +169,7 @@ class Place(NamedTuple):
     """The folders of a trial."""
 
     folder: Path
-    """What the commands write into, empty before each."""
+    """Folder that the commands write into, empty before each."""
     runs: Path
     """Recordings that are there."""
     run: Path
@@ -305,7 +314,7 @@ def _judge(
     if fault or isinstance(done, subprocess.TimeoutExpired) or done.returncode == _NOT_TRIED:
         return fault
     lines = done.stderr.splitlines()
-    cannot_write = verb.writes and (condition.mounts or name == "deleted folder")
+    cannot_write = verb.writes and condition.keeps_from_writing
     falls_short = verb.is_heavy and name in ("512 MB", "no /dev/shm")
     permitted = set(verb.statuses)
     if condition.loses_output and verb.after is None:
@@ -349,8 +358,8 @@ def _table(cells: list[Cell], conditions: list[str], groups: list[str]) -> str:
     for condition in conditions:
         row = [condition]
         for group in groups:
-            found = [cell for cell in cells if (cell.group, cell.condition) == (group, condition)]
-            row.append(_summary(found))
+            matches = [cell for cell in cells if (cell.group, cell.condition) == (group, condition)]
+            row.append(_summary(matches))
         rows.append(row)
     tried = sum(cell.tried for cell in cells)
     wrong = sum(bool(cell.wrong) for cell in cells)
