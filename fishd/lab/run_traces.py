@@ -33,7 +33,7 @@ MAX_QUANTITIES = 12
 MAX_EVENTS = 500
 """Events in one figure; of more, the first are drawn."""
 MAX_VALUE = 1e12
-"""Numbers beyond this are no signal of a fish [N, rad, s, any]."""
+"""Largest number that is drawn; larger ones are refused [N, rad, s, any]."""
 
 Array = NDArray[np.float64]
 

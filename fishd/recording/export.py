@@ -34,7 +34,7 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
 
     Ticks have a column a field, in its unit, and every bit of its value. In CSV, which terminals
     and spreadsheets show, control characters are escaped, and a `'` stands before a text that a
-    spreadsheet would compute. The Parquet files have all texts as they are, and carry configuration
+    spreadsheet would compute. The Parquet files have all texts unchanged, and carry configuration
     and provenance as the metadata `fishd` of their schema, in JSON.
 
     replace: may there be files of these names?

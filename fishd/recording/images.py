@@ -150,7 +150,7 @@ def decoded(payload: bytes) -> RecordedFrame:
 
 
 class _NoPicture(ValueError):
-    """What a picture is instead."""
+    """Reason why a picture is refused, in words."""
 
 
 def _intact_png(data: bytes) -> bytes:

@@ -73,7 +73,7 @@ def records(path: Path) -> Iterator[McapRecord | Damaged]:
     """Schemas, channels, messages, metadata, attachments and the footer, as they come.
 
     A file that was cut off ends with its last whole chunk. Raises `RecordingError` where it cannot
-    be read, is no MCAP file, or expands beyond `MAX_EXPANSION`.
+    be read, is not an MCAP file, or expands beyond `MAX_EXPANSION`.
     """
     expand = _Expander(path)
     for offset, record in _outer(path):
@@ -96,12 +96,12 @@ def metadata(path: Path) -> dict[str, dict[str, str]] | None:
 
     It takes a tenth of the time that the messages would take. Raises as `records` does.
     """
-    found: dict[str, dict[str, str]] = {}
+    entries: dict[str, dict[str, str]] = {}
     last: McapRecord | Damaged | None = None
     expand = _Expander(path)
     for _, last in _outer(path):
         if isinstance(last, Metadata):
-            found[last.name] = last.metadata
+            entries[last.name] = last.metadata
         elif isinstance(last, Chunk):
             try:
                 content = expand(last)
@@ -113,7 +113,7 @@ def metadata(path: Path) -> dict[str, dict[str, str]] | None:
                 return None
         elif isinstance(last, Damaged):
             return None
-    return found if isinstance(last, Footer) else None
+    return entries if isinstance(last, Footer) else None
 
 
 class _Expander:
@@ -139,7 +139,7 @@ class _Expander:
         if self._left < 0:
             raise RecordingError(
                 f"{self._path}: its chunks claim more than {MAX_EXPANSION} times the length of "
-                "the file: it is no recording of fishd"
+                "the file: it is not a recording of fishd"
             )
         content = self._content(chunk, size)
         if len(content) != size:
@@ -282,7 +282,7 @@ class _StrictStream(ReadDataStream):
     """Reads as many bytes as a record claims to have, or raises `EndOfFile`."""
 
     def read(self, length: int) -> bytes:
-        """Read exactly so many bytes."""
+        """Read this many bytes, and not fewer."""
         data = super().read(length)
         if len(data) != length:
             raise EndOfFile

@@ -62,7 +62,7 @@ class Run:
         self._yaml: dict[int, bytes] = {}
         """The configuration of each, by its number, as it stands in the file."""
         self._settings: dict[int, dict[str, Any]] = {}
-        """The same, as far as they were asked for."""
+        """Configurations that were decoded already, by number."""
         self.calibrations: list[Calibrations] = []
         """The calibrations that were in use, one after the other."""
         self.finished = False
@@ -74,7 +74,7 @@ class Run:
         self._damages: list[int] = []
         """How many ticks come before each damaged part that was skipped."""
         self.damage_reason = ""
-        """What is wrong with the first damaged part, where that is known."""
+        """Reason of the first damage, in words; empty where it is not known."""
         self.entries: list[Entry] = []
         """All messages of fishd in the order in which they came."""
         self.frame_heads: list[FrameHead] = []

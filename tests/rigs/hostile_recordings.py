@@ -32,14 +32,14 @@ from fishd.core.signals import Event
 TICK, EVENT, STATUS, CAMERA = 1, 2, 3, 4
 """Channels, as `RunWriter` numbers them."""
 CLAIM = 8 * 2**30
-"""What a hostile file claims to hold [bytes]."""
+"""Size that a hostile file claims to have [bytes]."""
 ODD = '\x1b[31m<script>alert(1)</script>\x9b\u202e$\\frac{"&'
 """Text that a terminal, a page or matplotlib would take for commands."""
 
 Good = list[Record]
 """Records of a good recording; its first chunk comes after metadata and configuration."""
 FILES: dict[str, Callable[[Good], bytes]] = {}
-"""What makes each file, by its name."""
+"""Functions that make the files, by name."""
 
 
 def file(make: Callable[[Good], bytes]) -> Callable[[Good], bytes]:

@@ -1,4 +1,4 @@
-"""Runs verbs on every hostile recording, in a process of its own: FOLDER VERB...
+"""Runs verbs on every hostile recording, in one process: FOLDER VERB...
 
 Prints how each ended, and the most memory that the process has held, as JSON.
 """
@@ -15,14 +15,14 @@ from common.recording_verbs import Outcome, peak_memory, run_verb
 from rigs.hostile_recordings import FILES
 
 MAX_ADDRESSES = 4 * 2**30
-"""What the process may allocate; no file may have so much allocated [bytes]."""
+"""Limit of what the process may allocate [bytes]."""
 DRAWN = {
     "ten-thousand-quantities",
     "texts-that-are-commands",
     "thousands-of-events",
     "numbers-that-no-fish-has",
 }
-"""Those that are drawn, which takes a second each: the others are read by `plot` as by `export`."""
+"""Files that are drawn, which takes a second each: the others are read by `plot` as by `export`."""
 
 
 class Result(msgspec.Struct):

@@ -4,7 +4,7 @@ Bytes flip, parts are cut out, inserted, repeated and spliced, lengths change; a
 whose checksums are then made right again, so that what is damaged reaches the parsers of messages.
 An answer is wrong that is a traceback, more than one line, or a line that does not name the file;
 that takes more than 10 s of processor time, or more memory than 300 MB. `plot` draws one file of a
-hundred, in a process of its own; of the others its curves are computed. One of ten is exported as
+hundred, in another process; of the others its curves are computed. One of ten is exported as
 Parquet and listed as JSON. Exit status 1 where an answer was wrong.
 """
 
@@ -51,18 +51,18 @@ from fishd.recording import open_run
 
 DOCUMENT = "reliability.md"
 MAX_ADDRESSES = 8 * 2**30
-"""What the process may allocate; a file that had 8 GB allocated would end in a MemoryError."""
+"""Limit of allocations, at which a file that claims 8 GB would end in a MemoryError [bytes]."""
 OFTEN = "runs", "export --csv", "rerun", "replay", "recover"
 SELDOM = "runs --json", "export --parquet"
 DRAWN = "plot --html", "plot --png"
 SELDOM_PERIOD, DRAWING_PERIOD = 10, 100
-"""One file of so many is read by these verbs."""
+"""Number of files of which one is read by the verbs of `SELDOM`, and of `DRAWN`."""
 GOOD_SECONDS = 2.0
 """Length of the good recording [s]."""
 LENGTHS = (0, 1, 0x7F, 0xFFFF, 2**31 - 1, 2**32 - 1, 2**33, 2**63 - 1, 2**64 - 1)
-"""What a damaged length may claim, beside random ones."""
+"""Values that a damaged length may claim, beside random ones."""
 WORDS = (b"1e308", b"-1e308", b"null", b"[]", b'"\\ud800"', b"9" * 30, b'"\x1b[0m"', b"{}", b"")
-"""What a damaged message may have instead of a value."""
+"""Values that a damaged message may have."""
 
 
 class Kind(Struct, frozen=True):
@@ -73,16 +73,16 @@ class Kind(Struct, frozen=True):
 
 
 class Result(Struct):
-    """What became of the files that were damaged in one way."""
+    """Result for the files that were damaged in one way."""
 
     what: str
     files: int = 0
     readable: int = 0
     """Files from which `export` wrote a table."""
     seconds: float = 0.0
-    """Of the slowest verb."""
+    """Processor time of the slowest verb."""
     megabytes: float = 0.0
-    """Most memory of the process so far."""
+    """Peak memory of the process until then."""
     mistakes: int = 0
 
 
@@ -225,7 +225,7 @@ def _compute_curves(file: Path) -> Outcome:
 
 
 def verbs_for(number: int) -> tuple[str, ...]:
-    """The verbs that read the file of this number, but for those that draw."""
+    """Return the verbs that read the file of this number, without those that draw."""
     return OFTEN if number // len(KINDS) % SELDOM_PERIOD else OFTEN + SELDOM
 
 
@@ -265,7 +265,7 @@ def try_all(
 
 
 def try_in_process(*arguments: Any) -> list[Result]:
-    """Do the same in a process of its own, whose memory is that of these verbs."""
+    """Do the same in another process, whose memory is that of these verbs."""
     with get_context("spawn").Pool(1, _limit_memory) as pool:
         return pool.apply(try_all, arguments)[0]
 
