@@ -8,13 +8,12 @@ from typing import cast
 
 import pytest
 from rigs.operator_rig import Bench, Dialogue, Talk, calibrations
-from rigs.processes import PATIENCE, Daemon, Subscriber
+from rigs.processes import LEASE, PATIENCE, Daemon, Subscriber
 from rigs.virtual_daemon import VirtualDaemon
 
 from fishd.cli.calibrate import servo
 from fishd.client import Fish
 from fishd.core.calibration import ServoCalibration
-from fishd.core.protocol import LEASE
 from fishd.core.signals import Tick
 
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rigs.processes import FISHCTL, PATIENCE, Daemon, Process, Subscriber, wait_until
+from rigs.processes import EXPERIMENT, PATIENCE, Daemon, Process, Subscriber, wait_until
 
 from fishd.client import AsyncFish, Fish, LeaseLost, NoDaemon
 from fishd.client.lease import LeaseRenewal
@@ -21,7 +21,7 @@ from fishd.client import Fish, LeaseLost
 
 with Fish(sys.argv[1], timeout=60.0) as fish:
     try:
-        with fish.lease("my experiment", seconds=1.0):
+        with fish.lease("my experiment", seconds=5.0):
             fish.set_controller("swing")
             for tick in fish.ticks():
                 pass
@@ -48,7 +48,7 @@ def test_a_program_that_is_killed_leaves_the_fish_at_rest(daemon: Daemon) -> Non
         program.process.kill()
         event = events.until(kind="lease-expired")
     assert event["data"]["pid"] == program.process.pid
-    assert event["message"].endswith("for 1 s: the fish fades to neutral")
+    assert event["message"].endswith("for 5 s: the fish fades to neutral")
     wait_until(lambda: rests(daemon))
     assert "\nrests, as   my experiment" in daemon.fishctl("status").stdout
 
@@ -59,7 +59,7 @@ def test_a_program_that_was_stopped_ends_in_one_line_and_does_not_drive_on(daemo
         wait_until(lambda: rests(daemon))
         program.process.send_signal(signal.SIGCONT)
         _, _, err = program.finish()
-    assert err == "lost: this program no longer holds the fish: it was not renewed for 1 s\n"
+    assert err == "lost: this program no longer holds the fish: it was not renewed for 5 s\n"
     assert daemon.status().mode == "idle"
 
 
@@ -71,6 +71,7 @@ def test_a_program_whose_fish_is_stopped_by_hand_says_so(daemon: Daemon) -> None
     assert err == "lost: this program no longer holds the fish: the fish was stopped by hand\n"
 
 
+@pytest.mark.realtime
 def test_a_fish_that_swims_keeps_its_program_while_that_computes(daemon: Daemon) -> None:
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         with fish.lease("a fit", seconds=0.6, idle_limit=0.3) as lease:
@@ -93,7 +94,7 @@ def test_a_second_verb_is_refused_unless_it_takes_the_fish(daemon: Daemon) -> No
         assert (refused.returncode, refused.stdout) == (1, "")
         assert "by my experiment (pid " in refused.stderr
         assert daemon.status().controller == "swing"
-        with Process(FISHCTL, "--endpoint", daemon.endpoint, *second, "--take") as taker:
+        with Process(*EXPERIMENT, "--endpoint", daemon.endpoint, *second, "--take") as taker:
             _, _, err = program.finish()
             assert (
                 err == "lost: this program no longer holds the fish: measure sine took the fish\n"
@@ -102,6 +103,7 @@ def test_a_second_verb_is_refused_unless_it_takes_the_fish(daemon: Daemon) -> No
     wait_until(lambda: rests(daemon))
 
 
+@pytest.mark.realtime
 def test_asyncio_programs_hold_the_fish_too(daemon: Daemon) -> None:
     async def lose(fish: AsyncFish) -> None:
         async with fish.lease("a page", seconds=0.5):

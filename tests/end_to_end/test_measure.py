@@ -5,7 +5,7 @@ import signal
 
 import msgspec
 import pytest
-from rigs.processes import FISHCTL, PATIENCE, Daemon, Process, Subscriber, running, wait_until
+from rigs.processes import EXPERIMENT, PATIENCE, Daemon, Process, Subscriber, running, wait_until
 
 from fishd.client import Fish
 from fishd.core.errors import Refused
@@ -24,7 +24,7 @@ def daemon(drifting: Daemon) -> Daemon:
 
 def begun(daemon: Daemon) -> Process:
     """A measurement whose fish has begun to swim."""
-    found = Process(FISHCTL, "--endpoint", daemon.endpoint, "measure", "swing", "--for", "60")
+    found = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, "measure", "swing", "--for", "60")
     wait_until(lambda: daemon.status().mode == "running")
     return found
 

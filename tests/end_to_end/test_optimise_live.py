@@ -4,7 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, one_line, wait_until
+from rigs.processes import EXPERIMENT, Daemon, Process, one_line, wait_until
 
 
 @pytest.mark.slow
@@ -15,7 +15,7 @@ def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
     table = folder / "trials.csv"
     words = ["--endpoint", daemon.endpoint, "optimise", "square", "--over", "frequency=1:3"]
     words += ["--on", "robot", "--folder", str(folder)]
-    searching = Process(FISHCTL, *words)
+    searching = Process(*EXPERIMENT, *words)
     wait_until(lambda: table.exists() and table.read_text().count("\n") >= 2)
     wait_until(lambda: daemon.status().mode == "running")
     status, out, err = searching.end(signal.SIGINT)

@@ -3,7 +3,7 @@
 import signal
 from pathlib import Path
 
-from rigs.processes import FISHCTL, Daemon, Process, wait_until
+from rigs.processes import EXPERIMENT, Daemon, Process, wait_until
 
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
@@ -42,7 +42,7 @@ def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
 ) -> None:
     path = tmp_path / "run.mcap"
     words = ("identify", "--experiment", "--on", "robot", "--for", "40", "--record", str(path))
-    swims = Process(FISHCTL, "--endpoint", daemon.endpoint, *words)
+    swims = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, *words)
     wait_until(lambda: daemon.status().mode == "running")
     wait_until(lambda: excited_in(path.with_name("run.mcap.part")) >= 15)
     status, out, err = swims.end(signal.SIGTERM)

@@ -3,7 +3,7 @@
 import signal
 from pathlib import Path
 
-from rigs.processes import FISHCTL, Daemon, Process, Subscriber, one_line, wait_until
+from rigs.processes import EXPERIMENT, Daemon, Process, Subscriber, one_line, wait_until
 
 
 def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
@@ -24,7 +24,7 @@ def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
 
 def test_a_closed_terminal_lets_the_fish_rest(daemon: Daemon, tmp_path: Path) -> None:
     words = ("sweep", "square", "--on", "robot", "--folder", str(tmp_path / "run"))
-    sweep = Process(FISHCTL, "--endpoint", daemon.endpoint, *words, "--frequency", "1,2")
+    sweep = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, *words, "--frequency", "1,2")
     wait_until(lambda: daemon.status().mode == "running")
     status, _, err = sweep.end(signal.SIGHUP)
     assert status == 130

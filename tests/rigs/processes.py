@@ -19,11 +19,9 @@ from fishd.client import Fish, NoDaemon
 from fishd.core.signals import Status
 
 __all__ = [
-    "FISHCTL", "FISHD", "PATIENCE", "Daemon", "Process", "Subscriber", "addresses", "call",
-    "fishctl", "install", "one_line", "running", "sets", "wait_until",
+    "EXPERIMENT", "FISHCTL", "FISHD", "LEASE", "PATIENCE", "Daemon", "Process", "Subscriber",
+    "addresses", "call", "fishctl", "install", "one_line", "running", "sets", "wait_until",
 ]  # fmt: skip
-
-UNHURRIED_FISHD = str(Path(__file__).with_name("unhurried_fishd.py"))
 
 
 def one_line(done: subprocess.CompletedProcess[str]) -> str:
@@ -34,11 +32,17 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     return done.stderr
 
 
-if os.environ.get("JUDGES_REAL_TIME"):
-    START: tuple[str, ...] = (FISHD,)
-else:  # it computes half as much, and nothing is too late
-    START = (sys.executable, "-P", UNHURRIED_FISHD, *sets("realtime.warm_up=false"))
+LEASE = 6.0
+"""Time after which an experiment that renews nothing loses an unhurried fish [s]."""
+START: tuple[str, ...] = (FISHD,)
 """The command that starts a fishd."""
+EXPERIMENT: tuple[str, ...] = (FISHCTL,)
+"""The command that starts a fishctl of its own, for an experiment on a fishd."""
+if not os.environ.get("JUDGES_REAL_TIME"):
+    _unhurried = (sys.executable, "-P", str(Path(__file__).with_name("unhurried.py")))
+    # Without the warm-up it computes half as much.
+    START = (*_unhurried, "fishd", *sets("realtime.warm_up=false", f"control.lease={LEASE:g}"))
+    EXPERIMENT = (*_unhurried, "fishctl")
 
 
 def addresses(folder: Path) -> list[str]:

@@ -1,0 +1,31 @@
+"""fishd and fishctl, undisturbed by a busy machine: for tests of anything but time.
+
+A tick that comes late, a controller that was kept from computing and a sample that is old are no
+faults, no answer of pigpiod is too late, and a measurement may miss any of its ticks. `make
+test-realtime` and the tests on the virtual clock judge them.
+"""
+
+import math
+import sys
+
+from msgspec.structs import replace
+
+from fishd.__main__ import fishctl, fishd
+from fishd.control import loop, supervisor
+from fishd.control.faults import FAULTS
+from fishd.hardware.servo import pigpio_link
+from fishd.lab import rig
+
+
+def have_patience() -> None:
+    """Lift the limits of time, in this process."""
+    supervisor.OVERRUN_SHARE = math.inf
+    loop.STALE = 100.0
+    pigpio_link.LATE_STREAK = 1_000_000
+    FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
+    rig.LOST, rig.IDLE_LIMIT = 1.0, 60.0
+
+
+if __name__ == "__main__":
+    have_patience()
+    {"fishd": fishd, "fishctl": fishctl}[sys.argv.pop(1)]()
