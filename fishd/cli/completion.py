@@ -4,13 +4,16 @@
 """
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import click
 from click.shell_completion import CompletionItem, get_completion_class
 
-from fishd.client import Fish
 from fishd.core.errors import FishError
 from fishd.core.schema import Field
+
+if TYPE_CHECKING:  # with zmq, which most completions do without
+    from fishd.client import Fish
 
 _PATIENCE = 1.0
 """How long a key press may wait for a daemon [s]."""
@@ -37,7 +40,7 @@ def endpoint_of(ctx: click.Context) -> str | None:
     return found
 
 
-def active_parameters(fish: Fish) -> dict[str, Field]:
+def active_parameters(fish: "Fish") -> dict[str, Field]:
     """Those of the active controller, by name."""
     active = fish.status().controller
     infos = (info for info in fish.controllers() if info.name == active)
@@ -57,6 +60,8 @@ def complete_pair(
     ctx: click.Context, param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
     """Names of the parameters of the running controller, and values where there are few."""
+    from fishd.client import Fish
+
     try:
         with Fish(endpoint_of(ctx), timeout=_PATIENCE) as fish:
             fields = active_parameters(fish)

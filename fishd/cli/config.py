@@ -10,7 +10,6 @@ import click
 from fishd.cli.completion import complete_key
 from fishd.cli.options import F, endpoint_option, json_option
 from fishd.cli.output import echo, print_json
-from fishd.client import Fish
 from fishd.config import (
     FILE_VARIABLE,
     SERVICE_FILE,
@@ -122,6 +121,8 @@ def show(
     if running:
         if file or overrides:
             raise click.UsageError("--running shows what fishd was started with: no FILE, no --set")
+        from fishd.client import Fish  # with zmq, which the other forms do without
+
         with Fish(endpoint) as fish:
             shown: Config | dict[str, Any] = fish.config()
     else:

@@ -12,7 +12,6 @@ from click.shell_completion import CompletionItem
 from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
 from fishd.cli.plausibility import running_config, warn_of_values
-from fishd.client import Fish
 from fishd.controllers import registry
 from fishd.core import files, text
 from fishd.core.errors import FishError, ParameterError, UnknownController
@@ -176,6 +175,8 @@ def _fish_of(values: dict[str, Any]) -> "Config | None":
     from fishd.config import load
 
     if "endpoint" in values and not values.get("file") and not values.get("overrides"):
+        from fishd.client import Fish  # with zmq, which simulations do without
+
         with Fish(values["endpoint"]) as fish:
             return running_config(fish)
     return load(values.get("file"), values.get("overrides", ()))
@@ -266,6 +267,8 @@ class ControllerGroup(click.Group):
     def _ask_daemon(
         self, ctx: click.Context, name: str, unknown: UnknownController
     ) -> ControllerInfo:
+        from fishd.client import Fish
+
         try:
             with Fish(endpoint_of(ctx)) as fish:
                 known = {info.name: info for info in map(made_printable, fish.controllers())}

@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fishd.cli.output import echo
-from fishd.client import Fish
 from fishd.core.errors import FishdError
 from fishd.core.schema import Field, ask_for_unit, find_doubts, format_quantity, is_valid_number
 
 if TYPE_CHECKING:
+    from fishd.client import Fish
     from fishd.config import Config
 
 
@@ -33,7 +33,7 @@ def warn_of_values(
         echo(f"fishctl: careful: {line}", err=True)
 
 
-def running_config(fish: Fish) -> "Config | None":
+def running_config(fish: "Fish") -> "Config | None":
     """Return the configuration of a running fishd; None where its forces are not in newtons."""
     from fishd.config import adopt
 

@@ -3,7 +3,6 @@
 import logging
 import warnings
 from contextlib import suppress
-from importlib import metadata
 from typing import Any
 
 from fishd.core.errors import StartupError
@@ -18,6 +17,8 @@ _EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older
 
 def installed() -> list[str]:
     """Which of the two packages are installed; one would be right."""
+    from importlib import metadata  # which takes long to load, and only a Pi needs
+
     found = []
     for name in _PROVIDERS:
         with suppress(metadata.PackageNotFoundError):
