@@ -113,7 +113,7 @@ VERBS = {
     "config": [Verb("config show"), Verb("config check CONFIG")],
     "swim": [Verb("set-controller square --frequency 1"), Verb("mark fin-é"), Verb("stop")],
     "estop": [Verb("estop", after=_is_stopped)],
-    "doctor": [Verb("doctor", statuses=(0, 1))],
+    "doctor": [Verb("doctor --set control.address=CONTROL --set telemetry.address=TELEMETRY")],
     "camera": [Verb("camera status", statuses=(1,))],
     "simulate": [Verb("simulate square --seconds 20")],
     "record": [
@@ -209,6 +209,8 @@ def _run(
         .replace("RUNS", str(place.runs))
         .replace("RUN", str(place.run))
         .replace("CONFIG", str(_CONFIG))
+        .replace("CONTROL", fishd.endpoint)
+        .replace("TELEMETRY", fishd.telemetry)
         for word in verb.words.split()
     ]
     return _under(name, [FISHCTL, *words], _environment(fishd), place)
