@@ -233,6 +233,7 @@ def test_in_lockstep_a_camera_that_dies_is_noticed(tmp_path: Path) -> None:
                 run.swim(20)
 
 
+@pytest.mark.realtime
 def test_processes_that_are_stopped_and_killed_at_random_are_survived(tmp_path: Path) -> None:
     random.seed(1)
     pairs = ("simulated.rate=60",)

@@ -228,6 +228,7 @@ def test_the_time_is_that_of_the_middle_of_the_exposure(
     assert 0.1 + 0.005 + 0.005 <= min(delays) < 0.1 + 0.005 + 0.005 + 0.05
 
 
+@pytest.mark.realtime
 def test_whatever_happens_to_a_camera_at_random_instants_it_comes_back(good: V4l2Rig) -> None:
     random.seed(5)
     faults = ["unplugged", "stalled", "broken", "garbage", "realtime_stamps"]

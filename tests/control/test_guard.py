@@ -93,7 +93,7 @@ def test_what_is_no_finite_real_number_is_refused_with_its_type(name: str) -> No
         Guard(0.42, 0.05, None, 0.4).apply(BAD[name], 0.0)
 
 
-SWITCHES = 10_000
+SWITCHES = 4_000
 CHOICES = {
     "hold": {"angle": (-0.42, 0.42)},
     "square": {"frequency": (0.2, 5.0), "amplitude": (0.02, 0.42)},
@@ -105,7 +105,7 @@ CHOICES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slew_limit", [None, 3.0])
-def test_ten_thousand_switches_stay_within_amplitude_and_slew(slew_limit: float | None) -> None:
+def test_thousands_of_switches_stay_within_amplitude_and_slew(slew_limit: float | None) -> None:
     rig = Rig(f"slew_limit={'null' if slew_limit is None else slew_limit}")
     generator = random.Random(7)
     step = 0.84 if slew_limit is None else slew_limit * 0.05

@@ -7,7 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, call, fishctl, one_line, running, wait_until
+from rigs.processes import (
+    FISHCTL,
+    PATIENCE,
+    Daemon,
+    Process,
+    call,
+    fishctl,
+    one_line,
+    running,
+    wait_until,
+)
 
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
@@ -145,10 +155,12 @@ def test_a_disk_that_is_full_ends_the_recording_and_fishd_is_told(
     daemon: Daemon, runs: Path
 ) -> None:
     before = daemon.status()
-    with Fish(daemon.endpoint, timeout=10) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         events = fish.events()
         limit = f"ulimit -f 16; exec {FISHCTL} --endpoint {daemon.endpoint} record run"
-        ended = call("bash", "-c", f"{limit} --folder {runs}")
+        # Python would leave compiled modules that are cut off at the limit, too.
+        uncompiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+        ended = call("bash", "-c", f"{limit} --folder {runs}", env=uncompiled)
         told = next(event for event in events if event.kind == "mark")
     _, complaint = ended.stderr.splitlines()
     assert "File too large; what was written is readable; with more room: fishctl recover" in (

@@ -43,6 +43,7 @@ def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then() ->
         assert deaths[phase]["neutral"] < deaths[phase]["off"], phase
 
 
+@pytest.mark.realtime
 def test_a_fishd_that_is_killed_at_any_moment_leaves_no_pulses() -> None:
     # With this seed, two of the first six are a SIGSTOP.
     kills = measured(*["kills", "--kills", "30", "--lanes", "6", "--seed", "10", "--limit", "100"])

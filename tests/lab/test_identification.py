@@ -95,7 +95,7 @@ def test_forces_tell_products_and_the_intervals_of_factors_allow_for_any_ratio(
 def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
     other = ("plant.quadratic_drag=0.8", "plant.lateral_quadratic_drag=0.003",
              "plant.lateral_inertia_ratio=0.7")  # fmt: skip
-    table = swum(*REAL, *other)
+    table = swum(*REAL, *other, seconds=60.0)
     truth = asdict(load(None, (*REAL, *other)).plant)
     found, known = identify(table), identify(table, fix=("coupling",))
     for each in (*found.estimates, *known.estimates):
@@ -110,7 +110,7 @@ def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
 
 @pytest.mark.slow
 def test_what_the_forces_show_is_fitted_too_unless_that_is_fixed() -> None:
-    table = swum(*REAL, "plant.servo_reaction=-0.0003", seconds=60.0)
+    table = swum(*REAL, "plant.servo_reaction=-0.0003", seconds=45.0)
     found = identify(table, start=FISH)
     assert found.failed_assumptions == ()
     assert found["servo_reaction"].value == pytest.approx(-0.0003, rel=0.05)
@@ -173,13 +173,14 @@ def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [135.0, 180.0])
-def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(seconds: float) -> None:
-    for seed in range(2):
-        table = swum(*REAL, f"simulation.seed={seed}", seconds=seconds)
-        found = identify(table, start=FISH, rig=load(None, REAL).simulation, fit=["coupling"])
-        for name in ("offset_x", "offset_y"):
-            assert found[name].low < 0.02 < found[name].high, (seed, name)
+@pytest.mark.parametrize(("seed", "seconds"), [(0, 135.0), (1, 180.0)])
+def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(
+    seed: int, seconds: float
+) -> None:
+    table = swum(*REAL, f"simulation.seed={seed}", seconds=seconds)
+    found = identify(table, start=FISH, rig=load(None, REAL).simulation, fit=["coupling"])
+    for name in ("offset_x", "offset_y"):
+        assert found[name].low < 0.02 < found[name].high, name
 
 
 @pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])

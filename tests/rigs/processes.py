@@ -141,11 +141,11 @@ def running(
     folder: Path, *arguments: str, under: Sequence[str] = (), start: Sequence[str] = START
 ) -> Iterator[Daemon]:
     """A daemon that is up, and gone afterwards whatever happens."""
-    daemon = Daemon(folder, *arguments, under=under, start=start)
-    try:
-        yield daemon.wait_until_up()
-    finally:
-        print(f"fishd said:\n{daemon.end()[2]}")  # which pytest shows for a test that failed
+    with Daemon(folder, *arguments, under=under, start=start) as daemon:
+        try:
+            yield daemon.wait_until_up()
+        finally:
+            print(f"fishd said:\n{daemon.end()[2]}")  # which pytest shows for a test that failed
 
 
 class Subscriber:
