@@ -86,7 +86,7 @@ def test_an_agent_sets_the_pace_however_slow_the_motion_is(tmp_path: Path) -> No
     with (
         running(tmp_path, *OPTIONS, *slow) as daemon,
         Fish(daemon.endpoint, timeout=PATIENCE) as fish,
-        Agent(f"ipc://{tmp_path}/agent") as agent,
+        Agent(f"ipc://{tmp_path}/agent", timeout=PATIENCE) as agent,
     ):
         fish.set_controller("remote", agent=agent.address)
         first, begun = agent.observe(), time.monotonic()
