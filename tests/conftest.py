@@ -3,13 +3,11 @@
 import contextlib
 import gc
 import os
-import re
 import signal
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 for variable in ("COLUMNS", "LINES"):  # which workers have; a terminal says itself how large it is
     os.environ.pop(variable, None)
+os.environ["FISHD_CONFIG"] = ""  # nor is the configuration of a service on this machine used
 
 # Little of what is loaded until the first test begins is ever garbage.
 gc.disable()
@@ -36,6 +35,8 @@ settings.register_profile(
 )
 settings.load_profile("fishd")
 
+UNIT = Path(__file__).parent / "unit"
+
 LOST = 0.03
 """A test of real time that fails is repeated if the machine lost so much time meanwhile [s]."""
 STALLS = """
@@ -49,12 +50,6 @@ while True:
     before = now
 """
 """Prints by how much it was woken late, each time that this was long [s]."""
-
-SLOW = re.compile(
-    r"subprocess|multiprocessing|asyncio|time\.sleep|SystemClock|running\("
-    r"|operator_rig|camera_process|pigpiod_client|virtual_pi_process|import torch|fishd\.learning"
-)
-"""A module of tests that mentions one of these starts processes, waits, or loads torch."""
 
 
 @pytest.fixture
@@ -84,14 +79,14 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """What has none of the tests that are asked for is not even imported.
 
-    With --fast, these are the slow modules; single slow tests are marked `slow`.
+    With --fast, these are all but tests/unit; single slow tests there are marked `slow`.
     """
     fast, realtime = config.option.fast, config.option.realtime
     if not (fast or realtime) or not collection_path.match("test_*.py"):
         return None
     if realtime:
         return "mark.realtime" not in collection_path.read_text(encoding="utf-8") or None
-    return is_slow(collection_path) or None
+    return not collection_path.is_relative_to(UNIT) or None
 
 
 def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
@@ -102,14 +97,9 @@ def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
         raise RuntimeError(f"a test with --fast starts {what[0]}: mark it slow")
 
 
-@cache
-def is_slow(module: Path) -> bool:
-    return "end_to_end" in module.parts or bool(SLOW.search(module.read_text(encoding="utf-8")))
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The slow modules first: the many short tests then share the end evenly among the workers."""
-    items.sort(key=lambda item: not is_slow(item.path))
+    items.sort(key=lambda item: item.path.is_relative_to(UNIT))
 
 
 def pytest_collection_finish() -> None:

@@ -1,10 +1,12 @@
 """What tests of the pigpio servo are built from: an emulated pigpiod, and servos on it."""
 
 import contextlib
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import pigpio
+import pytest
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import SystemClock, VirtualClock
@@ -137,3 +139,9 @@ def script_of(servo: CalibratedServo) -> int:
     """The number of its countdown script."""
     assert isinstance(servo.driver, Pigpio)
     return servo.driver._script
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with contextlib.ExitStack() as stack:
+        yield Bench(stack)

@@ -1,0 +1,5 @@
+"""An emulated pigpiod in virtual time."""
+
+from rigs.pigpio_rig import bench
+
+__all__ = ["bench"]

@@ -1,0 +1,90 @@
+"""The trial under a real systemd, as far as it can be tried without one: what it takes inside, and
+whether fishd says what the trial expects.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rigs.documents import ROOT
+from rigs.processes import FISHD, Daemon, call, fishctl, running, wait_until
+
+from common.report import BrokenPromise
+from fishd.cli import control
+from fishd.core.signals import Status
+from reliability.systemd import root, trials
+
+CHECKOUT = ROOT
+
+
+def test_the_trial_collects_what_the_installation_inside_will_ask_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is no network inside."""
+    collected: list[str] = []
+    run = subprocess.run
+
+    def record(command: list[Any], **options: Any) -> Any:
+        if "wheel" not in command:
+            return run(command, check=options.pop("check"), **options)
+        collected.extend(map(str, command))
+        return None
+
+    monkeypatch.setattr(root.subprocess, "run", record)
+    root._wheels(tmp_path)
+    script = f'source {CHECKOUT}/tools/install_pi.sh; core_extras $(about_python "$0")'
+    asked = subprocess.check_output(["bash", "-c", script, sys.executable], text=True).strip()
+    assert asked == "pi,record,policy"
+    assert f"{CHECKOUT}[{asked}]" in collected
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with running(tmp_path_factory.mktemp("daemon")) as daemon:
+        yield daemon
+
+
+@pytest.mark.parametrize("realtime", [True, False])
+def test_the_trial_finds_the_scheduling_in_the_output_of_its_command(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, realtime: bool
+) -> None:
+    status = msgspec.structs.replace(daemon.status(), realtime=realtime)
+
+    class Client(control.Fish):
+        def status(self) -> Status:
+            return status
+
+    monkeypatch.setattr(control, "Fish", Client)
+    command, *arguments = trials.STATUS
+    assert command == "fishctl"
+    shown = fishctl("--endpoint", daemon.endpoint, *arguments).stdout
+    if realtime:
+        trials.check_scheduling(shown)
+    else:
+        with pytest.raises(BrokenPromise, match="no real-time scheduling"):
+            trials.check_scheduling(shown)
+
+
+def test_the_trial_knows_a_fault_in_the_log(tmp_path: Path) -> None:
+    with running(tmp_path, "--set", "start.controller=remote") as daemon:
+        wait_until(lambda: daemon.status().mode == "fault")  # there is no agent
+        log = daemon.end()[2]
+    assert trials.FAULT in log
+
+
+def test_the_trial_knows_what_fishd_says_of_its_wrong_configuration(tmp_path: Path) -> None:
+    file = tmp_path / "fishd.yaml"
+    file.write_text((CHECKOUT / "config/virtual-pi.yaml").read_text() + trials.WRONG_LINE)
+    done = call(FISHD, "--config", file)
+    assert done.returncode == os.EX_CONFIG
+    assert trials.SUGGESTION in done.stderr
+
+
+def test_the_trial_waits_for_the_words_of_the_failure_unit() -> None:
+    unit = (CHECKOUT / "systemd/fishd-failure.service").read_text()
+    assert trials.FAILED in unit

@@ -1,0 +1,103 @@
+from pathlib import Path
+
+import pytest
+from rigs.documents import ROOT
+
+from fishd.core.errors import ConfigError
+from fishd.learning.settings import TrainingSettings, load, to_yaml
+
+CONFIG = ROOT / "config"
+
+
+def complaint(folder: Path, text: str) -> str:
+    file = folder / "learning.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    assert "\n" not in str(caught.value)
+    return str(caught.value).removeprefix(f"{folder}/")
+
+
+def test_the_shipped_file_holds_the_defaults_and_every_key() -> None:
+    shipped = CONFIG / "learning.yaml"
+    assert load(shipped) == TrainingSettings()
+    keys = {line.strip() for line in to_yaml(TrainingSettings()).splitlines() if ":" in line}
+    text = shipped.read_text(encoding="utf-8")
+    assert all(f"{key.partition(':')[0]}:" in text for key in keys)
+
+
+def test_the_setting_of_the_paper_updates_every_768_steps() -> None:
+    paper = load(CONFIG / "learning-paper.yaml")
+    assert (paper.steps, paper.ppo.n_steps, paper.ppo.decay_steps) == (100_000, 768, 10_000)
+    assert paper.environment.observation == ("fy", "fy_rate", "instruction_angle")
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    paper = load(CONFIG / "learning-paper.yaml")
+    (tmp_path / "settings.yaml").write_text(to_yaml(paper), encoding="utf-8")
+    assert load(tmp_path / "settings.yaml") == paper
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "steps: 100\nppo:\n  gamma: 2.0\n",
+            "learning.yaml:3: ppo.gamma: 2.0 is not valid: a number in [0, 1] is needed",
+        ),
+        ("ppo:\n  nsteps: 64\n", "did you mean 'n_steps'"),
+        ("randomization:\n  xi: 0.1\n", "learning.yaml:1: randomization"),
+        ("environment:\n  observation: [alpha]\n", "learning.yaml:2: environment.observation"),
+        (
+            "environment:\n  observation: [fy, alpha]\n",
+            " | previous_angle | side_time is needed; 'alpha' is none of them",
+        ),
+        (
+            "environment:\n  observation: [fy, fy]\n",
+            "learning.yaml:2: environment.observation: ['fy', 'fy'] is not valid: each may be in "
+            "it once",
+        ),
+        (
+            "ppo:\n  n_steps: 100\n  batch_size: 64\n",
+            "learning.yaml:3: ppo.batch_size: 64 is not valid: n_steps, 100, must be a multiple of "
+            "it",
+        ),
+        ("ppo:\n  hidden: []\n", "learning.yaml:2: ppo.hidden: [] is not valid: "),
+        (
+            "ppo:\n  hidden: 64\n",
+            "ppo.hidden: 64 is not valid: a list of whole numbers in [1, 1024] is needed: write "
+            "[64]",
+        ),
+        (
+            "evaluation:\n  others: 3\n",
+            "evaluation.others: 3 is not valid without a randomisation",
+        ),
+        (
+            "evaluation:\n  on_robot: 5.0\n",
+            "learning.yaml:2: evaluation.on_robot: 5.0 is not valid: a number in [8, 3600] s is "
+            "needed",
+        ),
+        (
+            "evaluation:\n  seconds: 4.0\n",
+            "evaluation.settle: 5 s is not valid: less than seconds, 4 s, is needed",
+        ),
+    ],
+)
+def test_a_wrong_value_is_one_line_that_names_file_line_key_and_what_is_needed(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    assert message in complaint(tmp_path, text)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
+        load(tmp_path / "none.yaml")
+
+
+def test_thrust_which_has_no_sign_to_change_must_not_be_seen(tmp_path: Path) -> None:
+    file = tmp_path / "learning.yaml"
+    file.write_text("environment:\n  observation: [fx, fy]\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"ppo\.symmetric: true is not valid where"):
+        load(file)
+    file.write_text(file.read_text() + "ppo:\n  symmetric: false\n", encoding="utf-8")
+    assert not load(file).ppo.symmetric

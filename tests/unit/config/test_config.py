@@ -1,0 +1,377 @@
+"""The configuration: what is accepted, and what is said about what is not."""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rigs.documents import ROOT
+from rigs.processes import fishctl
+
+from fishd.config import SERVICE_FILE, Config, load, mistakes, to_yaml
+from fishd.core.errors import ConfigError
+from fishd.core.strict_yaml import YamlProblem, parse
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 7)
+)
+"""Each line nine times the one before."""
+
+
+def complaint(text: str, tmp_path: Path) -> str:
+    file = tmp_path / "fish.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message in mistakes.find(file)
+    return message.replace(str(tmp_path) + "/", "")
+
+
+MANY = """\
+tik: 0.05
+tick: 3
+plant:
+  omega: 3
+  xi: on
+servo:
+  centre: abc
+  trim: 9000
+start:
+  controller: swing
+  parameters: {c: 1}
+telemetry: {address: foo}
+control: {address: 'tcp://0.0.0.0:5000'}
+robot: pi
+lockstep: true
+panel: {estop_gpio: 18, led_gpio: 18}
+tick: 4
+force_sensor: {driver: ads1116}
+"""
+KEYS = {
+    1: "tik", 2: "tick", 4: "plant.omega", 5: "plant.xi", 7: "servo.centre", 8: "servo.trim",
+    11: "start.parameters.c", 12: "telemetry.address", 13: "control.address", 15: "lockstep",
+    16: "panel.estop_gpio", 17: "tick", 18: "force_sensor.driver",
+}  # fmt: skip
+"""The key at fault in each wrong line."""
+
+
+def test_all_mistakes_of_a_file_are_found_in_the_order_of_its_lines(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text(MANY)
+    listed = mistakes.find(file, ["plant.B=soft", "tick"])
+    wrong = [mistake.removeprefix(f"{file}:") for mistake in listed if str(file) in mistake]
+    found = {int(line.partition(":")[0]): line.split(": ")[1] for line in reversed(wrong)}
+    assert found == KEYS
+    assert [int(line.partition(":")[0]) for line in wrong] == sorted([*KEYS, 16])  # both its pins
+    assert {mistake.partition(": ")[0] for mistake in listed[len(wrong) :]} == {
+        "--set plant.B=soft",
+        "--set tick",
+    }
+
+
+def test_a_good_file_has_no_mistakes() -> None:
+    for file in (ROOT / "config").glob("*.yaml"):
+        if not file.name.startswith(("camera", "learning")):
+            assert mistakes.find(file) == []
+
+
+def test_config_check_prints_each_mistake_in_a_line_of_its_own(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("tik: 1\ntick: 3\n")
+    done = fishctl("config", "check", str(file))
+    assert (done.returncode, done.stdout) == (os.EX_CONFIG, "")
+    assert [line.split(": ")[2] for line in done.stderr.splitlines()] == ["tik", "tick"]
+
+
+def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("")
+    assert load(file) == Config() == load()
+
+
+def test_a_length_in_millimetres_is_refused_with_the_question_whether_it_is_one() -> None:
+    with pytest.raises(ConfigError, match=r"m is needed \(mm\? that is 0\.1 m\)$"):
+        load(None, ["swimmer.body.length=100"])
+
+
+def test_only_values_that_were_given_are_doubted(caplog: pytest.LogCaptureFixture) -> None:
+    load(None, ["start.rest=3000", "simulation.noise=0.001"])
+    (record,) = caplog.records
+    assert record.message == (
+        "careful: --set start.rest=3000: start.rest: 3000 s is more than makes sense: up to 600 s "
+        "does (ms? that is 3 s)"
+    )
+
+
+def test_the_shipped_configuration_is_good() -> None:
+    config = load(ROOT / "config" / "simulated.yaml")
+    assert config.start.controller == "swing"
+
+
+def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("tick: 0.1\n")
+    assert load(str(file)).tick == 0.1
+    with pytest.raises(ConfigError, match=r"^nowhere\.yaml: no such file"):
+        load("nowhere.yaml")
+
+
+def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("plant:\n#  xi: 0.7\nstart: {controller: null, parameters: {}}\n")
+    assert load(file) == Config()
+
+
+def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
+    file = tmp_path / "fish.yaml"
+    original = load(None, ["plant.xi=0.7", "start.controller=swing", "start.parameters.C=0.3"])
+    file.write_text(to_yaml(original), encoding="utf-8")
+    assert load(file) == original
+
+
+BAD_FILES = """\
+tick: 0.05
+plant:
+  omega: 3
+=> fish.yaml:3: plant.omega: unknown key; did you mean 'omega0'?
+
+noise: 0.1
+=> fish.yaml:1: noise: unknown key; did you mean 'simulation.noise'?
+
+plant:
+  xi: soft
+=> fish.yaml:2: plant.xi: 'soft' is not valid: a number in [0, 20] is needed
+
+
+tick: 1
+=> fish.yaml:2: tick: 1 is not valid: a number in [0.002, 0.2] s is needed
+
+tick: .nan
+=> fish.yaml:1: tick: nan is not valid: a number in [0.002, 0.2] s is needed
+
+tick: true
+=> fish.yaml:1: tick: true is not valid: a number in [0.002, 0.2] s is needed
+
+realtime: {priority: 50.5}
+=> fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99]
+
+tick: 0.05
+tick: 0.1
+=> fish.yaml:2: tick: duplicate key, first given on line 1; keep one
+
+realtime:
+  lock_memory: on
+=> fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true, or quote it
+
+simulation:
+  seed: 1e2
+=> fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 100
+
+plant: 3
+=> fish.yaml:1: plant: 3 is not valid: a section (a mapping of keys to values)
+
+- 1
+=> fish.yaml:1: keys and values are needed, such as 'tick: 0.05'
+
+tick: [
+=> fish.yaml:2: not valid YAML
+
+tick: 1:30
+=> fish.yaml:1: tick: '1:30' counts in sixties in YAML
+
+a: &a [*a]
+=> nested too deeply
+
+plant.xi: 2
+=> plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'
+
+telemetry: {address: 'tcp://127.0.0.1:99999'}
+=> tcp://HOST:PORT or ipc://PATH
+
+control: {address: 'tcp://127.evil.com:99'}
+=> taken from this machine only
+
+control: {address: 'ipc:///tmp/a'}
+telemetry: {address: 'ipc:///tmp/a'}
+=> fish.yaml:1: control.address: 'ipc:///tmp/a' is the address of telemetry already
+
+start: {controller: swim}
+=> fish.yaml:1: start.controller: no controller is named 'swim'; did you mean 'swing'?
+
+start:
+  controller: swing
+  parameters:
+    c: 0.5
+=> fish.yaml:4: start.parameters.c: unknown parameter 'c' of controller swing; did you mean 'C'?
+
+start:
+  controller: swing
+  parameters:
+    amplitude: 0.5
+=> amplitude: 0.5 rad is beyond the robot's amplitude_limit, 0.42 rad
+
+start: {parameters: {C: 1}}
+=> there is no start.controller to take these
+
+control: {address: 'tcp://0.0.0.0:5000'}
+=> fish.yaml:1: control.address: 'tcp://0.0.0.0:5000' is not valid
+
+telemetry: {address: localhost}
+=> fish.yaml:1: telemetry.address: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH is needed
+"""
+"""Each with what is said about it."""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        *(case.split("=> ") for case in BAD_FILES[:-1].split("\n\n")),
+        ("a: " + "[" * 3000, "nested too deeply"),
+        ("x: 1\n" + "- " * 500, "fish.yaml:2: "),
+        (BOMB, "fish.yaml:1: more than 2000 values and keys, each alias counted as all that it"),
+        ("a: [" + "x, " * 3000 + "]", "fish.yaml:1: more than 2000 values and keys"),
+        ("# " + "x" * 70000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
+        ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 letters"),
+        ("a: !!int '" + "1:" * 20000 + "1'", "fish.yaml:1: a: a number of 40001 letters"),
+    ],
+)
+def test_a_bad_file_gets_a_line_with_place_and_remedy(
+    text: str, message: str, tmp_path: Path
+) -> None:
+    assert message in complaint(text, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("plant.omega=3", "--set plant.omega=3: plant.omega: unknown key; did you mean 'omega0'?"),
+        ("tick", "--set tick: write KEY=VALUE"),
+        ("=3", "--set =3: write KEY=VALUE"),
+        ("tick.x=3", "--set tick.x=3: "),
+        ("tick=soon", "--set tick=soon: tick: 'soon' is not valid: a number in [0.002, 0.2] s"),
+        ("tick=", "--set tick=: tick: '' is not valid"),
+        ("realtime.lock_memory=on", "realtime.lock_memory: 'on' is true in YAML; write true"),
+        ("control.address=ipc://@abstract", "'ipc://@abstract' is not valid: ipc://PATH"),
+        ("control.address=tcp://[::1]:5000", "is not valid: ipc://PATH or tcp://127.0.0.1:PORT"),
+    ],
+)
+def test_a_bad_override_is_named_as_it_was_written(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(None, [override])
+    assert message in str(caught.value)
+
+
+def test_overrides_take_numbers_as_people_write_them() -> None:
+    config = load(None, ["simulation.noise=1e-3", "slew_limit=null", "tick=0.1", "tick=0.02"])
+    assert config.simulation.noise == 1e-3
+    assert config.tick == 0.02
+
+
+def test_a_bomb_of_aliases_costs_milliseconds() -> None:
+    """Six levels of nine: half a million values from 300 letters."""
+    costs = []
+    for _ in range(3):
+        began = time.process_time()
+        with pytest.raises(YamlProblem):
+            parse(BOMB)
+        costs.append(time.process_time() - began)
+    assert min(costs) < 0.2  # some 6 ms; all of it took half a minute
+
+
+@given(st.text(max_size=60))
+def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> None:
+    problem = None
+    try:
+        parse(text)
+    except YamlProblem as error:
+        problem = error
+    assert problem is None or (problem.line >= 1 and "\n" not in str(problem))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "words"),
+    [
+        (["robot=pi", "force_sensor.full_scale=2"], "force_sensor.full_scale", "2.048"),
+        (
+            ["robot=pi", "force_sensor.saturation_low=3.3"],
+            "force_sensor.saturation_low",
+            "less than saturation_high, 3.2 V",
+        ),
+        (["robot=pi", "force_sensor.channel_y=A0-A1"], "force_sensor.channel_y", "channel_x"),
+        (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
+        (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),
+        (["servo.centre=2300", "servo.trim=400"], "servo.trim", "2700 µs"),
+        (["servo.host="], "servo.host", "127.0.0.1"),
+        (["servo.host=my pi"], "servo.host", "'my pi' is not valid"),
+        (["virtual_pi.socket="], "virtual_pi.socket", "a path or null"),
+        ([f"virtual_pi.socket=/tmp/{'x' * 103}"], "virtual_pi.socket", "this one has 108"),
+        ([f"control.address=ipc:///tmp/{'x' * 103}"], "control.address", "at most 107 bytes"),
+        ([f"telemetry.address=ipc:///tmp/{'é' * 60}"], "telemetry.address", "this one has 125"),
+        (
+            ["start.controller=null", "start.parameters.C=0.6"],
+            "start.parameters",
+            "there is no start.controller to take these; name one, or remove them",
+        ),
+        (["servo.frequency=100"], "servo.frequency", "drivers that have it: rpi-gpio, sysfs-pwm"),
+        (["servo.driver=steam"], "servo.driver", "installed: pigpio, rpi-gpio, sysfs-pwm"),
+        (["servo.driver=sysfs"], "servo.driver", "did you mean 'sysfs-pwm'?"),
+        (["servo.driver=3"], "servo.driver", "one of pigpio, rpi-gpio, sysfs-pwm"),
+        (["force_sensor=3"], "force_sensor", "a section"),
+        (["gpio=3"], "gpio", "did you mean 'servo.gpio'?"),
+        (["panel.led_gpio=18"], "panel.led_gpio", "servo.gpio"),
+        (["panel.estop_gpio=3"], "panel.estop_gpio", "force_sensor.bus"),
+        (["panel.estop_gpio=5", "panel.led_gpio=5"], "panel.led_gpio", "panel.estop_gpio"),
+        (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
+        (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
+        (["virtual_pi.channel_y=A0-A1"], "virtual_pi.channel_y", "channel_x"),
+        (["state_folder=~nobody-here/fish"], "state_folder", "no user here is 'nobody-here'"),
+        (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
+        (['state_folder="/var/\\ud800"'], "state_folder", "half of a character"),
+    ],
+)
+def test_hardware_that_is_at_odds_is_refused_by_key(
+    overrides: list[str], key: str, words: str
+) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        load(None, overrides)
+    assert f"{key}: " in str(refusal.value)
+    assert words in str(refusal.value)
+
+
+def test_pins_of_another_bus_are_free() -> None:
+    assert load(None, ["force_sensor.bus=3", "panel.estop_gpio=3"]).panel.estop_gpio == 3
+
+
+def test_the_longest_path_that_a_unix_socket_takes_is_good() -> None:
+    path = f"/tmp/{'x' * 102}"
+    config = load(None, [f"control.address=ipc://{path}", f"virtual_pi.socket={path}"])
+    assert len(config.virtual_pi.socket or "") == 107
+
+
+def test_what_is_installed_on_a_pi_is_the_file_that_the_verbs_look_for() -> None:
+    layout = (ROOT / "tools" / "pi_layout.sh").read_text()
+    assert f"\nCONFIG={SERVICE_FILE}\n" in layout
+
+
+@pytest.mark.parametrize("name", ["", " tank", "tank ", "a\nb", "tank\n", "a\x1bb", "x" * 41])
+def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
+    line = complaint(f"name: {json.dumps(name)}\n", tmp_path)
+    assert line.startswith("fish.yaml:1: name: ")
+    assert "a text of 1 to 40 printable characters (or null) is needed" in line
+    assert load(None, ["name=Große Fische 2"]).name == "Große Fische 2"
+
+
+def test_an_observer_of_a_robot_needs_a_plant_of_its_own(tmp_path: Path) -> None:
+    text = "robot: pi\nestimator:\n  kind: observer\n"
+    assert complaint(text, tmp_path) == (
+        "fish.yaml:3: estimator.kind: observer needs a model of this fish, and section plant is "
+        "not given; 'fishctl identify' writes it"
+    )
+    file = tmp_path / "fish.yaml"
+    file.write_text(text + "plant:\n  omega0: 11.2\n")
+    assert load(file).limits.scaled

@@ -1,0 +1,307 @@
+"""What is no policy file, or would be dangerous as one, is refused with one line that says why."""
+
+import io
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from rigs.documents import ROOT
+from rigs.policy_files import FLIP, card, random_layers, refusal, write
+
+from fishd.controllers.policy import file
+from fishd.controllers.policy.card import KEY, encode
+from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.network import to_onnx
+from fishd.core.errors import PolicyError
+
+Change = Callable[[Any], None]
+
+
+def changed(change: Change, content: bytes = FLIP) -> bytes:
+    """A policy file after a change of its ONNX model, with a checksum that fits."""
+    model = onnx.load_model_from_string(content)
+    change(model)
+    return sealed(model)
+
+
+def with_card(**values: Any) -> bytes:
+    """A policy file in whose card these keys have these values, or are missing where None."""
+    data = msgspec.json.decode(encode(card())) | values
+    text = msgspec.json.encode({key: value for key, value in data.items() if value is not None})
+    return changed(lambda model: helper.set_model_props(model, {KEY: text.decode()}))
+
+
+class Trap:
+    """Leaves a trace when it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.trace),)
+
+
+def test_a_sealed_file_of_an_older_fishd_still_tells_its_relative_thrust() -> None:
+    older = ROOT / "docs/figures/policies/amplitude-0.42.onnx"
+    assert b'"efficiency":' in older.read_bytes()
+    share = file.read(older).card.provenance.relative_thrust
+    assert share is not None
+    assert 0.9 < share < 1.0
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) -> None:
+    path = write(tmp_path, pickle.dumps(Trap(tmp_path / "trace"), protocol))
+    expected = (
+        "this is a pickle, which could run any code" if protocol >= 2 else "not an ONNX model"
+    )
+    with pytest.raises(PolicyError, match=expected):
+        file.read(path)
+    assert not (tmp_path / "trace").exists()
+    pickle.loads(path.read_bytes())
+    assert (tmp_path / "trace").exists()  # so it was a trap
+
+
+def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_path: Path) -> None:
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as made:
+        made.writestr("policy/data.pkl", pickle.dumps(Trap(tmp_path / "trace")))
+    message = refusal(archive.getvalue())
+    assert message == (
+        "this is a zip archive as torch writes, with a pickle, which could run any code; "
+        "export it with 'fishctl learn export'"
+    )
+    assert not (tmp_path / "trace").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00", b"hello fish", b"\x08\x07" * 9, os.urandom(999)])
+def test_what_is_no_onnx_is_refused(content: bytes) -> None:
+    assert refusal(b"\x01" + content) == (
+        "this is not an ONNX model; export it with 'fishctl learn export'"
+    )
+
+
+def test_a_file_without_a_card_is_refused() -> None:
+    def strip(model: Any) -> None:
+        del model.metadata_props[:]
+
+    assert refusal(changed(strip)) == (
+        "this ONNX file does not say for which observation, tick and Φ it was trained: its "
+        "metadata lacks fishd.card; export it with 'fishctl learn export'"
+    )
+
+
+def test_two_cards_are_refused() -> None:
+    def double(model: Any) -> None:
+        model.metadata_props.add(key=KEY, value=encode(card(amplitude=0.1)))
+
+    assert refusal(changed(double)) == "it has 2 cards that may contradict one another"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"format": 4}, "its card has format 4; this fishd reads format 3"),
+        (
+            {"format": 2},
+            "its card has format 2; this fishd reads format 3: it was written by an older fishd; "
+            "train and export it again",
+        ),
+        ({"format": None}, "its card has format null; this fishd reads format 3"),
+        ({"tick": None}, "its card: tick: is missing: a number in [1e-30, 1e+30] is needed"),
+        ({"tick": 0}, "its card: tick: 0 is not valid"),
+        ({"amplitude": -0.42}, "its card: amplitude: -0.42 is not valid"),
+        ({"amplitude": "wide"}, "its card: amplitude: 'wide' is not valid"),
+        ({"observation": []}, "its card names neither an observation nor pictures"),
+        (
+            {"observation": [{"name": "fz", "scale": 1.0}]},
+            "its card: observation.name: 'fz' is not valid: one of fin_velocity | fx | fy",
+        ),
+        (
+            {"observation": [{"name": "fy"}]},
+            "its card: observation.scale: is missing: a number in [1e-30, 1e+30]",
+        ),
+        (
+            {"observation": [{"name": "fy", "scale": 0.0}]},
+            "its card: observation.scale: 0.0 is not valid: ",
+        ),
+        (
+            {"observation": [{"name": "fy", "scale": 1e-320}]},
+            "its card: observation.scale: 1e-320 is not valid: ",
+        ),
+        ({"provenance": None}, "its card: provenance: is missing"),
+    ],
+)
+def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], message: str) -> None:
+    assert refusal(with_card(**values)).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "is not JSON: "),
+        ("NaN", "is not JSON: "),
+        ("[1]", "is not a JSON object"),
+        ('"', "is not JSON: "),
+        ("[" * 50_000, "is JSON that is nested too deeply"),
+        ('{"provenance":' * 100 + "1" + "}" * 100, "is JSON that is nested too deeply"),
+        (" " * 100_000, "has 100000 letters; 65536 are the most"),
+    ],
+)
+def test_a_card_that_is_not_json_or_no_object_is_refused(text: str, why: str) -> None:
+    content = changed(lambda model: helper.set_model_props(model, {KEY: text}))
+    assert refusal(content).startswith(f"its card {why}")
+
+
+def test_a_card_with_an_infinite_number_is_refused() -> None:
+    text = encode(card()).replace('"tick":0.05', '"tick":1e999')
+    content = changed(lambda model: helper.set_model_props(model, {KEY: text}))
+    assert refusal(content).startswith("its card")
+
+
+def rename_input(model: Any) -> None:
+    model.graph.input[0].name = "obs"
+
+
+def widen_input(model: Any) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[1].dim_value = 3
+
+
+def open_batch(model: Any) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_param = "batch"
+
+
+def double_precision(model: Any) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+def second_input(model: Any) -> None:
+    model.graph.input.append(helper.make_tensor_value_info("camera", TensorProto.FLOAT, [84, 84]))
+
+
+def widen_output(model: Any) -> None:
+    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = 2
+
+
+def no_output(model: Any) -> None:
+    del model.graph.output[:]
+
+
+_IN = "one float32 input of shape [1, 1] named 'observation' is needed"
+_OUT = "one float32 output of shape [1, 1] named 'action' is needed"
+
+
+@pytest.mark.parametrize(
+    ("change", "found", "wanted"),
+    [
+        (rename_input, "its inputs: float32 of shape [1, 1] named 'obs'", _IN),
+        (widen_input, "its inputs: float32 of shape [1, 3] named 'observation'", _IN),
+        (open_batch, "its inputs: float32 of shape [batch, 1] named 'observation'", _IN),
+        (double_precision, "its inputs: double of shape [1, 1] named 'observation'", _IN),
+        (second_input, ", float32 of shape [84, 84] named 'camera'", _IN),
+        (widen_output, "its outputs: float32 of shape [1, 2] named 'action'", _OUT),
+        (no_output, "its outputs: none", _OUT),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_wrong_ends_are_refused_with_what_is_right(change: Change, found: str, wanted: str) -> None:
+    message = refusal(changed(change))
+    assert found in message
+    assert wanted in message
+
+
+def test_a_card_with_more_features_than_the_network_has_inputs_is_refused() -> None:
+    wider = encode(card(("fy", 0.02), ("fy_rate", 0.3)))
+    content = changed(lambda model: helper.set_model_props(model, {KEY: wider}))
+    assert "one float32 input of shape [1, 2] named 'observation' is needed" in refusal(content)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_weights_that_are_not_finite_are_refused_though_tanh_hides_them(
+    bad: float, layer: int
+) -> None:
+    content = to_onnx(random_layers(1, 8, 8, 1), "tanh", card())
+
+    def spoil(model: Any) -> None:
+        tensor = next(t for t in model.graph.initializer if t.name == f"weight_{layer}")
+        array = numpy_helper.to_array(tensor).copy()
+        array.flat[-1] = bad
+        tensor.CopyFrom(numpy_helper.from_array(array, tensor.name))
+
+    assert refusal(changed(spoil, content)) == (
+        f"its weights 'weight_{layer}' are not all finite numbers: the training blew up; "
+        "export an earlier checkpoint"
+    )
+
+
+def constant_node(model: Any) -> None:
+    nan = numpy_helper.from_array(np.array([np.nan], np.float32))
+    model.graph.node.insert(0, helper.make_node("Constant", [], ["hidden"], value=nan))
+
+
+def constant_number(model: Any) -> None:
+    model.graph.node.insert(0, helper.make_node("Constant", [], ["hidden"], value_float=np.inf))
+
+
+@pytest.mark.parametrize("change", [constant_node, constant_number])
+def test_a_number_that_is_not_finite_is_found_wherever_it_hides(change: Change) -> None:
+    assert "not all finite" in refusal(changed(change))
+
+
+def test_weights_in_another_file_are_refused() -> None:
+    def move_out(model: Any) -> None:
+        tensor = model.graph.initializer[0]
+        tensor.data_location = TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value="/etc/passwd")
+
+    assert refusal(changed(move_out)) == (
+        "its weights 'weight_0' are in another file; save the model as a single file"
+    )
+
+
+def test_weights_that_contradict_their_shape_are_refused() -> None:
+    def shorten(model: Any) -> None:
+        model.graph.initializer[0].dims[0] = 7
+
+    assert refusal(changed(shorten)).startswith("its weights 'weight_0' cannot be read: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("missing.onnx", "no such file"), (".", "is a folder; a regular file is needed")],
+)
+def test_a_path_that_leads_to_no_file_is_named(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(PolicyError) as caught:
+        file.read(tmp_path / name)
+    assert str(caught.value) == f"{tmp_path / name}: {message}"
+
+
+def test_a_service_says_where_a_file_it_cannot_see_belongs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/fishd")
+    with pytest.raises(PolicyError) as caught:
+        file.read(Path("/home/nobody-here/swim.onnx"))
+    assert str(caught.value) == (
+        "/home/nobody-here/swim.onnx: no such file: this fishd is a service that sees no home "
+        "folders; put the file into /var/lib/fishd/policies and give its name"
+    )
+
+
+def test_a_file_that_is_far_too_large_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path, b"")
+    os.truncate(path, 2**40)  # a hole: reading it would take the memory of the machine
+    with pytest.raises(PolicyError, match="is longer than 16 MB, far more than a policy needs"):
+        file.read(path)
+
+
+def test_a_good_file_is_read_whole(tmp_path: Path) -> None:
+    found = file.read(write(tmp_path))
+    assert (found.content, found.card) == (FLIP, card())
