@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs fishd as docs/installing.md says on arm64 Debian 12 and 13, in chroots under qemu-user, and
+# Installs fishd as docs/how-to/installing.md says on arm64 Debian 12 and 13, in chroots under qemu-user, and
 # compares a simulation there with the same on this machine. Needs root, and an hour.
 #
 #   sudo tools/arm64_trial.sh [SUITE ...]     bookworm and trixie, where none is named
@@ -73,9 +73,9 @@ inside() {
     LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive "${variables[@]}" "$@"
 }
 
-# The packages of the first step in docs/installing.md.
+# The packages of the first step in docs/how-to/installing.md.
 documented_packages() {
-  sed -n 's/^\$ sudo apt install \(.*\)/\1/p' "$checkout/docs/installing.md" | head -n 1
+  sed -n 's/^\$ sudo apt install \(.*\)/\1/p' "$checkout/docs/how-to/installing.md" | head -n 1
 }
 
 # A Debian with these packages; kept for the next time.

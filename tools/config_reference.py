@@ -33,7 +33,10 @@ ANY = {
 
 def references() -> dict[str, str]:
     """A table for each section, by the document in which they stand."""
-    whole: dict[str, Struct] = {"configuration.md": Config(), "camera.md": CameraSettings()}
+    whole: dict[str, Struct] = {
+        "reference/configuration.md": Config(),
+        "how-to/camera.md": CameraSettings(),
+    }
     return {name: "\n\n".join(_sections(struct, "")) for name, struct in whole.items()}
 
 
@@ -66,7 +69,7 @@ def _choice_section(section: str) -> Iterator[str]:
     choice, *rows = [
         _row(field, getattr(common, field.name), f"{section}.") for field in fields_of(type(common))
     ]
-    choice[2] = f"{', '.join(f'`{name}`' for name in mine)}, or [another]({page})"
+    choice[2] = f"{', '.join(f'`{name}`' for name in mine)}, or [another](../how-to/{page})"
     yield table(HEAD, [choice, *rows])
     for name in mine:
         found = plugins.find(name)

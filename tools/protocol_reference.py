@@ -1,4 +1,4 @@
-"""The tables of docs/protocol.md, those of messages in docs/camera.md, faults and tracks.
+"""Writer of the tables of messages, operations, events, faults and tracks in docs/.
 
 `tools/protocol_reference.py --write` puts them into the documents; `--check` exits with 1 where one
 is out of date there.
@@ -51,35 +51,39 @@ CAMERA: dict[str, type[Struct]] = {
     "camera-state": messages.CameraState,
     "until": messages.Until,
 }
-"""Likewise, in docs/camera.md."""
+"""Likewise, in docs/how-to/camera.md."""
 
 
 def references() -> Iterator[tuple[str, str, str]]:
     """Document, name of the markers, and the table between them."""
     for name, struct in STRUCTS.items():
-        yield "protocol.md", name, _fields(struct)
+        yield "reference/protocol.md", name, _fields(struct)
     for name, struct in CAMERA.items():
-        yield "camera.md", name, _fields(struct)
+        yield "how-to/camera.md", name, _fields(struct)
     conditions = [[f"`{name}`", meaning] for name, meaning in messages.CONDITIONS.items()]
-    yield "camera.md", "conditions", table("state | what it means", conditions)
+    yield "how-to/camera.md", "conditions", table("state | what it means", conditions)
     kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]
-    yield "protocol.md", "kinds", table("kind | level | when | `data`", kinds)
+    yield "reference/protocol.md", "kinds", table("kind | level | when | `data`", kinds)
     operations = [
         [f"`{name}`", _arguments(operation.arguments), operation.does, operation.result]
         for name, operation in protocol.OPERATIONS.items()
     ]
     head = "op | arguments | what it does | result"
-    yield "protocol.md", "operations", table(head, operations)
+    yield "reference/protocol.md", "operations", table(head, operations)
     faults = [
-        [f"[`{code}`](troubleshooting.md#{code})", _times(row.in_a_row) + row.text, row.remedy]
+        [
+            f"[`{code}`](../how-to/troubleshooting.md#{code})",
+            _times(row.in_a_row) + row.text,
+            row.remedy,
+        ]
         for code, row in FAULTS.items()
     ]
-    yield "concepts.md", "faults", table("code | what triggers it | what to do", faults)
+    yield "explanation/concepts.md", "faults", table("code | what triggers it | what to do", faults)
     columns = [
         [f"`{name}`", "–" if unit == "1" else unit, about]
         for name, (unit, about) in COLUMNS.items()
     ]
-    yield "swimmer.md", "columns", table("column | unit | meaning", columns)
+    yield "explanation/swimmer.md", "columns", table("column | unit | meaning", columns)
 
 
 def _fields(struct: type[Struct]) -> str:

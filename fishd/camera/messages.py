@@ -1,4 +1,4 @@
-"""What `fishd-camera` says: frames, views for people, its state; see docs/camera.md.
+"""What `fishd-camera` says: frames, views for people, its state; see docs/how-to/camera.md.
 
 Each message of the PUB socket is a topic and one JSON object; behind that of a frame or a view
 comes the picture. Requests are those of fishd's control protocol (`fishd.core.protocol`).

@@ -32,7 +32,7 @@ from fishd.core.schema import Field, format_values, nearest
 from fishd.core.signals import Percentiles, Status
 
 T = TypeVar("T")
-_HELP = "docs/troubleshooting.md"
+_HELP = "docs/how-to/troubleshooting.md"
 _ZERO = "(its zero is not known: stop for 3 s, then swim on; or fishctl measure)"
 
 

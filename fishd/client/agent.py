@@ -1,4 +1,4 @@
-"""`Agent`: what the controller `remote` of a fishd asks for angles; see docs/remote.md."""
+"""`Agent`: what the controller `remote` of a fishd asks for angles; see docs/how-to/remote.md."""
 
 import contextlib
 import math

@@ -37,7 +37,7 @@ class Choice(NamedTuple):
     key: str
     """The key that names it."""
     page: str
-    """In docs/, about how to write another one."""
+    """Page in docs/how-to/ about how to write another one."""
 
 
 CHOICES = {

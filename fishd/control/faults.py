@@ -1,6 +1,6 @@
 """Every fault that fishd latches: one table from its code to its effect, its text and its remedy.
 
-The supervisor, `fishctl status`, docs/concepts.md and the tests read it.
+The supervisor, `fishctl status`, docs/explanation/concepts.md and the tests read it.
 """
 
 from enum import StrEnum

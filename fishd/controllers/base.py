@@ -1,4 +1,4 @@
-"""What a controller is. docs/writing-a-controller.md works through an example."""
+"""What a controller is. docs/how-to/writing-a-controller.md works through an example."""
 
 import math
 from abc import ABC, abstractmethod

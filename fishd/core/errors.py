@@ -92,7 +92,7 @@ class Untrusted(NoDaemon):
 class Refused(FishError, RuntimeError):
     """The daemon refused the request.
 
-    `code` is the machine-readable reason, as listed in docs/protocol.md.
+    `code` is the machine-readable reason, as listed in docs/reference/protocol.md.
     """
 
     def __init__(self, code: str, message: str) -> None:

@@ -1,7 +1,7 @@
 """The control protocol: JSON requests and replies, shared by server and client.
 
-docs/protocol.md is its reference for clients in other languages; its tables are written from what
-is declared here (`make docs`).
+docs/reference/protocol.md is its reference for clients in other languages; its tables are
+written from what is declared here (`make docs`).
 """
 
 from collections.abc import Callable
@@ -233,7 +233,7 @@ class Operation(NamedTuple):
 
     arguments: type[Struct]
     result: str
-    """What it gives, in the words of docs/protocol.md."""
+    """What it gives, in the words of docs/reference/protocol.md."""
     does: str
     """What it does, likewise."""
 

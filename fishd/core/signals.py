@@ -2,7 +2,7 @@
 
 Everything is SI: newtons, radians, seconds. `Tick`, `Event` and `Status` are exactly what goes out
 over telemetry and the control channel, so their field names are the public protocol. The tables
-of docs/protocol.md are written from what is declared here (`make docs`).
+of docs/reference/protocol.md are written from what is declared here (`make docs`).
 """
 
 from typing import Annotated, Any, Literal, get_args

@@ -1,7 +1,7 @@
 """Mock ticks just before a real one warm up the processor's caches for it.
 
 While the loop sleeps, others take these caches, and a tick that finds them cold takes several times
-as long (docs/performance.md). A mock tick runs the same code on a loop of its own.
+as long (docs/reference/performance.md). A mock tick runs the same code on a loop of its own.
 """
 
 from collections.abc import Callable

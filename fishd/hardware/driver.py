@@ -1,4 +1,6 @@
-"""What a driver of a force sensor, a servo or a power meter is; see docs/writing-a-driver.md.
+"""Protocols of a driver of a force sensor, a servo or a power meter.
+
+docs/how-to/writing-a-driver.md explains how to write one.
 
 A driver knows one kind of hardware and nothing else: calibration, limits, windows, staleness,
 suspicion and reconnecting are above it, the same for all.

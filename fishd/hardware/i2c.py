@@ -166,7 +166,7 @@ def _speed(machine: Machine, number: int) -> Result:
     if _CORE_CLOCK.search(machine.model):
         return ok(
             f"{found / 1e3:.0f} kbit/s are set; less while this Pi's core clock is lowered, see "
-            "docs/wiring.md"
+            "docs/how-to/wiring.md"
         )
     return ok(f"{found / 1e3:.0f} kbit/s")
 

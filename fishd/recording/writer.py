@@ -1,6 +1,6 @@
 """Writes one recording: an MCAP file that Foxglove, Lichtblick and PlotJuggler open.
 
-docs/recording.md shows its layout.
+docs/how-to/recording.md shows its layout.
 """
 
 import time

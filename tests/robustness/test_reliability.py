@@ -1,4 +1,4 @@
-"""A little of what docs/reliability.md measures: however fishd ends, the servo comes to rest."""
+"""A short run of docs/reference/reliability.md: however fishd ends, the servo goes to neutral."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ LONGEST_END = 3.0
 
 
 def measured(*arguments: str) -> Any:
-    """What the tool finds that writes docs/reliability.md."""
+    """What the tool finds that writes docs/reference/reliability.md."""
     done = call(sys.executable, ROOT / "tools" / "reliability", *arguments, "--json", timeout=200)
     assert done.returncode in (0, 1), done.stderr
     assert done.stdout, done.stderr

@@ -130,8 +130,8 @@ def test_a_fault_is_shown_with_what_to_do_about_it(daemon: Daemon) -> None:
     lines = daemon.fishctl("status").stdout.splitlines()
     assert lines[1:3] == [
         "mode        estop (leak)",
-        "to do       make sure that the fish may move again (docs/troubleshooting.md, estop); "
-        "then: fishctl clear-fault",
+        "to do       make sure that the fish may move again "
+        "(docs/how-to/troubleshooting.md, estop); then: fishctl clear-fault",
     ]
 
 

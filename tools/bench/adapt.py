@@ -26,7 +26,7 @@ from fishd.learning.adapt.state import AdaptFolder, Begun, Contender
 from fishd.learning.adapt.verdict import SQUARE
 from fishd.virtual.plant.optimum import best_square_wave
 
-DOCUMENT = "adapt.md"
+DOCUMENT = "how-to/adapt.md"
 FIRST_SEED = 900
 """Of the harsh fish; others were looked at while it was made."""
 FISH = 10

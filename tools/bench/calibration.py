@@ -22,7 +22,7 @@ from fishd.lab.rig import VirtualRig
 from fishd.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
-DOCUMENT = "measuring.md"
+DOCUMENT = "how-to/measuring.md"
 RIG = SimulationSettings(noise=1e-3, offset_y=0.01, rotation=0.05)
 LOAD_N = 0.2
 LOAD_SECONDS = 5.0

@@ -24,7 +24,7 @@ from common.report import Options, Report, progress, quantile, table
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter
 
-DOCUMENT = "camera.md"
+DOCUMENT = "how-to/camera.md"
 OLDEST = 10e-3
 """Age of a frame at a learner that is asked for, at p99 [s]."""
 MOST = 1.2

@@ -15,7 +15,7 @@ from fishd.controllers import registry
 from fishd.lab.compare.survey import Reversals
 from fishd.simulation import judge
 
-DOCUMENT = "policies.md"
+DOCUMENT = "reference/policies.md"
 RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
 HARSH = {
     "servo delay 30 ms": ("servo_delay=0.03",),

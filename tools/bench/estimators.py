@@ -28,7 +28,7 @@ from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave
 from fishd.virtual.plant.parameters import PlantParameters
 
-DOCUMENT = "identification.md"
+DOCUMENT = "how-to/identification.md"
 
 RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 3.0)
 """ω₀Φ/Ω."""

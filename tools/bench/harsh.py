@@ -19,7 +19,7 @@ from fishd.config import load
 from fishd.lab.other_fish import OtherFish
 from fishd.virtual.plant.optimum import best_square_wave
 
-DOCUMENT = "concepts.md"
+DOCUMENT = "explanation/concepts.md"
 FILE = DOCS.parent / "config" / "harsh.yaml"
 NAMES = {
     "servo delay": ("plant.servo_delay",),

@@ -24,7 +24,7 @@ from fishd.lab.rig import VirtualRig
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
-DOCUMENT = "identification.md"
+DOCUMENT = "how-to/identification.md"
 
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
 SPREAD = 0.3

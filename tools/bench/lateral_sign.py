@@ -21,7 +21,7 @@ from fishd.lab.other_fish import CHANGES, OtherFish, harsh_fish, mild
 from fishd.simulation import simulate
 from fishd.simulation.virtual_run import VirtualRun
 
-DOCUMENT = "calibration.md"
+DOCUMENT = "how-to/calibration.md"
 REST_S = 3.0
 """Time at rest before the start [s]."""
 SECONDS, SETTLE = 40.0, 10.0

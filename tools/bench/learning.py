@@ -3,7 +3,7 @@
 Trainings are those of `fishctl learn ppo`, in a temporary folder. Relative thrust is the share of
 the thrust of the best square wave of the same fish and amplitude.
 
-    relative_thrust  learning curves: several fish and settings; draws docs/learning-curves.png
+    relative_thrust  learning curves: several fish and settings; draws learning-curves.png
     amplitude        Φ = 0.3 rad, where two waves of whole ticks are nearly as good
     exploration      why one of these seeds goes to five ticks and stays there
     choices          what each of the default settings is worth
@@ -54,8 +54,8 @@ from fishd.learning.settings import TrainingSettings
 from fishd.simulation import simulate
 from fishd.virtual.plant.optimum import best_square_wave
 
-DOCUMENT = "learning.md"
-FIGURE = DOCS / "learning-curves.png"
+DOCUMENT = "how-to/learning.md"
+FIGURE = DOCS / "figures" / "learning-curves.png"
 MILESTONES = (500, 1000, 2000, 4000, 8000, 20_000)
 """Control steps."""
 PAPER_STEPS, CHOICE_STEPS = 20_000, 3000

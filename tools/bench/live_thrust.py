@@ -26,7 +26,7 @@ from fishd.hardware.base import ForceSensor
 from fishd.simulation import VirtualRun
 from fishd.virtual.plant.base import TrueWindow
 
-DOCUMENT = "measuring.md"
+DOCUMENT = "how-to/measuring.md"
 REST_S = 3.0
 """Length of each rest [s]."""
 SKIPPED_S = 30.0

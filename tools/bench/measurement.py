@@ -24,7 +24,7 @@ from fishd.lab.rig import VirtualRig
 from fishd.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
-DOCUMENT = "measuring.md"
+DOCUMENT = "how-to/measuring.md"
 FIRST_SEED = 31_000
 """Seed of the first run; nothing was chosen with it or the following ones."""
 DRIFTS: dict[str, dict[str, Any]] = {

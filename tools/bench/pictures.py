@@ -3,7 +3,7 @@
 Trainings are those of `fishctl learn ppo --see camera`, in a temporary folder, with seeds that no
 setting was chosen with. Relative thrust is the share of the best square wave's thrust.
 
-    steps     control steps until 97 %, babble included; draws docs/camera-learning.png
+    steps     control steps until 97 %, babble included; draws docs/figures/camera-learning.png
     optimum   what was learned at four amplitudes, from pictures and from forces
     speed     the environment with pictures, on one core
 """
@@ -29,8 +29,8 @@ from fishd.learning.eyes.making import make
 from fishd.learning.settings import TrainingSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
-DOCUMENT = "camera.md"
-FIGURE = DOCS / "camera-learning.png"
+DOCUMENT = "how-to/camera.md"
+FIGURE = DOCS / "figures" / "camera-learning.png"
 ENOUGH = 0.97
 UNUSED = 230
 """The first seed; none from here on was used to choose a setting."""

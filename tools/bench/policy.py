@@ -29,7 +29,7 @@ from fishd.controllers.policy.network import to_onnx
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Event, Observation, Percentiles, Tick
 
-DOCUMENT = "policies.md"
+DOCUMENT = "reference/policies.md"
 GOAL = 50.0
 """Longest update that is asked for, at p99 [µs]."""
 BLOCK = 500

@@ -29,7 +29,7 @@ from fishd.daemon import realtime
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.warm_up import mock_ticks
 
-DOCUMENT = "remote.md"
+DOCUMENT = "how-to/remote.md"
 GOAL = 2e-3
 """Longest round trip that is asked for, at p99 [s]."""
 AGENT_PRIORITY = 40

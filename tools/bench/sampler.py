@@ -19,7 +19,7 @@ from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
 from fishd.core.signals import Tick
 
-DOCUMENT = "reliability.md"
+DOCUMENT = "reference/reliability.md"
 HEAD = (
     "load | scheduler | lateness without sampler, p50 / p99 [µs] | with sampler | ratio of p99 | "
     "pairs per tick, least / median | sampler [% of a core] | write, p50 / p99 [µs]"

@@ -25,7 +25,7 @@ from fishd.lab.optimise.trials import trials, whole_ticks
 from fishd.lab.rig import VirtualRig
 from fishd.simulation import simulate
 
-DOCUMENT = "sweeps.md"
+DOCUMENT = "how-to/sweeps.md"
 FISH = DOCS.parent / "config" / "simulated.yaml"
 FREQUENCIES = "0.2:4:0.2"
 RANGE = (0.4, 5.0)

@@ -24,7 +24,7 @@ from bench.swimmer_flag import beam, turek_hron  # noqa: E402
 from common.machine import machine_in_short  # noqa: E402
 from common.report import Options, Report, progress  # noqa: E402
 
-DOCUMENT = "swimmer.md"
+DOCUMENT = "explanation/swimmer.md"
 PARTS = {
     "turek-hron": turek_hron,
     "cylinder": cylinder,

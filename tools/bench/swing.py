@@ -17,7 +17,7 @@ from fishd.config import Config, load
 from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
 from fishd.simulation import simulate
 
-DOCUMENT = "swing-efficiency.md"
+DOCUMENT = "explanation/swing-efficiency.md"
 LEARNT = 60.0
 """The search is judged after so long [s]."""
 SECONDS = 120.0

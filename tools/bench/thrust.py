@@ -22,7 +22,7 @@ from fishd.lab.other_fish import OtherFish, harsh
 from fishd.lab.rig import VirtualRig
 from fishd.simulation import KeepingPublisher, VirtualRun, simulate
 
-DOCUMENT = "holding-thrust.md"
+DOCUMENT = "explanation/holding-thrust.md"
 TARGETS = (2, 4, 6, 8, 10, 12, 14, 20, 26)
 """[mN]"""
 SEEDS = range(10)

@@ -28,7 +28,7 @@ from common.report import Options, Report, progress, quantile, table
 from fishd.control.statistics import PHASES
 from fishd.core.signals import Percentiles, Tick, Timing
 
-DOCUMENT = "performance.md"
+DOCUMENT = "reference/performance.md"
 TICK = 0.05
 """The tick that the robot swims with [s]."""
 FAST = 0.002

@@ -17,7 +17,7 @@ PARTS = (swing_map, figure_2b, figure_3, figure_4, figure_5, figure_6)
 
 
 def main() -> None:
-    """Write docs/figures/, and what docs/paper.md and docs/swing-efficiency.md say of them."""
+    """Write docs/figures/ and the parts of docs/explanation/ that state their numbers."""
     parser = argparse.ArgumentParser(prog="tools/paper", description=__doc__)
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
     jobs = parser.parse_args().jobs

@@ -1,6 +1,7 @@
 """Every number that the paper of Fu et al. states, beside what the tables and equations here give.
 
-The tables are those that the figures are drawn from; `docs/paper.md` holds what `sections` says.
+The tables are those that the figures are drawn from; docs/explanation/paper.md holds the result of
+`sections`.
 """
 
 import math
@@ -19,7 +20,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 from paper import figure_2b, figure_3, figure_4, figure_5, figure_6, swing_map
 from paper.runs import PLANT, column, read
 
-DOCUMENT = "paper.md"
+DOCUMENT = "explanation/paper.md"
 HARD_SERVO_LAG = 1e-4
 """Δ that stands for a servo without a lag, which turns at Ω until it is there [rad]."""
 PLATEAU = 0.99
@@ -247,7 +248,7 @@ def learning() -> Iterator[Claim]:
     )
     yield Claim(
         "an update every 768 steps, policy and value saved every 5000 steps",
-        "settings of [learning-paper.yaml](../config/learning-paper.yaml)",
+        "settings of [learning-paper.yaml](../../config/learning-paper.yaml)",
         None,
     )
     seen = read(figure_3.NAME, source=figure_3.SEEN)
@@ -268,8 +269,8 @@ def learning() -> Iterator[Claim]:
     )
     yield Claim(
         "from images: 4 frames of 84 × 84, compressed to 512 numbers",
-        "settings of [learning-camera-paper.yaml](../config/learning-camera-paper.yaml); the "
-        "points of figure 3 have the eye `modes`, see [the camera](camera.md)",
+        "settings of [learning-camera-paper.yaml](../../config/learning-camera-paper.yaml); the "
+        "points of figure 3 have the eye `modes`, see [the camera](../how-to/camera.md)",
         None,
     )
 

@@ -16,7 +16,7 @@ NAME, CASES = "figure-2b", "optimal-control"
 AMPLITUDE = 0.31
 """Φ [rad]"""
 SHOWN = 0.42
-"""Φ of the picture in docs/optimum.md [rad]."""
+"""Φ of the picture in docs/explanation/optimum.md [rad]."""
 REFERENCES = [(xi, amplitude) for xi in (1.2, 0.05) for amplitude in (0.1, 0.31, 0.42, 1.0, 1.4)]
 """ξ and Φ for which the best command of any shape is sought."""
 SETTLE, BEATS = 10.0, 2

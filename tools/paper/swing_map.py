@@ -19,7 +19,7 @@ from fishd.virtual.imperfections import SimulationSettings
 from paper.runs import FOLDER, PERFECT, PLANT, Run, column, read, swim_all, write
 
 NAME = "swing-map"
-DOCUMENT = "swing-efficiency.md"
+DOCUMENT = "explanation/swing-efficiency.md"
 REFERENCE = DOCS.parent / "tests" / "reference" / "swing_efficiency.csv"
 
 CRITERIA = tuple(tenths / 10 for tenths in range(11))

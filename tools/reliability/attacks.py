@@ -22,7 +22,7 @@ from fishd.client import Fish, FishError
 from fishd.core.signals import Status
 from reliability import attackers
 
-DOCUMENT = "reliability.md"
+DOCUMENT = "reference/reliability.md"
 SECONDS = 10.0
 SETTLE = 2.0
 TICKS = 0.05, 0.005

@@ -25,7 +25,7 @@ from common.report import Options, Report, progress, table
 from fishd.client import Fish, NoDaemon
 from fishd.virtual.pi.virtual_pi import VirtualPi
 
-DOCUMENT = "reliability.md"
+DOCUMENT = "reference/reliability.md"
 MAX_ESTOP_S = 0.2
 """Longest time to the answer to an emergency stop after a single failure [s]."""
 MAX_CONTROL_S = 0.5

@@ -35,7 +35,7 @@ from fishd.daemon.main import swim
 from fishd.daemon.shutdown import Shutdown
 from fishd.virtual.pi.virtual_pi import VirtualPi
 
-DOCUMENT = "reliability.md"
+DOCUMENT = "reference/reliability.md"
 GPIO = 18
 PATIENCE = 120.0
 BEGINNING = 5.0

@@ -29,7 +29,7 @@ from fishd.cli import main as fishctl
 from fishd.client import Fish
 from reliability.kills import PATIENCE, run, serve_forks
 
-DOCUMENT = "reliability.md"
+DOCUMENT = "reference/reliability.md"
 LEASE = 2.0
 """Time that a lease lasts, by default [s]."""
 GRACE = 0.5

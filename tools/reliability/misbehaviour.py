@@ -25,7 +25,7 @@ from fishd.client import Fish, NoDaemon, Refused
 from fishd.core.protocol import LOADING
 from fishd.daemon.background_calls import MOST_AT_ONCE
 
-DOCUMENT = "reliability.md"
+DOCUMENT = "reference/reliability.md"
 ZOO = DOCS.parent / "tests" / "rigs" / "zoo"
 LONGEST_END = 3.0
 """What fishd may take from a signal to its end, whatever hangs [s]."""

@@ -26,7 +26,7 @@ from common.report import Options, Report, progress, quantile, table
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
-DOCUMENT = "recording.md"
+DOCUMENT = "how-to/recording.md"
 MOST_LOST = 1.0
 """A kill of the recorder may lose so much [s]."""
 MOST_LATER = 1.2

@@ -22,7 +22,7 @@ _OLDEST = "brcm,bcm2835"
 """The one slow core of a Pi 1, Zero and Zero W, in the device tree."""
 _HEADER_OF_PI_5 = "1f000*"
 """Devices of the RP1, the chip that a Pi 5 has its header on, where the kernel knows it."""
-_RASPBERRY_PI_OS = "use Raspberry Pi OS, or see 'Which system' in docs/installing.md"
+_RASPBERRY_PI_OS = "use Raspberry Pi OS, or see 'Which system' in docs/how-to/installing.md"
 
 
 def model(context: Context) -> Result:

@@ -39,7 +39,9 @@ def daemon(context: Context) -> Result:
             "mend the cause, then fishctl clear-fault",
         )
     if status.degraded:
-        return warning(f"{message}; {'; '.join(status.degraded)}", "see docs/troubleshooting.md")
+        return warning(
+            f"{message}; {'; '.join(status.degraded)}", "see docs/how-to/troubleshooting.md"
+        )
     return ok(message)
 
 
@@ -96,7 +98,7 @@ def camera(context: Context) -> Result | None:
     lost = f", {state.dropped} lost, {state.broken} broken" if state.dropped + state.broken else ""
     message = f"{state.rate:.1f} frames a second from {state.device}{lost}"
     if state.degraded:
-        return warning(f"{message}; {'; '.join(state.degraded)}", "see docs/camera.md")
+        return warning(f"{message}; {'; '.join(state.degraded)}", "see docs/how-to/camera.md")
     return ok(message)
 
 

@@ -1,4 +1,4 @@
-"""`remote`: an agent in another process chooses the instruction angle; see docs/remote.md."""
+"""`remote`: an agent in another process chooses the instruction angle; docs/how-to/remote.md."""
 
 import secrets
 import time

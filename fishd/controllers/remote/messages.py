@@ -1,4 +1,4 @@
-"""The messages between fishd and an agent, one JSON object each; see docs/remote.md.
+"""The messages between fishd and an agent, one JSON object each; see docs/how-to/remote.md.
 
 fishd connects to the agent. Each observation is numbered within its session, and an action names
 the observation that it answers: one that comes too late is dropped.

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 
 SUPPLY = 3.3
-"""Of the ADC and of the amplifiers, as docs/wiring.md has them [V]."""
+"""Of the ADC and of the amplifiers, as docs/how-to/wiring.md has them [V]."""
 
 _CONFIG, _HIGH_THRESHOLD = 1, 3
 _RESET = 0x8583

@@ -32,7 +32,7 @@ _EARLIER = 2
 
 @dataclass(frozen=True)
 class Drive:
-    """What stands between the command and the fin, and the fin; the symbols of docs/concepts.md."""
+    """Parameters of the servo and of the fin; docs/explanation/concepts.md explains the symbols."""
 
     omega0: float
     """ω₀ [rad/s]"""

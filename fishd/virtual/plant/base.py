@@ -1,4 +1,4 @@
-"""What a plant is: a fish on its force sensor, as equations. docs/writing-a-plant.md adds one."""
+"""Equations of a fish on its force sensor; docs/how-to/writing-a-plant.md adds a plant."""
 
 import math
 from abc import ABC, abstractmethod

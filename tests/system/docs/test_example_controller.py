@@ -92,7 +92,7 @@ def test_a_bad_parameter_is_one_line(option: str, complaint: str) -> None:
 
 
 def test_the_page_about_it_shows_what_a_run_prints(laptop: Path) -> None:
-    page = (ROOT / "docs" / "writing-a-controller.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "writing-a-controller.md").read_text(encoding="utf-8")
     shown = page.partition("$ fishctl simulate chirp --seconds 130\n")[2].partition("timing ")[0]
     assert (
         shown == fishctl(laptop, "simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
@@ -101,7 +101,7 @@ def test_the_page_about_it_shows_what_a_run_prints(laptop: Path) -> None:
 
 @pytest.mark.parametrize("name", ["fishd_chirp.py", "pyproject.toml"])
 def test_the_page_about_it_shows_the_code_as_it_is(name: str) -> None:
-    page = (ROOT / "docs" / "writing-a-controller.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "writing-a-controller.md").read_text(encoding="utf-8")
     source = (ROOT / "docs" / "example-controller" / name).read_text(encoding="utf-8")
     shown = [block.partition("\n")[2].strip() for block in page.split("```")[1::2]]
     parts = [source.strip()] if name.endswith("toml") else source.split("\n\n\n")[-2:]

@@ -34,7 +34,7 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 pytestmark = pytest.mark.slow
 
-PAGE = ROOT / "docs" / "writing-a-driver.md"
+PAGE = ROOT / "docs" / "how-to" / "writing-a-driver.md"
 EXAMPLES = ROOT / "docs" / "example-drivers"
 VOLTS = {"x": 1e-3, "y": -2e-3}
 THRUST = 0.026

@@ -20,7 +20,7 @@ from fishd.virtual.plant.registry import open_plant
 from fishd.virtual.plant.tethered import TetheredFish
 
 pytestmark = pytest.mark.slow  # it starts processes
-PAGE = ROOT / "docs" / "writing-a-plant.md"
+PAGE = ROOT / "docs" / "how-to" / "writing-a-plant.md"
 MODEL = "plant.model=two-segments"
 THRUST = 0.01495
 """Of `swing` with C = 0.6 [N]."""

@@ -13,7 +13,7 @@ from fishd.core.errors import ConfigError
 from fishd.core.schema import leaves
 from fishd.core.signals import EVENTS, EventKind
 
-REFERENCE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+REFERENCE = (ROOT / "docs" / "reference" / "configuration.md").read_text(encoding="utf-8")
 
 
 def test_the_committed_configuration_reference_is_what_the_schema_says() -> None:

@@ -22,7 +22,7 @@ from fishd.core.schema import fields_of
 from fishd.daemon.main import fishd
 from fishd.virtual.pi.faults import FAULTS
 
-OPERATORS = [ROOT / "docs" / f"{name}.md" for name in (
+OPERATORS = [path for path in DOCS if path.stem in (
     "calibration", "configuration", "getting-started", "installing", "protocol", "troubleshooting",
     "virtual-pi", "wiring",
 )]  # fmt: skip
@@ -167,11 +167,11 @@ def test_every_configuration_that_is_shown_is_good(block: str, tmp_path: Path) -
 
 
 def test_the_table_of_faults_has_each_fault_of_the_virtual_pi_in_its_order() -> None:
-    assert first_cells(ROOT / "docs" / "virtual-pi.md", "Break it") == list(FAULTS)
+    assert first_cells(ROOT / "docs" / "how-to" / "virtual-pi.md", "Break it") == list(FAULTS)
 
 
 def test_the_table_of_checks_has_each_check_of_doctor_in_its_order() -> None:
-    table = first_cells(ROOT / "docs" / "troubleshooting.md", "Lines of doctor")
+    table = first_cells(ROOT / "docs" / "how-to" / "troubleshooting.md", "Lines of doctor")
     every = set()
     for driver in ("pigpio", "sysfs-pwm", "rpi-gpio"):
         config = load(None, ["robot=pi", f"servo.driver={driver}"])
@@ -181,7 +181,7 @@ def test_the_table_of_checks_has_each_check_of_doctor_in_its_order() -> None:
     assert {name for name in table if " " not in name} <= every
 
 
-DOCUMENT = ROOT / "docs" / "policies.md"
+DOCUMENT = ROOT / "docs" / "reference" / "policies.md"
 
 
 def test_each_key_of_the_card_is_described() -> None:
@@ -219,7 +219,7 @@ def test_each_permitted_operator_is_listed() -> None:
 def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
     layout = (ROOT / "tools/pi_layout.sh").read_text()
     users = (ROOT / "systemd/sysusers.d/fishd.conf").read_text()
-    table = text_of(ROOT / "docs/installing.md").split("What it brings:")[1].split("\n\n")[1]
+    table = text_of(ROOT / "docs/how-to/installing.md").split("What it brings:")[1].split("\n\n")[1]
     files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
     wanted = {f"`{name or other}`" for name, other in files}
     assert len(wanted) > 10

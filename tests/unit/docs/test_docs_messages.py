@@ -25,7 +25,7 @@ def test_every_fault_that_fishd_latches_is_in_the_table_and_no_other() -> None:
 
 
 def test_troubleshooting_has_a_section_for_each_fault_and_no_other() -> None:
-    document = text_of(ROOT / "docs" / "troubleshooting.md")
+    document = text_of(ROOT / "docs" / "how-to" / "troubleshooting.md")
     section = document.split("## By reason")[1].split("\n## ")[0]
     assert set(re.findall(r"^### (\S+)$", section, re.MULTILINE)) == FAULTS.keys()
 
@@ -72,7 +72,7 @@ def templates() -> tuple[Template, ...]:
 
 def quoted_messages() -> list[str]:
     """What troubleshooting.md says that fishd prints: tables of messages and lines, text blocks."""
-    document = text_of(ROOT / "docs" / "troubleshooting.md")
+    document = text_of(ROOT / "docs" / "how-to" / "troubleshooting.md")
     blocks = [block for kind, block in FENCE.findall(document) if kind == "text"]
     table = re.compile(r"^\| (?:message|line) \|.*\n\|[-|]+\n((?:\|.*\n)+)", re.MULTILINE)
     tables = table.findall(document)

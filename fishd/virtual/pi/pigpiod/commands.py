@@ -115,7 +115,8 @@ class Commands:
         if number not in self._told and len(self._told) < len(NAMES):
             self._told.add(number)
             log.warning(
-                "emulated pigpiod: command %s (%d) is not emulated; docs/virtual-pi.md has a table",
+                "emulated pigpiod: command %s (%d) is not emulated; "
+                "docs/how-to/virtual-pi.md has a table",
                 *(name, number),
             )
         return errors.UNKNOWN_COMMAND, b""
