@@ -40,6 +40,7 @@ lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 docs: $(VENV)/installed-dev  ## Write the generated parts of docs/ again
 	$(BIN)/python tools/config_reference.py --write
 	$(BIN)/python tools/protocol_reference.py --write
+	$(BIN)/python tools/rooms.py --write
 
 figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
 	$(BIN)/python tools/paper

@@ -1,20 +1,27 @@
-"""Prints the rooms of fishd/, what each is for, and which others it imports.
+"""Writer of the table of rooms in docs/: what each is for, and which others it imports.
 
-A room is a package or a module at the top of fishd/; an arrow is a pair of them of which one
-imports the other, wherever in it.
+A room is a package or a module at the top of fishd/; an arrow is a pair of rooms of which the first
+imports the second, in any of its files.
+
+`tools/rooms.py --write` puts the table into the page; `--check` exits with 1 where it is out of
+date.
 """
 
+import argparse
 import ast
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-from common.report import table
+from common.report import DOCS, between, put, table
 
 FISHD = Path(__file__).resolve().parents[1] / "fishd"
+PAGE = DOCS / "explanation" / "rooms.md"
 
 
 def rooms(folder: Path = FISHD) -> dict[str, Path]:
-    """Where each room is, by its name as in README: `core/`, `__main__.py`."""
+    """Return the path of each room by its name in the page: `core/`, `__main__.py`."""
     packages = {f"{path.parent.name}/": path.parent for path in folder.glob("*/__init__.py")}
     modules = {path.name: path for path in folder.glob("*.py") if path.stem != "__init__"}
     return dict(sorted({**packages, **modules}.items()))
@@ -56,16 +63,42 @@ def _imported(tree: ast.Module, package: str) -> Iterator[str]:
                 yield rest[0]
 
 
-def main() -> None:
-    """Print the table, and count."""
-    pairs = arrows()
+def layers() -> list[str]:
+    """Return the module names of the rooms as import-linter checks them, from top to bottom."""
+    project = tomllib.loads((FISHD.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = project["tool"]["importlinter"]["contracts"]
+    contract = next(contract for contract in contracts if contract["type"] == "layers")
+    names = [name.strip() for layer in contract["layers"] for name in layer.split(":")]
+    return contract["exhaustive_ignores"] + names
+
+
+def summary() -> str:
+    """Return the table of rooms, from top to bottom, and the number of arrows."""
+    pairs, order = arrows(), layers()
     rows = [
-        [f"`{name}`", purpose(path), ", ".join(b for a, b in sorted(pairs) if a == name)]
-        for name, path in rooms().items()
+        [f"`{name}`", purpose(path), ", ".join(b for a, b in sorted(pairs) if a == name) or "–"]
+        for name, path in sorted(rooms().items(), key=lambda room: order.index(room[1].stem))
     ]
-    print(table("in `fishd/` | what it is | imports", rows))
-    print(f"\n{len(rows)} rooms, {len(pairs)} arrows")
+    head = table("in `fishd/` | what it is | imports", rows)
+    return f"{head}\n\n{len(rows)} rooms, {len(pairs)} arrows."
+
+
+def main() -> int:
+    """Print the table, write it into the page, or compare it with the page."""
+    parser = argparse.ArgumentParser(prog="tools/rooms.py", description=__doc__)
+    parser.add_argument("--write", action="store_true", help=f"put it into {PAGE.name}")
+    parser.add_argument("--check", action="store_true", help="exit with 1 where it is out of date")
+    options = parser.parse_args()
+    text = summary()
+    if options.write:
+        put(PAGE, "rooms", text)
+    elif options.check and between(PAGE, "rooms") != text:
+        print(f"{PAGE.name} is out of date: run make docs", file=sys.stderr)
+        return 1
+    elif not options.check:
+        print(text)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
