@@ -12,7 +12,7 @@ from fishd.core.errors import FishdError, Refused
 
 VERBS = {
     "Watch": {
-        "status": Verb("control", "status", "Show what the fish and its daemon are doing."),
+        "status": Verb("status", "status", "Show what the fish and its daemon are doing."),
         "watch": Verb("watch", "watch", "Watch force, command and timing live."),
         "mark": Verb("control", "mark", "Put a mark in the event stream."),
     },

@@ -12,8 +12,7 @@ from click.shell_completion import CompletionItem
 from fishd.cli.completion import complete_value, endpoint_of
 from fishd.cli.output import made_printable
 from fishd.cli.plausibility import running_config, warn_of_values
-from fishd.controllers import registry
-from fishd.core import files, text
+from fishd.core import text
 from fishd.core.errors import FishError, ParameterError, UnknownController
 from fishd.core.schema import Field, names_file, spelled, wanted
 from fishd.core.signals import ControllerInfo
@@ -86,6 +85,8 @@ class ParameterType(click.ParamType[Any]):
         if value in field.words:
             return value
         if field.file and names_file(value, field.file):
+            from fishd.core import files
+
             return str(files.expanded(value).absolute())  # fishd may run in another folder
         try:
             return _PARSERS.get(field.kind, str)(value)
@@ -233,7 +234,17 @@ class ControllerGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The controllers installed here."""
+        from fishd.controllers import registry
+
         return [info.name for info in registry.describe_all()]
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Complete the name of a controller, and import only those that it may be."""
+        from fishd.controllers import registry
+
+        known = registry.describe_all(incomplete)
+        names = [CompletionItem(info.name, help=info.summary) for info in known]
+        return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The sub-command of one controller, or of several."""
@@ -257,6 +268,8 @@ class ControllerGroup(click.Group):
         return command
 
     def _info(self, ctx: click.Context, name: str) -> ControllerInfo:
+        from fishd.controllers import registry
+
         try:
             return registry.describe(name)
         except UnknownController as error:

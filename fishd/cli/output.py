@@ -1,20 +1,21 @@
 """How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
 
 import re
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import datetime
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 import msgspec
 
-from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.console import lose_output, why_not_written
-from fishd.core.protocol import State
 from fishd.core.schema import format_values
 from fishd.core.signals import Reason
+
+if TYPE_CHECKING:
+    from fishd.core.protocol import State
 
 T = TypeVar("T")
 
@@ -64,12 +65,14 @@ def made_printable(value: T) -> T:
 
 def spelled(controller: str, parameters: dict[str, Any]) -> str:
     """Return a controller with its parameters, as `square frequency=1.7 Hz amplitude=default`."""
-    return text.line(
-        f"{controller} {format_values(parameters, registry.units(controller))}".rstrip()
-    )
+    if not parameters:
+        return text.line(controller)
+    from fishd.controllers import registry  # as long as all else that most verbs load
+
+    return text.line(f"{controller} {format_values(parameters, registry.units(controller))}")
 
 
-def state_line(state: State) -> str:
+def state_line(state: "State") -> str:
     """Return mode, reason and controller."""
     state = made_printable(state)
     why = f" ({format_reason(state.reason)})" if state.reason else ""
@@ -112,7 +115,7 @@ def warn_of_fin(amplitude: float, where: str = "") -> None:
 
 def time_of_day(t: float) -> str:
     """Of unix time [s], here: `13:05:59`."""
-    return f"{datetime.fromtimestamp(t):%H:%M:%S}"
+    return time.strftime("%H:%M:%S", time.localtime(t))
 
 
 def _printable(value: Any) -> Any:

@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import click
+from click.shell_completion import CompletionItem
 
 from fishd.core.console import complain
 
@@ -87,6 +88,13 @@ class Verbs(click.Group):
             module = import_module(f"fishd.cli.{verb.module}")
         command: click.Command = getattr(module, verb.command)
         return command
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Complete the name of a verb without importing any."""
+        verbs = self._verbs.items()
+        names = [CompletionItem(name, help=verb.about) for name, verb in verbs]
+        names = [item for item in names if item.value.startswith(incomplete)]
+        return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs below their headings, without importing any."""

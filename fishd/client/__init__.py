@@ -12,18 +12,18 @@ does a `Fish`. `Agent` chooses the instruction angle itself, tick by tick.
 
 from typing import TYPE_CHECKING, Any
 
-from fishd.client.synchronous import Fish
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Refused
 
 if TYPE_CHECKING:
     from fishd.client.agent import Agent
     from fishd.client.asynchronous import AsyncFish
+    from fishd.client.synchronous import Fish
 
 __all__ = ["Agent", "AsyncFish", "Fish", "FishError", "LeaseLost", "NoDaemon", "Refused"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what few use only for those: asyncio would double the time that fishctl takes."""
+    """Import a client with its first use: zmq and asyncio take most of the time of a command."""
     if name == "Agent":
         from fishd.client.agent import Agent
 
@@ -32,4 +32,8 @@ def __getattr__(name: str) -> Any:
         from fishd.client.asynchronous import AsyncFish
 
         return AsyncFish
+    if name == "Fish":
+        from fishd.client.synchronous import Fish
+
+        return Fish
     raise AttributeError(f"module 'fishd.client' has no attribute '{name}'")

@@ -11,7 +11,7 @@ from typing import Self
 import msgspec
 import zmq
 
-from fishd.client.connection import milliseconds_until
+from fishd.client.zmq_sockets import milliseconds_until
 from fishd.controllers.remote.messages import (
     MAX_MESSAGE,
     VERSION,

@@ -11,16 +11,15 @@ import zmq.asyncio
 
 from fishd.client.connection import (
     ESTOP_WAIT_S,
+    IDLE_LIMIT,
     SECOND_LOOK,
     TIMEOUT,
     Connection,
     deadlines,
-    dealer,
-    milliseconds_until,
-    subscriber,
 )
-from fishd.client.lease import IDLE_LIMIT, LeaseRenewal, lease_arguments, report_unreturned
+from fishd.client.lease import LeaseRenewal, lease_arguments, report_unreturned
 from fishd.client.synchronous import Fish
+from fishd.client.zmq_sockets import dealer, milliseconds_until, subscriber
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted

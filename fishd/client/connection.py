@@ -6,18 +6,15 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
-import zmq
 
-from fishd.client.lease import LeaseRenewal
 from fishd.core import protocol, text
 from fishd.core.addresses import (
     ENDPOINT_VARIABLE,
     estop_path,
     find_control,
-    is_ipv6,
     socket_path,
 )
 from fishd.core.decoding import decoder
@@ -32,10 +29,15 @@ from fishd.core.errors import (
 from fishd.core.protocol import State
 from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
 
+if TYPE_CHECKING:
+    from fishd.client.lease import LeaseRenewal
+
 T = TypeVar("T")
 
 TIMEOUT = 2.0
 """How long to wait for an answer [s]."""
+IDLE_LIMIT = 30.0
+"""Time after which a program that does nothing while the fish swims counts as hung [s]."""
 SECOND_LOOK = 500
 """What has not come in time is looked for once more, for so long: of a process that was itself held
 up, by SIGSTOP say, it has come, but no thread has read it yet [ms].
@@ -44,8 +46,6 @@ ESTOP_WAIT_S = 0.1
 """Time after which an emergency stop goes to fishd's own socket as well [s]."""
 ESTOP_SOCKET_WAIT_S = 0.4
 """Longest time to wait for the answer from there [s]."""
-_RECONNECT_MS = 20
-"""Time after which a lost connection is made again, twice as long at most [ms]."""
 
 
 class Connection:
@@ -176,9 +176,6 @@ class Connection:
         return self._nobody(f"no telemetry within {self.timeout:g} s")
 
 
-S = TypeVar("S", bound="zmq.Socket[Any]")
-
-
 def _encodable(value: Any) -> Any:
     """Return a value without bytes of the command line that are not UTF-8: `?` instead."""
     if isinstance(value, str):
@@ -188,42 +185,6 @@ def _encodable(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_encodable(part) for part in value]
     return value
-
-
-def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
-    """A socket for requests; raises `NoDaemon` when the endpoint is no address."""
-    requests = context.socket(zmq.DEALER)
-    requests.set(zmq.LINGER, 0)
-    requests.set(zmq.RECONNECT_IVL, _RECONNECT_MS)
-    requests.set(zmq.IMMEDIATE, 1)  # do not queue for a daemon that is not there
-    _connect(requests, endpoint)
-    return requests
-
-
-def subscriber(context: "zmq.Context[S]", address: str, *topics: bytes) -> S:
-    """A socket for topics of telemetry; raises `NoDaemon` when the address is none."""
-    messages = context.socket(zmq.SUB)
-    for topic in topics:
-        messages.set(zmq.SUBSCRIBE, topic)
-    _connect(messages, address)
-    return messages
-
-
-def _connect(client: "zmq.Socket[Any]", address: str) -> None:
-    try:
-        client.set(zmq.IPV6, is_ipv6(address))
-        client.connect(address)
-    except zmq.ZMQError as error:
-        client.close()
-        raise NoDaemon(
-            f"'{address}' is no address: {zmq.strerror(error.errno or 0)}; "
-            "write ipc://PATH or tcp://HOST:PORT"
-        ) from None
-
-
-def milliseconds_until(deadline: float) -> int:
-    """Time left until a deadline [s, monotonic], rounded up; 0 after it [ms]."""
-    return max(0, math.ceil((deadline - time.monotonic()) * 1e3))
 
 
 def deadlines(seconds: float, *, again: bool) -> Iterator[float]:

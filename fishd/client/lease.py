@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 
 RENEWALS = 5
 """Renewals in the time for which a lease lasts."""
-IDLE_LIMIT = 30.0
-"""Time after which a program that does nothing while the fish swims counts as hung [s]."""
 BUSY_FRACTION = 0.02
 """A thread that takes more than this share of the time of a processor computes."""
 

@@ -4,26 +4,27 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import partial
-from typing import Any, Self, TypeVar
-
-import zmq
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from fishd.client.connection import (
     ESTOP_WAIT_S,
+    IDLE_LIMIT,
     SECOND_LOOK,
     TIMEOUT,
     Connection,
     deadlines,
-    dealer,
-    milliseconds_until,
-    subscriber,
 )
-from fishd.client.lease import IDLE_LIMIT, LeaseRenewal, lease_arguments, report_unreturned
+from fishd.client.request_socket import RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
 from fishd.core.protocol import LOADING, Calibrations, Grant, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
+
+if TYPE_CHECKING:
+    import zmq
+
+    from fishd.client.lease import LeaseRenewal
 
 T = TypeVar("T")
 
@@ -44,8 +45,9 @@ class Fish(Connection):
         telemetry: address of the telemetry socket; None asks the daemon
         """
         super().__init__(endpoint, timeout, telemetry)
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket: zmq.Socket[bytes] | None = None
+        self._socket: RequestSocket | None = None
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        """That of telemetry, with the first subscription."""
 
     def __enter__(self) -> Self:
         return self
@@ -57,7 +59,11 @@ class Fish(Connection):
         """Disconnect; may be called twice."""
         if self.held:
             self.held.stop()
-        self._context.destroy(linger=0)
+        if self._socket:
+            self._socket.close()
+            self._socket = None
+        if self._context:
+            self._context.destroy(linger=0)
 
     def status(self, timeout: float | None = None) -> Status:
         """The daemon in one snapshot.
@@ -171,7 +177,7 @@ class Fish(Connection):
         *,
         seconds: float | None = None,
         idle_limit: float | None = IDLE_LIMIT,
-    ) -> Iterator[LeaseRenewal]:
+    ) -> "Iterator[LeaseRenewal]":
         """Hold the fish, as an experiment: nobody else drives it, and it rests when this ends.
 
         Inside, requests of this object name the lease. fishd fades the fish to neutral when this
@@ -184,6 +190,8 @@ class Fish(Connection):
         idle_limit: time without a request or a tick, while the fish swims and this thread does not
             compute, after which the program counts as hung [s]; None for no limit
         """
+        from fishd.client.lease import LeaseRenewal, lease_arguments, report_unreturned
+
         grant = self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
         connect = partial(Fish, self.endpoint)
         self.held = renewal = LeaseRenewal(connect, grant, idle_limit)
@@ -239,16 +247,13 @@ class Fish(Connection):
         """
         if self._socket is None:
             self.check_endpoint()
-            self._socket = dealer(self._context, self.endpoint)
+            self._socket = RequestSocket(self.endpoint)
         identity, request = self.request(op, args)
-        wanted = zmq.POLLOUT
         for deadline in deadlines(self.timeout + patience, again=patience >= 0.0):
-            while self._socket.poll(milliseconds_until(deadline), wanted):
-                if wanted == zmq.POLLOUT:
-                    self._socket.send(request)
-                    wanted = zmq.POLLIN
-                    continue
-                result = self.result(self._socket.recv_multipart(), identity, kind)
+            if request and self._socket.send_by(deadline, request):
+                request = b""
+            while not request and (reply := self._socket.receive_by(deadline)):
+                result = self.result((reply,), identity, kind)
                 if result is not None:
                     return result
         raise self.silent(patience)
@@ -258,6 +263,11 @@ class Fish(Connection):
         address = self.telemetry_address or self.status().telemetry
         patience = -1 if forever else int(self.timeout * 1e3)
         decoders = {topic: decoder(kind) for topic, kind in kinds.items()}
+        import zmq
+
+        from fishd.client.zmq_sockets import subscriber
+
+        self._context = self._context or zmq.Context()
         socket = subscriber(self._context, address, *kinds)
 
         def messages() -> Iterator[T]:

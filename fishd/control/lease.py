@@ -3,7 +3,7 @@
 The loop asks once a tick whether it has run out; requests take it, renew it and end it.
 """
 
-import secrets
+import os
 from collections.abc import Callable
 
 from fishd.core.errors import Refused
@@ -58,7 +58,7 @@ class Lease:
         """Begin a lease, and return its token. seconds: that it lasts without a renewal"""
         self.active, self._dormant, self.expired = True, False, None
         self.drives = False
-        self._token = secrets.token_hex(8)  # another one than that of a daemon before this one
+        self._token = os.urandom(8).hex()  # another one than that of a daemon before this one
         self._name, self._host, self._pid, self._seconds = name, host, pid, seconds
         self._taken = self._now()
         self._fill()

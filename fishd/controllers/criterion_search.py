@@ -12,7 +12,6 @@ What a turned sensor mixes in of F_y is taken off first, so the sign of F_y does
 """
 
 import math
-import statistics
 from collections import deque
 from enum import Enum
 from typing import NamedTuple
@@ -207,17 +206,17 @@ class CriterionSearch:
     def _gait(self) -> Judgement:
         """As the half beats since the phase began show it."""
         squares, levels = self._ripples(self._halves)
-        middle = statistics.median(squares)
+        middle = _median(squares)
         half_beat = self._lasted / len(self._halves)
         self.ripple = math.sqrt(middle)
-        scatter = 1.25 * statistics.mean(abs(each - middle) for each in squares)
+        scatter = 1.25 * _mean([abs(each - middle) for each in squares])
         # Of the root. Each half beat is in two of them, so they count for two thirds; and a median
         # is off by a fourth more than a mean.
         error = (
             0.5 * 1.25 * scatter * math.sqrt(1.5 / len(squares)) / self.ripple if middle else 0.0
         )
-        level = statistics.mean(levels[::2])
-        scatter = 1.25 * statistics.mean(abs(each - level) for each in levels)
+        level = _mean(levels[::2])
+        scatter = 1.25 * _mean([abs(each - level) for each in levels])
         level_error = scatter * math.sqrt(1.5 / len(levels))
         if len(self._halves) < 2 * BEATS:  # the gait is not settled, and a turned sensor shows it
             level_error = self.ripple
@@ -304,7 +303,7 @@ class CriterionSearch:
         ripple_now = self._reference.ripple
         drifts = [UNSTEADY * move / ripple_now for move in self._moves]
         # As a share of the thrust. Rounds do not average it.
-        level_noise += 0.5 * statistics.mean(drift**2 for drift in (*drifts, DRIFT_AT_FIRST))
+        level_noise += 0.5 * _mean([drift**2 for drift in (*drifts, DRIFT_AT_FIRST)])
         share = level_noise / (level_noise + noise + RIPPLE_BIAS**2)  # by which the ripple counts
         error = math.hypot(share * math.sqrt(noise), (1.0 - share) * math.sqrt(level_noise))
         return share * ripple + (1.0 - share) * level, error
@@ -346,3 +345,14 @@ class CriterionSearch:
         else:
             self._known += 0.2 * (gait.ripple - self._known)
             self._start_sums()
+
+
+def _mean(values: list[float]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def _median(values: list[float]) -> float:
+    """Return the median; `statistics`, which has both, takes milliseconds to load."""
+    middle = len(values) // 2
+    values = sorted(values)
+    return values[middle] if len(values) % 2 else 0.5 * (values[middle - 1] + values[middle])

@@ -63,10 +63,13 @@ def units(name: str) -> dict[str, str]:
         return {}
 
 
-def describe_all() -> list[ControllerInfo]:
-    """All controllers that load in time; the name of one that does not says why when it is used."""
+def describe_all(prefix: str = "") -> list[ControllerInfo]:
+    """Describe all controllers that load in time; a use of one that does not says why.
+
+    prefix: what their names begin with
+    """
     found = []
-    for name in names():
+    for name in filter(lambda name: name.startswith(prefix), names()):
         attempt = Attempt(partial(describe, name))  # of a package that may never come back
         if attempt.wait(LONGEST_IMPORT) or not attempt.give_up():
             with contextlib.suppress(UnknownController):

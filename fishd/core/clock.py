@@ -164,7 +164,7 @@ class Ticker:
     """How long before the deadline to stop other work [s], at most a quarter of the period."""
 
     def __init__(self, period: float, warm_up: Callable[[], None] | None = None) -> None:
-        """Must be made inside a running asyncio loop; the first slot is one period from now.
+        """Must be made inside a running asyncio loop; the first slot is next, two margins from now.
 
         warm_up: called just before each deadline, if there is time for it
         """
@@ -176,7 +176,7 @@ class Ticker:
         self._warm_up_time = self._margin / 2
         self._latest_warm_up = math.inf
         """How long the latest one took [s]."""
-        self._start = time.monotonic() + period
+        self._start = time.monotonic() + 2.0 * self._margin
         self._index = -1
         self._timer = TimerFd()
         self._woken = asyncio.Event()

@@ -5,13 +5,15 @@ import os
 import resource
 import sys
 from contextlib import suppress
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
 from fishd.core import text
 from fishd.core.errors import ConfigError, FishdError
-from fishd.core.signals import Status
+
+if TYPE_CHECKING:  # with msgspec, which help and most completions do without
+    from fishd.core.signals import Status
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells give it: 128 and the number of SIGINT."""
@@ -20,7 +22,7 @@ MAX_COMPLAINT = 5000
 """Length of the longest complaint, which lists all keys of the configuration [characters]."""
 
 
-def status_line(status: Status) -> str:
+def status_line(status: "Status") -> str:
     """Mode, controller, frequency, mean thrust, power, lateness, missed ticks, a servo not reached.
 
     Of a swimmer its speed at that instant, instead of a thrust.
@@ -41,7 +43,7 @@ def status_line(status: Status) -> str:
     )
 
 
-def thrust_words(status: Status) -> str:
+def thrust_words(status: "Status") -> str:
     """Thrust and half of its 95 % interval: `25.7 ± 1.8 mN`; `?` while the zero is not known."""
     unit = f"m{text.quoted(status.force_unit)}"
     if status.sensor_lost:

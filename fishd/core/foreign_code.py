@@ -3,7 +3,6 @@
 Such code may raise anything, and may never return.
 """
 
-import ctypes
 import signal
 import threading
 from collections.abc import Callable
@@ -119,13 +118,16 @@ class Attempt(Generic[T]):
                 return False
             if not self._given_up:
                 self._given_up = True
-                self._raise_in_thread(ctypes.py_object(GivenUp))
+                self._raise_in_thread(GivenUp)
         return True
 
     def _raise_in_thread(self, error: Any) -> None:
         """Raise there, as soon as it is in Python; None takes back what was not raised yet."""
         if not (self._interrupt and self._begun):
             return
+        import ctypes  # only where a call is given up
+
+        error = ctypes.py_object(error) if error else None
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), error)
 
     def _run(self) -> None:

@@ -5,14 +5,12 @@ are read again once something was installed: a running fishd finds it without a 
 """
 
 import importlib
-import logging
 import os
-import pkgutil
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import reduce
 from importlib.machinery import PathFinder
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import msgspec
@@ -25,8 +23,6 @@ from fishd.core.schema import fields_of, nearest
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
-
-log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -106,7 +102,7 @@ class Plugins(Generic[T]):
             raise self._unknown(f"no {self.kind} is named '{text.quoted(name)}'; {hint}")
         where = f"{self.kind} '{name}' ({value} in {self.package(name)})"
         try:
-            found = contained(pkgutil.resolve_name, value.partition(" [")[0])
+            found = contained(_load_class, value.partition(" [")[0])
         except Exception as error:
             raise self._unknown(f"{where} does not load: {text.named(error)}") from error
         base = self._base
@@ -150,8 +146,16 @@ class Plugins(Generic[T]):
                 name = package.metadata["Name"] or "without a name"
                 problem = f"the entry points of package {name} cannot be read: {text.named(error)}"
                 self.problems[name] = problem
-                log.warning("%s", problem)
+                import logging  # with as much as all else that is loaded here
+
+                logging.getLogger(__name__).warning("%s", problem)
         return entries
+
+
+def _load_class(name: str) -> Any:
+    """Return what `module:class` names."""
+    module, _, attributes = name.partition(":")
+    return reduce(getattr, filter(None, attributes.split(".")), importlib.import_module(module))
 
 
 def _mentioned(group: str) -> bool:
@@ -184,7 +188,7 @@ def _stamps() -> list[int]:
     stamps = []
     for path in sys.path:
         try:
-            stamps.append(Path(path).stat().st_mtime_ns)
+            stamps.append(os.stat(path or ".").st_mtime_ns)  # noqa: PTH116
         except OSError:
             stamps.append(0)
     return stamps

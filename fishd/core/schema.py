@@ -5,8 +5,6 @@ and description (`unit`, `note`). From those this module takes validation with r
 (`convert`) and a description (`fields_of`) for help texts, command-line options and documentation.
 """
 
-import difflib
-import heapq
 import math
 import re
 import reprlib
@@ -217,6 +215,9 @@ def _close(word: str, words: list[str]) -> list[str]:
     """The nearest, if it is near enough; in microseconds, however long the word is."""
     if len(word) > LONGEST_WORD:
         return []
+    import difflib  # only where a word is wrong
+    import heapq
+
     letters = set(word)
 
     def distance(known: str) -> int:

@@ -1,6 +1,6 @@
 """`remote`: an agent in another process chooses the instruction angle; docs/how-to/remote.md."""
 
-import secrets
+import os
 import time
 from typing import Annotated, Any
 
@@ -87,7 +87,7 @@ class Remote(Controller[RemoteParameters]):
         super().__init__(parameters, limits)
         self._wire = Wire(parameters.agent)
         self._limit = DwellLimit(parameters.dwell, limits, limits.amplitude)
-        self._session = secrets.token_hex(8)
+        self._session = os.urandom(8).hex()
         self._observation: Observation | None = None
         """Of the tick that is going on."""
         self._question = b""

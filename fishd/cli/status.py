@@ -1,0 +1,139 @@
+"""`status`: what the fish and its daemon are doing, on one page."""
+
+import datetime
+
+import click
+
+from fishd.cli.options import daemon_options
+from fishd.cli.output import (
+    criterion_words,
+    echo_rows,
+    format_reason,
+    made_printable,
+    measured,
+    print_json,
+    spelled,
+)
+from fishd.client import Fish
+from fishd.core.console import power_words, thrust_words
+from fishd.core.schema import format_values
+from fishd.core.signals import Percentiles, Status
+
+_HELP = "docs/how-to/troubleshooting.md"
+_ZERO = "(its zero is not known: stop for 3 s, then swim on; or fishctl measure)"
+
+
+@click.command()
+@click.option("--timing", is_flag=True, help="Show how well the loop keeps its time, too.")
+@daemon_options
+def status(timing: bool, endpoint: str | None, as_json: bool) -> None:
+    """Show what the fish and its daemon are doing."""
+    with Fish(endpoint) as fish:
+        found = fish.status()
+    if as_json:
+        print_json(found)
+        return
+    rows = _status_rows(found := made_printable(found))
+    if timing:
+        rows += _timing_rows(found)
+    echo_rows(rows)
+
+
+def _status_rows(status: Status) -> list[tuple[str, str]]:
+    """The fish first, the daemon last."""
+    mode = [("mode", status.mode)]
+    if reason := status.reason:
+        remedy = f"{reason.remedy or 'mend the cause'} ({_HELP}, {reason.code})"
+        mode = [
+            ("mode", f"{status.mode} ({format_reason(reason)})"),
+            ("to do", f"{remedy}; then: fishctl clear-fault"),
+        ]
+    if holder := status.lease:
+        mode.append(("held by", f"{holder}, for {holder.age:.0f} s"))
+    if expired := status.lease_expired:
+        mode.append(("rests, as", f"{expired.message} ({_HELP}, {expired.code})"))
+    uptime = datetime.timedelta(seconds=int(status.uptime))
+    survived = {name: count for name, count in status.counters.items() if count}
+    missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
+    return [
+        ("fish", f"{status.name}, {status.robot}"),
+        *mode,
+        ("controller", spelled(status.controller, status.parameters)),
+        *([("", f"took over: {format_reason(status.fallback)}")] if status.fallback else []),
+        ("angle", f"{_angle(status)}, {_range(status)}"),
+        *_swum(status),
+        *([("leak", f"{status.leak:.3g} s, found")] if status.leak is not None else []),
+        *_criterion(status),
+        *([("shows", shown)] if (shown := _quantities(status)) else []),
+        *([("calibrating", "the servo, by a client")] if status.calibrating else []),
+        *(("degraded", line) for line in status.degraded),
+        *([("survived", format_values(survived, {}))] if survived else []),
+        *([("late", missed)] if status.missed or status.overruns else []),
+        ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
+        ("telemetry", status.telemetry),
+    ]
+
+
+def _criterion(status: Status) -> list[tuple[str, str]]:
+    """Return what `swing --C auto` has found, or tries."""
+    quantities = status.quantities
+    if status.parameters.get("C") != "auto" or "criterion" not in quantities:
+        return []
+    when = "on trial, or the best so far" if quantities.get("searching") else "found"
+    return [("C auto", criterion_words(quantities, when))]
+
+
+def _swum(status: Status) -> list[tuple[str, str]]:
+    if status.speed is not None:
+        return [("speed", f"{status.speed * 1e3:.1f} mm/s at {status.frequency:.2f} Hz")]
+    rows = [("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz")]
+    if status.thrust_error is None and not status.sensor_lost:
+        rows.append(("", _ZERO))
+    if status.power is not None:
+        rows.append(("power", f"{power_words(status.power)} into the servo, mean of 2 s"))
+    return rows
+
+
+def _timing_rows(status: Status) -> list[tuple[str, str]]:
+    timing = status.timing
+    scheduling = "real-time" if status.realtime else "normal"
+    loop = ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling")
+    if status.robot == "swimmer":
+        return [loop, ("", "in slow motion no tick is late")]
+    return [
+        loop,
+        ("", f"slots missed: {status.missed}, overruns: {status.overruns}"),
+        ("late", _percentiles(timing.lateness)),
+        ("busy", _percentiles(timing.busy)),
+        *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
+    ]
+
+
+def _quantities(status: Status) -> str:
+    each = measured(status.quantities, status.quantity_units)
+    return ", ".join(f"{name} {value}" for name, value in each)
+
+
+def _angle(status: Status) -> str:
+    if not status.servo_on:
+        return "no pulses"
+    lost = "; the servo cannot be reached, may still have pulses" if status.servo_lost else ""
+    return f"{status.phi_c:+.3f} rad{lost}"
+
+
+def _range(status: Status) -> str:
+    """The angles that the tail can be sent to."""
+    limit = status.amplitude_limit
+    if (status.lowest, status.highest) == (-limit, limit):
+        return f"within ±{limit:g} rad"
+    return (
+        f"within {status.lowest:+.4g} to {status.highest:+.4g} rad, less than ±{limit:g} rad of "
+        "amplitude_limit"
+    )
+
+
+def _percentiles(times: Percentiles) -> str:
+    return (
+        f"p50 {times.p50:.0f} µs, p99 {times.p99:.0f} µs, "
+        f"worst {times.worst:.0f} µs in tick {times.worst_seq}"
+    )
