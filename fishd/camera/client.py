@@ -27,7 +27,7 @@ from fishd.camera.requests import (
 )
 from fishd.camera.settings import CameraSettings
 from fishd.client import Fish
-from fishd.client.connection import milliseconds_until
+from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import text
 from fishd.core.errors import FishError
 

@@ -10,7 +10,8 @@ import zmq
 
 from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
-from fishd.client.connection import deadlines, milliseconds_until
+from fishd.client.connection import deadlines
+from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused

@@ -20,7 +20,8 @@ from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
-from fishd.client.connection import SECOND_LOOK, subscriber
+from fishd.client.connection import SECOND_LOOK
+from fishd.client.zmq_sockets import subscriber
 from fishd.core.addresses import find_control
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError

@@ -15,7 +15,7 @@ from rigs.documents import ROOT
 from rigs.processes import FISHD, Daemon, call, fishctl, running, wait_until
 
 from common.report import BrokenPromise
-from fishd.cli import control
+from fishd.cli import status as status_verb
 from fishd.core.signals import Status
 from reliability.systemd import root, trials
 
@@ -55,11 +55,11 @@ def test_the_trial_finds_the_scheduling_in_the_output_of_its_command(
 ) -> None:
     status = msgspec.structs.replace(daemon.status(), realtime=realtime)
 
-    class Client(control.Fish):
+    class Client(status_verb.Fish):
         def status(self) -> Status:
             return status
 
-    monkeypatch.setattr(control, "Fish", Client)
+    monkeypatch.setattr(status_verb, "Fish", Client)
     command, *arguments = trials.STATUS
     assert command == "fishctl"
     shown = fishctl("--endpoint", daemon.endpoint, *arguments).stdout
