@@ -151,11 +151,6 @@ def test_a_tail_that_is_brought_to_rest_does_not_beat_and_keeps_its_mean_force()
         assert beat.frequency == 0.0
 
 
-def test_a_new_frequency_is_followed() -> None:
-    slow = beats([5] * 20 + [8] * 30)
-    assert slow.frequency == pytest.approx(1 / 0.8)
-
-
 def test_neutral_between_two_sides_is_no_reversal() -> None:
     beat = TailBeat()
     for angle in ([0.4] * 5 + [0.0] + [0.4] * 5 + [-0.4] * 5 + [0.0] * 6) * 8:

@@ -59,12 +59,6 @@ def test_a_fade_takes_the_fade_time_from_the_limit_to_neutral() -> None:
     assert steps == 8
 
 
-@given(st.sampled_from([math.nan, math.inf, -math.inf]), angles)
-def test_a_command_that_is_no_number_is_refused(command: float, previous: float) -> None:
-    with pytest.raises(ValueError, match="not an angle"):
-        Guard(0.42, 0.05, None, 0.4).apply(command, previous)
-
-
 @given(angles, angles, st.lists(st.floats(allow_nan=False, allow_infinity=False)))
 def test_a_restricted_guard_permits_neither_more_than_the_servo_reaches_nor_more_than_phi(
     one: float, other: float, commands: list[float]
@@ -93,7 +87,6 @@ def test_what_is_no_finite_real_number_is_refused_with_its_type(name: str) -> No
         Guard(0.42, 0.05, None, 0.4).apply(BAD[name], 0.0)
 
 
-SWITCHES = 4_000
 CHOICES = {
     "hold": {"angle": (-0.42, 0.42)},
     "square": {"frequency": (0.2, 5.0), "amplitude": (0.02, 0.42)},
@@ -105,12 +98,12 @@ CHOICES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slew_limit", [None, 3.0])
-def test_thousands_of_switches_stay_within_amplitude_and_slew(slew_limit: float | None) -> None:
+def test_hundreds_of_switches_stay_within_amplitude_and_slew(slew_limit: float | None) -> None:
     rig = Rig(f"slew_limit={'null' if slew_limit is None else slew_limit}")
     generator = random.Random(7)
     step = 0.84 if slew_limit is None else slew_limit * 0.05
     angle = 0.0
-    for _ in range(SWITCHES):
+    for _ in range(500):
         name = generator.choice(list(CHOICES))
         if generator.random() < 0.1:
             rig.loop.stop()
@@ -123,14 +116,3 @@ def test_thousands_of_switches_stay_within_amplitude_and_slew(slew_limit: float 
         rig.recorder.ticks.clear()
         rig.recorder.events.clear()
     assert rig.mode in ("idle", "running")
-
-
-def test_sine_and_triangle_begin_from_the_angle_in_force_after_any_switch() -> None:
-    rig = Rig()
-    generator = random.Random(11)
-    for _ in range(500):
-        first = generator.choice(list(CHOICES))
-        rig.start(first, **{k: generator.uniform(*v) for k, v in CHOICES[first].items()})
-        before = rig.run(generator.randint(1, 9))[-1].phi_c
-        rig.start(generator.choice(("sine", "triangle")), frequency=generator.uniform(0.2, 3.0))
-        assert rig.run(1)[0].phi_c == pytest.approx(before, abs=1e-12)

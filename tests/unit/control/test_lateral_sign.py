@@ -57,7 +57,10 @@ def test_any_fish_shows_it_when_it_sets_off(seed: int) -> None:
 
 @pytest.mark.parametrize("tick", [0.005, 0.02, 0.1])
 def test_at_other_ticks_too(tick: float) -> None:
-    assert started(Rig(f"tick={tick}")) is False
+    right = Rig(f"tick={tick}")
+    assert started(right) is False
+    assert right.loop.lateral_sign.complaint == ""
+    assert "calibration" not in right.recorder.kinds()
     assert started(Rig(f"tick={tick}", wrap=reversed_robot)) is True
 
 
@@ -69,13 +72,6 @@ def test_it_is_told_once_in_one_line_that_says_what_to_do() -> None:
     assert event.message.startswith("F_y is reversed: ")
     assert "fishctl calibrate force" in event.message
     assert "fishctl calibrate servo" in event.message
-
-
-def test_a_right_sign_is_no_event_and_no_complaint() -> None:
-    rig = Rig()
-    assert started(rig) is False
-    assert rig.loop.lateral_sign.complaint == ""
-    assert "calibration" not in rig.recorder.kinds()
 
 
 def test_a_hang_as_the_tail_sets_off_shows_nothing() -> None:
@@ -130,7 +126,9 @@ def test_a_policy_that_trembles_before_it_swims_shows_it_by_its_first_true_push(
 def test_a_new_calibration_is_seen_anew_and_a_tare_asks_for_a_rest() -> None:
     rig = Rig(wrap=reversed_robot)
     assert started(rig) is True
-    rig.loop.lateral_sign.forget()
+    assert rig.loop.fy_corrected
+    rig.loop.forget_force(scale=True)
+    assert rig.run()[0].fy_corrected is UNSET
     assert rig.loop.lateral_sign.complaint == ""
     rig.loop.stop()
     rig.run_for(REST)
@@ -144,13 +142,12 @@ def test_a_new_calibration_is_seen_anew_and_a_tare_asks_for_a_rest() -> None:
 @pytest.mark.parametrize(
     ("controller", "parameters", "overrides"),
     [
-        ("swing", {}, ()),
         ("swing", {"C": 0.95, "lead": 0.1}, ("plant.servo_delay=0.05",)),
         ("swing", {"C": "auto"}, ()),
         ("swing", {}, ("estimator.kind=observer",)),
         ("swing", {}, ("estimator.leak=auto", "plant.lateral_drag=0.12")),
         ("swing", {}, harsh(FIRST_SEED).overrides),
-        ("ppo", {"policy": "default-fish"}, ()),
+        ("thrust", {"target": 0.015}, ()),
         ("ppo", {"policy": "default-fish"}, harsh(FIRST_SEED).overrides),
     ],
 )
@@ -160,11 +157,6 @@ def test_after_the_first_push_a_fish_with_a_reversed_force_swims_as_well_as_with
     right = swum(controller, parameters, *overrides, wrap=lambda robot: robot)
     corrected = swum(controller, parameters, *overrides, wrap=reversed_robot)
     assert corrected == pytest.approx(right, rel=0.02)
-
-
-def test_a_thrust_is_held_with_a_reversed_force_too() -> None:
-    held = swum("thrust", {"target": 0.015}, wrap=reversed_robot)
-    assert held == pytest.approx(0.015, rel=0.07)
 
 
 def test_controllers_see_the_other_sign_and_telemetry_the_force_as_measured() -> None:
@@ -202,17 +194,10 @@ def test_where_it_is_to_be_refused_the_first_push_is_a_fault_and_the_next_start_
         with pytest.raises(Refused, match="F_y is reversed") as refused:
             rig.start(controller, **parameters)
         assert refused.value.code == "fy-reversed"
-    rig.start("square", frequency=1.5)
-    rig.run_for(1.0)
+    assert started(rig, "square", frequency=1.5) is True  # which ignores the force
     assert rig.mode == "running"
     rig.loop.forget_force(scale=True)
     rig.start("swing")
-
-
-def test_a_wave_that_ignores_the_force_swims_on_where_it_is_to_be_refused() -> None:
-    rig = Rig("estimator.reversed_fy=refuse", wrap=reversed_robot)
-    assert started(rig, "square", frequency=1.5) is True
-    assert rig.mode == "running"
 
 
 def test_where_it_is_only_to_be_warned_of_nothing_is_corrected() -> None:
@@ -257,12 +242,3 @@ def test_a_force_from_elsewhere_turns_no_sign_that_was_known_and_one_at_first_no
         rig.run_for(0.5)
         found.append(rig.loop.fy_corrected)
     assert tuple(found) == corrected
-
-
-def test_a_new_calibration_ends_the_correction_at_once() -> None:
-    rig = Rig(wrap=reversed_robot)
-    started(rig)
-    assert rig.loop.fy_corrected
-    rig.loop.forget_force(scale=True)
-    (tick,) = rig.run(1)
-    assert tick.fy_corrected is UNSET

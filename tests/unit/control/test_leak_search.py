@@ -22,8 +22,7 @@ def found(*overrides: str, seconds: float = 60.0, **parameters: object) -> float
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("times", [0.5, 2.0, 3.0, 10.0])
-@pytest.mark.parametrize("rotation", [0.0, 0.175])
+@pytest.mark.parametrize(("times", "rotation"), [(0.5, 0.0), (3.0, 0.175), (10.0, 0.0)])
 def test_it_finds_the_leak_of_a_fish_with_another_drag(times: float, rotation: float) -> None:
     drag = f"plant.lateral_drag={times * DRAG}"
     leak = found(drag, f"simulation.rotation={rotation}", "simulation.offset_y=0.02")
@@ -37,7 +36,7 @@ def test_noise_and_a_late_servo_with_play_do_not_mislead_it() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tick", [0.01, 0.02, 0.1])
+@pytest.mark.parametrize("tick", [0.01, 0.1])
 def test_it_does_so_at_other_ticks(tick: float) -> None:
     drag = f"plant.lateral_drag={3.0 * DRAG}"
     assert found(f"tick={tick}", drag) == pytest.approx(RIGHT / 3.0, rel=0.3)
@@ -67,7 +66,7 @@ def test_swing_then_reaches_what_it_reaches_on_the_default_fish() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("amplitude", [0.1, 0.2, 0.42, 0.8])
+@pytest.mark.parametrize("amplitude", [0.1, 0.8])
 def test_on_the_default_fish_it_costs_no_thrust(amplitude: float) -> None:
     limit = f"amplitude_limit={amplitude}"
     shares = [

@@ -17,14 +17,10 @@ from fishd.hardware.base import Robot
 
 def test_at_rest_the_servo_is_held_at_neutral() -> None:
     rig, robot = fragile_rig()
-    tick = rig.run(3)[-1]
+    first, _, tick = rig.run(3)
+    assert (first.seq, first.t, tick.seq) == (1, 0.0, 3)
     assert (tick.mode, tick.controller, tick.phi_c, tick.servo_on) == ("idle", "hold", 0.0, True)
     assert robot.log == [0.0, 0.0, 0.0]
-
-
-def test_ticks_are_numbered_from_one_and_stamped_with_the_clock() -> None:
-    rig = Rig()
-    assert [(tick.seq, round(tick.t, 9)) for tick in rig.run(3)] == [(1, 0.0), (2, 0.05), (3, 0.1)]
 
 
 def test_a_tick_shows_what_was_sent_not_what_was_wanted() -> None:
@@ -50,17 +46,6 @@ def test_missed_slots_are_counted_and_the_next_observation_covers_them() -> None
     assert rig.recorder.kinds().count("overrun") == 1
 
 
-def test_the_simulated_fish_tells_its_truth_in_the_tick() -> None:
-    rig = Rig()
-    rig.start("square")
-    tick = rig.run(5)[-1]
-    assert (tick.alpha, tick.alpha_rate, tick.phi) == (
-        rig.fish.fish.state.alpha,
-        rig.fish.fish.state.alpha_rate,
-        rig.fish.fish.state.phi,
-    )
-
-
 def test_stopping_fades_to_neutral_within_the_fade_time() -> None:
     rig = Rig()
     rig.start("hold", angle=0.42)
@@ -74,7 +59,7 @@ def test_stopping_fades_to_neutral_within_the_fade_time() -> None:
     assert rig.recorder.ticks[-1].servo_on
 
 
-@pytest.mark.parametrize("tick", [0.002, 0.03, 0.05, 0.08, 0.2])
+@pytest.mark.parametrize("tick", [0.002, 0.03, 0.2])
 @pytest.mark.parametrize("fade_time", [0.1, 0.4])
 @pytest.mark.parametrize("missed", [0, 7])
 def test_in_fault_the_servo_gets_neutral_for_a_tenth_of_a_second_before_it_is_released(
@@ -131,21 +116,6 @@ def test_after_an_emergency_stop_the_way_back_is_clear_and_gentle() -> None:
 
 def test_a_tick_that_takes_longer_than_a_period_is_blamed_on_its_slowest_phase() -> None:
     rig = Rig()
-
-    def doze(_: Observation) -> float:
-        rig.clock.now += 0.06
-        return 0.0
-
-    rig.start(Scripted(doze))
-    rig.run()
-    assert rig.loop.statistics.overruns == 1
-    event = rig.recorder.events[-1]
-    assert event.kind == "overrun"
-    assert event.message == "tick 1 took 60.0 ms of its 50 ms, 60.0 ms of it in update"
-
-
-def test_the_slots_that_a_long_tick_cost_are_not_reported_twice() -> None:
-    rig = Rig()
     naps = iter([0.12])
 
     def doze(_: Observation) -> float:
@@ -154,9 +124,10 @@ def test_the_slots_that_a_long_tick_cost_are_not_reported_twice() -> None:
 
     rig.start(Scripted(doze))
     rig.run()
-    rig.run(missed=2)
-    assert rig.recorder.kinds().count("overrun") == 1
-    assert rig.recorder.ticks[-1].missed == 2
+    rig.run(missed=2)  # the slots that it cost are not reported again
+    assert rig.loop.statistics.overruns == 1
+    (event,) = (event for event in rig.recorder.events if event.kind == "overrun")
+    assert event.message == "tick 1 took 120.0 ms of its 50 ms, 120.0 ms of it in update"
 
 
 def test_one_or_two_failed_reads_are_bridged_with_the_last_measurement() -> None:
@@ -204,16 +175,6 @@ def test_clearing_a_fault_that_is_still_there_latches_it_again() -> None:
     assert rig.recorder.kinds().count("fault") == 2
 
 
-def test_one_suspect_window_and_failed_reads_are_not_three_suspect_windows() -> None:
-    rig, robot = fragile_rig()
-    rig.run(3)
-    robot.suspect = "F_x is clipped"
-    rig.run(1)
-    robot.read_error = SensorError("no acknowledge")
-    rig.run(2)
-    assert rig.mode == "idle"
-
-
 def test_a_force_that_is_not_to_be_believed_is_told_but_reaches_no_estimator() -> None:
     rig, robot = fragile_rig()
     seen: list[Observation] = []
@@ -239,7 +200,7 @@ def test_nor_does_it_when_a_slow_sensor_says_it_again() -> None:
     assert tick.age_ms < 10.0
 
 
-@pytest.mark.parametrize("tick", range(12))
+@pytest.mark.parametrize("tick", range(0, 12, 3))
 def test_one_such_force_costs_swing_no_beat(tick: int) -> None:
     rig, robot = fragile_rig()
     rig.start("swing")
@@ -336,38 +297,6 @@ def test_parameters_change_while_running_and_are_announced() -> None:
     assert rig.loop.active.controller.parameters.C == 0.3
     assert rig.recorder.events[-1].kind == "parameters"
     assert "C=0.3" in rig.recorder.events[-1].message
-
-
-def test_every_change_of_mode_and_controller_is_an_event() -> None:
-    rig = Rig()
-    rig.start("square")
-    rig.run()
-    rig.start("sine")
-    rig.loop.stop()
-    rig.loop.stop()
-    assert rig.recorder.kinds() == ["controller", "mode", "controller", "mode"]
-
-
-def test_the_wrapped_robot_of_these_tests_changes_nothing() -> None:
-    plain, (wrapped, _) = Rig(), fragile_rig()
-    for rig in (plain, wrapped):
-        rig.start("swing")
-        rig.run(50)
-    assert plain.recorder.ticks == wrapped.recorder.ticks
-
-
-@pytest.mark.parametrize("how", ["stop", "estop", "fault"])
-def test_a_tail_that_nobody_moves_has_no_frequency(how: str) -> None:
-    rig, wrapped = fragile_rig()
-    rig.start("square", frequency=0.5)
-    assert rig.run_for(10)[-1].frequency > 0.4
-    if how == "fault":
-        wrapped.read_error = SensorError("no answer")
-        rig.run(3)
-    else:
-        rig.loop.stop() if how == "stop" else rig.loop.estop("a test")
-    assert rig.mode == {"stop": "idle"}.get(how, how)
-    assert all(tick.frequency == 0.0 for tick in rig.run_for(5))
 
 
 class SlowSensor(Wrapped):

@@ -75,12 +75,12 @@ def judged(rig: Rig) -> Judged:
     return Judged(value / TRUE_FACTOR - 1.0, ci95 / TRUE_FACTOR)
 
 
-def test_a_steady_swim_of_20_000_beats_changes_no_factor() -> None:
+def test_a_steady_swim_of_5_000_beats_changes_no_factor() -> None:
     rig = Rig(0)
     rig.rest()
     rig.beats(20)
     before = judged(rig)
-    rig.beats(20_000)
+    rig.beats(5_000)
     after = judged(rig)
     assert after.error == pytest.approx(before.error, abs=1e-5)
     assert abs(after.error) < after.ci95
@@ -102,9 +102,9 @@ def random_swims(rig: Rig, beats: int) -> Iterator[Judged]:
 
 
 @pytest.mark.slow
-def test_the_factor_is_unbiased_over_100_000_beats_whatever_the_noise_and_the_drift() -> None:
+def test_the_factor_is_unbiased_over_20_000_beats_whatever_the_noise_and_the_drift() -> None:
     errors = []
-    for seed in range(100):
+    for seed in range(20):
         chance = random.Random(seed)
         rig = Rig(
             seed,

@@ -42,14 +42,19 @@ def test_the_dwell_is_a_time_in_whole_ticks_rounded_up(tick: float, ticks: int) 
     assert reversals(angles) == [ticks]
 
 
-def test_a_wave_that_is_slow_enough_passes_untouched() -> None:
-    wanted = [0.42 * (-1) ** (k // 4) * (0.5 + 0.1 * (k % 4)) for k in range(400)]
-    assert limited(wanted) == wanted
-
-
-def test_steps_on_one_side_are_no_reversals() -> None:
-    wanted = [0.42, 0.05, 0.42, 0.0, 0.3, 0.0, 0.42] * 20
-    assert limited(wanted) == wanted
+@pytest.mark.parametrize(
+    ("wanted", "dwell"),
+    [
+        ([0.42 * (-1) ** (k // 4) * (0.5 + 0.1 * (k % 4)) for k in range(400)], 0.2),
+        ([0.42, 0.05, 0.42, 0.0, 0.3, 0.0, 0.42] * 20, 0.2),
+        ([0.42 * (-1) ** k for k in range(1000)], 0.0),
+    ],
+    ids=["slow", "one side", "no dwell"],
+)
+def test_a_wave_without_quick_reversals_or_without_a_dwell_passes_untouched(
+    wanted: list[float], dwell: float
+) -> None:
+    assert limited(wanted, dwell) == wanted
 
 
 def test_who_rests_near_neutral_may_tremble_for_ever_and_the_servo_does_not() -> None:
@@ -68,23 +73,10 @@ def test_neutral_in_between_does_not_hide_a_reversal() -> None:
 
 def test_a_missed_tick_counts_as_time() -> None:
     limit = DwellLimit(0.2, LIMITS, 0.42)
-    limit.activate(0.42)
-    assert limit.apply(-0.42, 0.15) == 0.42
-    assert limit.apply(-0.42, 0.05) == -0.42
-
-
-def test_who_is_activated_again_waits_from_then() -> None:
-    limit = DwellLimit(0.2, LIMITS, 0.42)
-    limit.activate(0.42)
     assert limit.apply(0.42, 1.0) == 0.42
-    limit.activate(0.42)
+    limit.activate(0.42)  # from which on it waits again
     assert limit.apply(-0.42, 0.15) == 0.42
     assert limit.apply(-0.42, 0.05) == -0.42
-
-
-def test_without_a_dwell_every_command_passes() -> None:
-    wanted = [0.42 * (-1) ** k for k in range(1000)]
-    assert limited(wanted, dwell=0.0) == wanted
 
 
 @given(
@@ -100,7 +92,7 @@ def test_no_reversal_comes_too_soon(wanted: list[float], tick: float, dwell: flo
     assert all(abs(angle) <= max(map(abs, wanted)) for angle in angles)
 
 
-@pytest.mark.parametrize("tick", [0.005, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize("tick", [0.005, 0.05])
 @pytest.mark.parametrize("alternating", [False, True])
 def test_who_insists_for_two_seconds_loses_command(tick: float, alternating: bool) -> None:
     limits = replace(LIMITS, tick=tick)

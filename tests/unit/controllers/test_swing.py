@@ -71,8 +71,7 @@ def test_it_takes_over_towards_the_side_that_is_in_force() -> None:
     assert commands(registry.create("swing", {}, LIMITS), 1, angle=0.1) == [0.42]
 
 
-@pytest.mark.parametrize("amplitude", [0.02, 0.42, 1.4])
-@pytest.mark.parametrize("tick", [0.01, 0.05])
+@pytest.mark.parametrize(("amplitude", "tick"), [(0.02, 0.05), (1.4, 0.01)])
 def test_it_starts_from_rest_and_beats_within_seconds(amplitude: float, tick: float) -> None:
     rig = Rig(f"amplitude_limit={amplitude}", f"tick={tick}", *IMPERFECT)
     rig.start("swing")
@@ -80,7 +79,7 @@ def test_it_starts_from_rest_and_beats_within_seconds(amplitude: float, tick: fl
     assert 0.6 < rig.run(1)[-1].frequency < 3.0
 
 
-@pytest.mark.parametrize("C", [0.0, 0.3, 0.6, 0.9, 1.0])
+@pytest.mark.parametrize("C", [0.0, 0.6, 1.0])
 def test_it_never_stalls_whatever_the_offset(C: float) -> None:
     rig = Rig("amplitude_limit=0.03", "simulation.noise=2e-3", "simulation.offset_y=0.2")
     rig.start("hold")
@@ -119,13 +118,11 @@ def relative_thrust(ratio: float, seed: int) -> float:
     ],
 )
 def test_on_an_imperfect_rig_it_gets_most_of_the_best_thrust(ratio: float, least: float) -> None:
-    """ratio: ω₀Φ/Ω; the median over ten seeds of noise and drift."""
-    assert statistics.median(relative_thrust(ratio, seed) for seed in range(10)) >= least
+    """ratio: ω₀Φ/Ω; the median over five seeds of noise and drift."""
+    assert statistics.median(relative_thrust(ratio, seed) for seed in range(5)) >= least
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "change", ["omega0=5", "omega0=25", "xi=2.4", "coupling=1", "servo_speed=20"]
-)
+@pytest.mark.parametrize("change", ["omega0=5", "omega0=25", "xi=2.4", "coupling=1"])
 def test_fishes_that_have_little_in_common_swim_with_the_same_settings(change: str) -> None:
     assert simulate(load(None, [f"plant.{change}"]), "swing", {"C": 0.6}).relative_thrust > 0.9

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import pytest
 from msgspec.structs import replace
-from rigs.harness import LIMITS, Rig, observe
+from rigs.harness import LIMITS, Rig
 
 from fishd.controllers import registry
 from fishd.controllers.thrust import LEAST
@@ -119,14 +119,6 @@ def test_it_finds_the_target_again_with_another_fin() -> None:
     assert true_thrust(rig.run_for(10), coefficient) == pytest.approx(0.010, rel=0.15)
 
 
-def test_it_makes_the_wave_of_swing_whose_factor_is_then_its_own() -> None:
-    rig = rested(factor=None)
-    rig.start("swing")
-    wave = rig.loop.active.wave
-    rig.start("thrust", target=0.010)
-    assert rig.loop.active.wave == wave
-
-
 def test_what_was_measured_of_swing_holds_for_it() -> None:
     rig = rested(factor=None)
     rig.start("swing")
@@ -140,15 +132,6 @@ def test_what_was_measured_of_swing_holds_for_it() -> None:
     assert known.thrust_factor_error < 0.05 * FACTOR  # type: ignore[operator]
     rig.start("sine", frequency=1.5)
     assert rig.run(1)[-1].thrust_factor_error > 0.3 * FACTOR  # type: ignore[operator]
-
-
-def test_a_fish_that_is_held_still_gets_all_the_amplitude() -> None:
-    controller = registry.create("thrust", {"target": 0.01}, LIMITS)
-    controller.activate(observe())
-    angle = 0.0
-    for _ in range(1000):
-        angle = controller.update(observe(angle))
-    assert abs(angle) <= LIMITS.amplitude  # there is no force to go by, and nothing fails
 
 
 def test_the_mean_is_told_from_the_ripple_alone() -> None:

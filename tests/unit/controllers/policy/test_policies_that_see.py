@@ -46,15 +46,6 @@ def test_a_network_is_given_frames_and_numbers(tmp_path: Path) -> None:
     assert found.run() == pytest.approx(0.255 - 0.2 + 0.2 - 0.05)
 
 
-def test_a_policy_may_see_pictures_and_nothing_else(tmp_path: Path) -> None:
-    found = network(tmp_path, FOLLOWER)
-    assert found.row.shape == (0,)
-    found.frames[:] = 100
-    assert found.run() == pytest.approx(0.0, abs=1e-3)
-    found.frames[0, :16] += 1
-    assert found.run() > 0.9
-
-
 def test_a_card_says_in_a_word_what_is_seen() -> None:
     assert card(("fy", 0.1)).sees == "forces"
     assert seeing_card().sees == "pictures"
@@ -93,14 +84,6 @@ def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
     assert refused(none) == f"its inputs: none; {wanted}"
     assert "named 'frames' and one float32 input of shape [1, 1] named 'observation' are" in (
         refused(also_numbers)
-    )
-
-
-def test_frames_that_the_card_does_not_name_are_refused() -> None:
-    model = onnx.load_model_from_string(FOLLOWER)
-    helper.set_model_props(model, {KEY: encode(card())})
-    assert "one float32 input of shape [1, 1] named 'observation' is needed" in (
-        refusal(sealed(model))
     )
 
 

@@ -57,7 +57,7 @@ def test_a_sealed_file_of_an_older_fishd_still_tells_its_relative_thrust() -> No
     assert 0.9 < share < 1.0
 
 
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("protocol", [0, 2, pickle.HIGHEST_PROTOCOL])
 def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) -> None:
     path = write(tmp_path, pickle.dumps(Trap(tmp_path / "trace"), protocol))
     expected = (
@@ -89,23 +89,6 @@ def test_what_is_no_onnx_is_refused(content: bytes) -> None:
     )
 
 
-def test_a_file_without_a_card_is_refused() -> None:
-    def strip(model: Any) -> None:
-        del model.metadata_props[:]
-
-    assert refusal(changed(strip)) == (
-        "this ONNX file does not say for which observation, tick and Φ it was trained: its "
-        "metadata lacks fishd.card; export it with 'fishctl learn export'"
-    )
-
-
-def test_two_cards_are_refused() -> None:
-    def double(model: Any) -> None:
-        model.metadata_props.add(key=KEY, value=encode(card(amplitude=0.1)))
-
-    assert refusal(changed(double)) == "it has 2 cards that may contradict one another"
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -115,23 +98,12 @@ def test_two_cards_are_refused() -> None:
             "its card has format 2; this fishd reads format 3: it was written by an older fishd; "
             "train and export it again",
         ),
-        ({"format": None}, "its card has format null; this fishd reads format 3"),
         ({"tick": None}, "its card: tick: is missing: a number in [1e-30, 1e+30] is needed"),
-        ({"tick": 0}, "its card: tick: 0 is not valid"),
         ({"amplitude": -0.42}, "its card: amplitude: -0.42 is not valid"),
-        ({"amplitude": "wide"}, "its card: amplitude: 'wide' is not valid"),
         ({"observation": []}, "its card names neither an observation nor pictures"),
         (
             {"observation": [{"name": "fz", "scale": 1.0}]},
             "its card: observation.name: 'fz' is not valid: one of fin_velocity | fx | fy",
-        ),
-        (
-            {"observation": [{"name": "fy"}]},
-            "its card: observation.scale: is missing: a number in [1e-30, 1e+30]",
-        ),
-        (
-            {"observation": [{"name": "fy", "scale": 0.0}]},
-            "its card: observation.scale: 0.0 is not valid: ",
         ),
         (
             {"observation": [{"name": "fy", "scale": 1e-320}]},
@@ -147,10 +119,8 @@ def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], mes
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "is not JSON: "),
         ("NaN", "is not JSON: "),
         ("[1]", "is not a JSON object"),
-        ('"', "is not JSON: "),
         ("[" * 50_000, "is JSON that is nested too deeply"),
         ('{"provenance":' * 100 + "1" + "}" * 100, "is JSON that is nested too deeply"),
         (" " * 100_000, "has 100000 letters; 65536 are the most"),
@@ -159,12 +129,6 @@ def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], mes
 def test_a_card_that_is_not_json_or_no_object_is_refused(text: str, why: str) -> None:
     content = changed(lambda model: helper.set_model_props(model, {KEY: text}))
     assert refusal(content).startswith(f"its card {why}")
-
-
-def test_a_card_with_an_infinite_number_is_refused() -> None:
-    text = encode(card()).replace('"tick":0.05', '"tick":1e999')
-    content = changed(lambda model: helper.set_model_props(model, {KEY: text}))
-    assert refusal(content).startswith("its card")
 
 
 def rename_input(model: Any) -> None:
@@ -218,14 +182,7 @@ def test_wrong_ends_are_refused_with_what_is_right(change: Change, found: str, w
     assert wanted in message
 
 
-def test_a_card_with_more_features_than_the_network_has_inputs_is_refused() -> None:
-    wider = encode(card(("fy", 0.02), ("fy_rate", 0.3)))
-    content = changed(lambda model: helper.set_model_props(model, {KEY: wider}))
-    assert "one float32 input of shape [1, 2] named 'observation' is needed" in refusal(content)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("layer", [0, 1, 2])
+@pytest.mark.parametrize(("bad", "layer"), [(np.nan, 0), (-np.inf, 2)])
 def test_weights_that_are_not_finite_are_refused_though_tanh_hides_them(
     bad: float, layer: int
 ) -> None:
@@ -243,6 +200,24 @@ def test_weights_that_are_not_finite_are_refused_though_tanh_hides_them(
     )
 
 
+def strip(model: Any) -> None:
+    del model.metadata_props[:]
+
+
+def double(model: Any) -> None:
+    model.metadata_props.add(key=KEY, value=encode(card(amplitude=0.1)))
+
+
+def move_out(model: Any) -> None:
+    tensor = model.graph.initializer[0]
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="/etc/passwd")
+
+
+def shorten(model: Any) -> None:
+    model.graph.initializer[0].dims[0] = 7
+
+
 def constant_node(model: Any) -> None:
     nan = numpy_helper.from_array(np.array([np.nan], np.float32))
     model.graph.node.insert(0, helper.make_node("Constant", [], ["hidden"], value=nan))
@@ -252,27 +227,20 @@ def constant_number(model: Any) -> None:
     model.graph.node.insert(0, helper.make_node("Constant", [], ["hidden"], value_float=np.inf))
 
 
-@pytest.mark.parametrize("change", [constant_node, constant_number])
-def test_a_number_that_is_not_finite_is_found_wherever_it_hides(change: Change) -> None:
-    assert "not all finite" in refusal(changed(change))
-
-
-def test_weights_in_another_file_are_refused() -> None:
-    def move_out(model: Any) -> None:
-        tensor = model.graph.initializer[0]
-        tensor.data_location = TensorProto.EXTERNAL
-        tensor.external_data.add(key="location", value="/etc/passwd")
-
-    assert refusal(changed(move_out)) == (
-        "its weights 'weight_0' are in another file; save the model as a single file"
-    )
-
-
-def test_weights_that_contradict_their_shape_are_refused() -> None:
-    def shorten(model: Any) -> None:
-        model.graph.initializer[0].dims[0] = 7
-
-    assert refusal(changed(shorten)).startswith("its weights 'weight_0' cannot be read: ")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (strip, "its metadata lacks fishd.card; export it with 'fishctl learn export'"),
+        (double, "it has 2 cards that may contradict one another"),
+        (move_out, "its weights 'weight_0' are in another file; save the model as a single file"),
+        (shorten, "its weights 'weight_0' cannot be read: "),
+        (constant_node, "not all finite"),
+        (constant_number, "not all finite"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_what_the_model_lacks_or_hides_is_refused(change: Change, words: str) -> None:
+    assert words in refusal(changed(change))
 
 
 @pytest.mark.parametrize(

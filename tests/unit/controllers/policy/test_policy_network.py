@@ -16,7 +16,7 @@ FEATURES = (("fy", 0.02), ("fy_rate", 0.3), ("instruction_angle", 0.42), ("fin_v
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
-@pytest.mark.parametrize("hidden", [(), (8,), (64, 64)])
+@pytest.mark.parametrize("hidden", [(), (64, 64)])
 def test_onnx_agrees_with_numpy(
     activation: Literal["tanh", "relu"], hidden: tuple[int, ...]
 ) -> None:
@@ -25,13 +25,6 @@ def test_onnx_agrees_with_numpy(
     for inputs in np.random.default_rng(1).normal(0.0, 1.5, (200, 4)).astype(np.float32):
         (found,) = session.run(["action"], {"observation": inputs[np.newaxis]})
         assert found.item() == pytest.approx(answer(layers, activation, inputs), abs=1e-6)
-
-
-def test_the_output_is_cut_to_one_on_either_side() -> None:
-    session = onnxruntime.InferenceSession(to_onnx(linear(5.0), "tanh", card()))
-    for given, said in ((2.0, 1.0), (-2.0, -1.0), (0.1, 0.5)):
-        (found,) = session.run(None, {"observation": np.array([[given]], np.float32)})
-        assert found.item() == pytest.approx(said)
 
 
 def test_the_card_comes_back_as_it_was() -> None:

@@ -58,10 +58,7 @@ def test_an_endless_loop_is_refused_with_what_is_permitted() -> None:
     [
         (make("If", ["true"], ["action"], then_branch=body(), else_branch=body()), "If"),
         (make("Scan", ["observation"], ["action"], body=body(), num_scan_inputs=1), "Scan"),
-        (make("SequenceMap", ["observation"], ["action"], body=body()), "SequenceMap"),
-        (make("LSTM", ["observation", "w", "r"], ["action"]), "LSTM"),
         (make("RandomNormal", [], ["action"], shape=[1, 1]), "RandomNormal"),
-        (make("Tile", ["observation", "w"], ["action"]), "Tile"),
         (make("Tanh", ["observation"], ["action"], domain="com.example"), "com.example.Tanh"),
         (make("\x1b[31mRed\n" * 99, ["observation"], ["action"]), r"\?\[31mRed \S+"),
     ],
@@ -86,7 +83,7 @@ def test_a_graph_in_an_attribute_is_refused() -> None:
     assert refusal(of_nodes([node])) == "its Tanh holds a graph of its own"
 
 
-@pytest.mark.parametrize("opset", [0, 1, 10, 99])
+@pytest.mark.parametrize("opset", [10, 99])
 def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> None:
     content = of_nodes([make("Tanh", ["observation"], ["action"])], opset=opset)
     assert refusal(content) == (
@@ -197,7 +194,7 @@ def test_a_usual_network_is_fast_enough_for_the_shortest_tick(tmp_path: Path) ->
     Network(file.read(write(tmp_path, to_onnx(layers, "tanh", wide))))
 
 
-@pytest.mark.parametrize("opset", [operators.OPSETS[0], 13, 17, 21])
+@pytest.mark.parametrize("opset", [operators.OPSETS[0], 21])
 def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> None:
     """Layers as MatMul and Add, constants in nodes, scaling in the network, squashed Gaussians."""
     one = numpy_helper.from_array(np.array(0.5, np.float32))

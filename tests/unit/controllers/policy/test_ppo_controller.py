@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 from msgspec.structs import replace
 from onnx import TensorProto, helper, numpy_helper
 from rigs.harness import LIMITS, Rig, observe
-from rigs.policy_files import FLIP, answer, card, linear, of_nodes, random_layers, write
+from rigs.policy_files import answer, card, linear, of_nodes, random_layers, write
 from rigs.processes import FISHCTL, call
 
 from fishd.config import load
@@ -20,7 +19,6 @@ from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy.card import Card
 from fishd.controllers.policy.network import to_onnx
 from fishd.core.errors import ConfigError, ParameterError
-from fishd.simulation import simulate
 
 
 def made(path: Path, limits: Limits = LIMITS) -> Controller[Any]:
@@ -63,13 +61,6 @@ def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> Non
     rig = Rig()
     rig.start("ppo", policy=str(path))
     assert max(tick.phi_c for tick in rig.run(10)) == 0.2
-
-
-def test_a_virtual_fish_can_be_simulated_with_a_policy(tmp_path: Path) -> None:
-    config = load(None, ["chatter.dwell=0"])
-    report = simulate(config, "ppo", {"policy": str(write(tmp_path))}, seconds=5.0, settle=1.0)
-    assert (report.mode, report.reason) == ("running", None)
-    assert report.frequency == pytest.approx(10.0)
 
 
 def test_a_warm_up_changes_nothing(tmp_path: Path) -> None:
@@ -144,14 +135,6 @@ def test_an_amplitude_beyond_the_robots_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_a_bad_file_is_refused_with_its_path(tmp_path: Path) -> None:
-    path = write(tmp_path, b"\x80\x04]")
-    assert refusal(path) == (
-        f"ppo: policy: {path}: this is a pickle, which could run any code; "
-        "export it with 'fishctl learn export'"
-    )
-
-
 def test_a_policy_must_be_given() -> None:
     with pytest.raises(ParameterError, match=r"ppo: policy: is missing: a name or the path of a"):
         registry.check("ppo", {}, LIMITS)
@@ -179,10 +162,6 @@ def test_a_configuration_can_start_with_a_policy_or_says_why_not(tmp_path: Path)
     assert (rig.mode, rig.run(2)[-1].phi_c) == ("running", -0.42)
     with pytest.raises(ConfigError, match=r"tick of 50 ms, this robot's is 20 ms"):
         load(None, ("start.controller=ppo", f"start.parameters.policy={path}", "tick=0.02"))
-
-
-def test_the_flipping_policy_of_these_tests_is_an_ordinary_one() -> None:
-    onnx.checker.check_model(onnx.load_model_from_string(FLIP), full_check=True)
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
