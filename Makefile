@@ -31,16 +31,22 @@ test-fast: $(VENV)/installed-dev  ## Run what is on the virtual clock: no proces
 	@# These compute and hardly ever wait.
 	$(BIN)/python -m pytest -n $$(nproc) --dist worksteal --fast
 
+# A warning is an error; both formats are made of the same parsed pages.
+SPHINX := $(BIN)/python -m sphinx --quiet --fail-on-warning --conf-dir docs/sphinx --doctree-dir build/docs/parsed
+
 lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: $(VENV)/installed-dev  ## Write the generated parts of docs/ again
+docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build build/docs/html and build/docs/man
 	$(BIN)/python tools/config_reference.py --write
 	$(BIN)/python tools/protocol_reference.py --write
 	$(BIN)/python tools/rooms.py --write
+	$(SPHINX) -b html docs build/docs/html
+	$(SPHINX) -b man docs build/docs/man
+	@echo "Open build/docs/html/README.html, or: man build/docs/man/fishctl.1"
 
 figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
 	$(BIN)/python tools/paper
@@ -70,7 +76,11 @@ $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --no-deps 'rpi-lgpio>=0.6,<1'
 	@# Compiled here once, the tests need not be compiled by each of those that run at a time.
 	@$(BIN)/python -m pytest --collect-only -qq >/dev/null 2>&1 || true
-	@touch $@ $(VENV)/installed
+	@touch $@ $(VENV)/installed $(VENV)/installed-docs
+
+$(VENV)/installed-docs: pyproject.toml $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --constraint tools/constraints.txt --editable '.[docs]'
+	@touch $@
 
 .PHONY: install-pi uninstall-pi trial-systemd trial-arm64 release-check
 

@@ -3,16 +3,18 @@
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import ParameterError
 from fishd.core.files import write_atomically
-from fishd.virtual.swimmer.fish import Work
-from fishd.virtual.swimmer.grid import Array
-from fishd.virtual.swimmer.robot import Swimmer
+
+if TYPE_CHECKING:  # the columns are documented where numba is not installed
+    from fishd.virtual.swimmer.fish import Work
+    from fishd.virtual.swimmer.grid import Array
+    from fishd.virtual.swimmer.robot import Swimmer
 
 COLUMNS = {
     "time": ("s", "of the fish, at the end of the tick"),
@@ -43,7 +45,7 @@ SUFFIXES = (".csv", ".npz")
 class Track:
     """Rows of a swim, one a tick, all ticks of the same length."""
 
-    def __init__(self, rows: Array | None = None) -> None:
+    def __init__(self, rows: "Array | None" = None) -> None:
         """rows: those there are already, of shape (ticks, columns)"""
         self._rows: list[tuple[float, ...]] = [] if rows is None else list(map(tuple, rows))
         self._before: Work | None = None
@@ -51,11 +53,11 @@ class Track:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def begin(self, swimmer: Swimmer) -> None:
+    def begin(self, swimmer: "Swimmer") -> None:
         """Powers are those of what is done from now on."""
         self._before = swimmer.work
 
-    def add(self, swimmer: Swimmer, command: float) -> None:
+    def add(self, swimmer: "Swimmer", command: float) -> None:
         """Add the tick that has just ended; command: φ_c meanwhile [rad]."""
         motion, window, work = swimmer.motion, swimmer.window, swimmer.work
         before = self._before or work
@@ -87,11 +89,11 @@ class Track:
         }
         self._rows.append(tuple(row[name] for name in COLUMNS))
 
-    def rows(self) -> Array:
+    def rows(self) -> "Array":
         """All of them, of shape (ticks, columns)."""
         return np.array(self._rows, np.float64).reshape(len(self._rows), len(COLUMNS))
 
-    def columns(self) -> dict[str, Array]:
+    def columns(self) -> "dict[str, Array]":
         """The same by name, each of shape (ticks,)."""
         return dict(zip(COLUMNS, self.rows().T, strict=True))
 
