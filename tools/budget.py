@@ -72,7 +72,7 @@ fishd()
 def calls_per_tick(robot: str, controller: str) -> float:
     """Return the mean number of calls of Python functions in a tick of virtual time."""
     from fishd.config import load
-    from fishd.simulation import EncodingPublisher, VirtualRun
+    from fishd.lab.simulation import EncodingPublisher, VirtualRun
 
     calls, ticks = 0, TICKS[robot]
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fishd.camera.axis import Axis, NoMotion, find_motion
-from fishd.camera.frames import Frame, Pixels
+from fishd.core.camera_frames import Frame, Pixels
 
 SPAN = 20.0
 """It is found in the frames of so long [s]."""

@@ -8,7 +8,6 @@ import zmq
 
 from fishd.camera import messages
 from fishd.camera.clock_offset import ClockOffset, Offset, Reading, clock_of
-from fishd.camera.frames import EQUAL, Frame, FrameHistory, Stack, StackSettings
 from fishd.camera.messages import (
     BadMessage,
     CameraState,
@@ -29,6 +28,7 @@ from fishd.camera.settings import CameraSettings
 from fishd.client import Fish
 from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import text
+from fishd.core.camera_frames import EQUAL, Frame, FrameHistory, Stack, StackSettings
 from fishd.core.errors import FishError
 
 __all__ = ["CameraClient", "CameraLost"]

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import Axis, Floats
-from fishd.camera.frames import Pixels
 from fishd.camera.messages import Crop, PublishedView
+from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
 from fishd.core.files import write_atomically
 

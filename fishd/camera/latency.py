@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.frames import Frame
 from fishd.camera.tail import find_tails
+from fishd.core.camera_frames import Frame
 from fishd.core.errors import FishdError
 
 Floats = NDArray[np.float64]

@@ -5,8 +5,8 @@ import time
 from typing import Self
 
 from fishd.camera.client import CameraClient, CameraLost
-from fishd.camera.frames import Stack, StackSettings
 from fishd.client import Fish
+from fishd.core.camera_frames import Stack, StackSettings
 from fishd.core.errors import PolicyError
 
 FIRST_FRAMES = 5.0

@@ -14,9 +14,9 @@ from fishd.camera.sources.base import Source
 from fishd.core import text
 from fishd.core.console import complain, run
 from fishd.core.errors import FishdError
-from fishd.core.interruption import on_signal
-from fishd.daemon.logs import UNHURRIED, LogWriter
-from fishd.daemon.shutdown import leave
+from fishd.core.process.interruption import on_signal
+from fishd.core.process.logs import UNHURRIED, LogWriter
+from fishd.core.process.shutdown import leave
 
 log = logging.getLogger(__name__)
 NAME = "fishd-camera"

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from fishd.camera.frames import Pixels
+from fishd.core.camera_frames import Pixels
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
 from fishd.core.schema import note, unit

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from fishd.camera.frames import Pixels
 from fishd.camera.messages import Crop
 from fishd.camera.settings import PictureSettings, PublishSettings
+from fishd.core.camera_frames import Pixels
 
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 

@@ -12,14 +12,14 @@ from typing import Self
 import zmq
 
 from fishd.camera import messages, picture
-from fishd.camera.frames import Pixels
 from fishd.camera.messages import FrameHeader, Until, ViewHeader
 from fishd.camera.monitor import Monitor
 from fishd.camera.settings import CameraSettings, without_password
 from fishd.camera.sockets import MAX_UNKNOWN_BYTES, Publisher, Requests
 from fishd.camera.sources.base import Shot, Source, Timeline, Trouble
 from fishd.core import text
-from fishd.daemon.systemd_notify import SystemdNotifier
+from fishd.core.camera_frames import Pixels
+from fishd.core.process.systemd_notify import SystemdNotifier
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
-from fishd.config.overrides import apply_overrides
 from fishd.core import strict_yaml, text
 from fishd.core.addresses import why_not_connected, why_not_served
 from fishd.core.errors import ConfigError
+from fishd.core.overrides import apply_overrides
 from fishd.core.schema import PRINTABLE, Problem, convert, note, unit, without_empty_sections
 
 _Delay = Annotated[

@@ -23,7 +23,7 @@ from fishd.client import Fish
 from fishd.config import Config, Start, adopt, check_tethered, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 
 if TYPE_CHECKING:
     from fishd.lab.rig import Rig

@@ -17,12 +17,12 @@ from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.config import adopt
 from fishd.core.errors import ControllerFault, PolicyError
-from fishd.core.interruption import on_signal
+from fishd.core.process.interruption import on_signal
 from fishd.core.signals import Observation
 
 if TYPE_CHECKING:
     from fishd.camera.live_sight import LiveSight
-    from fishd.camera.pilot import Pilot
+    from fishd.controllers.policy.pilot import Pilot
     from fishd.learning.env.fishd_link import FishdLink
 
 GIVE_UP = 2.0
@@ -75,7 +75,7 @@ def agent(
     for package in ("onnx", "onnxruntime"):
         import_module(package)  # one that is missing is named with its extra, see `Verbs`
     from fishd.camera.live_sight import LiveSight
-    from fishd.camera.pilot import Pilot
+    from fishd.controllers.policy.pilot import Pilot
     from fishd.learning.env.fishd_link import FishdLink
     from fishd.learning.env.link import LinkLost
 

@@ -20,7 +20,7 @@ from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from fishd.core.interruption import held_back
+from fishd.core.process.interruption import held_back
 
 if TYPE_CHECKING:
     from rich.live import Live

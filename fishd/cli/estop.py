@@ -12,7 +12,7 @@ from fishd.cli.output import echo, output_may_fail, print_json, state_line
 from fishd.client import Fish
 from fishd.core.addresses import socket_path
 from fishd.core.errors import NoDaemon, StartupError, Untrusted
-from fishd.core.interruption import SIGNALS, handled
+from fishd.core.process.interruption import SIGNALS, handled
 from fishd.core.protocol import State
 from fishd.hardware import release_recipe
 

@@ -11,11 +11,11 @@ from fishd.cli.output import echo, echo_rows, print_json, spelled
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, MissingPackage
-from fishd.core.interruption import on_signal
+from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.config import Config
-    from fishd.simulation.free_swim import SwimReport, Swum
+    from fishd.lab.simulation.free_swim import SwimReport, Swum
     from fishd.virtual.swimmer.robot import Swimmer
 
 
@@ -26,8 +26,8 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     Raises `FishdError` and OSError.
     """
     try:
-        from fishd.simulation.free_swim import Keeping
-        from fishd.simulation.free_swim import swim as run
+        from fishd.lab.simulation.free_swim import Keeping
+        from fishd.lab.simulation.free_swim import swim as run
         from fishd.virtual.swimmer import checkpoint, track
         from fishd.virtual.swimmer.midlines import Midlines
     except ModuleNotFoundError as error:

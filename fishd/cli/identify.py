@@ -18,7 +18,7 @@ from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 from fishd.recording.folder import find, named
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from fishd.cli.output import echo, print_json, spelled
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.console import INTERRUPTED, power_words
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 
 if TYPE_CHECKING:
     from fishd.lab.measurement import Measured

@@ -32,9 +32,9 @@ from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, NoDaemon, ParameterError
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 from fishd.core.schema import Field, nearest, units_of
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 if TYPE_CHECKING:
     from fishd.lab.optimise.aim import Aim

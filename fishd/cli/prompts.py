@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import click
 
-from fishd.core.interruption import handled
+from fishd.core.process.interruption import handled
 
 _AGAIN = 0.1
 """Time after which a system call is interrupted again [s]."""

@@ -15,7 +15,7 @@ from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
 from fishd.core import text
 from fishd.core.addresses import find_control
 from fishd.core.errors import ConfigError, FishError, NoDaemon, ServoError, StartupError
-from fishd.core.interruption import SIGNALS, handled
+from fishd.core.process.interruption import SIGNALS, handled
 from fishd.hardware.release_recipe import NOT_RELEASED, outcome
 
 _NO_FOLDER = "/proc/self/no-calibrations"
@@ -92,7 +92,7 @@ def _release(config: Config) -> str:
 
 def _driver(config: Config) -> str:
     """Return the pid of a fishd that drives this servo; empty where there is none."""
-    from fishd.config.assembly import parts_of
+    from fishd.assembly import parts_of
     from fishd.hardware.ownership import owner_pid
 
     with suppress(StartupError):  # no good place for a virtual Pi: the release says so
@@ -106,7 +106,7 @@ def _endpoint(config: Config) -> str:
 
 def _ask(config: Config, driver: str) -> str:
     """Ask a fishd for an emergency stop, and read the pulses back; empty unless they have ended."""
-    from fishd.config.assembly import read_pulses
+    from fishd.assembly import read_pulses
 
     try:
         with Fish(_endpoint(config), timeout=_ANSWER_S) as fish:
@@ -138,7 +138,7 @@ def _loaded(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path
 
 def _end_pulses(config: Config) -> bool:
     """Return whether there were any; with an unreadable calibration, neutral lacks its trim."""
-    from fishd.config.assembly import end_pulses
+    from fishd.assembly import end_pulses
 
     try:
         return end_pulses(config)

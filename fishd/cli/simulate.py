@@ -16,8 +16,8 @@ from fishd.core.console import power_words
 from fishd.core.errors import MissingPackage
 
 if TYPE_CHECKING:
+    from fishd.lab.simulation import Report, VirtualRun
     from fishd.recording import RunWriter
-    from fishd.simulation import Report, VirtualRun
 
 _ROUNDED = "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
 
@@ -69,8 +69,8 @@ def _simulate(
     **swimmers: Any,
 ) -> int:
     of_swimmer = SwimmerOptions(**swimmers)
-    from fishd.simulation import check_whole_beat
-    from fishd.simulation import simulate as run
+    from fishd.lab.simulation import check_whole_beat
+    from fishd.lab.simulation import simulate as run
 
     config = load(file, overrides)
     free = config.robot == "swimmer"

@@ -19,7 +19,7 @@ from fishd.cli.output import echo, echo_rows, print_json
 from fishd.config import Config, load
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.console import complain
-from fishd.daemon import realtime
+from fishd.core.process import realtime
 from fishd.hardware.settings import PanelSettings
 from fishd.virtual.pi.faults import FAULTS
 from fishd.virtual.pi.link import RemotePi

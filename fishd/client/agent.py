@@ -12,7 +12,8 @@ import msgspec
 import zmq
 
 from fishd.client.zmq_sockets import milliseconds_until
-from fishd.controllers.remote.messages import (
+from fishd.core.addresses import claimed, is_ipv6, parse
+from fishd.core.agent_messages import (
     MAX_MESSAGE,
     VERSION,
     Action,
@@ -23,7 +24,6 @@ from fishd.controllers.remote.messages import (
     decode_from_fish,
     encode,
 )
-from fishd.core.addresses import claimed, is_ipv6, parse
 from fishd.core.errors import FishError, NoDaemon, ParameterError, StartupError
 
 PATIENCE = 10.0

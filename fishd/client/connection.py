@@ -26,8 +26,8 @@ from fishd.core.errors import (
     Refused,
     Untrusted,
 )
+from fishd.core.process.unix_sockets import Listener, is_deserted, listener, stranger
 from fishd.core.protocol import State
-from fishd.core.unix_sockets import Listener, is_deserted, listener, stranger
 
 if TYPE_CHECKING:
     from fishd.client.lease import LeaseRenewal

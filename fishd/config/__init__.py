@@ -1,4 +1,4 @@
-"""The configuration: YAML in, one frozen `Config` out, and from it the robot and its loop."""
+"""The configuration: YAML in, one frozen `Config` out."""
 
 from fishd.config.configuration import (
     FILE_VARIABLE,

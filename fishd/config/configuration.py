@@ -15,11 +15,11 @@ from msgspec import Meta, Struct
 
 from fishd.config import consistency as checks
 from fishd.config import drivers
-from fishd.config.overrides import apply_overrides
 from fishd.control.estimators.base import EstimatorSettings
 from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
+from fishd.core.overrides import apply_overrides
 from fishd.core.protocol import LEASE, LONGEST_LEASE, SHORTEST_LEASE
 from fishd.core.schema import (
     Problem,

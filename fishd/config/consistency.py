@@ -13,8 +13,8 @@ from fishd.controllers.base import Limits
 from fishd.core import files
 from fishd.core.addresses import FORM, is_local, why_not_served
 from fishd.core.errors import ParameterError, UnknownController
+from fishd.core.process.unix_sockets import check_length
 from fishd.core.schema import Problem
-from fishd.core.unix_sockets import check_length
 from fishd.hardware.driver import Claim
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import PanelSettings, ServoSettings

@@ -12,8 +12,8 @@ from typing import Any
 from fishd.config import configuration
 from fishd.config.configuration import Config
 from fishd.config.drivers import CHOICES
-from fishd.config.overrides import apply_overrides
 from fishd.core.errors import ConfigError
+from fishd.core.overrides import apply_overrides
 from fishd.core.schema import Problem, without_empty_sections
 
 MAX_MISTAKES = 100

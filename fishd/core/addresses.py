@@ -17,9 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from fishd.core import unix_sockets
 from fishd.core.errors import StartupError
-from fishd.core.runtime_folder import runtime_folder
+from fishd.core.process import unix_sockets
+from fishd.core.process.runtime_folder import runtime_folder
 
 FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"

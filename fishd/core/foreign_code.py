@@ -11,7 +11,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 from fishd.core import text
 from fishd.core.errors import Escaped
-from fishd.core.interruption import Interrupted
+from fishd.core.process.interruption import Interrupted
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -11,7 +11,8 @@ from collections.abc import Awaitable, Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from fishd.core import protocol, unix_sockets
+from fishd.core import protocol
+from fishd.core.process import unix_sockets
 
 log = logging.getLogger(__name__)
 

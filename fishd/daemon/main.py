@@ -14,8 +14,8 @@ from pathlib import Path
 
 import click
 
-from fishd import __version__
-from fishd.config import Config, assembly, load
+from fishd import __version__, assembly
+from fishd.config import Config, load
 from fishd.control.lease import Lease
 from fishd.control.loop import SETTLING
 from fishd.control.supervisor import Mode
@@ -25,17 +25,17 @@ from fishd.core import addresses
 from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
-from fishd.daemon import realtime
+from fishd.core.process import realtime
+from fishd.core.process.logs import UNHURRIED, LogWriter
+from fishd.core.process.shutdown import Shutdown, leave
+from fishd.core.process.systemd_notify import SystemdNotifier
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.estop_socket import EstopSocket
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
 from fishd.daemon.lockstep import Lockstep
-from fishd.daemon.logs import UNHURRIED, LogWriter
 from fishd.daemon.requests import Operations
-from fishd.daemon.shutdown import Shutdown, leave
 from fishd.daemon.slow_motion import SlowMotion
-from fishd.daemon.systemd_notify import SystemdNotifier
 from fishd.daemon.warm_up import mock_ticks
 from fishd.hardware.base import Robot
 from fishd.hardware.servo.pulses import REST

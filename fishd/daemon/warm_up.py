@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
+from fishd.assembly import build_loop, simulated_fish
 from fishd.config import Config, Start
-from fishd.config.assembly import build_loop, simulated_fish
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.gateway.link import pair

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fishd.core.errors import StartupError
-from fishd.core.lockfile import Taken, holder, lock_path, locked
-from fishd.core.runtime_folder import runtime_folder
-from fishd.core.unix_sockets import stranger
+from fishd.core.process.lockfile import Taken, holder, lock_path, locked
+from fishd.core.process.runtime_folder import runtime_folder
+from fishd.core.process.unix_sockets import stranger
 from fishd.hardware.driver import Claim
 
 log = logging.getLogger(__name__)

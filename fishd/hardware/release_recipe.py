@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import Any
 
 from fishd.core.errors import ServoError, StartupError
-from fishd.core.runtime_folder import runtime_folder
+from fishd.core.process.runtime_folder import runtime_folder
 
 NOT_RELEASED = "the servo was not released and may still have pulses: cut its power"
 """What to say where a release has failed."""

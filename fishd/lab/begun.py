@@ -12,7 +12,7 @@ from fishd import __version__
 from fishd.core import files
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
-from fishd.core.lockfile import NotALock, Taken, locked
+from fishd.core.process.lockfile import NotALock, Taken, locked
 
 OTHERS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
 """Sections and keys of a configuration that have no part in the thrust."""

@@ -15,7 +15,7 @@ from joblib._multiprocessing_helpers import mp as multiprocessing
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from fishd.core.errors import FishdError
-from fishd.core.safe_path import SafeChildren
+from fishd.core.process.safe_path import SafeChildren
 
 T = TypeVar("T")
 R = TypeVar("R")

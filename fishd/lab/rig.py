@@ -19,7 +19,7 @@ from fishd.core.errors import (
     UnknownController,
 )
 from fishd.core.signals import Event, Reason, Tick
-from fishd.simulation import VirtualRun
+from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
     from fishd.recording.provenance import Source

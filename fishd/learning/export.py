@@ -12,13 +12,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from fishd.camera.frames import Stack
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config, adopt
 from fishd.controllers.policy.card import Card
 from fishd.controllers.policy.file import FRAMES, INPUT, PolicyFile
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
 from fishd.learning.env.environment import SwimEnv

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import find_motion
-from fishd.camera.frames import Stack
-from fishd.camera.pilot import Pilot
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers.policy import opening
 from fishd.controllers.policy.card import Card, History
 from fishd.controllers.policy.file import OUTPUT, PolicyFile
+from fishd.controllers.policy.pilot import Pilot
 from fishd.controllers.policy.runtime import Network
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.lab.drawing import BLUE, drawn

@@ -14,8 +14,8 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
-from fishd.camera.frames import Stack
-from fishd.camera.pilot import HOLD
+from fishd.controllers.policy.pilot import HOLD
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.learning.env.environment import spaces

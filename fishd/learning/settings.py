@@ -8,9 +8,9 @@ import yaml
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from fishd.camera.frames import StackSettings
 from fishd.controllers.policy.card import COMMANDS, LONGEST_HISTORY, FeatureName
 from fishd.core import strict_yaml
+from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
 from fishd.virtual.plant.parameters import PlantParameters

@@ -4,10 +4,10 @@ import time
 from typing import NamedTuple, Self
 
 from fishd.camera.client import CameraClient
-from fishd.camera.frames import Frame, Pixels
 from fishd.camera.messages import FrameHeader
 from fishd.client import Fish
 from fishd.core import text
+from fishd.core.camera_frames import Frame, Pixels
 from fishd.core.errors import FishError
 from fishd.recording.images import FrameHead
 

@@ -13,9 +13,9 @@ from mcap.records import Attachment, Channel, Footer, Message, Metadata
 
 from fishd.config import Config, adopt
 from fishd.core import strict_yaml, text
+from fishd.core.dataframes import frame
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
-from fishd.core.frames import frame
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording import images
@@ -222,7 +222,7 @@ class Run:
                 yield record.data
 
     def frame(self) -> "DataFrame":
-        """The ticks as a table: `fishd.core.frames.frame`; raises `RecordingError`."""
+        """The ticks as a table: `fishd.core.dataframes.frame`; raises `RecordingError`."""
         names: set[str] = set()
         for tick in self.ticks:
             names.update(tick.quantities or ())

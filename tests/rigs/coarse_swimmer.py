@@ -1,7 +1,7 @@
 """A free swimmer that is soon computed, and looks like one: for tests of what is around it."""
 
+from fishd.assembly import open_swimmer
 from fishd.config import Config, load
-from fishd.config.assembly import open_swimmer
 from fishd.virtual.swimmer.robot import Swimmer
 from rigs.documents import ROOT
 from rigs.processes import sets

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fishd.config.assembly import assemble
+from fishd.assembly import assemble
 from fishd.controllers import registry
 from fishd.core.clock import VirtualClock
 from fishd.hardware.base import Robot

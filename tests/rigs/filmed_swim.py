@@ -2,12 +2,12 @@
 
 from itertools import pairwise
 
-from fishd.camera.frames import Frame
 from fishd.camera.latency import Force
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.cli.camera.latency import forces_of
 from fishd.config import load
+from fishd.core.camera_frames import Frame
 from fishd.core.signals import Tick
 from fishd.lab.rig import VirtualRig
 

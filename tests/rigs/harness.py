@@ -4,8 +4,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from fishd.assembly import build_loop, simulated_fish
 from fishd.config import Config, load
-from fishd.config.assembly import build_loop, simulated_fish
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, Limits
 from fishd.core.clock import Slot, VirtualClock

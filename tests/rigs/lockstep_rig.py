@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from fishd.config.assembly import open_in_virtual_time
+from fishd.assembly import open_in_virtual_time
 from fishd.hardware.base import Robot
 from rigs.harness import Rig
 

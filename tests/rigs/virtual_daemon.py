@@ -9,7 +9,7 @@ from fishd.config import Config
 from fishd.core.errors import LeaseLost, ParameterError, Refused
 from fishd.core.protocol import State
 from fishd.core.signals import Event, Tick
-from fishd.simulation import KeepingPublisher, VirtualRun
+from fishd.lab.simulation import KeepingPublisher, VirtualRun
 
 
 class VirtualStatus:

@@ -96,7 +96,7 @@ def test_python_is_started_in_one_way() -> None:
     for path in (ROOT / "fishd").rglob("*.py"):
         code = path.read_text(encoding="utf-8")
         name = str(path.relative_to(ROOT))
-        if name not in ("fishd/core/safe_path.py", "fishd/__main__.py"):
+        if name not in ("fishd/core/process/safe_path.py", "fishd/__main__.py"):
             assert not re.search(r"\[\s*sys\.executable|\(sys\.executable,", code), name
         if re.search(r"^(import|from) (joblib|multiprocessing|concurrent)\b", code, re.MULTILINE):
             assert "SafeChildren()" in code, name

@@ -22,10 +22,10 @@ from rigs.processes import (
     wait_until,
 )
 
-from fishd.camera.frames import StackSettings
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.client import Fish
 from fishd.config import Config
+from fishd.core.camera_frames import StackSettings
 from fishd.core.protocol import State
 from fishd.lab.compare import compare
 

@@ -25,8 +25,8 @@ from rigs.processes import (
     wait_until,
 )
 
+from fishd.core.process.unix_sockets import is_deserted
 from fishd.core.signals import Tick
-from fishd.core.unix_sockets import is_deserted
 
 SHIPPED = str(ROOT / "config" / "simulated.yaml")
 
@@ -214,7 +214,7 @@ def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None
         assert not daemon.status().realtime
         status, _, errors = daemon.end()
     assert status == 0
-    assert errors.count("fishd.daemon.realtime") == 1
+    assert errors.count("fishd.core.process.realtime") == 1
     assert "memory is not locked" in errors
     assert "no real-time scheduling" in errors
     assert "; run as the systemd service, or set realtime.priority: 0 and " in errors
@@ -222,7 +222,7 @@ def test_without_the_privilege_it_warns_once_and_goes_on(tmp_path: Path) -> None
 
 ABOVE = """
 import logging, os, resource
-from fishd.daemon import realtime
+from fishd.core.process import realtime
 
 def forbid(*_):
     raise PermissionError(1, "Operation not permitted")
@@ -244,7 +244,7 @@ def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:
     modest = sets("realtime.priority=0", "realtime.lock_memory=false")
     with running(tmp_path, *modest) as daemon:
         assert not daemon.status().realtime
-        assert "fishd.daemon.realtime" not in daemon.end()[2]
+        assert "fishd.core.process.realtime" not in daemon.end()[2]
 
 
 @pytest.mark.realtime

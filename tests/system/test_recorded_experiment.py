@@ -7,10 +7,10 @@ from rigs.processes import EXPERIMENT, Daemon, Process, wait_until
 
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
+from fishd.lab.rerun import rerun
 from fishd.lab.rig import LiveRig
 from fishd.lab.rig_recording import recorded
 from fishd.recording import open_run
-from fishd.recording.rerun import rerun
 
 
 def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ import rooms as tool
 from rooms import arrows, layers, purpose, rooms
 
 ROOMS = rooms()
-MAX_ROOMS = 16
+MAX_ROOMS = 14
 MAX_ARROWS_PER_ROOM = 5
 """Largest mean number of other rooms that a room imports."""
 

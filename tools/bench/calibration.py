@@ -19,7 +19,7 @@ from fishd.core.calibration import ForceCalibration
 from fishd.hardware.force_sensor.calibration_fit import FEWEST_LOADS, Load, fit
 from fishd.lab.measurement import measure as measured
 from fishd.lab.rig import VirtualRig
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
 DOCUMENT = "how-to/measuring.md"

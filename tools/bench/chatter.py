@@ -13,7 +13,7 @@ from common.report import Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.lab.compare.survey import Reversals
-from fishd.simulation import judge
+from fishd.lab.simulation import judge
 
 DOCUMENT = "reference/policies.md"
 RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")

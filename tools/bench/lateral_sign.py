@@ -18,8 +18,8 @@ from common.report import Options, Report, table
 from common.reversed_force import reversed_robot
 from fishd.config import load
 from fishd.lab.other_fish import CHANGES, OtherFish, harsh_fish, mild
-from fishd.simulation import simulate
-from fishd.simulation.virtual_run import VirtualRun
+from fishd.lab.simulation import simulate
+from fishd.lab.simulation.virtual_run import VirtualRun
 
 DOCUMENT = "how-to/calibration.md"
 REST_S = 3.0

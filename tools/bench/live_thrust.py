@@ -23,7 +23,7 @@ from common.report import Options, Report, table
 from fishd.config import Config, load
 from fishd.core.signals import Measurement, Tick
 from fishd.hardware.base import ForceSensor
-from fishd.simulation import VirtualRun
+from fishd.lab.simulation import VirtualRun
 from fishd.virtual.plant.base import TrueWindow
 
 DOCUMENT = "how-to/measuring.md"

@@ -21,7 +21,7 @@ from fishd.config import Config
 from fishd.core.signals import Tick
 from fishd.lab.measurement import measure as measured
 from fishd.lab.rig import VirtualRig
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
 DOCUMENT = "how-to/measuring.md"

@@ -20,8 +20,8 @@ from common.daemon import Fishd
 from common.machine import machine_in_short
 from common.report import Options, Report, quantile, table
 from fishd import __version__
+from fishd.assembly import build_loop, simulated_fish
 from fishd.config import Config, load
-from fishd.config.assembly import build_loop, simulated_fish
 from fishd.control.loop import ControlLoop
 from fishd.controllers import registry
 from fishd.controllers.policy.card import Card, Feature, Provenance

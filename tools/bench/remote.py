@@ -20,12 +20,12 @@ from msgspec import Struct
 
 from common.machine import PRIORITY, fifo_permitted, machine_in_short, priorities, scheduling
 from common.report import Options, Report, progress, table
+from fishd.assembly import build_loop, simulated_fish
 from fishd.config import Config, load
-from fishd.config.assembly import build_loop, simulated_fish
 from fishd.controllers.remote.controller import Remote, RemoteParameters
 from fishd.core.clock import SystemClock, Ticker
+from fishd.core.process import realtime
 from fishd.core.signals import Observation
-from fishd.daemon import realtime
 from fishd.daemon.gateway.gateways import Telemetry
 from fishd.daemon.warm_up import mock_ticks
 

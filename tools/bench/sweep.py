@@ -23,7 +23,7 @@ from fishd.config import Config, load
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials, whole_ticks
 from fishd.lab.rig import VirtualRig
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 DOCUMENT = "how-to/sweeps.md"
 FISH = DOCS.parent / "config" / "simulated.yaml"

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from common.report import BrokenPromise, Options, Report, table
 from fishd.config import Config, load
 from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 DOCUMENT = "explanation/swing-efficiency.md"
 LEARNT = 60.0

@@ -17,9 +17,9 @@ from msgspec.structs import replace
 
 from bench.trainings import CONFIG, UNTOUCHED, rig, settings_of
 from common.report import progress, spread, table
-from fishd.camera.frames import Stack
 from fishd.config import Config, load
 from fishd.controllers.dwell import DwellLimit
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.measurement import Sample, evaluate, plan

@@ -20,7 +20,7 @@ from fishd.lab.measurement import measure as measured
 from fishd.lab.measurement import summary
 from fishd.lab.other_fish import OtherFish, harsh
 from fishd.lab.rig import VirtualRig
-from fishd.simulation import KeepingPublisher, VirtualRun, simulate
+from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 
 DOCUMENT = "explanation/holding-thrust.md"
 TARGETS = (2, 4, 6, 8, 10, 12, 14, 20, 26)

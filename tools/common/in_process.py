@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 from fishd.cli.main import main
-from fishd.core.interruption import SIGNALS
+from fishd.core.process.interruption import SIGNALS
 
 
 def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:

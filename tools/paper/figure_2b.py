@@ -8,7 +8,7 @@ from fishd.core.signals import Event, Tick
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, ORANGE
 from fishd.lab.optimum import best_square_waves, figure, optimal_control
-from fishd.simulation import VirtualRun
+from fishd.lab.simulation import VirtualRun
 from fishd.virtual.plant.parameters import PlantParameters
 from paper.runs import FINE_TICK, FOLDER, PERFECT, PLANT, column, read, write
 

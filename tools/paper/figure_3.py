@@ -7,7 +7,7 @@ from fishd.config import Config
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, YELLOW
 from fishd.lab.optimum import best_square_waves, fast_servo, saturation_amplitude, slow_servo
-from fishd.simulation import Report
+from fishd.lab.simulation import Report
 from paper.runs import FOLDER, PLANT, Row, Run, column, read, swim_all, write
 
 NAME = "figure-3"

@@ -14,7 +14,7 @@ from fishd.config import Config
 from fishd.control.estimators.base import EstimatorSettings
 from fishd.lab.compare.contestants import Contestant, build
 from fishd.lab.compare.seeing import SeeingController
-from fishd.simulation import KeepingPublisher, Report, VirtualRun, judge
+from fishd.lab.simulation import KeepingPublisher, Report, VirtualRun, judge
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 

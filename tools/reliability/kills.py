@@ -31,8 +31,8 @@ from common.report import Options, Report, progress, table
 from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.errors import FishdError
+from fishd.core.process.shutdown import Shutdown
 from fishd.daemon.main import swim
-from fishd.daemon.shutdown import Shutdown
 from fishd.virtual.pi.virtual_pi import VirtualPi
 
 DOCUMENT = "reference/reliability.md"

@@ -25,8 +25,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from common.report import BrokenPromise, Options, Report, progress
+from fishd.assembly import build_loop, open_in_virtual_time, simulated_fish
 from fishd.config import Config, load
-from fishd.config.assembly import build_loop, open_in_virtual_time, simulated_fish
 from fishd.control.loop import ControlLoop
 from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import Slot, VirtualClock, virtual_slots

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fishd.camera.frames import EQUAL, Frame
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter
+from fishd.core.camera_frames import EQUAL, Frame
 
 
 class Tail(NamedTuple):

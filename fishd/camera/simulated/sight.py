@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from fishd.camera.frames import FrameHistory, Stack, StackSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.core.camera_frames import FrameHistory, Stack, StackSettings
 from fishd.core.signals import Truth
 
 

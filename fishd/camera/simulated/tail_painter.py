@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.frames import Pixels
 from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.core.camera_frames import Pixels
 
 PIVOT, LENGTH = 0.14, 0.74
 """Where the tail begins, and its length, as shares of the picture's width."""

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from fishd.camera.frames import Pixels
 from fishd.camera.messages import Condition
+from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishdError
 
 

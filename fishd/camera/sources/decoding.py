@@ -3,7 +3,7 @@
 import numpy as np
 import simplejpeg
 
-from fishd.camera.frames import Pixels
+from fishd.core.camera_frames import Pixels
 
 
 class Broken(ValueError):

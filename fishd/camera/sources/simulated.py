@@ -15,7 +15,6 @@ import zmq
 from msgspec import UNSET, Struct, UnsetType
 
 from fishd.camera.clock_offset import ClockOffset, clock_of
-from fishd.camera.frames import EQUAL
 from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
@@ -23,6 +22,7 @@ from fishd.client import Fish
 from fishd.client.connection import SECOND_LOOK
 from fishd.client.zmq_sockets import subscriber
 from fishd.core.addresses import find_control
+from fishd.core.camera_frames import EQUAL
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError
 from fishd.core.schema import Problem, convert

@@ -12,9 +12,9 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 import numpy as np
 
-from fishd.camera.frames import Pixels
 from fishd.camera.settings import StreamSettings, public
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
+from fishd.core.camera_frames import Pixels
 from fishd.core.clock import boot_id
 
 PAUSES = 1.0, 10.0

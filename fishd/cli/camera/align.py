@@ -29,8 +29,8 @@ from fishd.core.errors import FishdError, NoDaemon
 if TYPE_CHECKING:
     from fishd.camera.alignment import Alignment
     from fishd.camera.client import CameraClient
-    from fishd.camera.frames import Frame
     from fishd.client import Fish
+    from fishd.core.camera_frames import Frame
 
 LET_IT_SWIM = "let it swim, with 'fishctl set-controller swing', or add --swim"
 

@@ -13,12 +13,12 @@ from fishd.cli.lease_options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core.errors import FishdError, NoDaemon
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 from fishd.core.signals import Event, Tick
 
 if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
-    from fishd.camera.frames import Frame
+    from fishd.core.camera_frames import Frame
     from fishd.lab.rig import LiveRig
 
 camera_option = click.option(

@@ -9,7 +9,7 @@ import click
 from fishd.cli.camera.options import camera_option
 from fishd.cli.output import echo
 from fishd.core.errors import StartupError
-from fishd.core.interruption import on_signal
+from fishd.core.process.interruption import on_signal
 
 PORT = 9876
 LEAVING = 1.0

@@ -11,16 +11,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fishd import assembly
 from fishd.client import Fish
 from fishd.client.connection import TIMEOUT
-from fishd.config import Config, assembly
+from fishd.config import Config
 from fishd.config.drivers import CHOICES
 from fishd.core.addresses import find_control, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.plugins import Plugins
+from fishd.core.process.unix_sockets import is_deserted
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status, Tick
-from fishd.core.unix_sockets import is_deserted
 from fishd.hardware import ownership
 from fishd.hardware.checks import Machine, Result, skipped
 

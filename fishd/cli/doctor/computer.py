@@ -6,8 +6,8 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
+from fishd.assembly import state_folder
 from fishd.cli.doctor.base import Context
-from fishd.config.assembly import state_folder
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder

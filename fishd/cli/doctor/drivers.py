@@ -9,8 +9,8 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+from fishd.assembly import open_sensor
 from fishd.cli.doctor.base import Context
-from fishd.config.assembly import open_sensor
 from fishd.config.drivers import claims_of
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, MissingPackage, SensorError, ServoError, StartupError

@@ -6,8 +6,8 @@ import resource
 import subprocess
 
 from fishd.cli.doctor.base import Context
-from fishd.core import safe_path
-from fishd.daemon.realtime import limit_for
+from fishd.core.process import safe_path
+from fishd.core.process.realtime import limit_for
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
 _TRY = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"

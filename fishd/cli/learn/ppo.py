@@ -15,7 +15,7 @@ from fishd.cli.options import endpoint_option
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
-from fishd.core.interruption import on_signal
+from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.learning.train.jobs import Job, Outcome

@@ -10,7 +10,7 @@ from fishd.cli.options import FiniteRange
 from fishd.cli.output import counted, echo
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.core.addresses import control_address, find_control
-from fishd.core.interruption import interrupted_once
+from fishd.core.process.interruption import interrupted_once
 from fishd.recording.replay import Replay
 
 TELEMETRY = "tcp://127.0.0.1:9872"

@@ -10,8 +10,8 @@ from fishd.cli.options import ParameterType, json_option
 from fishd.cli.output import counted, echo, print_json, spelled
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.controllers import registry
-from fishd.recording.rerun import Estimates, Stretch
-from fishd.recording.rerun import rerun as choose_again
+from fishd.lab.rerun import Estimates, Stretch
+from fishd.lab.rerun import rerun as choose_again
 
 
 @click.command()

@@ -14,9 +14,10 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.core.files import SETTINGS, with_current_names
-from fishd.core.schema import Problem, convert, nested_too_deeply, note, spelled, unit
+from fishd.core.schema import Problem, convert, nested_too_deeply, spelled
 from fishd.core.signals import Observation
 
 KEY = "fishd.card"
@@ -54,32 +55,6 @@ class Feature(Struct, frozen=True, forbid_unknown_fields=True):
     name: FeatureName
     scale: Positive
     """The value that the network sees as 1, in the unit of the observation's field."""
-
-
-class StackSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which frames a policy is shown in a tick; part of a policy that sees."""
-
-    size: Annotated[int, unit("px", "Height and width of a frame.", ge=16, le=256)] = 84
-    frames: Annotated[int, note("Frames in the stack, newest first.", ge=1, le=8)] = 4
-    interval: Annotated[float, unit("s", "Time between two of them.", ge=1e-3, le=1)] = 0.05
-    delay: Annotated[
-        float,
-        unit(
-            "s",
-            "The stack ends so long before the tick: as a camera delivers its frames late, frames "
-            "of even distance are then to be had.",
-            ge=0,
-            le=1,
-        ),
-    ] = 0.0
-    oldest: Annotated[
-        float, unit("s", "A frame may be so much older than it should be.", ge=1e-3, le=2)
-    ] = 0.15
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Of a stack: frames, height, width."""
-        return self.frames, self.size, self.size
 
 
 class Layout:

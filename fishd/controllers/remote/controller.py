@@ -10,9 +10,9 @@ from msgspec.structs import astuple
 from fishd.controllers.base import LONGEST_DWELL, Controller, Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.controllers.quantities import quantity
-from fishd.controllers.remote.messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.controllers.remote.wire import Wire
 from fishd.core.addresses import why_not_connected
+from fishd.core.agent_messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.core.errors import ControllerFault, ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation

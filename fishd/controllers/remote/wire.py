@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from fishd.controllers.remote.messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
+from fishd.core.agent_messages import MAX_MESSAGE, VERSION, FromAgent, decode_from_agent
 from fishd.core.decoding import decoder
 from fishd.core.errors import ControllerFault, ParameterError
 from fishd.core.zmtp import Dealer

@@ -18,8 +18,9 @@ from functools import partial
 import msgspec
 
 from fishd.control.reporting import Reporter
-from fishd.core import addresses, safe_path
+from fishd.core import addresses
 from fishd.core.errors import StartupError
+from fishd.core.process import safe_path
 from fishd.core.signals import Event, Status, Tick
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.gateway.link import (

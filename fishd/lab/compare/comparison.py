@@ -25,7 +25,7 @@ from fishd.lab.ranking import (
     rank,
     ratio,
 )
-from fishd.simulation import KeepingPublisher, Report, VirtualRun, check_whole_beat, judge
+from fishd.lab.simulation import KeepingPublisher, Report, VirtualRun, check_whole_beat, judge
 
 TRACE = 3.0
 """How much of the end of a run a picture shows [s]."""

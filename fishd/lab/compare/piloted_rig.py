@@ -8,10 +8,10 @@ from typing import Any
 from msgspec.structs import replace
 
 from fishd.camera.live_sight import LiveSight
-from fishd.camera.pilot import Pilot
 from fishd.client import Agent, Fish
 from fishd.config import adopt
 from fishd.controllers.base import Limits
+from fishd.controllers.policy.pilot import Pilot
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.signals import Tick
 from fishd.lab.compare.seeing import sees_pictures

@@ -2,15 +2,15 @@
 
 from typing import Any
 
-from fishd.camera.pilot import Pilot
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import file, library, opening
 from fishd.controllers.policy.controller import PpoParameters
+from fishd.controllers.policy.pilot import Pilot
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
-from fishd.simulation import VirtualRun
+from fishd.lab.simulation import VirtualRun
 
 
 def sees_pictures(policy: Any, limits: Limits) -> bool:

@@ -93,7 +93,7 @@ def survey(
     """Let each contestant swim each fish once, in virtual time.
 
     configs: the fish, and each as a configuration
-    seconds, settle: as for `fishd.simulation.simulate` [s]
+    seconds, settle: as for `fishd.lab.simulation.simulate` [s]
     progress: called with the time that has been swum [s]
     camera: what shows the fish to policies that see it; by default a good one
 

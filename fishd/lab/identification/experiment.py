@@ -3,8 +3,8 @@
 import math
 from typing import TYPE_CHECKING
 
+from fishd.core.dataframes import frame
 from fishd.core.errors import ParameterError
-from fishd.core.frames import frame
 from fishd.lab.rig import Rig
 
 if TYPE_CHECKING:

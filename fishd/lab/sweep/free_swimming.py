@@ -8,10 +8,10 @@ from msgspec.structs import replace
 from fishd.config import Config, Start
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
+from fishd.lab.simulation import VirtualRun
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.sweep.settling import is_steady, judged_from
-from fishd.simulation import VirtualRun
 from fishd.virtual.swimmer.gait import gait
 from fishd.virtual.swimmer.track import Track
 

@@ -17,10 +17,10 @@ from fishd.lab.measurement import measure
 from fishd.lab.objective import per_watt
 from fishd.lab.parallel import Stop
 from fishd.lab.rig import Rig, is_of_one
+from fishd.lab.simulation import Beats, VirtualRun
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import Found, Result
 from fishd.recording.writer import RunWriter
-from fishd.simulation import Beats, VirtualRun
 from fishd.virtual.plant.optimum import best_square_wave
 
 SLOWEST = 0.4

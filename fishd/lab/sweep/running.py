@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from fishd.config import Config
-from fishd.core.interruption import interrupted_once, on_signal
+from fishd.core.process.interruption import interrupted_once, on_signal
 from fishd.lab.parallel import workers
 from fishd.lab.rig import Rig
 from fishd.lab.rig_recording import recorded

@@ -12,6 +12,7 @@ from fishd.lab import error_budget
 from fishd.lab.identification import experiment
 from fishd.lab.measurement import REST, measure
 from fishd.lab.rig import Rig, is_of_one
+from fishd.lab.simulation import simulate
 from fishd.learning.adapt import steps as do
 from fishd.learning.adapt.practice import TRIES, practise, simulated
 from fishd.learning.adapt.state import (
@@ -26,7 +27,6 @@ from fishd.learning.adapt.state import (
 )
 from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import SQUARE, judge
-from fishd.simulation import simulate
 
 
 class Show(Protocol):

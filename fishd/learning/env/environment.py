@@ -21,10 +21,10 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
-from fishd.camera.frames import Stack
 from fishd.config import Config, check_tethered
 from fishd.controllers.dwell import Dwell
 from fishd.controllers.policy.card import Feature, FeatureName, Window
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost

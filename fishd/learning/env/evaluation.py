@@ -8,12 +8,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fishd import simulation
-from fishd.camera.frames import Stack
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start
 from fishd.controllers.dwell import DwellLimit
+from fishd.core.camera_frames import Stack
 from fishd.core.signals import Observation
+from fishd.lab import simulation
+from fishd.lab.simulation import Report, VirtualRun
 from fishd.learning.env.simulated_link import (
     Camera,
     FunctionController,
@@ -21,7 +22,6 @@ from fishd.learning.env.simulated_link import (
     drawn,
 )
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
-from fishd.simulation import Report, VirtualRun
 
 STALLED = 0.05
 """A policy whose mean |φ_c| is below this share of Φ does not swim."""
@@ -81,7 +81,7 @@ def judge(
 ) -> Report:
     """Let a policy swim the simulated fish of `config`, from rest, as a controller does.
 
-    seconds, settle: as for `fishd.simulation.simulate` [s]
+    seconds, settle: as for `fishd.lab.simulation.simulate` [s]
     camera: what it sees the fish with, if it sees any
 
     Raises `ParameterError` where the lengths do not fit one another.

@@ -8,12 +8,12 @@ from typing import Any
 import msgspec
 
 from fishd.camera.client import CameraLost
-from fishd.camera.frames import Stack, StackSettings
 from fishd.camera.live_sight import LiveSight
 from fishd.client import Fish
 from fishd.client.agent import Agent
 from fishd.config import Config
-from fishd.controllers.remote.messages import Observed
+from fishd.core.agent_messages import Observed
+from fishd.core.camera_frames import Stack, StackSettings
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, PolicyError, Refused
 from fishd.core.signals import Observation, Reason, Status
 from fishd.learning.env.link import LinkLost, StepResult

@@ -5,8 +5,8 @@ One step of an agent: it sends an instruction angle, one tick passes, it receive
 
 from typing import NamedTuple, Protocol
 
-from fishd.camera.frames import Stack
 from fishd.config import Config
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError
 from fishd.core.signals import Observation
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.frames import Stack
 from fishd.controllers.policy.card import ONE_TICK, Feature, History, Window
+from fishd.core.camera_frames import Stack
 from fishd.core.signals import Observation
 from fishd.learning.eyes.base import Eye
 

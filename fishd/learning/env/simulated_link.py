@@ -7,13 +7,13 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.camera.frames import Stack, StackSettings
+from fishd.assembly import build_loop, simulated_fish
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.sight import SimulatedSight
 from fishd.config import Config, Start, check_tethered
-from fishd.config.assembly import build_loop, simulated_fish
 from fishd.control.loop import ControlLoop, Turn
 from fishd.controllers.base import Controller
+from fishd.core.camera_frames import Stack, StackSettings
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.signals import Observation, Truth
 from fishd.learning.env.link import LinkLost, StepResult

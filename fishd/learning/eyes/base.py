@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.frames import Pixels, Stack, StackSettings
+from fishd.core.camera_frames import Pixels, Stack, StackSettings
 
 Array = NDArray[np.float32]
 

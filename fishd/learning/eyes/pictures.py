@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import find_motion
-from fishd.camera.frames import Pixels, StackSettings
+from fishd.core.camera_frames import Pixels, StackSettings
 from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
 
 SHRINK = 4

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 from fishd.controllers.policy.card import Card
 from fishd.core.errors import ConfigError
-from fishd.core.lockfile import Taken, locked
+from fishd.core.process.lockfile import Taken, locked
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs

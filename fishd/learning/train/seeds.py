@@ -15,7 +15,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
-from fishd.core.interruption import on_signal
+from fishd.core.process.interruption import on_signal
 from fishd.lab.parallel import Killed, Stop, workers
 from fishd.learning.train.jobs import Job, Outcome
 

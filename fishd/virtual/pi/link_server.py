@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from fishd.core.errors import StartupError
-from fishd.core.unix_sockets import bind, claimed
+from fishd.core.process.unix_sockets import bind, claimed
 from fishd.virtual.pi.i2c import Message, Read, Write
 from fishd.virtual.pi.link import (
     LONG_POLL,

@@ -11,12 +11,12 @@ from rigs.processes import PATIENCE, wait_until
 
 from fishd.camera import server
 from fishd.camera.client import CameraClient
-from fishd.camera.frames import StackSettings
 from fishd.camera.messages import CameraState
 from fishd.camera.server import Server
 from fishd.camera.settings import load
 from fishd.camera.sockets import Publisher
 from fishd.camera.sources.base import Shot, Sink, Source, Timeline
+from fishd.core.camera_frames import StackSettings
 
 Stopping = Callable[[float], bool]
 pytestmark = pytest.mark.slow

@@ -16,11 +16,11 @@ from rigs.processes import PATIENCE, Daemon, Subscriber, running, wait_until
 from rigs.virtual_pi_process import virtual_pi
 
 from fishd.camera.client import CameraClient, CameraLost
-from fishd.camera.frames import EQUAL, Frame, Stack, StackSettings
 from fishd.camera.messages import FrameHeader
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.client import Agent, Fish
+from fishd.core.camera_frames import EQUAL, Frame, Stack, StackSettings
 from fishd.core.signals import Tick
 
 TICK = 0.05

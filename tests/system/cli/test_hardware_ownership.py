@@ -17,7 +17,7 @@ from rigs.processes import FISHD, Daemon, running
 from rigs.spare_bus import ANOTHER, spare_bus
 
 from fishd.core.errors import StartupError
-from fishd.core.lockfile import lock_path
+from fishd.core.process.lockfile import lock_path
 from fishd.hardware import ownership
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")

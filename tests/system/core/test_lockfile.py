@@ -10,12 +10,12 @@ import pytest
 
 from fishd.core.addresses import claimed
 from fishd.core.errors import StartupError
-from fishd.core.lockfile import NotALock, Taken, holder, lock_path, locked
+from fishd.core.process.lockfile import NotALock, Taken, holder, lock_path, locked
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from fishd.core.lockfile import locked
+from fishd.core.process.lockfile import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
@@ -120,7 +120,9 @@ def test_a_pid_that_is_none_is_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
     path = tmp_path / "control"
-    monkeypatch.setattr("fishd.core.lockfile._LOCKS", tmp_path / "nowhere")  # the kernel says none
+    monkeypatch.setattr(
+        "fishd.core.process.lockfile._LOCKS", tmp_path / "nowhere"
+    )  # the kernel says none
     with locked(path):
         lock_path(path).write_bytes(text)
         with pytest.raises(Taken) as caught, locked(path):

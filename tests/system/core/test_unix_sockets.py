@@ -15,7 +15,7 @@ from rigs.processes import FISHCTL, PATIENCE, call, one_line, running, wait_unti
 from fishd.client import Fish, NoDaemon
 from fishd.core import addresses
 from fishd.core.errors import Untrusted
-from fishd.core.unix_sockets import stranger
+from fishd.core.process.unix_sockets import stranger
 
 USER, OTHER = 60101, 60102
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two other users")

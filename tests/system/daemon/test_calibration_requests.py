@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.lockstep_rig import LockstepRig, lockstep_rig
 
-from fishd.config.assembly import state_folder
+from fishd.assembly import state_folder
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import Refused
 from fishd.core.protocol import (

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from rigs.processes import PATIENCE
 
-from fishd.daemon.logs import JsonFormatter, LogWriter, TextFormatter
+from fishd.core.process.logs import JsonFormatter, LogWriter, TextFormatter
 
 
 def record(message: str, error: BaseException | None = None) -> logging.LogRecord:

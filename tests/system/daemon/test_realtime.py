@@ -4,11 +4,11 @@ import sys
 
 import pytest
 
-from fishd.daemon import realtime
+from fishd.core.process import realtime
 
 ENTER_THEN_LEAVE_AS_ANOTHER_USER = """
 import os
-from fishd.daemon import realtime
+from fishd.core.process import realtime
 
 granted = realtime.enter(1, lock_memory=False)
 os.setuid(65534)  # as in the service: a user without capabilities

@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 from rigs.lockstep_rig import LockstepRig, lockstep_rig
 from rigs.processes import PATIENCE
 
-from fishd.config.assembly import state_folder
+from fishd.assembly import state_folder
 from fishd.controllers import registry
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import Refused

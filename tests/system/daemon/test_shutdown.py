@@ -27,8 +27,8 @@ from fishd.hardware.base import Robot
 
 PROGRAM = """
 import logging, sys, threading, time
-from fishd.daemon import shutdown as module
-from fishd.daemon.shutdown import Shutdown, leave
+from fishd.core.process import shutdown as module
+from fishd.core.process.shutdown import Shutdown, leave
 
 {limits}
 

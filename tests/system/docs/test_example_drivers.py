@@ -20,7 +20,8 @@ from rigs.example_packages import (
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.pca9685_chip import AUTO_INCREMENT, LED0, MODE1, PRE_SCALE, RESTART, SLEEP, Pca9685Chip
 
-from fishd.config import assembly, load
+from fishd import assembly
+from fishd.config import load
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ConfigError, ServoError, StartupError

@@ -12,9 +12,9 @@ from rigs.processes import running, sets, wait_until
 
 from fishd.client import Fish
 from fishd.config import load, to_yaml
+from fishd.lab.simulation import simulate
 from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import Randomisation
-from fishd.simulation import simulate
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.registry import open_plant
 from fishd.virtual.plant.tethered import TetheredFish

@@ -9,7 +9,7 @@ import joblib
 import pytest
 
 from fishd.core.errors import FishdError
-from fishd.core.interruption import on_signal
+from fishd.core.process.interruption import on_signal
 from fishd.lab import parallel
 from fishd.lab.parallel import workers
 

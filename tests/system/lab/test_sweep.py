@@ -18,6 +18,7 @@ from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Event, Tick
 from fishd.lab.begun import owned
+from fishd.lab.rerun import rerun
 from fishd.lab.rig import Disturbed, VirtualRig
 from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
 from fishd.lab.sweep.folder import Begun, SweepFolder
@@ -26,7 +27,6 @@ from fishd.lab.sweep.measuring import swim
 from fishd.lab.sweep.results import Result, quantity_of
 from fishd.lab.sweep.running import on_robot
 from fishd.recording import open_run
-from fishd.recording.rerun import rerun
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
 MEASURED = quantity_of("robot", {}, "N").measured

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from fishd.camera.frames import Stack
 from fishd.config import load
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.compare.contestants import best_on_grid
+from fishd.lab.simulation import simulate
 from fishd.learning.env.evaluation import in_simulation, judge, worst_of_others
 from fishd.learning.env.simulated_link import at_edge, drawn
 from fishd.learning.settings import (
@@ -21,7 +22,6 @@ from fishd.learning.settings import (
 )
 from fishd.learning.train.jobs import Job
 from fishd.learning.train.training import train
-from fishd.simulation import simulate
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
 CONFIG = load(None, ["simulation.offset_y=0.005"])

@@ -11,15 +11,15 @@ from msgspec.structs import replace
 from rigs.seeing_policies import babbled
 from stable_baselines3 import PPO
 
-from fishd.camera.frames import StackSettings
-from fishd.camera.pilot import Pilot
 from fishd.camera.simulated.settings import DEFAULT
 from fishd.cli.main import fishctl
 from fishd.config import Config
 from fishd.controllers.policy import file
 from fishd.controllers.policy.file import PolicyFile
 from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.pilot import Pilot
 from fishd.controllers.policy.runtime import Network
+from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
 from fishd.learning import export as exporting

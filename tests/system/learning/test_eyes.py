@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 pytest.importorskip("stable_baselines3")
 
 from fishd.camera.axis import NoMotion
-from fishd.camera.frames import Stack, StackSettings
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
+from fishd.core.camera_frames import Stack, StackSettings
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import Camera, SimulatedLink

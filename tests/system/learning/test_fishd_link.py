@@ -11,7 +11,7 @@ from rigs.processes import Daemon, Subscriber, running, sets
 
 from fishd.client import Agent, Fish, FishError, NoDaemon
 from fishd.config import load
-from fishd.controllers.remote.messages import Observed
+from fishd.core.agent_messages import Observed
 from fishd.core.signals import Status
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.fishd_link import FishdLink

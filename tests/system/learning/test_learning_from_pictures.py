@@ -13,9 +13,9 @@ from msgspec.structs import replace
 from rigs.swimming import brief_job, rows
 
 from fishd.camera.axis import NoMotion
-from fishd.camera.frames import StackSettings
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
+from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ConfigError
 from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv

@@ -10,6 +10,7 @@ from rigs.swimming import BRIEF, brief_job
 from fishd.config import load
 from fishd.controllers.policy.file import read
 from fishd.core.signals import Observation
+from fishd.lab.simulation import simulate
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import in_simulation, worst_of_others
 from fishd.learning.env.simulated_link import SimulatedLink, drawn
@@ -22,7 +23,6 @@ from fishd.learning.settings import (
     TrainingSettings,
 )
 from fishd.learning.train.training import train
-from fishd.simulation import simulate
 
 CONFIG = load(None, ["simulation.noise=0.001"])
 HARSH = Randomisation(

@@ -12,8 +12,9 @@ from rigs.processes import FISHCTL, PATIENCE, Process, Subscriber, fishctl, one_
 from rigs.recordings import recorded, swum
 
 from fishd.client import Fish, Refused
-from fishd.core import addresses, unix_sockets
+from fishd.core import addresses
 from fishd.core.errors import StartupError
+from fishd.core.process import unix_sockets
 from fishd.recording import open_run
 from fishd.recording.replay import Replay
 

@@ -7,9 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from fishd.camera.axis import NoMotion, find_motion
-from fishd.camera.frames import Pixels
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter
+from fishd.core.camera_frames import Pixels
 
 BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)
 

@@ -9,8 +9,8 @@ from rigs import filmed_swim
 from rigs.filmed_swim import filmed
 
 from fishd.camera.axis_watch import AGAIN, FEWEST, AxisWatch
-from fishd.camera.frames import Frame
 from fishd.camera.simulated.settings import DEFAULT, WEB
+from fishd.core.camera_frames import Frame
 
 swum = cache(filmed_swim.swum)  # nobody changes a tick
 CAMERA = replace(DEFAULT, off_axis=3.0, tilt=0.05)

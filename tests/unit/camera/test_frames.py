@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fishd.camera.frames import Frame, FrameHistory, StackSettings
+from fishd.core.camera_frames import Frame, FrameHistory, StackSettings
 
 
 def history_of(*times: float, late: float = 0.0, **settings: float) -> FrameHistory:

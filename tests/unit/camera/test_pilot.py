@@ -8,9 +8,9 @@ from msgspec.structs import replace
 from rigs.harness import observe
 from rigs.policy_files import FLIP, of_pixels, seeing_card, velocity_follower, write
 
-from fishd.camera.frames import Stack
-from fishd.camera.pilot import HOLD, Pilot
 from fishd.controllers.base import Limits
+from fishd.controllers.policy.pilot import HOLD, Pilot
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import ControllerFault, PolicyError
 
 LIMITS = Limits(0.42, 0.05, dwell=0.0)

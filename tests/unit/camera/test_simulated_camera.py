@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from fishd.camera.frames import Frame
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter
+from fishd.core.camera_frames import Frame
 
 CLEAR = replace(DEFAULT, noise=0.0)
 TICK = 0.05

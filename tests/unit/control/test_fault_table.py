@@ -15,7 +15,7 @@ from fishd.control.guard import Guard
 from fishd.controllers.swing import Swing
 from fishd.core.signals import Reason, Tick
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 from fishd.virtual.pi.faults import TRANSFER_ERRORS
 
 # Of the virtual Pi: the fault that each leads to, when at the earliest and at the latest [s].

@@ -5,7 +5,7 @@ from msgspec import UNSET
 from rigs.harness import Rig
 
 from fishd.config import load
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 from fishd.virtual.plant.parameters import PlantParameters
 
 DRAG = PlantParameters().lateral_drag

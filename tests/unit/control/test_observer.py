@@ -5,7 +5,7 @@ import pytest
 from rigs.harness import Rig, fragile_rig
 
 from fishd.core.errors import SensorError
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 OBSERVER = "estimator.kind=observer"
 REAL = ("simulation.offset_y=0.02", "simulation.drift=0.005")

@@ -9,7 +9,7 @@ from fishd.controllers import registry
 from fishd.controllers.criterion_search import BEGIN, LADDER
 from fishd.core.errors import ParameterError
 from fishd.lab.other_fish import harsh
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 
 def relative_thrust(

@@ -10,7 +10,7 @@ from rigs.harness import Rig, Scripted
 
 from fishd.controllers import quantity, registry
 from fishd.controllers.base import Controller
-from fishd.core.frames import frame
+from fishd.core.dataframes import frame
 from fishd.core.signals import Observation
 
 

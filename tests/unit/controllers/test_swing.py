@@ -9,7 +9,7 @@ from rigs.harness import LIMITS, Rig, commands, observe
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.core.errors import ParameterError
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 IMPERFECT = ["simulation.noise=1e-3", "simulation.offset_y=0.02", "simulation.drift=0.02"]
 SERVO_SPEED_OVER_OMEGA0 = 5.8 / 12.5

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fishd.daemon.systemd_notify import SystemdNotifier
+from fishd.core.process.systemd_notify import SystemdNotifier
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from common.report import DOCS, between
+from fishd.lab.simulation import Report
 from fishd.lab.sweep.grid import Lengths
-from fishd.simulation import Report
 from paper import claims, figure_3, figure_4, figure_5, figure_6, swing_map
 from paper.runs import Run, read, swim
 

@@ -12,7 +12,7 @@ from fishd.lab.error_budget import budget, spelled, unknown_calibration
 from fishd.lab.measurement import Measured, measure, summary
 from fishd.lab.other_fish import harsh
 from fishd.lab.rig import VirtualRig
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 GAIN_ERROR = 0.02
 KNOWN = ForceCalibration(

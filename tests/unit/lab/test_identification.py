@@ -11,8 +11,8 @@ from msgspec.structs import asdict
 from rigs.harness import Rig
 
 from fishd.config import load
+from fishd.core.dataframes import frame
 from fishd.core.errors import ParameterError
-from fishd.core.frames import frame
 from fishd.lab.identification import (
     DEFAULT,
     Estimate,

@@ -22,7 +22,7 @@ from fishd.lab.measurement import (
     samples_of,
 )
 from fishd.lab.rig import Disturbed, VirtualRig
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 RIG = load(None, ["simulation.rotation=0.05", "simulation.offset_y=0.01"])
 DRIFTS = {

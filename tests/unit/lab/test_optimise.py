@@ -13,10 +13,10 @@ from fishd.config import load
 from fishd.lab.optimise.folder import Begun, SearchFolder
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials, whole_ticks
+from fishd.lab.rerun import rerun
 from fishd.lab.rig import VirtualRig
+from fishd.lab.simulation import VirtualRun, simulate
 from fishd.recording import open_run, read
-from fishd.recording.rerun import rerun
-from fishd.simulation import VirtualRun, simulate
 from fishd.virtual.plant.base import TrueWindow
 
 BEST = 25.736e-3

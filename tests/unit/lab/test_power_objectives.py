@@ -21,7 +21,7 @@ from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range
 from fishd.lab.optimise.trials import Trial
 from fishd.lab.rig import VirtualRig
-from fishd.simulation import simulate
+from fishd.lab.simulation import simulate
 
 DRIFTING = load("config/simulated.yaml")
 RANGE = Range("frequency", 0.5, 5.0)

@@ -19,6 +19,7 @@ from rigs.recordings import recorded, status, swum, write
 from fishd.config import Config
 from fishd.core.errors import NoDaemon, RecordingError, Refused
 from fishd.core.signals import Tick
+from fishd.lab.simulation import simulate
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
 from fishd.recording.camera_tap import Taken
@@ -26,7 +27,6 @@ from fishd.recording.folder import find, glance, glances, paths
 from fishd.recording.recorder import Description, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
-from fishd.simulation import simulate
 
 
 def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ import pytest
 from rigs.documents import ROOT
 
 from fishd.config import load
-from fishd.simulation import simulate
-from fishd.simulation.virtual_run import KeepingPublisher
+from fishd.lab.simulation import simulate
+from fishd.lab.simulation.virtual_run import KeepingPublisher
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 

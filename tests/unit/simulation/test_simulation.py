@@ -12,12 +12,12 @@ import pytest
 from rigs.documents import ROOT
 from rigs.processes import fishctl, one_line
 
-from fishd import simulation
+from fishd.assembly import simulated_fish
 from fishd.config import load
-from fishd.config.assembly import simulated_fish
 from fishd.controllers import registry
 from fishd.core.errors import ConfigError, ParameterError
-from fishd.simulation import Beats, EncodingPublisher, Report, judge, simulate
+from fishd.lab import simulation
+from fishd.lab.simulation import Beats, EncodingPublisher, Report, judge, simulate
 from fishd.virtual.imperfections import Imperfections
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.optimum import square_wave

@@ -5,11 +5,11 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from fishd.assembly import build_loop, open_in_virtual_time, simulated_fish
 from fishd.config import load
-from fishd.config.assembly import build_loop, open_in_virtual_time, simulated_fish
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Measurement
-from fishd.simulation.virtual_run import KeepingPublisher
+from fishd.lab.simulation.virtual_run import KeepingPublisher
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters

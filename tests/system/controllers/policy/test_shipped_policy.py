@@ -8,9 +8,9 @@ from fishd.config import load
 from fishd.controllers.policy import library
 from fishd.controllers.policy.file import read
 from fishd.lab.other_fish import mild
+from fishd.lab.simulation import simulate
 from fishd.learning import settings as training
 from fishd.learning.settings import TrainingSettings
-from fishd.simulation import simulate
 
 SETTINGS = ROOT / "config" / "learning-harsh.yaml"
 

@@ -20,7 +20,7 @@ from rigs.scripted_agent import (
     swim,
 )
 
-from fishd.controllers.remote.messages import Pause
+from fishd.core.agent_messages import Pause
 
 GREETING_OF_2 = b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"
 PLAIN = b"\xff" + bytes(8) + b"\x7f\x03\x01PLAIN" + bytes(47)

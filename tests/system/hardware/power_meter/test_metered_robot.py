@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from rigs.processes import PATIENCE, wait_until
 
+from fishd.assembly import parts_of
 from fishd.config import load
-from fishd.config.assembly import parts_of
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, SensorError
 from fishd.hardware.driver import PowerMeterDriver, PowerMeterSettings, PowerSample
 from fishd.hardware.power_meter.sampled_power import SampledPower
-from fishd.simulation import KeepingPublisher, VirtualRun, simulate
+from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 
 VIRTUAL_PI = Path("config/virtual-pi.yaml")
 METER = "power_meter.driver=ina219"

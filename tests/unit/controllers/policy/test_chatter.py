@@ -11,8 +11,8 @@ from rigs.policy_files import write
 from fishd.config import load
 from fishd.controllers.swing import Swing
 from fishd.core.signals import Tick
-from fishd.simulation import simulate
-from fishd.simulation.virtual_run import KeepingPublisher
+from fishd.lab.simulation import simulate
+from fishd.lab.simulation.virtual_run import KeepingPublisher
 
 HARSH = {
     "slack": ("plant.cable_slack=0.2",),

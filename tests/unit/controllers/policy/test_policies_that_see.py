@@ -20,10 +20,11 @@ from rigs.policy_files import (
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy import file, library
-from fishd.controllers.policy.card import KEY, StackSettings, encode
+from fishd.controllers.policy.card import KEY, encode
 from fishd.controllers.policy.checksum import sealed
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
+from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ParameterError, PolicyError
 
 FOLLOWER = velocity_follower()

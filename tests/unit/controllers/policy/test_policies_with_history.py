@@ -9,11 +9,11 @@ from msgspec.structs import replace
 from rigs.harness import LIMITS, Rig, observe
 from rigs.policy_files import card, linear, random_layers, write
 
-from fishd.camera.pilot import Pilot
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy.card import Card, Feature, FeatureName, History, Window
 from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.pilot import Pilot
 from fishd.core.signals import Observation
 
 FREE = Limits(LIMITS.amplitude, LIMITS.tick, dwell=0.0)

@@ -9,8 +9,8 @@ from rigs.processes import install
 
 from fishd.config import json_schema, load, to_yaml
 from fishd.core.errors import ConfigError, FishLost, StartupError
-from fishd.simulation import simulate
-from fishd.simulation.virtual_run import KeepingPublisher, VirtualRun
+from fishd.lab.simulation import simulate
+from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun
 from fishd.virtual.plant.registry import open_plant
 
 CODE = """

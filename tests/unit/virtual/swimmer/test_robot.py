@@ -8,7 +8,7 @@ import pytest
 from rigs.coarse_swimmer import coarse, swimmer
 
 from fishd.core.errors import ConfigError, FishLost
-from fishd.simulation import KeepingPublisher, VirtualRun, simulate
+from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 from fishd.virtual.swimmer.fish import Diverged

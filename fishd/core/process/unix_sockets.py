@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fishd.core.errors import StartupError
-from fishd.core.lockfile import NotALock, Taken, lock_path, locked
+from fishd.core.process.lockfile import NotALock, Taken, lock_path, locked
 
 LONGEST_PATH = 107
 """Of the path of a Unix socket, by Linux [bytes]."""

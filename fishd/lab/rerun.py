@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
+from fishd.assembly import build_estimator
 from fishd.config import Config, adopt
-from fishd.config.assembly import build_estimator
 from fishd.control.guard import Guard
 from fishd.controllers import registry
 from fishd.controllers.base import Controller

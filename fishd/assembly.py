@@ -1,4 +1,4 @@
-"""Builds a robot as the configuration describes it, and the loop that ticks on it."""
+"""From a configuration to the robot and its control loop, in real or virtual time."""
 
 import logging
 import os

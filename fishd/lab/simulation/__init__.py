@@ -1,9 +1,9 @@
 """A run in virtual time: the robot's own loop on a simulated fish, its ticks or a report."""
 
-from fishd.simulation.beats import Beats
-from fishd.simulation.report import Report, check_whole_beat, judge, simulate
-from fishd.simulation.table import run
-from fishd.simulation.virtual_run import EncodingPublisher, KeepingPublisher, VirtualRun
+from fishd.lab.simulation.beats import Beats
+from fishd.lab.simulation.report import Report, check_whole_beat, judge, simulate
+from fishd.lab.simulation.table import run
+from fishd.lab.simulation.virtual_run import EncodingPublisher, KeepingPublisher, VirtualRun
 
 __all__ = [
     "Beats",

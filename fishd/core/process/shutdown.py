@@ -13,7 +13,7 @@ from types import FrameType
 from typing import NoReturn
 
 from fishd.core import text
-from fishd.daemon import realtime
+from fishd.core.process import realtime
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from fishd.config import Config, adopt, load
-from fishd.core.frames import frame
-from fishd.simulation.virtual_run import KeepingPublisher, VirtualRun, check_length
+from fishd.core.dataframes import frame
+from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun, check_length
 
 if TYPE_CHECKING:
     from pandas import DataFrame

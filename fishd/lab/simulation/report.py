@@ -15,8 +15,8 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller, amplitude_of
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Reason
-from fishd.simulation.beats import Beats
-from fishd.simulation.virtual_run import (
+from fishd.lab.simulation.beats import Beats
+from fishd.lab.simulation.virtual_run import (
     VirtualRun,
     check_length,
 )

@@ -1,14 +1,13 @@
-"""Frames of a camera, and which of them a tick is shown: chosen by their times."""
+"""Frames of a camera, and the choice of the frames that a policy sees in a tick."""
 
 from collections import deque
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
-from fishd.controllers.policy.card import StackSettings
-
-__all__ = ["EQUAL", "Frame", "FrameHistory", "Pixels", "Stack", "StackSettings"]
+from fishd.core.schema import note, unit
 
 Pixels = NDArray[np.uint8]
 """Grey levels, shape (height, width)."""
@@ -29,6 +28,32 @@ class Frame(NamedTuple):
     available: float
     """When it could first be had, on the same clock [s]."""
     pixels: Pixels
+
+
+class StackSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which frames a policy is shown in a tick; part of a policy that sees."""
+
+    size: Annotated[int, unit("px", "Height and width of a frame.", ge=16, le=256)] = 84
+    frames: Annotated[int, note("Frames in the stack, newest first.", ge=1, le=8)] = 4
+    interval: Annotated[float, unit("s", "Time between two of them.", ge=1e-3, le=1)] = 0.05
+    delay: Annotated[
+        float,
+        unit(
+            "s",
+            "The stack ends so long before the tick: as a camera delivers its frames late, frames "
+            "of even distance are then to be had.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
+    oldest: Annotated[
+        float, unit("s", "A frame may be so much older than it should be.", ge=1e-3, le=2)
+    ] = 0.15
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of a stack: frames, height, width."""
+        return self.frames, self.size, self.size
 
 
 class FrameHistory:

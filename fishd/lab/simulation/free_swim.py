@@ -14,8 +14,8 @@ from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Reason
-from fishd.simulation.report import count_ticks
-from fishd.simulation.virtual_run import EncodingPublisher, VirtualRun
+from fishd.lab.simulation.report import count_ticks
+from fishd.lab.simulation.virtual_run import EncodingPublisher, VirtualRun
 from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.fish import Diverged
@@ -86,7 +86,7 @@ def swim(
 ) -> Swum:
     """Let a controller swim a free swimmer for `seconds`, and judge it after `settle` seconds.
 
-    publisher, begun: as for `fishd.simulation.simulate`
+    publisher, begun: as for `fishd.lab.simulation.simulate`
     progress: called after every tick with the time [s] and the mean speed since it settled [m/s]
     keeping: write checkpoints, the last one when it ends
     resume: go on from there; with the same controller the time before counts

@@ -5,12 +5,12 @@ For `fishctl agent` and for comparisons; within the loop the controller `ppo` do
 
 import math
 
-from fishd.camera.frames import Stack
 from fishd.controllers.base import Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.controllers.policy import opening
 from fishd.controllers.policy.card import History
 from fishd.controllers.policy.runtime import Network
+from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 

@@ -8,8 +8,8 @@ import msgspec
 from msgspec.structs import replace
 
 from fishd import __version__
+from fishd.assembly import build_loop, open_fish_in_virtual_time
 from fishd.config import Config
-from fishd.config.assembly import build_loop, open_fish_in_virtual_time
 from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.core.clock import VirtualClock, virtual_slots

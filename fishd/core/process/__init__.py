@@ -1,0 +1,1 @@
+"""Plumbing of a process: its log, end, lock, priority, sockets, and systemd."""
