@@ -157,12 +157,14 @@ class Segment:
 
     def peak(self, response: Vector) -> float:
         """Return the largest |α| (rad) within it, given the product `self.response @ …`."""
-        angle, rate, acceleration = response[: 3 * N].reshape(3, N) @ _TO_FINE
-        k = int(np.abs(angle).argmax())
-        if acceleration[k] == 0.0:
-            return float(abs(angle[k]))
+        angles = response[:N].dot(_TO_FINE)
+        k = int(np.abs(angles).argmax())
+        motion: list[float] = response[: 3 * N].reshape(3, N).dot(_TO_FINE[:, k]).tolist()
+        angle, rate, acceleration = motion
+        if acceleration == 0.0:
+            return abs(angle)
         # Between fine points, the vertex of the parabola there; an end may curve the other way.
         low, high = -_FINE[1] * (k > 0), _FINE[1] * (k < len(_FINE) - 1)
-        time = max(low * self.length, min(high * self.length, -rate[k] / acceleration[k]))
-        vertex = angle[k] + time * (rate[k] + 0.5 * time * acceleration[k])
-        return float(max(abs(angle[k]), abs(vertex)))
+        time = max(low * self.length, min(high * self.length, -rate / acceleration))
+        vertex = angle + time * (rate + 0.5 * time * acceleration)
+        return float(max(abs(angle), abs(vertex)))

@@ -17,7 +17,7 @@ from fishd.virtual.plant.base import PlantState
 from fishd.virtual.plant.drive_train import lag_after_reversal
 from fishd.virtual.plant.parameters import TETHERED, PlantParameters
 from fishd.virtual.plant.registry import open_plant
-from fishd.virtual.plant.tethered import FinWindow, TetheredFish
+from fishd.virtual.plant.tethered import AnyWindow, TetheredFish
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _PRECISION = 1e-4  # of the best frequency, relative; the thrust is flat there
@@ -136,7 +136,7 @@ class _Swimming:
         return SteadyState(frequency, thrust, peak)
 
 
-def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> FinWindow:
+def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> AnyWindow:
     """Return the half period after a reversal to +amplitude, in the periodic regime.
 
     Half a period is an affine map of (α, α̇); by antisymmetry the regime is what it negates. The

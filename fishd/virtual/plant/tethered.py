@@ -7,8 +7,9 @@ about 1e-9 in one step: the servo in closed form, the fin by collocation on a fe
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from msgspec import Struct
@@ -16,6 +17,7 @@ from msgspec import Struct
 from fishd.virtual.plant.base import REST, Plant, PlantState
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
 from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
+from fishd.virtual.plant.held import COUNT, Ahead, HeldWindow, HeldWindows
 from fishd.virtual.plant.motor import Motor, Stretch
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 
@@ -26,6 +28,7 @@ _GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer segments g
 _FIN_REACH = 3.0  # segment length, in units of the fin's shortest time, that N nodes resolve
 _LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all segment long
 _ROUNDING = 1e-9  # a window of exactly one servo time constant stays one segment
+_HELD = 3  # an instruction that lasts so many windows makes it worth while to look ahead
 _DRAG_STEP = 0.05  # longest segment with quadratic drag, s
 REACTION_TIME = 0.01
 """Of the mount that passes the servo's reaction on to the sensor [s]."""
@@ -37,7 +40,8 @@ class FinWindow(Struct, frozen=True, eq=False):
     Attributes:
         course: the segments of the window, with the motion of wheel and fin in each.
         motor: of the servo; None where its power is of no interest.
-        drives: arguments of `Motor.energy` for each part of the window with pulses.
+        drives: lag/Δ before and after the instruction, and the course, of each part of the window
+            with pulses.
     """
 
     duration: float
@@ -62,8 +66,12 @@ class FinWindow(Struct, frozen=True, eq=False):
             return math.nan
         energy = 0.0
         for before, after, course in self.drives:
-            energy += motor.energy(before, after, course)
+            energy += motor.jump(before, after)
+            energy += sum(float(motor.energy(stretch)) for stretch in course)
         return motor.idle + energy / self.duration
+
+
+AnyWindow: TypeAlias = FinWindow | HeldWindow
 
 
 class TetheredFish(Plant[PlantParameters]):
@@ -104,8 +112,19 @@ class TetheredFish(Plant[PlantParameters]):
         self._pulls = True
         """Did the wheel move the tail in the latest segment?"""
         self._graded_from = _GRADED_FROM * self._servo_time
+        self._is_plain = self.cables.taut and not (
+            self._line or self._brakes or parameters.servo_dead_zone or parameters.servo_reaction
+        )
+        self._request: tuple[float | None, float, int] = (None, 0.0, 0)
+        self._lasted = self._lasted_before = 0
+        """Number of windows of this request so far, and of the one before."""
+        self._held: HeldWindows | None = None
+        """Windows of this request that were worked out at once."""
+        self._expected: PlantState | None = None
+        """The state at the start of the next one of these."""
+        self._ahead = lru_cache(maxsize=8)(partial(Ahead, parameters))
 
-    def advance(self, instruction_angle: float | None, duration: float, samples: int) -> FinWindow:
+    def advance(self, instruction_angle: float | None, duration: float, samples: int) -> AnyWindow:
         """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
 
         None means no pulses: the servo then holds the wheel where it is. `samples` instants make
@@ -117,6 +136,10 @@ class TetheredFish(Plant[PlantParameters]):
         """
         if not (duration > 0.0 and samples > 0):
             raise ValueError(f"a window needs time and samples, not {duration} s and {samples}")
+        if self._is_plain and instruction_angle is not None:
+            held = self._hold(instruction_angle, duration, samples)
+            if held:
+                return self._take(held, instruction_angle, duration)
         if self._line is None:
             return self._swim(instruction_angle, duration, samples, (0.0, duration))
         parts = self._line.passed(instruction_angle, duration)
@@ -134,6 +157,45 @@ class TetheredFish(Plant[PlantParameters]):
             [stretch for w in windows for stretch in w.course],
             self._motor,
             [drive for w in windows for drive in w.drives],
+        )
+
+    def _hold(self, angle: float, duration: float, samples: int) -> HeldWindows | None:
+        """Return windows to take the next one of; None where the instruction may soon change.
+
+        It is expected to last as long as the one before, or as long again as it has lasted.
+        """
+        request = (angle, duration, samples)
+        if request != self._request:
+            self._request, self._held = request, None
+            self._lasted_before, self._lasted = self._lasted, 0
+        self._lasted += 1
+        held, state = self._held, self.state
+        if held and held.taken < COUNT and state is self._expected:
+            return held
+        self._held = None
+        p = self.parameters
+        lag = (angle - state.phi) / p.servo_lag
+        if max(self._lasted, self._lasted_before) < _HELD or abs(lag) > _LINEAR_LAG:
+            return None
+        segments = self._equal_segments(duration, samples, (0.0, duration))
+        if len(segments) > 1 or duration > self._graded_from:
+            return None
+        self._held = held = self._ahead(segments[0], samples).swim(state, p.coupling * angle, lag)
+        if self._motor:
+            held.jump = self._motor.jump(self._lag, lag)
+        return held
+
+    def _take(self, held: HeldWindows, angle: float, duration: float) -> HeldWindow:
+        """Swim the next one of the windows of an instruction that is held."""
+        p, k = self.parameters, held.taken
+        held.taken += 1
+        alpha, rate, side_force, sampled_side_force = held.ends[k]
+        thrust, sampled_thrust = held.thrusts[k]
+        lag = math.sinh((angle - self.state.phi) / p.servo_lag)
+        self._lag = lag = math.asinh(held.stretch.segment.decay * lag)
+        self.state = self._expected = PlantState(angle - p.servo_lag * lag, alpha, rate)
+        return HeldWindow(
+            duration, thrust, side_force, sampled_thrust, sampled_side_force, held, k, self._motor
         )
 
     def _swim(

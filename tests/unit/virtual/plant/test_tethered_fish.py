@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from fishd.virtual.plant import tethered
 from fishd.virtual.plant.base import REST, PlantState
-from fishd.virtual.plant.parameters import PlantParameters
-from fishd.virtual.plant.tethered import FinWindow, TetheredFish
+from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
+from fishd.virtual.plant.tethered import AnyWindow, FinWindow, TetheredFish
 
 Fish = PlantParameters
 FISHES = {
@@ -119,7 +119,7 @@ def natural_scales(p: PlantParameters) -> tuple[list[float], list[float]]:
     return [1.0, alpha, rate], [thrust, lateral_force] * 2
 
 
-def means(window: FinWindow) -> list[float]:
+def means(window: AnyWindow) -> list[float]:
     return [
         window.thrust,
         window.lateral_force,
@@ -233,10 +233,28 @@ def test_the_reaction_of_the_servo_is_felt_once_the_wheel_turns_and_once_it_stop
             kicked.advance(command, 0.05, 10).lateral_force
             - still.advance(command, 0.05, 10).lateral_force
         )
-    assert kicked.state == still.state
+    assert kicked.state == pytest.approx(still.state, rel=1e-12)
     assert pushes[0] < -0.05  # it speeds up
     assert max(pushes[1:]) > 0.02  # it slows down
     assert sum(pushes) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_an_instruction_that_is_held_gives_what_single_windows_give() -> None:
+    # A fish with a reaction of the servo, however small, is never looked ahead of.
+    held, single = (
+        TetheredFish(PlantParameters(servo_reaction=reaction), motor=MotorSettings())
+        for reaction in (0.0, 1e-30)
+    )
+    lengths = [12, 5, 6, 1, 1, 7, 20]
+    for number, length in enumerate(lengths):
+        for _ in range(length):
+            angle = 0.4 if number % 2 else -0.3
+            window, expected = held.advance(angle, 0.05, 10), single.advance(angle, 0.05, 10)
+            assert held.state == pytest.approx(single.state, rel=1e-12, abs=1e-15)
+            assert [*means(window), window.power, window.fin_peak] == pytest.approx(
+                [*means(expected), expected.power, expected.fin_peak], rel=1e-11, abs=1e-15
+            )
+        held.state = single.state = PlantState(0.1, number * 0.01, 1.0)
 
 
 def test_an_instruction_far_beyond_the_servo_lag_does_not_overflow() -> None:
