@@ -1,4 +1,4 @@
-"""Networks that look at pictures: a small one, and the one of the paper."""
+"""Networks that look at pictures, and hidden layers with left-right symmetry."""
 
 import math
 from typing import Any, Literal
@@ -112,21 +112,28 @@ class PictureExtractor(BaseFeaturesExtractor):
         return torch.cat((seen, others, mirrored, -others), dim=1)
 
 
-class PairExtractor(MlpExtractor):
-    """Hidden layers for features of a fish, and of its mirror image behind them."""
+class SymmetricExtractor(MlpExtractor):
+    """Hidden layers that are odd in their input for the policy, even for the value."""
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        """f(x) − f(mirrored x), over √2."""
-        seen, mirrored = self.policy_net(_stacked(features)).chunk(2)
+        """Return f(x) − f(mirrored x), over √2."""
+        seen, mirrored = self.policy_net(self._both(features)).chunk(2)
         odd: torch.Tensor = HALF * (seen - mirrored)
         return odd
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        """The mean of f(x) and f(mirrored x)."""
-        seen, mirrored = self.value_net(_stacked(features)).chunk(2)
+        """Return the mean of f(x) and f(mirrored x)."""
+        seen, mirrored = self.value_net(self._both(features)).chunk(2)
         even: torch.Tensor = 0.5 * (seen + mirrored)
         return even
 
+    def _both(self, features: torch.Tensor) -> torch.Tensor:
+        """Return the features of all fish, then those of their mirror images."""
+        return torch.cat((features, -features))
 
-def _stacked(features: torch.Tensor) -> torch.Tensor:
-    return torch.cat(features.chunk(2, dim=1))
+
+class PairExtractor(SymmetricExtractor):
+    """Hidden layers for features of a fish, and of its mirror image behind them."""
+
+    def _both(self, features: torch.Tensor) -> torch.Tensor:
+        return torch.cat(features.chunk(2, dim=1))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
@@ -18,29 +18,21 @@ from fishd.controllers.policy.pilot import HOLD
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
+from fishd.learning.adam import Adam
 from fishd.learning.env.environment import spaces
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
-from fishd.learning.picture_networks import HALF, PairExtractor, PictureExtractor
+from fishd.learning.picture_networks import (
+    HALF,
+    PairExtractor,
+    PictureExtractor,
+    SymmetricExtractor,
+)
 from fishd.learning.settings import PpoSettings, TrainingSettings
 from fishd.learning.thrust_signal import ThrustSignal
 
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Weights, shape (outputs, inputs), and biases of each layer."""
-
-
-class SymmetricExtractor(MlpExtractor):
-    """Hidden layers that are odd in their input for the policy, even for the value."""
-
-    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        """f(x) − f(−x), over √2."""
-        odd: torch.Tensor = self.policy_net(features) - self.policy_net(-features)
-        return HALF * odd
-
-    def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        """The mean of f(x) and f(−x)."""
-        even: torch.Tensor = self.value_net(features) + self.value_net(-features)
-        return 0.5 * even
 
 
 class SymmetricPolicy(ActorCriticPolicy):
@@ -181,6 +173,7 @@ def _shape(ppo: PpoSettings, eye: Eye | None) -> dict[str, Any]:
         "net_arch": {"pi": list(ppo.hidden), "vf": list(ppo.hidden)},
         "activation_fn": _ACTIVATIONS[ppo.activation],
         "log_std_init": ppo.log_std_init,
+        "optimizer_class": Adam,
     }
     if eye and eye.shape:
         found["features_extractor_class"] = PictureExtractor
@@ -234,23 +227,41 @@ def is_finite(model: PPO) -> bool:
     return all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())
 
 
-class DeterministicPolicy:
-    """A policy without exploration: what is observed in, instruction angle out [rad].
+class MeanAction:
+    """The mean of a policy's action, for one input at a time.
 
-    Plain layers are copied and run in numpy, which for a single input is several times as fast as
-    torch; a network for pictures runs as it is.
+    Plain layers are copied and computed in NumPy, which for a single input is several times as fast
+    as torch; a network for pictures runs as it is.
     """
+
+    def __init__(self, policy: ActorCriticPolicy) -> None:
+        self._policy = policy
+        is_plain = isinstance(policy.features_extractor, FlattenExtractor)
+        self._layers = layers_of(policy) if is_plain else []
+        self._tanh = policy.activation_fn is torch.nn.Tanh
+
+    def __call__(self, values: NDArray[np.float32]) -> float:
+        """Return the mean, which may be beyond ±1."""
+        if not self._layers:
+            with torch.no_grad():
+                action = self._policy.get_distribution(torch.from_numpy(values[None])).mode()
+            return float(action[0, 0])
+        *hidden, (weight, bias) = self._layers
+        for inner, offset in hidden:
+            values = inner @ values + offset
+            values = np.tanh(values) if self._tanh else np.maximum(values, 0.0)
+        return float((weight @ values + bias)[0])
+
+
+class DeterministicPolicy:
+    """A policy without exploration: what is observed in, instruction angle out [rad]."""
 
     def __init__(self, policy: ActorCriticPolicy, perception: Perception, amplitude: float) -> None:
         """amplitude: Φ [rad]"""
         self._perception = perception.anew()
         self._amplitude = amplitude
         self._latest = self._blind = 0.0
-        self._policy = policy
-        self._layers: Layers = []
-        if isinstance(policy.features_extractor, FlattenExtractor):
-            self._layers = [(weight.copy(), bias.copy()) for weight, bias in layers_of(policy)]
-        self._tanh = policy.activation_fn is torch.nn.Tanh
+        self._mean = MeanAction(policy)
 
     def __call__(self, observation: Observation, stack: Stack | None = None) -> float:
         """The angle that answers an observation [rad].
@@ -262,19 +273,6 @@ class DeterministicPolicy:
             self._blind += observation.dt
             return self._latest if self._blind <= HOLD else 0.0
         self._blind = 0.0
-        values = self._perception.vector(observation, stack)
-        action = self._plain(values) if self._layers else self._torch(values)
+        action = self._mean(self._perception.vector(observation, stack))
         self._latest = max(-1.0, min(1.0, action)) * self._amplitude
         return self._latest
-
-    def _plain(self, values: NDArray[np.float32]) -> float:
-        *hidden, (weight, bias) = self._layers
-        for inner, offset in hidden:
-            values = inner @ values + offset
-            values = np.tanh(values) if self._tanh else np.maximum(values, 0.0)
-        return float((weight @ values + bias)[0])
-
-    def _torch(self, values: NDArray[np.float32]) -> float:
-        with torch.no_grad():
-            action = self._policy.get_distribution(torch.from_numpy(values[None])).mode()
-        return float(action[0, 0])

@@ -233,6 +233,15 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """The deterministic evaluations during training."""
 
     every: Annotated[int, note("An evaluation after so many updates; 0 for none.", ge=0)] = 2
+    patience: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        unit(
+            "evaluations",
+            "A training in simulation ends after this number of evaluations in a row that show no "
+            "better policy, if the newest is as good as the best and has 97 % of the thrust of the "
+            "best square wave; null: it ends after `steps`.",
+        ),
+    ] = 8
     seconds: Annotated[float, unit("s", "Its length.", ge=1, le=3600)] = 20.0
     settle: Annotated[
         float, unit("s", "Time at its beginning that is not judged.", ge=0, le=3600)
@@ -269,7 +278,10 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """A whole training; the defaults suit the default fish."""
 
     steps: Annotated[
-        int, note("Control steps that PPO learns from; 0 after an imitation that is all.", ge=0)
+        int,
+        note(
+            "Control steps that PPO learns from, at most; 0 after an imitation that is all.", ge=0
+        ),
     ] = 8000
     seed: Annotated[int, note("Of networks, exploration and start.", ge=0, le=2**32 - 1)] = 0
     checkpoint_every: Annotated[int, note("Steps between checkpoints.", ge=1)] = 5000

@@ -25,7 +25,7 @@ NOISY = ("simulation.noise=0.001", "simulation.offset_y=0.005")
 BRIEF = TrainingSettings(
     steps=128,
     ppo=PpoSettings(n_steps=64, n_epochs=4, log_std_init=0.7),
-    evaluation=EvaluationSettings(every=1, seconds=4.0, settle=2.0),
+    evaluation=EvaluationSettings(every=1, patience=None, seconds=4.0, settle=2.0),
 )
 """Two short updates, each followed by a short evaluation; so few epochs need less exploration."""
 

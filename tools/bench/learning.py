@@ -11,6 +11,7 @@ the thrust of the best square wave of the same fish and amplitude.
     tank             tank time of trainings on a robot, evaluations included
     harsh            the policy that is shipped, and swing, on rigs that delay, play and react
     speed            environment and inference, on one core
+    time             whole runs of `fishctl learn ppo`, one at a time
 """
 
 import itertools
@@ -28,6 +29,7 @@ from bench.learning_curves import learning_curves
 from bench.middle_amplitude import amplitude, exploration
 from bench.policy import policy_file
 from bench.tank_time import tank
+from bench.training_time import training_time
 from bench.trainings import (
     CONFIG,
     SECONDS,
@@ -336,6 +338,7 @@ PARTS = {
     "tank": tank,
     "harsh": harsh,
     "speed": speed,
+    "time": training_time,
 }
 
 

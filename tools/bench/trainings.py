@@ -70,9 +70,13 @@ def rig(amplitude: float = 0.42) -> Config:
 
 
 def settings_of(name: str | None, steps: int | None = None) -> TrainingSettings:
-    """Those of a file in config/, or the defaults; with another number of steps."""
+    """Those of a file in config/, or the defaults; with another number of steps.
+
+    A training does all steps, so that learning curves can be compared.
+    """
     chosen = training.load(CONFIG / name if name else None)
-    return replace(chosen, steps=steps or chosen.steps)
+    evaluation = replace(chosen.evaluation, patience=None)
+    return replace(chosen, steps=steps or chosen.steps, evaluation=evaluation)
 
 
 def trained(row: Row, seed: int, others: bool) -> Trained:

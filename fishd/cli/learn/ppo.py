@@ -61,7 +61,9 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
-    help="Control steps to learn from, in all; rounded up to whole rollouts of ppo.n_steps.",
+    help="Control steps to learn from, in all; rounded up to whole rollouts of ppo.n_steps. A "
+    "simulated training ends sooner, with a good policy, once its evaluations show no better one; "
+    "evaluation.patience: null in the settings makes it do all steps.",
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the training.")
 @click.option(
@@ -253,7 +255,8 @@ def report(outcome: "Outcome", job: "Job") -> int:
         )
         return INTERRUPTED
     rest = NOT_COUNTED if job.on == "simulation" else ""
-    click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}")
+    why = f"; {outcome.message}" if outcome.message else ""
+    click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}{why}")
     if found := outcome.best_evaluation:
         click.echo(f"best: {described(found).strip()}")
         off = found.error / found.thrust if found.error else 0.0

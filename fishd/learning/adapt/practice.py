@@ -46,7 +46,7 @@ def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
         randomisation=Randomisation(fish=fitted.cloud, offset=min(10.0, fitted.offset)),
         imitation=ImitationSettings(rounds=IMITATION_ROUNDS, fish=IMITATION_FISH),
         ppo=PpoSettings(decay_steps=max(1, steps)),
-        evaluation=EvaluationSettings(every=EVERY, others=OTHERS),
+        evaluation=EvaluationSettings(every=EVERY, others=OTHERS, patience=None),
     )
 
 

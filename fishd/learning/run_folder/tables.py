@@ -1,7 +1,6 @@
 """The CSV files of a run, which go on after a resume, and the summary of several seeds."""
 
 import statistics
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -107,14 +106,20 @@ def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
 
 
 def write_summary(path: Path, folders: Sequence[Path]) -> None:
-    """Write seeds.csv from the run folders of all seeds: a row for each evaluation."""
-    at: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    """Write seeds.csv from the run folders of all seeds: a row for each evaluation.
+
+    The policies of a training that has ended stay as they are.
+    """
+    runs = []
     for folder in folders:
         evaluations = read_evaluations(folder)
-        for one, best in zip(evaluations, best_so_far(evaluations), strict=True):
-            at[one.steps].append((one.relative_thrust, best))
+        shares = zip(evaluations, best_so_far(evaluations), strict=True)
+        runs.append({one.steps: (one.relative_thrust, best) for one, best in shares})
     lines: list[Sequence[Any]] = [SUMMARY]
-    for steps, pairs in sorted(at.items()):
+    latest: dict[int, tuple[float, float]] = {}
+    for steps in sorted(set().union(*runs)):
+        latest |= {number: run[steps] for number, run in enumerate(runs) if steps in run}
+        pairs = list(latest.values())
         columns = list(zip(*pairs, strict=True))
         spread = [f(values) for values in columns for f in (statistics.median, min, max)]
         lines.append([steps, len(pairs), *spread])

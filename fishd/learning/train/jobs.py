@@ -93,7 +93,7 @@ class Outcome(Struct, frozen=True, kw_only=True):
     ended: Ended
     """failed: one of several seeds raised an exception."""
     message: str = ""
-    """Why, where it is neither finished nor interrupted by the user."""
+    """Why, where it has neither done all steps nor was interrupted by the user."""
     checkpoint: Path | None = None
     """The newest."""
     best: Path | None = None

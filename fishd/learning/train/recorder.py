@@ -23,6 +23,11 @@ from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, Table
 from fishd.learning.train.candidates import Candidate
 from fishd.learning.train.jobs import Job
 
+GOOD_ENOUGH = 0.97
+"""Smallest merit with which a training may end before its last step."""
+IMPROVEMENT = 0.001
+"""Smallest rise of the merit that counts as a better policy."""
+
 
 class ProgressWriter(KVWriter):
     """Writes what stable-baselines3 logs in an update as a row of progress.csv."""
@@ -56,6 +61,10 @@ class RunRecorder:
         """Updates."""
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
+        self.unimproved = 0
+        """Evaluations in simulation since the merit of the best policy rose by `IMPROVEMENT`."""
+        self._plateau = 0.0
+        """Merit of the best policy after the latest rise of this size."""
         self.imitated = False
         """Has it learned by imitation what it was to?"""
         self.checkpoint: Path | None = None
@@ -95,7 +104,18 @@ class RunRecorder:
     def add(self, evaluation: Evaluation) -> Evaluation:
         """Write one row of evaluations.csv; returns the evaluation with `best` set."""
         is_best = self.best is None or evaluation.merit >= self.best.merit
+        self.unimproved += 1
+        if evaluation.merit >= self._plateau + IMPROVEMENT:
+            self._plateau, self.unimproved = evaluation.merit, 0
         return self.add_measured(replace(evaluation, best=is_best and not evaluation.stalled))
+
+    @property
+    def has_converged(self) -> bool:
+        """Has it a good policy, the newest one, and has it found no better one for long enough?"""
+        patience, latest, best = self._job.settings.evaluation.patience, self.latest, self.best
+        if patience is None or latest is None or best is None or self.unimproved < patience:
+            return False
+        return best.merit >= GOOD_ENOUGH and latest.merit > best.merit - IMPROVEMENT
 
     def add_measured(self, evaluation: Evaluation) -> Evaluation:
         """The same where it is known already whether the policy is the best so far."""
@@ -107,7 +127,7 @@ class RunRecorder:
         return evaluation
 
     def save(self, *, due: bool = True, anew: bool = False) -> None:
-        """Write a checkpoint where another policy is the best so far.
+        """Write a checkpoint where another policy is better than the best so far.
 
         due: write one in any case, if the newest is not of this step
         anew: or even if it is, since the policy has changed without a step
@@ -116,7 +136,10 @@ class RunRecorder:
         than the checkpoint, but could not add missing ones.
         """
         name, best, kept = f"{self.steps:06d}", self.best, self._kept
-        if best and best != kept and (due or kept is None or best.policy != kept.policy):
+        is_better = kept is None or (
+            best and best.policy != kept.policy and best.merit != kept.merit
+        )
+        if best and best != kept and (due or is_better):
             with _wearing(self._model, self.winner.parameters) if self.winner else nullcontext():
                 self._save("best")
             self._kept = best
@@ -231,6 +254,7 @@ class RunRecorder:
         path = checkpoints.best(self._job.folder) if state.on == "robot" else None
         past = checkpoints.read_state(path) if path else state
         best = self._kept = self.best = past.best
+        self._plateau = best.merit if best else 0.0
         if path and best:
             self.winner = Candidate(
                 steps=past.steps,

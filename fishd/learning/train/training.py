@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.core.errors import FishdError
@@ -38,14 +37,11 @@ from fishd.learning.ppo import (
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.thrust_signal import ThrustSignal
-from fishd.learning.train.callbacks import RolloutCallback
 from fishd.learning.train.jobs import Ended, Job, Outcome
 from fishd.learning.train.progress import NOT_COUNTED, Display, minutes
 from fishd.learning.train.recorder import RunRecorder
+from fishd.learning.train.rollouts import Rollouts
 from fishd.learning.train.tank import TankEvaluations
-
-_NEVER = 10**9
-"""Updates after which stable-baselines3 logs by itself."""
 
 
 def train(
@@ -61,6 +57,7 @@ def train(
     """
     job.check()
     torch.set_num_threads(1)
+    torch.distributions.Distribution.set_default_validate_args(False)
     link: Link
     if job.on == "robot":
         stack = job.settings.camera.stack if job.settings.see != "force" else None
@@ -104,7 +101,7 @@ class Training:
         self._model = make_learner(job.settings, self._vec_env, self._eye)
         if job.cleans_rewards:
             _clean(cast(Rollout, self._model.rollout_buffer), self._env)
-        self._callback = RolloutCallback(self._env, display, stop)
+        self._rollouts = Rollouts(self._model, self._env, display, stop)
         self._recorder = RunRecorder(job, self._env, self._model)
         self._tank = TankEvaluations(self._model, self._env, self._recorder.winner, stop)
         if job.parent and not job.resume:
@@ -130,7 +127,7 @@ class Training:
                 self._reset()
             if ended == "finished" and self._eye and not self._eye.is_fitted:
                 ended, message = self._babble()
-            while recorder.steps < job.settings.steps and ended == "finished":
+            while recorder.steps < job.settings.steps and ended == "finished" and not message:
                 ended, message = self._update()
         except LinkLost as error:
             ended, message = "lost", str(error)
@@ -141,7 +138,7 @@ class Training:
         return Outcome(
             folder=job.folder,
             steps=recorder.steps,
-            dropped=self._callback.steps if self._callback.stopped else 0,
+            dropped=self._rollouts.dropped,
             tank_time=self._env.tank_time,
             ended=ended,
             message=message,
@@ -158,7 +155,8 @@ class Training:
             done = job.settings.camera.babble
         last = job.last_step(done)
         whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
-        text = f"{job.folder}: {last} steps{whole} on {job.on}"
+        most = "at most " if job.on == "simulation" and job.settings.evaluation.patience else ""
+        text = f"{job.folder}: {most}{last} steps{whole} on {job.on}"
         if self._eye:
             also = " and forces" if job.settings.see == "both" else ""
             text += f", from pictures{also} with the eye {job.settings.camera.eye}"
@@ -177,12 +175,7 @@ class Training:
         if self._recorder.steps:
             mixed = np.random.SeedSequence([self._job.settings.seed, self._recorder.steps])
             self._model.set_random_seed(int(mixed.generate_state(1)[0]))
-        self._start_with(cast(NDArray[np.float32], self._vec_env.reset()))
-
-    def _start_with(self, observations: NDArray[np.float32]) -> None:
-        """The observation of the next step, which begins an episode."""
-        self._model._last_obs = observations
-        self._model._last_episode_starts = np.ones(1, dtype=bool)
+        self._rollouts.begin(cast(NDArray[np.float32], self._vec_env.reset())[0])
 
     def _babble(self) -> tuple[Ended, str]:
         """Move at random first, so that the eye knows what it sees; these steps count, too."""
@@ -217,22 +210,16 @@ class Training:
         """One rollout, its update and evaluation; how it ended, and why."""
         model, settings, recorder = self._model, self._job.settings, self._recorder
         if self._paused:
-            self._start_with(self._env.resume()[np.newaxis])
+            self._rollouts.begin(self._env.resume())
             self._paused = False
         before = recorder.steps
-        rate = learning_rate(settings.ppo, before + settings.ppo.n_steps)
-        model.lr_schedule = FloatSchedule(rate)  # whatever share of the training is done
-        try:
-            model.learn(
-                settings.ppo.n_steps, self._callback, log_interval=_NEVER, reset_num_timesteps=False
-            )
-        except ValueError:  # torch refuses a distribution whose mean is NaN
-            if is_finite(model):
-                raise
-        if self._callback.stopped:
-            model.num_timesteps = before  # the policy has not changed since
+        if not self._rollouts.collect():
             return "interrupted", ""
         self._paused = True
+        model.num_timesteps += settings.ppo.n_steps
+        rate = learning_rate(settings.ppo, model.num_timesteps)
+        model.lr_schedule = lambda _: rate  # whatever share of the training is done
+        model.train()
         if not is_finite(model):
             return "diverged", (
                 f"learning diverged in the update after {model.num_timesteps} steps; "
@@ -248,6 +235,11 @@ class Training:
             recorder.log()
         every = settings.checkpoint_every
         recorder.save(due=last or before // every < recorder.steps // every)
+        if recorder.has_converged and not last:
+            return "finished", (
+                f"ended early: the last {recorder.unimproved} evaluations have shown no better "
+                "policy (evaluation.patience)"
+            )
         return ("interrupted" if self._stop() and not last else "finished"), ""
 
     def _evaluate(self) -> None:

@@ -25,7 +25,7 @@ from fishd.learning.train.jobs import Outcome
 SETTINGS = """\
 steps: 128
 ppo: {n_steps: 64, n_epochs: 4, log_std_init: 0.7}
-evaluation: {every: 1, seconds: 4.0, settle: 2.0}
+evaluation: {every: 1, patience: null, seconds: 4.0, settle: 2.0}
 """
 
 
@@ -215,7 +215,7 @@ def test_on_a_terminal_it_shows_a_bar(
 @pytest.fixture
 def hasty(settings: str) -> str:
     """Settings with rollouts that take little time in the tank, and no evaluations."""
-    text = SETTINGS.replace("every: 1, seconds: 4.0, settle: 2.0", "every: 0")
+    text = SETTINGS.replace("every: 1, patience: null, seconds: 4.0, settle: 2.0", "every: 0")
     text = text.replace("n_steps: 64", "n_steps: 16, batch_size: 16").replace("128", "32")
     Path(settings).write_text(text, encoding="utf-8")
     return settings

@@ -25,7 +25,7 @@ SETTINGS = """\
 steps: {steps}
 checkpoint_every: 128
 ppo: {{n_steps: 64, n_epochs: 2, log_std_init: 0.7}}
-evaluation: {{every: 1, seconds: 4.0, settle: 2.0}}
+evaluation: {{every: 1, patience: null, seconds: 4.0, settle: 2.0}}
 """
 LONG = 1_000_000
 
@@ -273,6 +273,23 @@ def test_a_cluster_that_does_not_answer_is_one_line(
     assert "no Dask scheduler answers at tcp://127.0.0.1:1" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert not (tmp_path / "run").exists()
+
+
+def test_in_a_summary_the_policies_of_a_seed_that_ended_early_stay_as_they_are(
+    tmp_path: Path,
+) -> None:
+    table = "steps,thrust,relative_thrust,frequency,fullness,stalled,best\n"
+    rows = [f"{steps},0.02,0.{steps},1.7,1,0,1\n" for steps in (64, 72, 80)]
+    for name, swum in (("short", rows[:1]), ("long", rows)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "evaluations.csv").write_text(table + "".join(swum))
+    write_summary(tmp_path / "seeds.csv", [tmp_path / "short", tmp_path / "long"])
+    found = csv.DictReader((tmp_path / "seeds.csv").read_text().splitlines())
+    assert [(row["seeds"], row["lowest"], row["best_highest"]) for row in found] == [
+        ("2", "0.64", "0.64"),
+        ("2", "0.64", "0.72"),
+        ("2", "0.64", "0.8"),
+    ]
 
 
 def test_a_summary_of_seeds_that_got_nowhere_is_a_head(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from fishd.controllers.policy.card import Layout
 from fishd.core.errors import ConfigError
 from fishd.learning.env.environment import features, thrust_scale
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
@@ -149,6 +150,47 @@ def test_the_best_policy_is_kept_beside_the_newest(tmp_path: Path) -> None:
         outcome.best_evaluation.relative_thrust
     )
     assert len(list(job.folder.glob("best-*"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("merits", "ends_after"),
+    [
+        ((0.98, 0.98, 0.98, 0.98), 4),
+        ((0.98, 0.98, 0.98, 0.982, 0.98, 0.982, 0.982), 7),
+        ((0.98, 0.9806, 0.9811, 0.9811, 0.9811, 0.9811), 6),
+        ((0.99, 0.9, 0.9, 0.9, 0.99), 5),
+        ((0.96,) * 9, None),
+    ],
+    ids=["no better one", "a better one", "little by little", "a lost one", "poor ones"],
+)
+def test_a_training_has_converged_where_a_good_policy_was_not_improved_for_long_enough(
+    tmp_path: Path, merits: tuple[float, ...], ends_after: int | None
+) -> None:
+    evaluation = EvaluationSettings(patience=3)
+    job = brief_job(tmp_path / "run", evaluation=evaluation)
+    recorder = Training(job, SimulatedLink(job.config), Display(), lambda: False)._recorder
+    converged = []
+    for merit in merits:
+        swum = {"thrust": 0.02, "frequency": 1.7, "fullness": 1.0, "stalled": False}
+        recorder.add(Evaluation(relative_thrust=merit, **swum))
+        converged.append(recorder.has_converged)
+    recorder.close()
+    assert converged == [number == ends_after for number in range(1, len(merits) + 1)]
+
+
+def test_a_training_that_has_converged_ends_before_its_last_step(tmp_path: Path) -> None:
+    evaluation = EvaluationSettings(every=1, patience=2, seconds=6.0, settle=2.0)
+    job = brief_job(tmp_path / "run", steps=6400, ppo=PpoSettings(), evaluation=evaluation)
+    outcome = train(job)
+    assert outcome.ended == "finished"
+    assert outcome.message.startswith("ended early: the last 2 evaluations have shown no better")
+    assert outcome.best_evaluation
+    assert outcome.best_evaluation.relative_thrust > 0.97
+    assert outcome.steps < 3200
+    assert outcome.checkpoint == job.folder / f"step-{outcome.steps:06d}"
+    assert outcome.best == job.folder / f"best-{outcome.best_evaluation.steps:06d}"
+    again = train(resumed(job, 6400))
+    assert again.steps >= outcome.steps + 2 * 64
 
 
 def test_a_policy_that_holds_still_is_marked_and_never_the_best(tmp_path: Path) -> None:
