@@ -326,6 +326,41 @@ def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
     assert paused == pytest.approx([0.0, 3.0, 3.0])
 
 
+def test_a_rollout_holds_what_stable_baselines_would_have_computed_step_by_step(
+    tmp_path: Path,
+) -> None:
+    environment = EnvironmentSettings(episode=25)
+    job = brief_job(tmp_path / "run", environment=environment)
+    training = Training(job, SimulatedLink(job.config), Display(), lambda: False)
+    buffer, model, rewards = training._model.rollout_buffer, training._model, list[float]()
+    buffer.signal = None  # type: ignore[attr-defined]
+    step, reset = training._env.step, training._env.reset
+    ends: list[np.ndarray] = []
+
+    def watched_step(action: np.ndarray) -> Any:
+        found = step(action)
+        rewards.append(found[1])
+        if found[3]:
+            ends.append(found[0])
+        return found
+
+    training._env.step = watched_step  # type: ignore[method-assign]
+    training._rollouts.begin(reset(seed=1)[0])
+    assert training._rollouts.collect()
+    seen, actions = (torch.from_numpy(each[:, 0]) for each in (buffer.observations, buffer.actions))
+    with torch.no_grad():
+        values, log_probabilities, _ = model.policy.evaluate_actions(seen, actions)
+        of_ends = model.policy.predict_values(torch.from_numpy(np.array(ends)))[:, 0].numpy()
+    assert buffer.values == pytest.approx(values.numpy(), abs=1e-6)
+    assert buffer.log_probs[:, 0] == pytest.approx(log_probabilities.numpy(), abs=1e-6)
+    assert np.flatnonzero(buffer.episode_starts).tolist() == [0, 25, 50]
+    for number, end in enumerate((24, 49)):
+        rewards[end] += model.gamma * float(of_ends[number])
+    assert buffer.rewards[:, 0] == pytest.approx(np.array(rewards), abs=1e-6)
+    assert buffer.advantages[24] == pytest.approx(buffer.rewards[24] - buffer.values[24], abs=1e-6)
+    assert np.std(buffer.actions) == pytest.approx(np.exp(0.7), rel=0.3)
+
+
 def test_actions_that_came_too_late_are_counted_and_teach_nothing(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     training = Training(job, Losing(job), Display(), lambda: False)
