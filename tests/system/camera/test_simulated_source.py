@@ -1,9 +1,5 @@
 """A simulated camera above a running fishd: true processes, in real time and in lockstep."""
 
-import os
-import random
-import signal
-import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -12,10 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 from rigs.camera_process import CameraProcess, running_camera
-from rigs.processes import PATIENCE, Daemon, Subscriber, running, wait_until
+from rigs.processes import PATIENCE, Daemon, Subscriber, running
 from rigs.virtual_pi_process import virtual_pi
 
-from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.client import CameraLost
 from fishd.camera.messages import FrameHeader
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
@@ -35,15 +31,6 @@ def settings(daemon: Daemon, *pairs: str) -> tuple[str, ...]:
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     with running(tmp_path_factory.mktemp("fishd"), *SWIMMING) as daemon:
         yield daemon
-
-
-def collect(client: CameraClient, number: int) -> list[Frame]:
-    found: list[Frame] = []
-    for frame in client.frames():
-        found.append(frame)
-        if len(found) == number:
-            break
-    return found
 
 
 def expected(ticks: list[Tick], camera: SimulatedCameraSettings) -> dict[float, np.ndarray]:
@@ -78,20 +65,6 @@ def test_frames_show_the_tail_as_it_truly_was(tmp_path: Path, daemon: Daemon) ->
         assert difference.mean() < 0.02  # the light, which has another phase, is not on
 
 
-def test_times_of_frames_and_ticks_are_on_one_clock(tmp_path: Path, daemon: Daemon) -> None:
-    with (
-        running_camera(tmp_path, *settings(daemon, "simulated.rate=30")) as camera,
-        Fish(daemon.endpoint) as fish,
-    ):
-        camera.is_in("streaming")
-        with camera.client(fish=fish) as client:
-            frames = collect(client, 20)
-            assert client.offset() == (0.0, 0.0)
-            tick = next(fish.ticks())
-    assert 0.0 <= tick.time - frames[-1].time < 5.0
-    assert all(frame.available - frame.time >= 0.03 for frame in frames)
-
-
 def test_from_another_machine_the_offset_is_estimated(
     tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,22 +83,6 @@ def test_from_another_machine_the_offset_is_estimated(
     assert abs(offset.seconds) <= offset.uncertainty  # it is one clock in truth
     sent, frame = found[-1]
     assert frame.time == pytest.approx(sent.time, abs=offset.uncertainty)
-
-
-def test_a_stack_has_the_frames_before_the_tick(tmp_path: Path, daemon: Daemon) -> None:
-    with running_camera(tmp_path, *settings(daemon, "simulated.rate=100")) as camera:
-        camera.is_in("streaming")
-        stack = StackSettings(frames=3, interval=0.05, delay=0.1, oldest=1.0)
-        with Fish(daemon.endpoint) as fish, camera.client(fish=fish, stack=stack) as client:
-            seen: list[Stack | None] = []
-
-            def moved() -> bool:
-                seen.append(client.stack_at(time.monotonic()))
-                return bool(seen[-1] and np.any(seen[-1][0] != seen[-1][2]))
-
-            wait_until(moved)
-    assert seen[-1]
-    assert [each.shape for each in seen[-1]] == [(84, 84)] * 3
 
 
 def test_the_camera_waits_for_a_fishd_and_follows_it_through_a_restart(tmp_path: Path) -> None:
@@ -179,7 +136,7 @@ class Lockstep:
         return seen
 
 
-@pytest.mark.parametrize("rate", ["null", "30", "400"])
+@pytest.mark.parametrize("rate", ["null", "400"])
 def test_in_lockstep_every_tick_has_its_frames_however_fast_it_is(
     tmp_path: Path, rate: str
 ) -> None:
@@ -231,30 +188,3 @@ def test_in_lockstep_a_camera_that_dies_is_noticed(tmp_path: Path) -> None:
             camera.process.kill()
             with pytest.raises(CameraLost, match="no camera at"):
                 run.swim(20)
-
-
-@pytest.mark.realtime
-def test_processes_that_are_stopped_and_killed_at_random_are_survived(tmp_path: Path) -> None:
-    random.seed(1)
-    pairs = ("simulated.rate=60",)
-    with running(tmp_path, *SWIMMING) as daemon:
-        camera = CameraProcess(tmp_path, *settings(daemon, *pairs))
-        try:
-            camera.is_in("streaming")
-            with camera.client(timeout=1.0) as client:
-                for _ in range(4):
-                    victim = random.choice(["camera", "fishd"])
-                    if victim == "camera":
-                        camera.process.send_signal(random.choice([signal.SIGSTOP, signal.SIGKILL]))
-                        client.poll(random.uniform(0.0, 0.6))
-                        camera.process.kill()
-                        camera.finish()
-                        camera = CameraProcess(tmp_path, *settings(daemon, *pairs))
-                    else:
-                        os.kill(daemon.process.pid, signal.SIGSTOP)
-                        client.poll(random.uniform(0.0, 1.5))
-                        os.kill(daemon.process.pid, signal.SIGCONT)
-                    camera.is_in("streaming")
-                    wait_until(lambda: bool(client.poll(0.5)))
-        finally:
-            camera.end()

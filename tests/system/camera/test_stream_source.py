@@ -54,14 +54,6 @@ def test_a_file_that_is_not_repeated_ends(tmp_path: Path, video: Path) -> None:
     assert state.seq == 12
 
 
-def test_a_file_that_appears_later_is_found(tmp_path: Path, video: Path) -> None:
-    later = tmp_path / "later.avi"
-    with running_camera(tmp_path, "source=stream", f"stream.url={later}") as camera:
-        assert camera.is_in("unplugged").problem == f"{later}: no such file"
-        later.write_bytes(video.read_bytes())
-        camera.is_in("streaming")
-
-
 @pytest.mark.parametrize("content", [b"", b"no video at all\n" * 100])
 def test_a_file_that_is_no_video_is_said(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "fish.avi"

@@ -66,14 +66,6 @@ def test_other_formats_show_the_same(tmp_path: Path, format_: str) -> None:
         assert np.all(pixels[2:40, 2:40] > 240)
 
 
-def test_extraneous_bytes_in_a_jpeg_do_no_harm(good: V4l2Rig) -> None:
-    broken = good.status().broken
-    good.set(extraneous=True)
-    with good.client() as client:
-        published(client, 20)
-        assert client.status().broken == broken
-
-
 @pytest.mark.parametrize("fault", ["broken", "garbage"])
 def test_broken_jpegs_are_counted_and_left_out(good: V4l2Rig, fault: str) -> None:
     before = good.status().broken
@@ -83,11 +75,10 @@ def test_broken_jpegs_are_counted_and_left_out(good: V4l2Rig, fault: str) -> Non
     good.until(lambda state: state.seq > after.seq + 3)
 
 
-@pytest.mark.parametrize("fault", ["broken", "garbage"])
 def test_a_camera_that_sends_only_broken_frames_does_not_stream_and_is_opened_anew(
-    good: V4l2Rig, fault: str
+    good: V4l2Rig,
 ) -> None:
-    good.set(**{fault: True})
+    good.set(broken=True)
     state = good.is_in("stalled")
     assert "/dev/video7 has sent only broken frames for 2 s (" in state.problem
     assert "another cable or port" in state.remedy
@@ -102,15 +93,6 @@ def test_frames_that_the_kernel_never_got_are_counted(good: V4l2Rig) -> None:
     before = good.status().dropped
     good.set(skip=5)
     good.until(lambda state: state.dropped >= before + 3)
-
-
-def test_a_camera_that_is_unplugged_is_said_and_followed_when_it_is_back(good: V4l2Rig) -> None:
-    good.set(unplugged=True)
-    state = good.is_in("unplugged")
-    assert state.problem == "/dev/video7: there is no such camera"
-    assert "plug it in" in state.remedy
-    good.set()
-    good.is_in("streaming")
 
 
 def test_a_client_is_told_that_the_camera_is_unplugged(good: V4l2Rig) -> None:
@@ -129,8 +111,7 @@ def test_a_client_is_told_that_the_camera_is_unplugged(good: V4l2Rig) -> None:
 
 def test_a_camera_that_stalls_is_opened_anew(good: V4l2Rig) -> None:
     good.set(stalled=True)
-    state = good.is_in("stalled")
-    assert "has sent no frame for 2 s" in state.problem
+    assert "has sent no frame for 2 s" in good.is_in("stalled").problem
     good.set()
     good.is_in("streaming")
 
@@ -179,14 +160,6 @@ def test_frames_that_have_waited_in_the_driver_are_dropped_and_counted(good: V4l
     assert (after.session, after.degraded) == (before.session, ())
     assert all(each.header.available - each.header.time < 3.0 for each in found)
     assert all(a.header.time < b.header.time for a, b in pairwise(found))
-
-
-def test_if_all_frames_seem_to_have_waited_their_clock_is_another_one(good: V4l2Rig) -> None:
-    good.set(late=10**6)
-    state = good.until(lambda state: bool(state.degraded))
-    assert "times are those of arrival" in state.degraded[0]
-    good.set()
-    good.until(lambda state: not state.degraded)
 
 
 def test_controls_are_set_and_tell_the_exposure(tmp_path: Path) -> None:

@@ -37,25 +37,14 @@ def test_virtual_time_is_never_late_and_moves_its_clock() -> None:
     assert turns == [(Slot(k, k * 0.05, k * 0.05, 0), k * 0.05) for k in range(3)]
 
 
-def test_no_tick_begins_before_its_deadline() -> None:
-    for slot in asyncio.run(slots(20)):
-        assert slot.now >= slot.deadline
-
-
-def test_deadlines_are_whole_periods_apart_for_ever() -> None:
-    found = asyncio.run(slots(20, {5: 0.013, 9: 0.031}))
-    first = found[0]
-    for slot in found:
-        elapsed = slot.deadline - first.deadline
-        assert elapsed == pytest.approx((slot.index - first.index) * PERIOD, abs=1e-9)
-
-
 def test_a_long_turn_costs_whole_slots_which_are_counted_and_not_caught_up() -> None:
-    found = asyncio.run(slots(10, {4: 3.5 * PERIOD}))
+    found = asyncio.run(slots(20, {4: 3.5 * PERIOD, 9: 0.031}))
     assert found[4].missed >= 2
     for before, after in pairwise(found):
         assert after.index - before.index == after.missed + 1
-        assert after.now - after.deadline < PERIOD
+        assert 0.0 <= after.now - after.deadline < PERIOD
+        elapsed = after.deadline - found[0].deadline
+        assert elapsed == pytest.approx((after.index - found[0].index) * PERIOD, abs=1e-9)
 
 
 def test_the_asyncio_loop_is_served_between_ticks_even_under_overload() -> None:

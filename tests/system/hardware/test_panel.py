@@ -136,18 +136,6 @@ def test_without_edges_polls_do(pins: Pins, make: Make, caplog: pytest.LogCaptur
     assert len(caplog.messages) == 1
 
 
-def test_a_button_that_cannot_be_read_is_an_error(
-    pins: Pins, panel: RpiGpioPanel, caplog: pytest.LogCaptureFixture
-) -> None:
-    from RPi import GPIO
-
-    GPIO.cleanup()  # by another part of the program
-    for _ in range(2):
-        with pytest.raises(OSError, match=r"^E-stop button on GPIO 17: "):
-            panel.update("idle", 0.5)
-    panel.close()
-
-
 def shown(pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: float) -> list[int]:
     """The light after each tick."""
     levels = []
@@ -160,10 +148,6 @@ def shown(pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: floa
 def flashes(levels: list[int]) -> int:
     """How many times the light went on."""
     return sum(after > before for before, after in zip([0, *levels], levels, strict=False))
-
-
-def test_the_light_is_on_while_running(pins: Pins, panel: RpiGpioPanel) -> None:
-    assert all(shown(pins, panel, "running", 0.05, 2.0))
 
 
 @pytest.mark.parametrize("tick", [0.01, 0.05, 0.2])
@@ -187,19 +171,6 @@ def test_the_light_flickers_after_a_fault(
 def test_the_light_is_written_to_only_when_it_changes(pins: Pins, panel: RpiGpioPanel) -> None:
     shown(pins, panel, "running", 0.05, 5.0)
     assert pins.writes(LIGHT) == [0, 1]
-
-
-def test_a_light_that_fails_is_reported_once_and_stops_nothing(
-    pins: Pins, make: Make, caplog: pytest.LogCaptureFixture
-) -> None:
-    from RPi import GPIO
-
-    panel = make(PanelSettings(led_gpio=LIGHT))
-    GPIO.cleanup()
-    for time in range(4):
-        assert panel.update("fault", 0.1 * time) is False
-    (message,) = caplog.messages
-    assert message.startswith("the status light on GPIO 27 stays dark: ")
 
 
 def test_close_ends_the_light_and_gives_back_only_its_pins(pins: Pins, panel: RpiGpioPanel) -> None:

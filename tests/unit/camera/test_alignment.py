@@ -12,7 +12,7 @@ from rigs.filmed_swim import filmed, swum
 from fishd.camera.alignment import Alignment, judge
 from fishd.camera.axis import find_motion
 from fishd.camera.settings import CameraSettings, PictureSettings, Square
-from fishd.camera.simulated.settings import DEFAULT, WEB
+from fishd.camera.simulated.settings import WEB
 from fishd.core.camera_frames import Pixels
 
 V4L2 = CameraSettings(source="v4l2")
@@ -98,8 +98,3 @@ def test_of_a_simulated_camera_its_own_settings_are_named() -> None:
     found = judged(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
     assert found.settings["simulated.off_axis"] == pytest.approx(0.0, abs=0.3)
     assert found.settings["simulated.tilt"] == pytest.approx(0.0, abs=0.015)
-
-
-def test_default_optics_are_aligned() -> None:
-    frames = filmed(swum(10.0, controller="square"), DEFAULT)
-    assert judged(np.stack([frame.pixels for frame in frames])).good

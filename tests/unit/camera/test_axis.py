@@ -23,7 +23,7 @@ def swinging(settings: SimulatedCameraSettings, *, amplitude: float = 0.2) -> Pi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("rig", [DEFAULT, WEB, BAD])
 @pytest.mark.parametrize(("off", "tilt"), [(0.0, 0.0), (3.0, 0.02), (-3.0, -0.02), (6.5, 0.1)])
 def test_the_axis_is_found_within_a_quarter_of_a_pixel(
@@ -35,7 +35,7 @@ def test_the_axis_is_found_within_a_quarter_of_a_pixel(
 
 
 @pytest.mark.parametrize("rig", [DEFAULT, WEB, BAD])
-@pytest.mark.parametrize("slope", [0.25, -0.3, math.pi / 8, -math.pi / 8])
+@pytest.mark.parametrize("slope", [-0.3, math.pi / 8])
 def test_a_steep_axis_is_found_too(rig: SimulatedCameraSettings, slope: float) -> None:
     motion = find_motion(swinging(replace(rig, tilt=slope)))
     assert math.tan(motion.axis.tilt) == pytest.approx(slope, abs=0.03)
@@ -52,8 +52,8 @@ def test_a_tail_that_rests_has_no_axis() -> None:
         find_motion(swinging(WEB, amplitude=0.0))
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("seconds", [2, 3, 5])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seconds", [2, 5])
 def test_light_that_moves_on_the_water_has_no_axis(seconds: int, seed: int) -> None:
     painter = TailPainter(replace(WEB, seed=seed), 84)
     times = np.arange(0.0, seconds, 1 / 30)
@@ -64,8 +64,3 @@ def test_light_that_moves_on_the_water_has_no_axis(seconds: int, seed: int) -> N
 def test_few_pictures_are_refused() -> None:
     with pytest.raises(NoMotion, match="9 pictures are too few"):
         find_motion(swinging(DEFAULT)[:9])
-
-
-def test_black_pictures_have_no_axis() -> None:
-    with pytest.raises(NoMotion, match="nothing moves"):
-        find_motion(np.zeros((20, 84, 84), np.uint8))

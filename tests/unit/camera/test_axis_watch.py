@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import filmed
 
-from fishd.camera.axis_watch import AGAIN, FEWEST, AxisWatch
+from fishd.camera.axis_watch import AGAIN, AxisWatch
 from fishd.camera.simulated.settings import DEFAULT, WEB
 from fishd.core.camera_frames import Frame
 
@@ -54,22 +54,14 @@ def test_it_is_found_once_the_tail_has_moved_for_some_seconds_and_kept_while_it_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [30.0, 60.0])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_rate_that_goes_with_the_beat_does_no_harm(rate: float, seed: int) -> None:
+def test_a_rate_that_goes_with_the_beat_does_no_harm(rate: float) -> None:
     clock = Clock()
     watch = AxisWatch(clock)
-    camera = replace(WEB, off_axis=3.0, tilt=0.05, rate=rate, seed=seed)
+    camera = replace(WEB, off_axis=3.0, tilt=0.05, rate=rate)
     shown(watch, clock, filmed(swum(20.0, controller="swing"), camera))
     assert watch.axis
     assert watch.axis.offset == pytest.approx(3.0, abs=0.15)
     assert watch.axis.tilt == pytest.approx(0.05, abs=0.006)
-
-
-def test_few_frames_are_not_looked_at() -> None:
-    clock = Clock()
-    watch = AxisWatch(clock)
-    swims = filmed(swum(12.0, controller="swing"), replace(CAMERA, rate=(FEWEST - 2) / 12.0))
-    assert shown(watch, clock, swims) == 0
 
 
 def test_of_a_fast_camera_some_20_frames_a_second_are_kept() -> None:

@@ -78,13 +78,6 @@ def test_it_is_asked_seldom_and_an_answer_that_fails_keeps_the_latest() -> None:
     assert network.asked == asked + 1
 
 
-def test_a_first_answer_that_fails_is_told() -> None:
-    network = Network()
-    network.down = True
-    with pytest.raises(NoDaemon):
-        ClockOffset(network.ask, lambda: network.now).update()
-
-
 @pytest.mark.parametrize("boot", ["its next start", ""])
 def test_another_start_of_their_machine_begins_anew(boot: str) -> None:
     network = Network()

@@ -33,18 +33,6 @@ def test_in_a_whole_picture_it_is_drawn_within_what_frames_show() -> None:
     assert rows_of(drawn, drawing.CROP, 30) == [10, 30]
 
 
-def test_without_an_axis_nothing_is_drawn() -> None:
-    assert (drawing.with_axis(drawing.coloured(GREY), None, 40) == 120).all()
-
-
-def test_a_picture_of_motion_is_bright_where_most_moves() -> None:
-    energy = np.zeros((84, 84))
-    energy[40:44, 20:60] = 1.0
-    colours = drawing.motion_colours(energy)
-    assert colours[42, 30].sum() > 500
-    assert colours[5, 5].sum() < 20
-
-
 def test_a_file_shows_the_same_colours(tmp_path: Path) -> None:
     drawing.write_png(tmp_path / "a.png", drawing.with_axis(drawing.coloured(GREY), None, 40))
     red = np.zeros((4, 4, 3), np.uint8)

@@ -2,23 +2,14 @@
 
 import random
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
-from rigs.recordings import status, swum
 
-from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import Tail
-from fishd.camera.sources import simulated
-from fishd.camera.sources.base import Shot, Timeline, Trouble
-from fishd.camera.sources.simulated import Foresight, SimulatedSource, Swimmer, TickTruth
-from fishd.client import Fish
-from fishd.config import Config
-from fishd.core.signals import Status, Tick
+from fishd.camera.sources.simulated import Foresight, Swimmer, TickTruth
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -100,70 +91,3 @@ def test_after_ticks_that_nobody_heard_it_begins_anew_from_the_true_state() -> N
     for _ in range(4):  # until what was under way to the servo has arrived
         ((_, believed),) = ahead.follow(swim.tick())
     assert swim.tick().alpha == pytest.approx(believed.alpha, abs=1e-9)
-
-
-class Heard:
-    """Ticks that a process finds only at its second look, as it was held up itself."""
-
-    def __init__(self, ticks: list[TickTruth]) -> None:
-        self._ticks = ticks
-        self.looks = 0
-
-    def poll(self, _: int) -> int:
-        self.looks += 1
-        return int(self.looks > 1)
-
-    def recv_multipart(self) -> list[bytes]:
-        return [b"tick", msgspec.json.encode(self._ticks.pop(0))]
-
-
-class Told:
-    """A sink that keeps what it is told, until there are frames."""
-
-    def __init__(self) -> None:
-        self.troubles: list[str] = []
-        self.frames = 0
-
-    def begin(self, timeline: Timeline, degraded: tuple[str, ...] = ()) -> None:
-        pass
-
-    def put(self, shot: Shot) -> None:
-        self.frames += 1
-
-    def covered(self, until: float) -> None:
-        pass
-
-    def lost(self, dropped: int = 0, broken: int = 0) -> None:
-        pass
-
-    def trouble(self, trouble: Trouble) -> None:
-        self.troubles.append(str(trouble))
-
-    def alive(self) -> None:
-        pass
-
-
-class Fishd:
-    """What a camera asks of a fishd."""
-
-    def __init__(self, tick: Tick) -> None:
-        self._status = replace(status(tick, pid=1), clock=0.0, boot="here")
-
-    def status(self, _: float | None = None) -> Status:
-        return self._status
-
-    def config(self) -> dict[str, Any]:
-        return dict(msgspec.to_builtins(Config()) | {"lockstep": True})
-
-
-def test_a_camera_that_was_held_up_itself_does_not_say_that_fishd_does_not_tick(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    swim, sink = Swim(PlantParameters(), 3), Told()
-    heard = Heard([swim.tick() for _ in range(20)])
-    monkeypatch.setattr(simulated, "SILENCE", -1.0)  # it has been as long at each look
-    monkeypatch.setattr(simulated, "subscriber", lambda *_: heard)
-    source, fishd = SimulatedSource(SimulatedSettings(), 84), Fishd(swum(0.2).recorder.ticks[0])
-    source._follow(cast(Fish, fishd), sink, lambda _: sink.frames > 3)
-    assert sink.frames > 3
-    assert sink.troubles == []

@@ -52,10 +52,6 @@ def test_nothing_is_shown_where_a_frame_is_missing_for_too_long(missing: int) ->
     assert shown(history_of(*times), 0.95) is None
 
 
-def test_nothing_is_shown_before_there_are_enough_frames() -> None:
-    assert shown(history_of(0.15, 0.2), 0.2) is None
-
-
 def test_a_frame_that_is_not_newer_than_the_others_is_dropped() -> None:
     history = history_of(0.0, 0.1, 0.05, 0.1, 0.2)
     assert shown(history, 0.2) == [4, 1, 1, 0]

@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import felt, filmed
 
-from fishd.camera.axis import NoMotion
 from fishd.camera.latency import NoDelay, find_latency
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.core.camera_frames import Frame
@@ -29,11 +28,11 @@ def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("late", [-0.01, 0.0, 0.04])
+@pytest.mark.parametrize("late", [-0.01, 0.04])
 @pytest.mark.parametrize(
     ("camera", "within"),
-    [(DEFAULT, 1.5e-3), (WEB, 1.5e-3), (BAD, 3e-3)],
-    ids=["default", "web", "bad"],
+    [(DEFAULT, 1.5e-3), (BAD, 3e-3)],
+    ids=["default", "bad"],
 )
 def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_are(
     camera: SimulatedCameraSettings, within: float, late: float
@@ -49,18 +48,12 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "other", ["plant.omega0=9", "plant.lateral_drag=0.1", "plant.servo_delay=0.05",
-              "plant.thrust_coefficient=0.03", "simulation.rotation=0.05"]
+    "other", ["plant.omega0=9", "plant.servo_delay=0.05", "simulation.rotation=0.05"]
 )  # fmt: skip
 def test_no_parameter_of_the_fish_is_needed(other: str) -> None:
     ticks = swum(40.0, other)
     found = find_latency(filmed(ticks, WEB), felt(ticks))
     assert found.stamps == pytest.approx(0.0, abs=3e-3)
-
-
-def test_ticks_that_are_lost_do_no_harm() -> None:
-    kept = [tick for tick in swum(40.0) if tick.seq % 97]
-    assert find_latency(film(WEB), felt(kept)).stamps == pytest.approx(0.0, abs=3e-3)
 
 
 def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped() -> None:
@@ -85,12 +78,6 @@ def test_frames_of_another_swim_are_refused() -> None:
     mixed = [frame._replace(pixels=one) for frame, one in zip(frames, pixels, strict=True)]
     with pytest.raises(NoDelay, match=r"agree by .* only: is it the same fish"):
         find_latency(mixed, felt(swum(40.0)))
-
-
-def test_a_fish_that_rests_tells_no_delay() -> None:
-    ticks = swum(12.0, controller="hold")
-    with pytest.raises(NoMotion, match="nothing moves"):
-        find_latency(filmed(ticks, DEFAULT), felt(ticks))
 
 
 def test_a_short_swim_is_refused() -> None:

@@ -84,7 +84,7 @@ def test_a_camera_in_phase_has_a_frame_there_when_each_tick_begins() -> None:
     assert [frame.available - frame.time for frame in frames] == pytest.approx([0.03] * 20)
 
 
-@pytest.mark.parametrize("latency", [0.0, 0.05, 0.1, 0.15, 0.03, 0.12])
+@pytest.mark.parametrize("latency", [0.0, 0.05, 0.12])
 @pytest.mark.parametrize("error", [-1e-12, 1e-12])
 def test_frames_in_phase_are_evenly_apart_whatever_the_rounding_of_a_tick(
     latency: float, error: float

@@ -19,7 +19,7 @@ swum = cache(filmed_swim.swum)  # nobody changes a tick
 def test_its_position_follows_the_fin_angle(
     camera: SimulatedCameraSettings, light_tail: bool
 ) -> None:
-    ticks = swum(20.0)
+    ticks = swum(10.0)
     camera = replace(camera, rate=None, latency=0.0, jitter=0.0)
     pictures = np.stack([frame.pixels for frame in filmed(ticks, camera)])
     tails = find_tails(255 - pictures if light_tail else pictures)

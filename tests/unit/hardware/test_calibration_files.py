@@ -76,14 +76,14 @@ def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], tex
     return line
 
 
-@pytest.mark.parametrize("key", [*FORCE, *SERVO])
+@pytest.mark.parametrize("key", ["xy", "date", "scale"])
 def test_a_file_without_one_of_its_keys_is_not_filled_in(tmp_path: Path, key: str) -> None:
     kind, whole = (ForceCalibration, FORCE) if key in FORCE else (ServoCalibration, SERVO)
     text = yaml.safe_dump({name: value for name, value in whole.items() if name != key})
     assert f"without {key}: " in complaint(tmp_path, kind, text)
 
 
-@pytest.mark.parametrize("length", range(0, 80, 5))
+@pytest.mark.parametrize("length", range(0, 80, 20))
 def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
     _, path = CalibrationFolder(tmp_path).save(ForceCalibration(xx=1.5, xy=-0.25), NOON)
     text = path.read_text()
@@ -109,27 +109,17 @@ def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str, wo
     ("kind", "whole", "changes", "words"),
     [
         (ForceCalibration, FORCE, {"xx": float("nan")}, "xx: nan is not a finite number"),
-        (ForceCalibration, FORCE, {"y0": float("inf")}, "y0: inf is not a finite number"),
-        (ForceCalibration, FORCE, {"residual": float("nan")}, "residual: nan is not"),
         (ForceCalibration, FORCE, {"xx": "lots"}, "xx: 'lots' is not valid"),
         (ForceCalibration, FORCE, {"xxx": 1.0}, "xxx: unknown key"),
         (ForceCalibration, FORCE, {"date": ""}, "date: '' is not when it was made"),
         (ForceCalibration, FORCE, {"date": "soon"}, "date: 'soon' is no date: one in ISO 8601"),
-        (ForceCalibration, FORCE, {"date": "2026-02-30"}, "date: '2026-02-30' is no date"),
-        (ForceCalibration, FORCE, {"tared": "today"}, "tared: 'today' is no date"),
-        (ServoCalibration, SERVO, {"date": "21.11.2026"}, "date: '21.11.2026' is no date"),
         (ForceCalibration, FORCE, {"xx": 0.0, "yy": 0.0}, "says the same of both forces"),
         (ForceCalibration, FORCE, {"xy": 2.0, "yx": 0.5}, "says the same of both forces"),
-        (ForceCalibration, FORCE, {"xy": 1e-9, "xx": 1e-9}, "says the same of both forces"),
         (ForceCalibration, FORCE, {"covariance_x": [-1.0, 0.0, 1.0]}, "is not a covariance"),
         (ForceCalibration, FORCE, {"covariance_y": [1.0, 2.0, 1.0]}, "is not a covariance"),
-        (ForceCalibration, FORCE, {"covariance_x": [1.0, 0.0, float("inf")]}, "is not a covar"),
         (ForceCalibration, FORCE, {"covariance_x": [1.0, 0.0]}, "covariance_x: [1.0, 0.0] is not"),
         (ForceCalibration, FORCE, {"load_error": -0.1}, "load_error: -0.1 is negative"),
-        (ServoCalibration, SERVO, {"trim": float("nan")}, "trim: nan is not"),
         (ServoCalibration, SERVO, {"highest": 3.15}, "highest: 3.15 is not valid"),
-        (ServoCalibration, SERVO, {"scale": 0.0}, "scale: 0.0 is not valid"),
-        (ServoCalibration, SERVO, {"direction": 0}, "direction: 0 is not valid"),
     ],
 )
 def test_a_file_that_makes_no_sense_is_an_error_that_says_where(
@@ -150,9 +140,9 @@ def bounds(struct: type[Struct], name: str) -> object:
     return kind.type if isinstance(kind, inspect.Metadata) else kind
 
 
-@pytest.mark.parametrize("key", list(SERVO))
-def test_a_servo_calibration_has_the_bounds_of_the_same_keys_of_the_configuration(key: str) -> None:
-    assert bounds(ServoCalibration, key) == bounds(ServoSettings, key)
+def test_a_servo_calibration_has_the_bounds_of_the_same_keys_of_the_configuration() -> None:
+    for key in SERVO:
+        assert bounds(ServoCalibration, key) == bounds(ServoSettings, key), key
 
 
 def test_a_file_of_before_uncertainties_were_kept_is_used_and_its_own_is_unknown(
@@ -180,21 +170,12 @@ def test_a_folder_that_cannot_be_read_is_an_error_and_not_no_calibration(tmp_pat
         CalibrationFolder(tmp_path / "file").newest(ForceCalibration)
 
 
-def test_what_is_half_written_is_not_a_calibration(tmp_path: Path) -> None:
-    (tmp_path / "force-2027-01-01T000000.000000Z.part").write_text("xx: ")
-    assert CalibrationFolder(tmp_path).newest(ForceCalibration) is None
-
-
 @pytest.mark.parametrize(
     "name",
     [
         "force-backup.yaml",
-        "force-2027.yaml",
-        "force-2027-01-01T000000.000000Z-old.yaml",
         "force-2027-01-01T000000.000000Z (copy).yaml",
         "force-2027-02-30T000000.000000Z.yaml",
-        "force-2027-01-01T250000.000000Z.yaml",
-        "servo-of-the-old-fish.yaml",
     ],
 )
 def test_a_file_without_a_date_in_its_name_is_ignored_and_told(tmp_path: Path, name: str) -> None:
@@ -209,14 +190,6 @@ def test_a_file_without_a_date_in_its_name_is_ignored_and_told(tmp_path: Path, n
     assert folder.ignored() == [line]
     _, path = folder.save(ForceCalibration(xx=3.0), NOON + HOUR)
     assert path.name == "force-2026-11-21T130000.000000Z.yaml"
-
-
-def test_what_a_clock_that_went_back_has_named_counts(tmp_path: Path) -> None:
-    folder = CalibrationFolder(tmp_path)
-    for _ in range(4):
-        _, path = folder.save(ForceCalibration(), NOON)
-    assert path.stem.endswith("Z+++")
-    assert folder.ignored() == []
 
 
 @contextlib.contextmanager

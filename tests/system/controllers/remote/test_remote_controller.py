@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from rigs.harness import LIMITS, Rig
-from rigs.processes import wait_until
 from rigs.scripted_agent import (
     ScriptedAgent,
     answered,
@@ -23,8 +22,6 @@ from rigs.scripted_agent import (
 
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.controllers.remote.wire import Wire
-from fishd.core.clock import Slot
 from fishd.core.errors import ConfigError, ParameterError
 
 
@@ -127,17 +124,6 @@ def test_what_was_lost_is_told_with_the_next_observation(rig: Rig, agent: Script
         assert (after["answered"] == before["seq"]) == applied
 
 
-def test_ticks_without_an_observation_are_lost_too(rig: Rig, agent: ScriptedAgent) -> None:
-    rig.start("remote", agent=f"{agent.address}-later", deadline=0.001)
-    rig.run(7)
-    agent._socket.bind(f"{agent.address}-later")
-    connected(rig)
-    rig.run()
-    first = agent.next()
-    assert first["seq"] == 1
-    assert first["lost"] == 7
-
-
 def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, misses=2)
     swim(rig, agent)
@@ -177,23 +163,6 @@ def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> No
     assert rig.mode == "running"
     rig.run(2)
     assert rig.reason == "remote-silent"
-
-
-def test_in_virtual_time_an_agent_that_comes_unseen_is_asked_as_well(
-    still: Rig, agent: ScriptedAgent, tmp_path: Path
-) -> None:
-    still.start("remote", agent=agent.address)
-    controller = remote(still)
-    turn = still.loop.observe(Slot(0, 0.0, 0.0, 0))
-    wait_until(lambda: controller.ready(turn.observation) or controller._seq == 1)
-    asked = agent.next()
-    agent.close()
-    with closing(ScriptedAgent(tmp_path)) as successor:
-        wait_until(lambda: controller.ready(turn.observation) or successor.has_message())
-        assert successor.next() == asked
-        successor.send(successor.action(0.1))
-        still.loop.act(turn)
-    assert still.recorder.ticks[-1].phi_c == 0.1
 
 
 def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) -> None:
@@ -237,14 +206,8 @@ def test_an_agent_that_does_not_read_costs_no_time(rig: Rig, agent: ScriptedAgen
     ("values", "complaint"),
     [
         ({"agent": "localhost"}, "agent: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH"),
-        ({"agent": "tcp://127.0.0.1:99999"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
-        ({"agent": "tcp://127.0.0.1:99999"}, "99999 is no port, 65535 is the highest"),
-        ({"agent": "tcp://127.0.0.1:*"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
         ({"agent": "tcp://*:1"}, "* is what an agent binds, here give the host that it runs on"),
         ({"agent": "tcp://127.0.0.1:0"}, "0 is what an agent binds, here give the port"),
-        ({"agent": "tcp://user@host:90"}, "'user@host' is no host"),
-        ({"agent": "tcp://-a:90"}, "'-a' is no host"),
-        ({"agent": "ipc://*"}, "is not valid: tcp://HOST:PORT or ipc://PATH"),
         ({"agent": "ipc:///" + 119 * "a"}, "at most 107 bytes, this one has 120"),
         ({"deadline": 0.024}, "deadline: 0.024 s is not valid: at most 0.0225 s, 0.45 of a tick"),
     ],
@@ -253,24 +216,6 @@ def test_parameters_that_cannot_work_are_refused(values: dict[str, Any], complai
     with pytest.raises(ParameterError, match="remote: ") as caught:
         registry.check("remote", values, LIMITS)
     assert complaint in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "address",
-    ["tcp://127.0.0.1:9873", "tcp://my-pi_4.local:1", "tcp://[::1]:65535", "ipc:///" + 106 * "a"],
-)
-def test_what_passes_as_an_address_can_be_connected_to(
-    address: str,
-) -> None:
-    registry.create("remote", {"agent": address}, LIMITS).close()
-
-
-def test_what_is_no_address_is_a_parameter_error() -> None:
-    with pytest.raises(
-        ParameterError, match=r"agent: cannot connect to 'udp://host:1': "
-    ) as caught:
-        Wire("udp://host:1")
-    assert caught.value.path == ("agent",)
 
 
 def test_another_program_that_listens_there_after_the_agent_has_ended_is_not_asked(
@@ -299,10 +244,9 @@ def test_before_the_first_action_an_agent_that_was_started_again_is_asked(
         assert successor.next()["answered"] == 0
 
 
-@pytest.mark.parametrize("address", ["tcp://*:1", "tcp://user@host:90", "ipc:///" + 119 * "a"])
-def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to(address: str) -> None:
+def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to() -> None:
     with pytest.raises(ConfigError, match=r"start\.parameters\.agent: .* is not valid: "):
-        load(None, ["start.controller=remote", f"start.parameters.agent='{address}'"])
+        load(None, ["start.controller=remote", "start.parameters.agent='tcp://*:1'"])
 
 
 def test_deadlines_change_while_it_swims_the_agent_stays(rig: Rig, agent: ScriptedAgent) -> None:

@@ -48,10 +48,8 @@ def spoiled(**changes: Any) -> dict[str, Any]:
         (b'{"a":' + 60_000 * b"[", "maximum recursion depth exceeded"),
         (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
         (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
-        (spoiled(phi_c="0.1"), "Expected `float`, got `str` - at `$.phi_c`"),
         (spoiled(speed=1), "Object contains unknown field `speed`"),
         (spoiled(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
-        (spoiled(v=2), "a message of version 2; this fishd needs version 1"),
         (spoiled(v=2, angle=1), "a message of version 2; this fishd needs version 1"),
         ({"kind": "pause", "v": 1, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
     ],
@@ -67,14 +65,6 @@ def test_rubbish_is_a_fault_that_says_what_came(
     assert f"the agent at {agent.address} sent " in reason(rig)
     assert complaint in reason(rig)
     assert "\n" not in reason(rig)
-
-
-def test_more_frames_than_one_are_rubbish(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent)
-    agent.send(b"", agent.action(0.1))
-    arrived(rig)
-    rig.run()
-    assert "a message of several frames; one frame of JSON is needed" in reason(rig)
 
 
 class RawAgent:
@@ -114,7 +104,6 @@ def raw(tmp_path: Path) -> Iterator[RawAgent]:
     [
         (100 * (b"\x01\xff" + bytes(255)), "a message of several frames; one frame of JSON"),
         (b"\x02" + (2**33).to_bytes(8, "big"), "a message of 8589934592 bytes; at most 65536"),
-        (b"\x03" + (2**33).to_bytes(8, "big"), "a message of 8589934592 bytes; at most 65536"),
         (b"\x06" + (2**40).to_bytes(8, "big"), "a message of 1099511627776 bytes; at most 65536"),
     ],
 )
@@ -190,7 +179,6 @@ def test_messages_that_come_byte_by_byte_are_put_together(rig: Rig, raw: RawAgen
     [
         (b"nul", 0, b'"phi_c":nul}'),
         (b"nul", 900, b'"phi_c":nul}'),
-        (b"[0.1]", 0, b'"phi_c":[0.1]}'),
     ],
 )
 def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
@@ -252,14 +240,6 @@ def flip(agent: ScriptedAgent, seen: dict[str, float]) -> dict[str, object]:
     return agent.action(0.42 if seen["instruction_angle"] <= 0.0 else -0.42)
 
 
-def test_without_a_dwell_an_agent_may_reverse_every_tick(still: Rig, agent: ScriptedAgent) -> None:
-    still.start("remote", agent=agent.address)
-    with agent.answering(lambda seen: flip(agent, seen)):
-        angles = [tick.phi_c for tick in still.run(100)]
-    assert angles == [0.42, -0.42] * 50
-    assert still.loop.active.name == "remote"
-
-
 def test_with_a_dwell_its_reversals_wait(still: Rig, agent: ScriptedAgent) -> None:
     still.start("remote", agent=agent.address, dwell=0.15)
     with agent.answering(lambda seen: flip(agent, seen)):
@@ -273,7 +253,7 @@ def test_with_a_dwell_its_reversals_wait(still: Rig, agent: ScriptedAgent) -> No
 def test_a_dwell_can_be_changed_in_flight(still: Rig, agent: ScriptedAgent) -> None:
     still.start("remote", agent=agent.address)
     with agent.answering(lambda seen: flip(agent, seen)):
-        still.run(10)
+        assert [tick.phi_c for tick in still.run(10)] == [0.42, -0.42] * 5
         still.retune(dwell=0.1)
         angles = [tick.phi_c for tick in still.run(8)]
     assert angles == [0.42, 0.42, -0.42, -0.42] * 2

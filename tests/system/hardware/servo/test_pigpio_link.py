@@ -63,22 +63,21 @@ def eventually(condition: Callable[[], bool], seconds: float = 10.0) -> None:
         time.sleep(0.01)
 
 
-def test_a_healthy_pigpiod_takes_the_first_write(bench: Swimming) -> None:
-    bench.write_until_it_works(0.5)
-    assert bench.width == 1800
-
-
 def test_one_thread_and_one_connection_are_all_it_needs(bench: Swimming) -> None:
     kinds = [type(thread).__name__ for thread in threading.enumerate()]
     assert "_callback_thread" not in kinds
-    names = [thread.name for thread in threading.enumerate()]
-    assert names.count("pigpio-link") == 1
+    assert link_threads() == 1
     bench.swimmer.close()
-    assert "pigpio-link" not in [thread.name for thread in threading.enumerate()]
+    assert link_threads() == 0
+
+
+def link_threads() -> int:
+    """Number of the threads that keep a link."""
+    return [thread.name for thread in threading.enumerate()].count("pigpio-link")
 
 
 @pytest.mark.parametrize(("fault", "forgiven"), [("pigpiod-gone", 0), ("pigpiod-frozen", 2)])
-def test_no_write_is_held_up(bench: Swimming, fault: str, forgiven: int) -> None:
+def test_no_call_is_held_up_and_no_thread_spins(bench: Swimming, fault: str, forgiven: int) -> None:
     bench.swimmer.close()
     bench.swimmer = bench.servo(replace(bench.settings(), countdown=2.0))  # which forgives longest
     bench.write_until_it_works(0.5)
@@ -89,6 +88,11 @@ def test_no_write_is_held_up(bench: Swimming, fault: str, forgiven: int) -> None
         errors.append(bench.write(0.5))
         durations.append(time.monotonic() - begun)
         time.sleep(0.01)
+    for _ in range(3):
+        begun = time.monotonic()
+        with pytest.raises(ServoError):
+            bench.swimmer.release()
+        durations.append(time.monotonic() - begun)
     assert max(durations) < BOUND
     assert errors[:forgiven] == [None] * forgiven
     for error in errors[forgiven:]:
@@ -96,31 +100,21 @@ def test_no_write_is_held_up(bench: Swimming, fault: str, forgiven: int) -> None
         assert error.startswith(f"pigpiod at 127.0.0.1:{bench.daemon.port}: ")
         assert error.endswith("; reconnecting")
         assert "\n" not in error
-
-
-@pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_no_release_is_held_up_either(bench: Swimming, fault: str) -> None:
-    bench.write_until_it_works(0.5)
-    bench.faults.inject(fault)
-    for _ in range(3):
-        begun = time.monotonic()
-        with pytest.raises(ServoError):
-            bench.swimmer.release()
-        assert time.monotonic() - begun < BOUND
-
-
-@pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_no_thread_spins_meanwhile(bench: Swimming, fault: str) -> None:
-    bench.write_until_it_works(0.5)
-    bench.faults.inject(fault)
-    bench.write(0.5)
     used, begun = time.process_time(), time.monotonic()
     time.sleep(1.5)
     assert time.process_time() - used < 0.3 * (time.monotonic() - begun)
+    begun = time.monotonic()
+    with pytest.raises(ServoError):
+        bench.swimmer.close()
+    bench.swimmer.close()
+    assert time.monotonic() - begun < 1.0
+    assert link_threads() == 0
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen", "pigpiod-restart"])
-def test_pulses_come_back_only_with_a_write(bench: Swimming, fault: str) -> None:
+def test_pulses_come_back_only_with_a_write_and_with_a_countdown(
+    bench: Swimming, fault: str
+) -> None:
     bench.write_until_it_works(0.5)
     before = bench.swimmer.driver.counters()["servo_reconnects"]
     bench.faults.inject(fault)
@@ -131,15 +125,6 @@ def test_pulses_come_back_only_with_a_write(bench: Swimming, fault: str) -> None
     assert bench.width == 0
     bench.write_until_it_works(-0.5)
     assert bench.width == 1200
-
-
-@pytest.mark.parametrize("fault", ["pigpiod-frozen", "pigpiod-restart"])
-def test_the_countdown_is_there_again_after_a_reconnection(bench: Swimming, fault: str) -> None:
-    bench.write_until_it_works(0.5)
-    bench.faults.inject(fault)
-    eventually(lambda: bench.write(0.5) is not None)
-    bench.faults.clear()
-    bench.write_until_it_works(0.5)
     eventually(lambda: bench.width == 1500, 2.0)
     eventually(lambda: bench.width == 0, 2.0)
     assert bench.scripts() == 1
@@ -157,19 +142,6 @@ def test_without_a_pigpiod_it_starts_all_the_same_and_connects_later(bench: Swim
     bench.faults.clear()
     bench.write_until_it_works(0.1)
     assert bench.width == 1560
-
-
-@pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_closing_takes_a_bounded_time(bench: Swimming, fault: str) -> None:
-    bench.write_until_it_works(0.5)
-    bench.faults.inject(fault)
-    eventually(lambda: bench.write(0.5) is not None)
-    begun = time.monotonic()
-    with pytest.raises(ServoError):
-        bench.swimmer.close()
-    bench.swimmer.close()
-    assert time.monotonic() - begun < 1.0
-    assert "pigpio-link" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_an_emergency_release_of_another_thread_does_not_disturb_writes(bench: Swimming) -> None:

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from adafruit_ads1x15 import ADS1115, AnalogIn
-from adafruit_extended_bus import ExtendedI2C
 from rigs.processes import PATIENCE
 
 from fishd.core.clock import VirtualClock
@@ -74,14 +72,6 @@ def test_a_transfer_over_the_link_is_one_on_the_bus(pi: VirtualPi, path: Path) -
         assert pi.bus.transfer(ADDRESS, [Write(b"\x02"), Read(2)]) == [b"\x12\x34"]
 
 
-def test_the_true_driver_works_over_the_link(pi: VirtualPi, path: Path) -> None:
-    with RemotePi(path) as remote, LinuxI2c(remote.transfer, {204}, remote.set_timeout):
-        ads = ADS1115(ExtendedI2C(204, frequency=None), data_rate=860, gain=8)
-        assert abs(AnalogIn(ads, 2, 3).voltage) < 0.1
-        pi.faults.inject("clipped")
-        assert AnalogIn(ads, 2, 3).value == 0x7FFF
-
-
 def test_errors_of_the_bus_arrive_as_they_are(pi: VirtualPi, path: Path) -> None:
     with RemotePi(path) as remote:
         remote.inject("arbitration-lost", 60.0)
@@ -91,18 +81,6 @@ def test_errors_of_the_bus_arrive_as_they_are(pi: VirtualPi, path: Path) -> None
         assert caught.value.errno == errno.EAGAIN
         remote.clear("arbitration-lost")
         assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
-
-
-def test_what_makes_no_sense_is_refused_with_the_reason(pi: VirtualPi, path: Path) -> None:
-    with RemotePi(path) as remote:
-        with pytest.raises(ValueError, match=r"no fault is called 'nak'; did you mean 'nack'\?"):
-            remote.inject("nak")
-        with pytest.raises(ValueError, match="a positive number is needed"):
-            remote.inject("nack", -1.0)
-        with pytest.raises(ValueError, match="no fault is called 'x'"):
-            remote.clear("x")
-        with pytest.raises(ValueError, match="GPIO 99 is not valid"):
-            remote.set_level(99, 1)
 
 
 def test_bytes_that_are_no_request_do_no_harm(pi: VirtualPi, path: Path) -> None:
@@ -157,16 +135,6 @@ def test_a_button_is_found_again_when_the_virtual_pi_was_restarted(path: Path) -
     with contextlib.closing(wires), LinkServer(second, path):
         second.set_level(17, 1)
         wait_until_equal(seen, (17, 1))
-
-
-def test_nobody_there_is_one_line_that_says_what_to_do(path: Path) -> None:
-    with pytest.raises(StartupError) as caught:
-        RemotePi(path)
-    assert str(caught.value) == (
-        f"no virtual Pi is running at {path}; start one with 'fishctl virtual-pi run'"
-    )
-    with pytest.raises(StartupError, match="too long"):
-        RemotePi(path / ("x" * 200))
 
 
 def test_a_virtual_pi_that_goes_away_is_no_device_until_it_is_back(path: Path) -> None:

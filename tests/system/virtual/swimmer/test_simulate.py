@@ -75,17 +75,11 @@ def test_a_person_gets_the_same_in_a_few_lines() -> None:
     assert "whole beats" in out
 
 
-def test_a_single_beat_is_one() -> None:
-    words = ("square", "--frequency", "2.5", "--seconds", "1.5", "--settle", "0.5")
-    assert "over 1 whole beat\n" in simulated(*words).stdout
-
-
 def test_a_table_is_a_row_for_each_tick_in_either_form(tmp_path: Path) -> None:
-    words = ("sine", "--seconds", "0.3", "--settle", "0.1")
     for name in ("a.csv", "b.npz"):
-        assert simulated(*words, "--save", str(tmp_path / name)).returncode == 0
+        words = ("sine", "--seconds", "0.3", "--settle", "0.1", "--save", tmp_path / name)
+        assert simulated(*words).returncode == 0
     rows = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
-    assert rows.dtype.names == tuple(COLUMNS)
     other = table(tmp_path / "b.npz")
     for name in COLUMNS:
         assert rows[name] == pytest.approx(other[name], rel=1e-6, abs=1e-9)
@@ -138,21 +132,10 @@ def test_a_swim_that_is_as_long_already_leaves_its_files_alone(
     assert saved.read_text() == "precious"
 
 
-def test_another_controller_swims_on_with_a_track_of_its_own(
-    swum: tuple[dict[str, Any], Path],
-) -> None:
-    found = report("sine", "--seconds", "0.3", "--settle", "0.1", "--resume", str(swum[1] / "end"))
-    assert found["resumed"] == pytest.approx(4.0)
-    assert found["ticks"] == 30
-    assert abs(found["speed"]) > 0.01  # of the swim before
-
-
 @pytest.mark.parametrize(
     ("override", "complaint"),
     [
         ("swimmer.muscle.strain=0.5", "swimmer.muscle.strain 1.0, and here it is 0.5"),
-        ("swimmer.body.viscosity=2e-4", "swimmer.body.viscosity 0.0001, and here it is 0.0002"),
-        ("tick=0.02", "tick 0.01, and here it is 0.02"),
         ("swimmer.muscle.servo=true", "swimmer.muscle.servo false, and here it is true"),
         ("amplitude_limit=0.3", "amplitude_limit 0.42, and here it is 0.3"),
     ],
@@ -165,15 +148,7 @@ def test_a_checkpoint_of_another_fish_is_refused_with_the_key_that_differs(
     assert line.startswith(f"fishctl: {kept}: it is of a swim with {complaint}")
 
 
-def test_how_slow_the_motion_is_does_not_matter_to_a_checkpoint(
-    swum: tuple[dict[str, Any], Path],
-) -> None:
-    kept = ("--resume", str(swum[1] / "end"))
-    words = ("sine", "--seconds", "0.2", "--settle", "0.1", *kept)
-    assert simulated(*words, "--set", "swimmer.slow_motion=9").returncode == 0
-
-
-@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 nor this"])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nor this"])
 def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "kept").write_bytes(content)
     line = one_line(simulated("swing", "--resume", str(tmp_path / "kept")))
@@ -190,19 +165,13 @@ def bad(array: np.ndarray[Any, Any], value: float) -> np.ndarray[Any, Any]:
     ("name", "change", "complaint"),
     [
         ("state.u", lambda u: u[:1], r"u is of shape \(1, \d+\) and type float64, and needs to be"),
-        ("state.u", lambda u: u[0, 0], r"u is of shape \(\) and type float64"),
         ("state.p", lambda p: p.astype(complex), r"p is of shape .* and type complex128"),
-        ("state.p", lambda p: p.astype("U9"), r"p is of shape .* and type <U9"),
-        ("state.q", lambda q: bad(q, np.nan), "q has values that are not finite"),
         ("state.velocity", lambda v: bad(v, np.inf), "velocity has values that are not finite"),
         ("state.robot", lambda r: bad(r, np.nan), "robot has values that are not finite"),
-        ("state.robot", lambda r: r + np.inf, "robot has values that are not finite"),
         ("state.steps", lambda steps: -steps, "steps is negative"),
         ("state.steps", lambda steps: steps + 10, "track ends at 4 s, and the fish is at 4.02 s"),
-        ("state.steps", lambda steps: steps + 0.5, "steps is of shape .* and type float64"),
         ("track", lambda track: bad(track, np.nan), "track has values that are not finite"),
         ("track", lambda track: track[:0], "track is of shape"),
-        ("track", lambda track: track[0], "track is of shape"),
     ],
 )
 def test_a_damaged_checkpoint_is_said_to_be_with_the_array_that_is(
@@ -275,10 +244,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
         (("--save", "track.txt"), "track.txt: a name that ends in .csv or .npz is needed"),
         (("--save", "no-such/track.csv"), "there is no folder no-such"),
         (("--checkpoint", "no-such/kept"), "no-such/kept: there is no folder to put it into"),
-        (("--resume", "no-such"), "no-such: no such file"),
         (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
-        (("--seconds", "1", "--settle", "0.98"), "a run of 1 s is too short"),
-        (("--checkpoint", ""), "the name of a file is empty"),
         (("--checkpoint", "/dev/null"), "/dev/null: is a device; a regular file is needed"),
         (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need a file each"),
     ],
@@ -311,14 +277,8 @@ def test_a_folder_that_goes_away_costs_its_files_and_not_the_swim(
         gone.rename(tmp_path / "elsewhere")
 
     monkeypatch.setattr(checkpoint, "save", save_and_go)
-    files = (
-        "--checkpoint",
-        gone / "kept",
-        "--checkpoint-every",
-        "0.5",
-        "--save",
-        gone / "track.csv",
-    )
+    files = ("--checkpoint", gone / "kept", "--checkpoint-every", "0.5", "--save")
+    files = (*files, gone / "track.csv")
     done = simulated("swing", "--seconds", "2", "--settle", "0.5", *files)
     assert (tmp_path / "elsewhere" / "kept").exists()
     assert done.returncode == 1
@@ -328,11 +288,6 @@ def test_a_folder_that_goes_away_costs_its_files_and_not_the_swim(
         "fish swims on",
         f"fishctl: {gone}/track.csv: the track cannot be written: No such file or directory",
     ]
-
-
-def test_a_tethered_fish_has_no_checkpoints() -> None:
-    line = one_line(fishctl("simulate", "swing", "--checkpoint", "kept"))
-    assert "--checkpoint is for robot: swimmer" in line
 
 
 def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) -> None:
@@ -358,13 +313,6 @@ def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) 
     assert "interrupted; its last checkpoint is of" in seen.decode()
     rows = len(saved.read_text().splitlines()) - 1
     assert len(checkpoint.load(kept).track) == rows >= 10
-
-
-def test_muscles_with_a_servo_swim_too_and_slower_than_at_once() -> None:
-    words = ("square", "--frequency", "2.5", "--seconds", "1.2", "--settle", "0.4")
-    quick = report(*words)
-    slow = report(*words, "--set", "swimmer.muscle.servo=true")
-    assert slow["muscle_power"] < quick["muscle_power"]
 
 
 def test_a_recording_has_where_the_fish_was(tmp_path: Path) -> None:

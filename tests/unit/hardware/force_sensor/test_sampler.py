@@ -50,50 +50,11 @@ def test_the_order_cancels_the_lag_of_the_second_channel() -> None:
     assert abs(sum(differences[: len(differences) // 2 * 2])) <= 2
 
 
-def test_the_sampler_sleeps_through_a_conversion_and_asks_once(rig: ForceRig) -> None:
-    sampler = rig.sampler()
-    sampler.step()
-    polls = 0
-    transfer = rig.device.transfer
-
-    def counted(address: int, messages: Any) -> list[bytes]:
-        nonlocal polls
-        polls += 1
-        return transfer(address, messages)
-
-    rig.device.transfer = counted
-    sampler.step()
-    assert polls == 4  # start, config, pointer, conversion
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_chips_at_either_end_of_the_tolerance_are_read_without_an_error(seed: int) -> None:
-    with ForceRig(seed=seed) as rig:
-        sampler = rig.sampler()
-        rig.chip.rate_factor = 0.9 if seed % 2 else 1.1
-        assert len(take_pairs(sampler, rig, 0.5)) >= 130
-    assert sampler.errors == 0
-
-
-@pytest.mark.parametrize("data_rate", [8, 16, 32, 64, 128, 250, 475, 860])
+@pytest.mark.parametrize("data_rate", [8, 128, 860])
 def test_every_data_rate_gives_right_values(rig: ForceRig, data_rate: int) -> None:
     pairs = take_pairs(rig.sampler(data_rate=data_rate), rig, 2.0)
     assert len(pairs) >= 0.75 * data_rate * 2.0 / 2 * 0.7
     assert all(volts(pair) == pytest.approx((0.5, -0.25), abs=6 * STEP) for pair in pairs)
-
-
-@pytest.mark.slow
-def test_no_value_is_ever_of_the_other_channel_though_one_transfer_in_a_hundred_fails() -> None:
-    wrong = reads = 0
-    with ForceRig(seed=7) as rig:
-        sampler = rig.sampler()
-        rig.faults.error_rate = 0.01
-        while reads < 20_000:
-            for pair in take_pairs(sampler, rig, 5.0):
-                reads += 2
-                wrong += volts(pair) != pytest.approx((0.5, -0.25), abs=8 * STEP)
-    assert sampler.errors > 400
-    assert wrong == 0
 
 
 def test_after_an_error_no_conversion_begins_before_the_last_one_has_ended() -> None:
@@ -164,7 +125,7 @@ def as_pairs(window: list[tuple[int, int]]) -> list[Pair]:
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32),
     error_rate=st.sampled_from((0.0, 0.02, 0.2)),
@@ -232,7 +193,7 @@ def test_a_watch_finds_mean_and_deviation_of_all_pairs(parts: list[list[tuple[in
         assert sample.vx_std == pytest.approx(deviation, abs=1e-12)
 
 
-@pytest.mark.parametrize("tick", [0.005, 0.01, 0.02, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize("tick", [0.005, 0.05, 0.2])
 def test_a_loop_of_any_tick_gets_most_of_the_possible_samples(rig: ForceRig, tick: float) -> None:
     ticks = Ticks(rig.sensor(tick=tick), tick)
     ticks.run(0.05)

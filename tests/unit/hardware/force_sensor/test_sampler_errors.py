@@ -13,7 +13,6 @@ from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 from fishd.core.errors import MissingPackage
 from fishd.hardware.registry import driver_packages
 from fishd.hardware.sampler import LONGEST_PAUSE
-from fishd.virtual.pi.i2c import Message
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 
@@ -178,35 +177,6 @@ def test_sampling_leaves_no_garbage(rig: ForceRig) -> None:
     assert not leaves_garbage(lambda: take_pairs(sampler, rig, 1.0))
 
 
-def test_a_bus_that_cannot_be_closed_is_reopened(
-    rig: ForceRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from Adafruit_PureIO import smbus
-
-    emulated = smbus.open
-
-    def stubborn(*arguments: Any, **options: Any) -> Any:
-        file = emulated(*arguments, **options)
-        close = file.close
-
-        def fail() -> None:
-            close()
-            raise OSError(5, "Input/output error")
-
-        file.close = fail
-        return file
-
-    monkeypatch.setattr(smbus, "open", stubborn)
-    sampler = rig.sampler()
-    take_pairs(sampler, rig, 0.1)
-    rig.faults.inject("unplugged", 1.0)
-    for _ in range(10):
-        sampler.step()
-    assert sampler.trouble.startswith("nothing answers at 0x48")
-    assert take_pairs(sampler, rig, 2.0)
-    sampler.close()
-
-
 def test_a_hanging_bus_keeps_the_sampler_for_20_ms_not_the_kernels_second(rig: ForceRig) -> None:
     sampler = rig.sampler()
     take_pairs(sampler, rig, 0.1)
@@ -214,17 +184,6 @@ def test_a_hanging_bus_keeps_the_sampler_for_20_ms_not_the_kernels_second(rig: F
     begun = rig.clock.now
     sampler.step()
     assert rig.clock.now - begun < 0.03
-
-
-def test_an_error_of_an_unknown_kind_is_passed_on_with_its_number() -> None:
-    def broken(address: int, messages: list[Message]) -> list[bytes]:
-        raise OSError(71, "Protocol error")
-
-    with ForceRig() as rig:
-        rig.device.transfer = broken
-        sampler = rig.sampler()
-        sampler.step()
-    assert sampler.trouble == "a transfer on /dev/i2c-1 failed: Protocol error (error 71)"
 
 
 def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

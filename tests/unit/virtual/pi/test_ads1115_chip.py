@@ -27,7 +27,7 @@ def test_the_driver_reads_every_input(board: Board) -> None:
 
 @pytest.mark.parametrize(
     ("gain", "full_scale"),
-    [(2 / 3, 6.144), (1, 4.096), (2, 2.048), (4, 1.024), (8, 0.512), (16, 0.256)],
+    [(2 / 3, 6.144), (2, 2.048), (16, 0.256)],
 )
 def test_a_code_is_a_share_of_its_range_or_end(
     board: Board, gain: float, full_scale: float
@@ -67,16 +67,6 @@ def test_a_conversion_lasts_a_period_of_a_rate_that_is_off_by_a_tenth(bits: int,
     assert 1.03 < max(lengths) <= 1 / 0.9
 
 
-def test_a_late_reader_gets_the_voltage_of_the_time_of_the_conversion(board: Board) -> None:
-    board.configure(config(X))
-    begun = board.clock.now
-    board.clock.sleep(100.0)
-    assert board.measured == []
-    board.register(0)
-    ((_, start, end),) = board.measured
-    assert begun < start < end < begun + 2e-3
-
-
 def test_registers_have_their_reset_values(board: Board) -> None:
     assert [board.register(pointer) for pointer in range(4)] == [0x0000, 0x8583, 0x8000, 0x7FFF]
 
@@ -100,13 +90,6 @@ def test_a_busy_chip_tells_so_and_ignores_a_start(board: Board) -> None:
     assert board.register(1) == config(Y), "the config is kept, but it did not start"
     assert board.register(0) == codes(VOLTS[X])
     assert [mux for mux, _, _ in board.measured] == [X]
-
-
-def test_a_config_without_the_start_bit_starts_nothing(board: Board) -> None:
-    board.configure(config(Y, start=False))
-    assert board.register(1) & 0x8000
-    board.wait()
-    assert board.measured == []
 
 
 @pytest.mark.parametrize(
@@ -151,19 +134,6 @@ def test_after_an_error_amid_a_conversion_a_read_without_a_wait_returns_the_othe
         board.wait()
     assert ads.read(Y) == codes(VOLTS[Y if waits else X])
     assert ads.read(Y) == codes(VOLTS[Y])
-
-
-def test_an_error_of_the_start_itself_may_leave_the_chip_converting(board: Board) -> None:
-    ads = board.driver()
-    swapped = 0
-    for _ in range(20):
-        board.faults.inject("clock-stretch")
-        with pytest.raises(OSError, match="Errno"):
-            ads._write_config(X)
-        board.faults.clear()
-        swapped += ads.read(Y) == codes(VOLTS[X])
-        board.wait()
-    assert 0 < swapped < 20
 
 
 def test_a_brown_out_amid_a_conversion_reads_as_zero_and_shows_in_the_config(board: Board) -> None:

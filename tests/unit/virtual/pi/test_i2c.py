@@ -1,11 +1,8 @@
 """The emulated I2C bus: its transfers, and what the true drivers meet at its /dev/i2c-N."""
 
-import array
 import errno
 import fcntl
 import os
-import termios
-import threading
 from collections.abc import Iterator
 
 import adafruit_extended_bus
@@ -13,13 +10,10 @@ import pytest
 from adafruit_extended_bus import ExtendedI2C
 from Adafruit_PureIO import smbus
 from rigs.ads1115_board import ABSENT_BUS, Board
-from rigs.processes import PATIENCE
 
-from fishd.core.clock import VirtualClock
 from fishd.virtual.pi.ads1115 import RESET_CONFIG, Ads1115Chip
-from fishd.virtual.pi.faults import TRANSFER_ERRORS, Faults
+from fishd.virtual.pi.faults import TRANSFER_ERRORS
 from fishd.virtual.pi.i2c import I2cBus, Read, Write
-from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 RESET_WORD = 0x8000 | RESET_CONFIG
 
@@ -63,44 +57,6 @@ def test_nobody_acknowledges_an_address_without_a_chip(board: Board, address: in
             board.bus.transfer(address, [message])
 
 
-def test_an_address_takes_one_chip_only(board: Board) -> None:
-    with pytest.raises(ValueError, match="0x48 is taken"):
-        board.bus.attach(0x48, board.chip)
-
-
-def test_transfers_from_several_threads_queue() -> None:
-    class Watched(VirtualClock):
-        inside = 0
-        most = 0
-
-        def sleep(self, seconds: float) -> None:
-            self.inside += 1
-            self.most = max(self.most, self.inside)
-            threading.Event().wait(0.001)
-            super().sleep(seconds)
-            self.inside -= 1
-
-    clock = Watched()
-    faults = Faults(clock)
-    bus = I2cBus(clock, 400e3, faults)
-    bus.attach(0x48, Ads1115Chip(clock, lambda *_: 0.0, faults))
-    together = threading.Barrier(4)
-    replies: list[bytes] = []
-
-    def work() -> None:
-        together.wait(PATIENCE)
-        for _ in range(5):
-            replies.extend(bus.transfer(0x48, [Write(b"\x01"), Read(2)]))
-
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(PATIENCE)
-    assert replies == [RESET_WORD.to_bytes(2, "big")] * 20
-    assert clock.most == 1
-
-
 def test_a_failed_transfer_may_have_reached_the_chip_all_the_same(board: Board) -> None:
     outcomes: dict[str, set[bool]] = {}
     for fault in TRANSFER_ERRORS:
@@ -141,10 +97,6 @@ def test_a_hanging_bus_costs_a_second_or_what_is_asked_for(
     assert cost() == pytest.approx(0.02, abs=1e-3)
 
 
-def test_a_scan_finds_the_chip(board: Board) -> None:
-    assert ExtendedI2C(ABSENT_BUS, frequency=None).scan() == [0x48]
-
-
 def test_pureio_runs_on_the_device_file_unchanged(pureio: smbus.SMBus) -> None:
     pureio.write_quick(0x48)
     pureio.write_i2c_block_data(0x48, 0x02, b"\x12\x34")
@@ -172,22 +124,6 @@ def test_the_device_file_exists_only_while_it_is_installed(board: Board) -> None
     assert adafruit_extended_bus.path is os.path
 
 
-def test_other_buses_and_files_stay_real(pureio: smbus.SMBus) -> None:
-    with pytest.raises(ValueError, match="No device found"):
-        ExtendedI2C(ABSENT_BUS + 1, frequency=None)
-    with pytest.raises(FileNotFoundError):
-        smbus.SMBus(ABSENT_BUS + 1)
-    reader, writer = os.pipe()
-    try:
-        os.write(writer, b"abc")
-        waiting = array.array("i", [0])
-        smbus.ioctl(reader, termios.FIONREAD, waiting)
-        assert waiting[0] == 3
-    finally:
-        os.close(reader)
-        os.close(writer)
-
-
 def test_each_open_device_file_has_an_address_of_its_own(board: Board) -> None:
     other = Ads1115Chip(board.clock, lambda *_: 0.0, board.faults)
     board.bus.attach(0x49, other)
@@ -196,16 +132,6 @@ def test_each_open_device_file_has_an_address_of_its_own(board: Board) -> None:
         two.write_i2c_block_data(0x49, 0x02, b"\x22\x22")
         assert one._device.fileno() != two._device.fileno()
         assert (one._device.read(2), two._device.read(2)) == (b"\x11\x11", b"\x22\x22")
-
-
-def test_two_buses_are_emulated_side_by_side_but_never_one_twice(board: Board) -> None:
-    other = Board()
-    both = LinuxI2c(other.transfer, {ABSENT_BUS, ABSENT_BUS + 1}, other.set_timeout)
-    with pytest.raises(ValueError, match=f"i2c-{ABSENT_BUS} is emulated already"):
-        both.install()
-    with LinuxI2c(other.transfer, {ABSENT_BUS + 1}, other.set_timeout):
-        ExtendedI2C(ABSENT_BUS, frequency=None).writeto(0x48, b"\x01")
-    assert (board.transfers, other.transfers) == (1, 0)
 
 
 @pytest.mark.parametrize(
@@ -218,14 +144,3 @@ def test_a_request_that_the_stand_in_cannot_serve_fails_as_in_the_kernel(
     with pytest.raises(OSError, match="Errno") as caught:
         smbus.ioctl(pureio._device.fileno(), request_number, argument)
     assert caught.value.errno == number
-
-
-def test_a_closed_device_file_takes_no_more_requests(pureio: smbus.SMBus) -> None:
-    device = pureio._device
-    number = device.fileno()
-    device.close()
-    with pytest.raises(OSError, match="Errno") as caught:
-        smbus.ioctl(number, I2C_TIMEOUT, 2)
-    assert caught.value.errno == errno.EBADF
-    with pytest.raises(ValueError, match="closed file"):
-        device.read(1)

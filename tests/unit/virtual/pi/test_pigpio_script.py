@@ -86,24 +86,10 @@ def test_a_script_goes_through_its_states() -> None:
         assert script.state(begun + seconds) is state
 
 
-def test_stopped_in_a_delay_it_halts_when_the_delay_is_over() -> None:
-    rig = Rig("mils 100 s 18 1500").run(0.01)
-    rig.script.stop()
-    assert rig.state is State.RUNNING
-    assert rig.run(0.2).state is State.HALTED
-    assert rig.pulses == []
-
-
 def test_started_again_while_it_runs_it_only_gets_its_parameters() -> None:
     rig = Rig("s p0 1 mils 100 s p0 2", 4).run(0.01)
     rig.script.start(START + 0.01, (5,))
     assert [gpio for _, gpio, _ in rig.run(1.0).pulses] == [4, 5]
-
-
-def test_started_again_after_its_end_it_begins_from_the_top() -> None:
-    rig = Rig("s 18 p0", 1).run(0.01)
-    rig.script.start(START + 0.02, ())
-    assert [width for _, _, width in rig.run(1.0).pulses] == [1, 1]
 
 
 def test_an_endless_loop_without_pauses_costs_a_bounded_effort() -> None:

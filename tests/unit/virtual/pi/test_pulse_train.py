@@ -10,11 +10,6 @@ def train() -> PulseTrain:
     return PulseTrain()
 
 
-def test_there_are_no_pulses_at_first(train: PulseTrain) -> None:
-    assert train.width(1.0) == 0.0
-    assert train.level(1.0) == 0
-
-
 def test_a_new_width_takes_effect_with_the_next_frame(train: PulseTrain) -> None:
     train.set(0.0, 1500.0)
     train.set(0.1001, 1600.0)
@@ -59,13 +54,6 @@ def test_cutting_shortens_the_pulse_under_way(train: PulseTrain) -> None:
     assert train.width(0.06) == 0.0
 
 
-def test_cutting_between_pulses_shortens_none(train: PulseTrain) -> None:
-    train.set(0.0, 1500.0)
-    train.cut(0.05)
-    assert train.width(0.0599) == 1500.0
-    assert train.history[-1] == (pytest.approx(0.06), 0.0)
-
-
 def test_cutting_cancels_a_change_that_was_to_come(train: PulseTrain) -> None:
     train.set(0.0, 1500.0)
     train.set(0.041, 1600.0)
@@ -79,14 +67,3 @@ def test_shorter_frames_begin_where_the_longer_one_ends(train: PulseTrain) -> No
     assert train.width(0.1199) == 1500.0
     assert train.width(0.1201) == 1600.0
     assert train.level(0.1231) == train.level(0.1201 + 0.0031) == 1
-
-
-def test_a_full_duty_is_a_steady_level(train: PulseTrain) -> None:
-    train.set(0.0, 20_000.0)
-    assert train.level(0.0399999) == 1
-
-
-def test_memory_is_bounded(train: PulseTrain) -> None:
-    for frame in range(3 * PulseTrain.KEPT):
-        train.set(0.02 * frame, 1000.0 + frame % 2)
-    assert len(train.history) == PulseTrain.KEPT

@@ -9,7 +9,7 @@ import pytest
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.pulse_train import PulseTrain
 from fishd.virtual.pi.settings import VirtualPiSettings
-from fishd.virtual.pi.tank import STEP, Tank
+from fishd.virtual.pi.tank import Tank
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
@@ -78,14 +78,6 @@ def test_pulses_that_change_during_a_conversion_count_from_their_frame_on() -> N
     before, after = fish.advance(LEFT, 0.02, 1), fish.advance(RIGHT, 0.03, 1)
     impulse = 0.02 * before.lateral_force + 0.03 * after.lateral_force
     assert rig.tank.volts(Y, 0.1, 0.15) == pytest.approx(impulse / 0.05, rel=1e-6)
-
-
-def test_every_change_in_a_long_time_without_conversions_is_obeyed() -> None:
-    rig = Rig()
-    rig.beat(until=2.0, half_period=0.1)
-    rig.tank.catch_up(2.0)
-    turns = [(LEFT if k % 2 == 0 else RIGHT, 0.1) for k in range(20)]
-    assert rig.tank.truth().alpha == pytest.approx(fish_at(*turns).state.alpha, rel=1e-6)
 
 
 def test_without_pulses_the_wheel_stays_where_it_is() -> None:
@@ -164,23 +156,3 @@ def test_the_window_is_what_the_fish_truly_did_since_the_previous_one() -> None:
         assert swum.thrust == pytest.approx(expected.thrust, rel=1e-6)
         assert swum.fin_peak == pytest.approx(expected.fin_peak, rel=1e-6)
     assert rig.tank.take_window().duration == 0.0
-
-
-def test_a_state_that_is_asked_for_during_a_conversion_does_no_harm() -> None:
-    rig = Rig()
-    rig.pin.set(0.0, width(LEFT))
-    rig.tank.catch_up(0.105)
-    rest = fish_at((LEFT, 0.105)).advance(LEFT, 0.005, 1)
-    assert rig.tank.volts(Y, 0.1, 0.11) == pytest.approx(rest.lateral_force)
-    rig.tank.catch_up(0.2)
-    assert rig.tank.volts(Y, 0.12, 0.13) == pytest.approx(rest.lateral_force)  # too late: the last
-
-
-def test_time_may_begin_anywhere() -> None:
-    late, early = Rig(start=1e6), Rig()
-    late.pin.set(1e6, width(LEFT))
-    early.pin.set(0.0, width(LEFT))
-    begin, end = 0.1 + 0.3 * STEP, 0.1012 + 0.3 * STEP
-    assert late.tank.volts(Y, 1e6 + begin, 1e6 + end) == pytest.approx(
-        early.tank.volts(Y, begin, end), rel=1e-6
-    )

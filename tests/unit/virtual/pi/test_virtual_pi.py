@@ -2,7 +2,6 @@
 
 import errno
 import math
-import socket
 from typing import Any, Self
 
 import pytest
@@ -11,7 +10,6 @@ from adafruit_extended_bus import ExtendedI2C
 from rigs.processes import PATIENCE
 
 from fishd.core.clock import VirtualClock
-from fishd.core.errors import StartupError
 from fishd.hardware.servo.pigpio_client import Client
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.lgpio import EmulatedLgpio
@@ -71,29 +69,6 @@ class VirtualPiRig:
         self.pi.bus.timeout = seconds
 
 
-@pytest.mark.slow
-def test_the_rig_is_as_imperfect_as_the_simulation_says() -> None:
-    imperfections = {"offset_x": 0.02, "offset_y": -0.03, "noise": 1e-3, "drift": 0.0}
-    with VirtualPiRig(imperfections, sensitivity=0.5, adc_noise=0.0) as rig:
-        x, y = rig.forces_until(2.0)
-        assert x == pytest.approx(0.01, abs=5e-4)
-        assert y == pytest.approx(-0.015, abs=5e-4)
-        noisy = [rig.x.voltage for _ in range(500)]
-        rms = math.sqrt(sum((v - 0.01) ** 2 for v in noisy) / len(noisy))
-        duration = 1 / 860 / rig.pi.chip.rate_factor
-        assert rms == pytest.approx(0.5e-3 * math.sqrt(TICK / duration), rel=0.15)
-
-
-def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
-    def run(seed: int) -> list[int]:
-        with VirtualPiRig({"noise": 1e-3, "seed": seed}) as rig:
-            rig.steer(AMPLITUDE)
-            return [rig.y.value for _ in range(100)]
-
-    assert run(1) == run(1)
-    assert run(1) != run(2)
-
-
 def test_faults_reach_both_halves_of_the_pi() -> None:
     with VirtualPiRig() as rig:
         rig.steer(AMPLITUDE)
@@ -141,19 +116,3 @@ def test_a_button_is_seen_by_the_true_gpio_library() -> None:
         gpio.cleanup()
     with pytest.raises(ValueError, match="GPIO 40 is not valid: 0 to 27 is needed"):
         rig.pi.set_level(40, 1)
-
-
-def test_a_port_that_is_taken_is_one_line() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        pi = VirtualPi(
-            VirtualPiSettings(bus=BUS, pigpio_port=port),
-            PlantParameters(),
-            SimulationSettings(),
-            TICK,
-            VirtualClock(),
-        )
-        with pytest.raises(
-            StartupError, match=f"virtual_pi.pigpio_port: cannot listen on .*{port}"
-        ):
-            pi.start()

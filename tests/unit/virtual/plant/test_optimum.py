@@ -67,13 +67,13 @@ def test_the_best_square_wave_is_the_reference_one_at_every_amplitude(reference:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("xi", [0.01, 1.2, 20.0])
+@pytest.mark.parametrize("xi", [0.01, 20.0])
 @pytest.mark.parametrize("amplitude", [0.05, 3.0])
 @pytest.mark.parametrize("slack", [0.0, 0.04])
 def test_no_frequency_beats_the_best_square_wave(xi: float, amplitude: float, slack: float) -> None:
     p = PlantParameters(xi=xi, cable_slack=slack)
     best = best_square_wave(p, amplitude)
-    for frequency in (1.99, *np.geomspace(0.1, 6.0, 40).tolist()):
+    for frequency in (1.99, *np.geomspace(0.1, 6.0, 15).tolist()):
         assert square_wave(p, amplitude, frequency).thrust <= best.thrust
 
 
@@ -81,11 +81,8 @@ def test_no_frequency_beats_the_best_square_wave(xi: float, amplitude: float, sl
     "p",
     [
         DEFAULT,
-        PlantParameters(backlash=0.1),
         PlantParameters(backlash=0.1, cable_slack=0.1, servo_dead_zone=0.05),
-        PlantParameters(servo_delay=0.03, servo_reaction=0.002),
         PlantParameters(backlash=0.9),
-        PlantParameters(servo_dead_zone=0.5),
         PlantParameters(quadratic_drag=3.0, servo_delay=0.03, backlash=0.05),
         PlantParameters(xi=0.0, quadratic_drag=0.5),
     ],
@@ -98,14 +95,6 @@ def test_a_square_wave_from_rest_ends_up_in_the_periodic_state(p: PlantParameter
     assert windows[-1].thrust == pytest.approx(steady.thrust, rel=digits, abs=1e-12)
     if p == DEFAULT:
         assert windows[-1].fin_peak == pytest.approx(steady.fin_amplitude, rel=1e-9)
-
-
-def test_a_trace_of_quadratic_drag_hardly_changes_the_best_square_wave() -> None:
-    without = best_square_wave(DEFAULT, 0.42)
-    best = best_square_wave(PlantParameters(quadratic_drag=1e-9), 0.42)
-    assert best.frequency == pytest.approx(without.frequency, rel=1e-3)
-    assert best.thrust == pytest.approx(without.thrust, rel=1e-6)
-    assert best.fin_amplitude == pytest.approx(without.fin_amplitude, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -123,11 +112,6 @@ def test_a_servo_that_follows_at_once_makes_the_closed_form_thrust(xi: float) ->
     for frequency in (0.05, 0.5, 1.9, 3.0, 6.0):
         expected = fast_servo_thrust(p, 0.05, frequency)
         assert square_wave(p, 0.05, frequency).thrust == pytest.approx(expected, rel=1e-6)
-
-
-def test_the_closed_form_does_not_overflow_at_low_frequencies() -> None:
-    slow, slower = (fast_servo_thrust(DEFAULT, 0.4, frequency) for frequency in (2e-3, 1e-3))
-    assert slow == pytest.approx(2.0 * slower, rel=1e-9)
 
 
 STEP = 0.004  # s

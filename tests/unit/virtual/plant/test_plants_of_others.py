@@ -9,7 +9,6 @@ from rigs.processes import install
 
 from fishd.config import json_schema, load, to_yaml
 from fishd.core.errors import ConfigError, FishLost, StartupError
-from fishd.lab.simulation import simulate
 from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun
 from fishd.virtual.plant.registry import open_plant
 
@@ -158,10 +157,3 @@ def test_one_that_cannot_go_on_is_the_fault_fish_lost(name: str, why: str) -> No
     assert reason
     assert reason.code == "fish-lost"
     assert why in reason.message
-
-
-def test_its_best_square_wave_is_what_it_swims() -> None:
-    config = load(None, ["plant.model=good"])
-    report = simulate(config, "square", {"frequency": 1.0}, 5.0, 1.0)
-    assert report.best_square_thrust == 0.01
-    assert report.relative_thrust == pytest.approx(1.0)

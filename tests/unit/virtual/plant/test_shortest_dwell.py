@@ -21,8 +21,8 @@ def test_it_is_the_time_in_which_the_wheel_has_turned_by_nine_tenths_after_the_d
 
 
 @pytest.mark.parametrize("omega0", [5.0, 12.5, 40.0])
-@pytest.mark.parametrize("delay", [0.0, 0.05, 0.5])
-@pytest.mark.parametrize("speed", [0.5, 5.8, 1e3])
+@pytest.mark.parametrize("delay", [0.0, 0.5])
+@pytest.mark.parametrize("speed", [0.5, 1e3])
 def test_it_forbids_no_best_wave_and_lets_no_fast_servo_shake_a_slow_fin(
     omega0: float, delay: float, speed: float
 ) -> None:

@@ -23,8 +23,8 @@ def bar(
     )
 
 
-@pytest.mark.parametrize("half", [2e-4, 8e-4, 4e-3])
-@pytest.mark.parametrize("angle", [0.0, 0.3, -1.0])
+@pytest.mark.parametrize("half", [2e-4, 4e-3])
+@pytest.mark.parametrize("angle", [0.3, -1.0])
 @pytest.mark.parametrize("y", [0.0, 3e-4])
 def test_a_body_covers_its_own_area(half: float, angle: float, y: float) -> None:
     covered = bar(half, angle=angle, y=y)

@@ -53,16 +53,6 @@ def test_still_water_stays_still() -> None:
     assert not flow.v.any()
 
 
-@pytest.mark.parametrize("grid_velocity", [0.0, -0.4])
-def test_an_even_stream_stays_even(grid_velocity: float) -> None:
-    grid = box(16, stretched=True)
-    flow = Flow(grid, NU, "slip", inlet=np.full(grid.ny, 0.3))
-    flow.u[:], flow.grid_velocity = 0.3, grid_velocity
-    run(flow, 0.2, 0.01)
-    assert flow.u == pytest.approx(0.3)
-    assert flow.v == pytest.approx(0.0, abs=1e-12)
-
-
 def test_after_a_step_the_water_keeps_its_volume() -> None:
     flow = Flow(box(24, stretched=True), NU, "no-slip")
     flow.predict(0.01)
@@ -115,20 +105,6 @@ def test_its_momentum_changes_by_what_crosses_the_boundaries() -> None:
         before = flow.momentum()
         run(flow, 0.01, 0.01)
         assert flow.momentum() - before == pytest.approx(flow.boundary_impulse, abs=1e-15)
-
-
-def test_a_restart_is_the_same_to_the_last_bit() -> None:
-    flow = Flow(box(16), NU, "slip")
-    put_vortex(flow, 0.5, 0.4, age=4.0, stream=0.1)
-    run(flow, 0.05, 0.01)
-    kept = flow.state()
-    run(flow, 0.05, 0.01)
-    other = Flow(box(16), NU, "slip", inlet=np.full(16, 0.1))
-    other.restore(kept)
-    run(other, 0.05, 0.01)
-    assert np.array_equal(flow.u, other.u)
-    assert np.array_equal(flow.v, other.v)
-    assert np.array_equal(flow.p, other.p)
 
 
 def test_it_says_how_far_the_water_goes_in_a_step() -> None:

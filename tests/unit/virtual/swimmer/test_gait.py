@@ -41,11 +41,6 @@ def test_a_ripple_within_the_beat_is_no_uncertainty() -> None:
     assert gait(track(20.0, ripple), SETTINGS).speed_error == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_fish_that_has_hardly_beaten_has_no_interval() -> None:
-    assert gait(track(1.5), SETTINGS).speed_error is None
-    assert gait(track(2.2), SETTINGS).speed_error is not None
-
-
 def test_a_fish_that_does_not_beat_or_get_on_has_no_efficiency() -> None:
     for still in (gait(track(2.0) | {"command": np.zeros(200)}, SETTINGS),
                   gait(track(2.0, -0.01), SETTINGS)):  # fmt: skip
@@ -79,10 +74,6 @@ def test_a_fish_that_still_speeds_up_is_said_to_and_the_interval_widens_too_litt
 )
 def test_a_fish_whose_halves_agree_is_steady(speed: Array) -> None:
     assert gait(track(20.0, speed), SETTINGS).speed_trend is None
-
-
-def test_few_beats_tell_no_trend() -> None:
-    assert gait(track(2.2, rising(0.1, 2.2)), SETTINGS).speed_trend is None
 
 
 def test_chance_is_seldom_taken_for_a_trend() -> None:

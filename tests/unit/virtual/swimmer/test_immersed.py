@@ -74,15 +74,6 @@ def test_it_bends_as_far_however_short_the_steps() -> None:
     assert swung(400) == pytest.approx(swung(50), rel=0.05)
 
 
-def test_it_comes_to_rest_where_its_muscles_want_it() -> None:
-    body = swimmer()
-    forces = bend(body, 6.0)
-    for _ in range(500):
-        body.step(4e-3, forces)
-    q = beam_of(body).q
-    assert q[-1] - q[2] == pytest.approx(6.0 * LENGTH, rel=0.1)
-
-
 @pytest.mark.parametrize("excess", [-200.0, 0.0, 7000.0])
 def test_a_light_body_is_as_stable_as_a_heavy_one(excess: float) -> None:
     body = swimmer(excess=excess)
@@ -135,34 +126,6 @@ def test_water_rests_in_a_circle_and_pushes_it_downstream() -> None:
 
 def test_the_drag_of_a_circle_does_not_depend_on_the_step() -> None:
     assert circle_in_stream(60)[1] == pytest.approx(circle_in_stream(240)[1], rel=0.02)
-
-
-def test_outside_of_bodies_the_water_keeps_its_volume() -> None:
-    body = swimmer()
-    for _ in range(10):
-        body.step(4e-3, bend(body, 10.0))
-    flow, grid = body.flow, body.flow.grid
-    divergence = np.diff(flow.u, axis=0) / grid.dx[:, None] + np.diff(flow.v, axis=1) / grid.dy
-    x, y = grid.xc[:, None], grid.yc[None]
-    outside = (x < 0.09) | (x > 0.17) | (np.abs(y - 0.06) > 0.03)
-    assert np.abs(divergence[outside]).max() < 1e-9
-
-
-def test_a_restart_is_the_same_to_the_last_bit() -> None:
-    body = swimmer(excess=500.0)
-    forces = bend(body, 6.0)
-    for _ in range(10):
-        body.step(4e-3, forces)
-    kept = body.state()
-    other = swimmer(excess=500.0)
-    other.restore(kept)
-    for one in (body, other):
-        for _ in range(10):
-            one.step(4e-3, forces)
-    end, again = body.state(), other.state()
-    assert end.keys() == again.keys()
-    for name, value in end.items():
-        assert np.array_equal(value, again[name]), name
 
 
 @pytest.mark.parametrize(

@@ -95,15 +95,6 @@ def test_a_fish_goes_on_from_its_state_to_the_last_bit() -> None:
         assert np.array_equal(array, other.state()[name], equal_nan=True), name
 
 
-def test_to_compile_it_moves_nothing() -> None:
-    fish, other = swimmer(), swimmer()
-    fish.compile()
-    for each in (fish, other):
-        each.write(PHI)
-        swum(each, 5)
-    assert fish.motion == other.motion
-
-
 def diverges(_: float) -> NoReturn:
     raise Diverged("the swimmer cannot go on at 0.100 s: a test")
 
