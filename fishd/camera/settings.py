@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
-import yaml
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
@@ -204,7 +203,7 @@ def public(url: str) -> str:
 
 def to_yaml(settings: CameraSettings) -> str:
     """All settings, defaults included, as YAML that `load` reads back."""
-    return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False, allow_unicode=True)
+    return strict_yaml.dump(msgspec.to_builtins(settings))
 
 
 def _check(settings: CameraSettings) -> None:

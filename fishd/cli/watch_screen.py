@@ -86,6 +86,8 @@ class View:
                 f"{'took over: ' if why is fallback else ''}{why.code}: {why.message}"
             )
             header += Text(message, "red" if reason else "yellow").wrap(console, width)
+        if holder := self.status.lease:
+            header.append(_one_line(text.line(f"held by {holder}, for {holder.age:.0f} s")))
         yield from header
         own = self._quantities()
         yield self._figures()

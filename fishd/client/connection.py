@@ -108,7 +108,10 @@ class Connection:
         return listener(self._path) if self._path else None
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
-        """A new id, and the request as JSON; raises `ParameterError` for NaN and infinity."""
+        """Return a new id, and the request as JSON.
+
+        Raises `ParameterError` for NaN, infinity and text that is not UTF-8.
+        """
         identity = next(self._ids)
         arguments = protocol.OPERATIONS[op].arguments
         if self.held and "lease" in arguments.__struct_fields__:
@@ -119,9 +122,12 @@ class Connection:
         request = protocol.Request(v=protocol.VERSION, id=identity, op=op, args=dict(args))
         try:
             payload = protocol.encode(request)
-        except UnicodeEncodeError:  # bytes of a command line that are not UTF-8
-            request = msgspec.structs.replace(request, args=_encodable(request.args))
-            payload = protocol.encode(request)
+        except UnicodeEncodeError as error:  # bytes of a command line that are not UTF-8
+            if op != "estop":
+                what = text.quoted(error.object)
+                raise ParameterError(f"{op}: '{what}' is not a text in UTF-8") from None
+            message = args["message"].encode("utf-8", "replace").decode()
+            payload = protocol.encode(msgspec.structs.replace(request, args={"message": message}))
         if len(payload) > protocol.MAX_MESSAGE:
             raise ParameterError(f"{op}: the request is longer than {protocol.MAX_MESSAGE} bytes")
         return identity, payload
@@ -174,17 +180,6 @@ class Connection:
     def telemetry_silent(self) -> NoDaemon:
         """What to raise when no telemetry comes in time."""
         return self._nobody(f"no telemetry within {self.timeout:g} s")
-
-
-def _encodable(value: Any) -> Any:
-    """Return a value without bytes of the command line that are not UTF-8: `?` instead."""
-    if isinstance(value, str):
-        return value.encode("utf-8", "replace").decode()
-    if isinstance(value, dict):
-        return {_encodable(key): _encodable(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_encodable(part) for part in value]
-    return value
 
 
 def deadlines(seconds: float, *, again: bool) -> Iterator[float]:

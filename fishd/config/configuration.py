@@ -369,9 +369,7 @@ def keys() -> list[str]:
 
 def to_yaml(config: Config | dict[str, Any]) -> str:
     """The whole configuration, defaults included, as YAML that `load` reads back."""
-    import yaml
-
-    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False, allow_unicode=True)
+    return strict_yaml.dump(msgspec.to_builtins(config))
 
 
 def json_schema() -> dict[str, Any]:

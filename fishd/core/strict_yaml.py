@@ -117,6 +117,24 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
+class _Dumper(yaml.SafeDumper):
+    """Quotes the texts that the reader would refuse."""
+
+    def represent_str(self, data: str) -> yaml.ScalarNode:
+        """Return the node of a text."""
+        style = "'" if _surprise(data, _TEXT) else None
+        return self.represent_scalar(_TEXT, data, style=style)
+
+
+_TEXT = "tag:yaml.org,2002:str"
+_Dumper.add_representer(str, _Dumper.represent_str)
+
+
+def dump(data: Any) -> str:
+    """Return plain values as YAML that `read` takes back."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
 class _Builder:
     """Converts the nodes of a document to plain values."""
 

@@ -6,6 +6,8 @@ LONGEST = 1000
 """Longer texts are cut, in the middle [characters]."""
 LONGEST_WORD = 60
 """Of a word that is quoted in a message [characters]."""
+FORMULAS = tuple("=+-@＝＋－＠")
+"""Characters at the beginning of a text that a spreadsheet computes."""
 EXACT_CI95 = 1e-9
 """Half-width of a 95 % interval below which a value is called exact [N, or another unit]."""
 
@@ -39,6 +41,11 @@ def escaped(text: str) -> str:
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
         for letter in text
     )
+
+
+def for_spreadsheet(text: str) -> str:
+    """Escape control characters, and put a `'` before what a spreadsheet would compute."""
+    return ("'" if text.startswith(FORMULAS) else "") + escaped(text)
 
 
 def quoted(word: str) -> str:

@@ -59,8 +59,6 @@ class CalibrationFolder:
         Raises OSError when it cannot be written, and `ConfigError` as `newest` does. An older file
         is never touched, and the new one sorts after it, even where the clock went back.
         """
-        import yaml
-
         dated = msgspec.structs.replace(calibration, date=now.isoformat(timespec="seconds"))
         self.folder.mkdir(parents=True, exist_ok=True)
         stem = f"{_NAMES[type(calibration)]}-{now.astimezone(datetime.UTC):{_STAMP}}"
@@ -68,7 +66,7 @@ class CalibrationFolder:
         if names and stem <= Path(names[-1]).stem:
             stem = f"{Path(names[-1]).stem}+"
         path = self.folder / f"{stem}.yaml"
-        text = yaml.safe_dump(msgspec.to_builtins(dated), sort_keys=False)
+        text = strict_yaml.dump(msgspec.to_builtins(dated))
         files.write_atomically(path, text, new=True)
         files.sync_folder(self.folder)
         return dated, path

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fishd.core import files
+from fishd.core import files, text
 from fishd.core.files import FileProblem, write_atomically
 
 
@@ -33,19 +33,34 @@ def read(path: Path, longest: int = files.TABLE) -> list[list[str]]:
     longest: more is not read [bytes]
     Raises `FileProblem`.
     """
-    text = files.read_text(path, longest, "a table")
+    content = files.read_text(path, longest, "a table")
     try:
-        rows = list(csv.reader(io.StringIO(text)))
+        rows = [list(map(_unescaped, row)) for row in csv.reader(io.StringIO(content))]
     except csv.Error as error:
         raise FileProblem(f"not a CSV file: {error}") from None
-    return rows if text.endswith("\n") else rows[:-1]
+    return rows if content.endswith("\n") else rows[:-1]
 
 
 def lines(rows: Iterable[Sequence[Any]]) -> str:
-    """Rows as the text of a CSV file."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
+    """Return rows as the text of a CSV file, in which a spreadsheet computes nothing."""
+    file = io.StringIO()
+    csv.writer(file, lineterminator="\n").writerows(map(_escaped, row) for row in rows)
+    return file.getvalue()
+
+
+def _escaped(value: Any) -> Any:
+    """Escape a text that is not a number."""
+    if not isinstance(value, str):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return text.for_spreadsheet(value)
+    return value
+
+
+def _unescaped(word: str) -> str:
+    return word[1:] if word[:1] == "'" and word[1:].startswith(text.FORMULAS) else word
 
 
 def _plain(value: Any) -> Any:

@@ -4,7 +4,6 @@ import os
 from typing import Annotated, Literal
 
 import msgspec
-import yaml
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
@@ -327,7 +326,7 @@ def check(settings: TrainingSettings) -> None:
 
 def to_yaml(settings: TrainingSettings) -> str:
     """All settings, defaults included, as YAML that `load` reads back."""
-    return yaml.safe_dump(msgspec.to_builtins(settings), sort_keys=False)
+    return strict_yaml.dump(msgspec.to_builtins(settings))
 
 
 def _check(settings: TrainingSettings) -> None:

@@ -22,9 +22,6 @@ from fishd.recording.reader import Run
 
 Format = Literal["csv", "parquet"]
 
-FORMULAS = tuple("=+-@＝＋－＠")
-"""What a text begins with that a spreadsheet computes."""
-
 
 def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> list[Path]:
     """Write `NAME.csv` and `NAME-events.csv`, or the same as Parquet; their paths.
@@ -71,15 +68,10 @@ def _harmless(table: pandas.DataFrame) -> pandas.DataFrame:
     shown = table.copy(deep=False)
     for name in table.columns[[not is_numeric_dtype(kind) for kind in table.dtypes]]:
         shown[name] = shown[name].map(
-            lambda value: _harmless_text(value) if isinstance(value, str) else value
+            lambda value: text.for_spreadsheet(value) if isinstance(value, str) else value
         )
-    shown.columns = pandas.Index([_harmless_text(name) for name in table.columns])
+    shown.columns = pandas.Index([text.for_spreadsheet(name) for name in table.columns])
     return shown
-
-
-def _harmless_text(words: str) -> str:
-    """Escape control characters, and put a `'` before what a spreadsheet would compute."""
-    return ("'" if words.startswith(FORMULAS) else "") + text.escaped(words)
 
 
 def _events(run: Run) -> pandas.DataFrame:

@@ -10,6 +10,7 @@ import pytest
 from rigs.processes import PATIENCE, Daemon
 
 from fishd.client import AsyncFish, Fish, NoDaemon, Refused
+from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ParameterError
 
 
@@ -109,3 +110,11 @@ def test_asyncio_programs_get_the_same(daemon: Daemon) -> None:
             assert (await fish.stop()).mode == "idle"
 
     asyncio.run(swim())
+
+
+def test_text_that_is_not_utf8_is_refused_but_never_stops_an_emergency_stop() -> None:
+    connection = Fish("ipc:///nowhere")
+    for calibration in ("\udcff", ServoCalibration(date="\udcff")):
+        with pytest.raises(ParameterError, match=r"calibrate-servo: '\?' is not a text in UTF-8"):
+            connection.request("calibrate-servo", {"calibration": calibration})
+    assert b"stop ?" in connection.request("estop", {"message": "stop \udcff"})[1]

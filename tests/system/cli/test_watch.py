@@ -24,7 +24,7 @@ from rigs.processes import FISHCTL, PATIENCE, Daemon, running, wait_until
 
 from fishd.cli.watch_screen import View
 from fishd.client import Fish
-from fishd.core.signals import Percentiles, Reason, Status, Tick, Timing
+from fishd.core.signals import LeaseHolder, Percentiles, Reason, Status, Tick, Timing
 
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
@@ -250,6 +250,13 @@ def test_lost_ticks_are_counted_and_leave_a_gap_in_the_traces() -> None:
     gap = re.compile("[\u2801-\u28ff][ \u2800]{8,}[\u2801-\u28ff]")
     assert gap.search(still_trace(holed))
     assert not gap.search(still_trace(whole))
+
+
+def test_it_shows_which_experiment_holds_the_fish() -> None:
+    holder = LeaseHolder(name="sweep", host="lab", pid=7, age=65.2)
+    held = "held by sweep (pid 7 on lab), for 65 s"
+    assert held in shown(view_of(map(tick, range(1, 101)), lease=holder))
+    assert held not in shown(view_of(map(tick, range(1, 101))))
 
 
 def test_a_daemon_that_was_restarted_is_not_a_loss() -> None:

@@ -127,9 +127,12 @@ def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> N
     assert load(file) == Config()
 
 
-def test_what_is_shown_can_be_read_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["y", "1e5", "7:30", "Fu's fish"])
+def test_what_is_shown_can_be_read_back(tmp_path: Path, name: str) -> None:
     file = tmp_path / "fish.yaml"
-    original = load(None, ["plant.xi=0.7", "start.controller=swing", "start.parameters.C=0.3"])
+    changes = ["plant.xi=0.7", "start.controller=swing", "start.parameters.C=0.3"]
+    original = load(None, [*changes, f'name="{name}"'])
+    assert original.name == name
     file.write_text(to_yaml(original), encoding="utf-8")
     assert load(file) == original
 
