@@ -1,5 +1,6 @@
 """The `fishctl` command: its verbs, loaded when they are called, and how errors look."""
 
+import gc
 import sys
 import warnings
 
@@ -92,3 +93,5 @@ def main() -> None:
         complain("fishctl", str(error), 1)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    finally:
+        gc.freeze()  # at its end Python would look through all that is loaded for garbage
