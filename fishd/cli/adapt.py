@@ -1,45 +1,39 @@
-"""The verb that makes a gait for a fish that nobody has seen."""
+"""The verb that makes a gait for a fish that was never measured before."""
 
-import contextlib
 import shlex
-from collections.abc import Iterator, Sequence
-from datetime import datetime
 from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 import msgspec
-from msgspec.structs import replace
 
-from fishd.cli.config import set_option
-from fishd.cli.lab_progress import showing
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import FiniteRange, endpoint_option, json_option
+from fishd.cli.experiment_options import (
+    ChosenFish,
+    Ending,
+    Place,
+    Resumable,
+    fish_choice,
+    folder_options,
+)
+from fishd.cli.options import FiniteRange, json_option, seed_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.sweep import ON, refuse_other
-from fishd.cli.sweep_output import again
-from fishd.client import Fish
-from fishd.config import Config, Start, adopt, check_tethered, load
-from fishd.core.console import INTERRUPTED
+from fishd.cli.progress import showing
 from fishd.core.errors import FishdError
-from fishd.core.process.interruption import interrupted_once
 
 if TYPE_CHECKING:
-    from fishd.lab.rig import Rig
-    from fishd.learning.adapt.state import AdaptFolder, Contender, State
+    from fishd.learning.adapt.state import Contender, State
 
 STEPS = 6400
 
 
-@click.command()
-@ON
+@click.command(cls=Resumable)
 @click.option(
-    "--tank-time",
+    "--budget",
     type=FiniteRange(min=150.0, max=3600.0),
+    metavar="SECONDS",
     default=300.0,
     show_default=True,
-    help="For all that needs the fish, rests included [s]: a fifth of it excitation, a seventh the "
+    help="Largest tank time, rests included [s]: a fifth of it excitation, a seventh the "
     "search of swing, a fifth that of square waves, the rest the comparison.",
 )
 @click.option(
@@ -47,40 +41,24 @@ STEPS = 6400
     type=click.IntRange(min=640),
     default=STEPS,
     show_default=True,
-    help="Of the training, in simulation, while the fish rests.",
+    help="Control steps of the training, in simulation, while the fish rests.",
 )
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of cloud and training.")
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Where everything goes; an adaptation that began there is resumed. [default: "
-    "runs/adapt-DATE-TIME]",
-)
+@seed_option("cloud and training")
 @click.option(
     "--no-command",
     is_flag=True,
-    help="On a robot: leave the fish at rest; without it, the chosen gait swims on.",
+    help="Live: leave the fish at rest; without it, the chosen gait swims on.",
 )
-@click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path, readable=False),
-    help="In simulation: YAML file of the fish; without it, the defaults.",
-)
-@set_option
-@endpoint_option
-@take_option
+@fish_choice
+@folder_options
 @json_option
 def adapt(
-    on: str,
-    tank_time: float,
+    budget: float,
     steps: int,
     seed: int,
-    folder: Path | None,
     no_command: bool,
-    file: Path | None,
-    overrides: tuple[str, ...],
-    endpoint: str | None,
+    fish: ChosenFish,
+    place: Place,
     as_json: bool,
 ) -> int:
     """Find the best gait of a fish that nobody has seen, in five minutes of tank time.
@@ -91,74 +69,47 @@ def adapt(
     where the measurement leaves that undecided, the simplest of those that may be it. Nothing is
     assumed of plant and rig, even if the configuration describes them.
 
-    Ctrl-C lets the fish rest; the same command with the --folder goes on, and measures nothing
-    again.
+    Ctrl-C lets the fish rest; --resume goes on, and measures nothing again.
     """
     for package in ("onnxruntime", "tensorboard"):  # missing ones are named before the fish swims
         import_module(package)
     from fishd.lab import drawing
-    from fishd.lab.begun import owned
+    from fishd.lab.session import LiveSession
     from fishd.learning.adapt import report
     from fishd.learning.adapt.adaptation import Adaptation
-    from fishd.learning.adapt.state import AdaptFolder, Begun
+    from fishd.learning.adapt.state import AdaptFolder
 
     drawing.check_installed()
-    refuse_other(on, {"--config": file, "--set": overrides}, {"--no-command": no_command or None})
-    path = folder or Path("runs") / f"adapt-{datetime.now():%Y%m%d-%H%M%S}"
-    with _fish(on, file, overrides, endpoint) as (rig, config, data, fish):
-        if rig.unit != "N":
-            raise FishdError(
-                "the force sensor is not calibrated, so no force is known in newtons: "
-                "fishctl calibrate force"
-            )
-        with owned(path, "adaptation"):
-            run = AdaptFolder(path, Begun(on, steps, seed, data))
-            try:
-                with (
-                    interrupted_once(),
-                    rig,
-                    showing(tank_time, "s of tank time", err=as_json) as show,
-                ):
-                    state = Adaptation(rig, config, run, tank_time, steps, seed, show).run()
-                    words = command_of(_chosen(state), on, file, overrides, endpoint)
-                    files = report.write(run, rig.amplitude, words)
-            except KeyboardInterrupt:
-                kept = f"{run.state.tank_time:.0f} s of tank time are kept"
-                echo(f"fishctl: stopped; {kept}; to go on: {again(path)}", err=True)
-                return INTERRUPTED
-            except FishdError as error:
-                error.args = (f"{error}; {_kept(run)}{again(path)}",)
-                raise
+    fish.refuse_other({}, {"--no-command": no_command})
+    settings = {"steps": steps, "seed": seed}
+    with fish.session() as session:
+        session.check_calibrated()
+        with place.open(fish, session.config, settings) as experiment:
+            run = AdaptFolder(experiment)
+            ending = Ending(experiment)
+            fish.announce(as_json)
+            with (
+                ending.measuring(FishdError),
+                session,
+                showing(budget, "s of tank time", err=as_json) as show,
+            ):
+                state = Adaptation(session, run, budget, steps, seed, show).run()
+                words = command_of(_chosen(state), fish)
+                files = report.write(run, session.amplitude, words)
+            if ending.is_interrupted:
+                return ending.interrupted(f"{run.state.tank_time:.0f} s of tank time are kept")
         if as_json:
             print_json(msgspec.to_builtins(state))
         else:
-            _say(state)
+            _print(state)
             echo(f"report: {files[1]}, picture: {files[0]}")
         chosen = _chosen(state)
-        if fish and not no_command:
-            fish.set_controller(chosen.controller, **chosen.parameters)
-            echo(f"{chosen.name} swims the fish now; to have it again: {words}", err=as_json)
+        if isinstance(session, LiveSession) and not no_command:
+            session.fish.set_controller(chosen.controller, **chosen.parameters)
+            echo(f"{chosen.name} swims the fish now; to swim it again: {words}", err=as_json)
         else:
-            echo(f"to have it again: {words}", err=as_json)
+            echo(f"to swim it again: {words}", err=as_json)
     return 0
-
-
-@contextlib.contextmanager
-def _fish(
-    on: str, file: Path | None, overrides: tuple[str, ...], endpoint: str | None
-) -> "Iterator[tuple[Rig, Config, dict[str, Any], Fish | None]]":
-    """What swims, its configuration, the same as plain data, and the fishd that it is of."""
-    from fishd.lab.rig import LiveRig, VirtualRig
-
-    if on == "simulation":
-        config = replace(load(file, overrides), start=Start())
-        check_tethered(config.robot, "adapt")
-        yield VirtualRig(config), config, msgspec.to_builtins(config), None
-        return
-    with Fish(endpoint) as fish:
-        rig = LiveRig(fish, *verb_lease())
-        data = fish.config()
-        yield rig, adopt(fish.config()), data, fish
 
 
 def _chosen(state: "State") -> "Contender":
@@ -166,34 +117,20 @@ def _chosen(state: "State") -> "Contender":
     return next(one for one in state.contenders if one.name == state.verdict.chosen)
 
 
-def _kept(run: "AdaptFolder") -> str:
-    """Before the command that goes on."""
-    used = run.state.tank_time
-    return f"{used:.0f} s of tank time are kept; to go on: " if used else "to begin again: "
-
-
-def command_of(
-    one: "Contender",
-    on: str,
-    file: Path | None = None,
-    overrides: Sequence[str] = (),
-    endpoint: str | None = None,
-) -> str:
-    """Return the command line that lets a gait swim the same fish.
-
-    file, overrides: configuration of a simulated one; endpoint: of the fishd of another one
-    """
-    words = ["fishctl", "set-controller" if on == "robot" else "simulate", one.controller]
-    for name, value in one.parameters.items():
+def command_of(gait: "Contender", fish: ChosenFish) -> str:
+    """Return the command line with which a gait swims the same fish."""
+    verb = "set-controller" if fish.on == "live" else "simulate"
+    words = ["fishctl", verb, gait.controller]
+    for name, value in gait.parameters.items():
         shown = f"{value:.6g}" if isinstance(value, float) else str(value)
         words += [f"--{name.replace('_', '-')}", shown]
-    words += ["--config", str(file)] if file else []
-    words += [word for text in overrides for word in ("--set", text)]
-    words += ["--endpoint", endpoint] if endpoint else []
+    words += ["--config", str(fish.file)] if fish.file else []
+    words += [word for text in fish.overrides for word in ("--set", text)]
+    words += ["--endpoint", fish.endpoint] if fish.endpoint else []
     return shlex.join(words)
 
 
-def _say(state: "State") -> None:
+def _print(state: "State") -> None:
     assert state.verdict
     echo(f"{state.verdict.claim[0].upper()}{state.verdict.claim[1:]}.")
     for one in state.contenders:

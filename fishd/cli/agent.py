@@ -11,8 +11,7 @@ import click
 import msgspec
 
 from fishd.cli.completion import complete_policy
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import FiniteRange, endpoint_option
+from fishd.cli.options import endpoint_option, for_option, take_option, verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.config import adopt
@@ -48,11 +47,7 @@ REPORT = 1.0
     help="Where fishd reaches this program, such as tcp://192.168.1.20:9873, where that is on "
     "another machine. [default: any free port of this one]",
 )
-@click.option(
-    "--seconds",
-    type=FiniteRange(min=0, min_open=True),
-    help="End by itself after this time; by default Ctrl-C ends it.",
-)
+@for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
 @endpoint_option
 @take_option
 def agent(

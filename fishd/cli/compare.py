@@ -3,20 +3,18 @@
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
+import msgspec
 from msgspec import to_builtins
 
 from fishd.cli.completion import complete_contestant
-from fishd.cli.config import fish_options
-from fishd.cli.lab_progress import showing
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, kept
+from fishd.cli.options import for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.sweep import ON, refuse_other
-from fishd.client import Fish
-from fishd.config import Config, adopt, check_tethered, load
+from fishd.cli.progress import showing
+from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
@@ -27,6 +25,7 @@ if TYPE_CHECKING:
 
     from fishd.lab.compare.comparison import Standing, Trace
     from fishd.lab.compare.contestants import Contestant
+    from fishd.lab.experiment import Experiment
 
 WIDE = 1000
 """Columns of a table in a file or a pipe, where nothing is wrapped."""
@@ -48,7 +47,6 @@ class _Outcome(NamedTuple):
 @click.argument(
     "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
-@ON
 @click.option(
     "--runs",
     type=click.IntRange(1, 1000),
@@ -56,28 +54,22 @@ class _Outcome(NamedTuple):
     show_default=True,
     help="Runs of each contestant; in simulation, with different noise.",
 )
-@click.option(
-    "--for",
-    "live_seconds",
-    type=float,
-    help=f"On a robot: length of each run, swimming and resting in turn [s]. [default: {SECONDS}]",
-)
-@click.option(
-    "--seconds", type=float, help=f"In simulation: length of each run [s]. [default: {SECONDS}]"
+@for_option(
+    "Length of each run [s]; live, swimming and resting in turn.",
+    default=SECONDS,
+    kind=click.FLOAT,
 )
 @click.option(
     "--settle",
     type=float,
     help=f"In simulation: time before figures are taken [s]. [default: {SETTLE}]",
 )
-@fish_options
-@endpoint_option
-@take_option
+@fish_choice
 @click.option(
     "--camera",
     metavar="FILE|ENDPOINT",
     help="For policies that see pictures: in simulation, the YAML file of a simulated camera, such "
-    "as config/camera-web.yaml; on a robot, where its fishd-camera takes requests. [default: a "
+    "as config/camera-web.yaml; live, where its fishd-camera takes requests. [default: a "
     "good simulated one; $FISHD_CAMERA, else that of this machine]",
 )
 @click.option(
@@ -86,25 +78,18 @@ class _Outcome(NamedTuple):
     help="For policies that see pictures, on a robot elsewhere: where its fishd reaches this "
     "program. [default: any free port of this machine]",
 )
+@keep_option
 @json_option
-@click.option(
-    "--plot",
-    "picture",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw command, fin, force and result of each into this file (.png, .svg).",
-)
+@plot_option("command, fin, force and result of each")
 def compare(
     contestants: tuple[str, ...],
-    on: str,
     runs: int,
-    live_seconds: float | None,
-    seconds: float | None,
+    seconds: float,
     settle: float | None,
-    file: Path | None,
-    overrides: tuple[str, ...],
-    endpoint: str | None,
+    fish: ChosenFish,
     camera: str | None,
     agent: str | None,
+    folder: Path | None,
     as_json: bool,
     picture: Path | None,
 ) -> int:
@@ -115,10 +100,10 @@ def compare(
     best square wave, swing, and the named policies that are made for this fish.
 
     In simulation thrust is the true one, and relative thrust its share of that of the best square
-    wave. On a robot thrust is measured, by swimming and resting in turn; Ctrl-C lets the fish
+    wave. The thrust of a live fish is measured, by swimming and resting in turn; Ctrl-C lets it
     rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
-    simulated camera, on a robot by a running fishd-camera. ± is the 95 % interval of the mean
-    thrust of all runs, from how they differ and, on a robot, from the error of each measurement
+    simulated camera, a live one by a running fishd-camera. ± is the 95 % interval of the mean
+    thrust of all runs, from how they differ and, live, from the error of each measurement
     and of the sensor's calibration, which is the same fraction of all thrusts.
     The verdict names those that may be the best one, by intervals that hold together in 95 % of
     cases, and chooses the simplest of them.
@@ -127,20 +112,17 @@ def compare(
     Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
     in mode fault; the others swim all the same.
     """
-    of_simulation = {
-        "--seconds": seconds, "--settle": settle, "--config": file, "--set": overrides,
-    }  # fmt: skip
-    refuse_other(on, of_simulation, {"--for": live_seconds, "--agent": agent})
+    fish.refuse_other({"--settle": settle}, {"--agent": agent})
     if picture:
         from fishd.lab import drawing
 
         drawing.check(picture)
-    if on == "robot":
-        length = SECONDS if live_seconds is None else live_seconds
-        outcome = _on_robot(contestants, length, runs, endpoint, camera, agent)
+    settings = {"contestants": list(contestants), "runs": runs, "for": seconds, "settle": settle}
+    task = _Task(contestants, fish, seconds, runs, camera, folder, settings, as_json)
+    if fish.on == "live":
+        outcome = _measure(task, agent)
     else:
-        lengths = SECONDS if seconds is None else seconds, SETTLE if settle is None else settle
-        outcome = _in_simulation(contestants, file, overrides, *lengths, runs, camera)
+        outcome = _swim(task, SETTLE if settle is None else settle)
     status = _report(outcome, runs, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
@@ -149,73 +131,84 @@ def compare(
     return status
 
 
-def _in_simulation(
-    texts: tuple[str, ...],
-    file: Path | None,
-    overrides: tuple[str, ...],
-    seconds: float,
-    settle: float,
-    runs: int,
-    camera: str | None,
-) -> _Outcome:
+class _Task(NamedTuple):
+    texts: tuple[str, ...]
+    fish: ChosenFish
+    seconds: float
+    runs: int
+    camera: str | None
+    folder: Path | None
+    settings: dict[str, Any]
+    as_json: bool
+
+    def keep(self, experiment: "Experiment | None", standings: "list[Standing]") -> None:
+        """Write the result into the folder of the experiment, where there is one."""
+        if experiment:
+            experiment.write("result.json", msgspec.json.encode(standings))
+
+
+def _swim(task: _Task, settle: float) -> _Outcome:
     from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import is_missing, parse, refusal
 
-    config, seen = load(file, overrides), cameras.simulated(camera)
+    config, camera = task.fish.load(), cameras.simulated(task.camera)
     check_tethered(config.robot, "compare")
-    chosen = [parse(text) for text in texts] or _all(config)
-    _check_seen(camera, chosen)
+    chosen = [parse(text) for text in task.texts] or _all(config)
+    _check_seen(task.camera, chosen)
     left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
     for one, why in left_out:
         if is_missing(one):  # a misspelt path, and no policy for another fish
             raise why
-    able = [one for one in chosen if one not in (out for out, _ in left_out)]
-    swum = able or chosen
-    with showing(len(swum) * runs * seconds, "s swum") as bar:
-        found = comparison.compare(config, swum, seconds, settle, runs, bar.at, seen)
+    able = [one for one in chosen if one not in (out for out, _ in left_out)] or chosen
+    with (
+        kept(task.folder, task.fish, None, task.settings) as experiment,
+        showing(len(able) * task.runs * task.seconds, "s swum") as bar,
+    ):
+        result = comparison.compare(config, able, task.seconds, settle, task.runs, bar.at, camera)
+        task.keep(experiment, result[0])
+    task.fish.announce(task.as_json)
     return _Outcome(
-        *found,
+        *result,
         [(*each, 0) for each in left_out],
         config.amplitude_limit,
         is_random=config.simulation.is_random,
     )
 
 
-def _on_robot(
-    texts: tuple[str, ...],
-    seconds: float,
-    runs: int,
-    endpoint: str | None,
-    camera: str | None,
-    agent: str | None,
-) -> _Outcome:
+def _measure(task: _Task, agent: str | None) -> _Outcome:
     from fishd.lab.compare.contestants import absolute, parse
     from fishd.lab.compare.live import LiveComparison
-    from fishd.lab.compare.piloted_rig import PilotedRig
 
     ended, status = "", 0
-    chosen = [absolute(parse(text)) for text in texts]
-    with interrupted_once(), Fish(endpoint) as fish:  # whatever ends it leaves the fish at rest
-        chosen = chosen or _all(adopt(fish.config()))
-        _check_seen(camera, chosen)
-        unit = fish.status().force_unit
+    chosen = [absolute(parse(text)) for text in task.texts]
+    with (  # whatever ends it leaves the fish at rest
+        interrupted_once(),
+        task.fish.session(camera=task.camera, agent=agent) as session,
+    ):
+        chosen = chosen or _all(session.read_config())
+        _check_seen(task.camera, chosen)
+        live = LiveComparison(session, chosen)
         with (
-            PilotedRig(fish, *verb_lease(), camera=camera, agent=agent) as rig,
-            showing(len(chosen) * runs * seconds, "s") as bar,
+            session,
+            kept(task.folder, task.fish, session, task.settings) as experiment,
+            showing(len(chosen) * task.runs * task.seconds, "s") as bar,
         ):
-            live = LiveComparison(rig, chosen)
+            task.fish.announce(task.as_json)
+            session.progress = bar.at
             try:
-                live.swim(seconds, runs, bar.at)
+                live.swim(task.seconds, task.runs)
             except KeyboardInterrupt:
                 ended, status = "interrupted; the fish rests", INTERRUPTED
             except ParameterError:
                 raise
             except FishdError as error:
                 ended, status = str(error), 1
+            task.keep(experiment, live.standings())
     return _Outcome(
-        live.standings(), live.traces(), live.left_out, rig.amplitude, unit, True, ended, status
-    )
+        live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True,
+        ended, status,
+    )  # fmt: skip
 
 
 def _check_seen(camera: str | None, chosen: "list[Contestant]") -> None:

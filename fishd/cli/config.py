@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -61,21 +62,19 @@ set_option = click.option(
 
 def fish_options(function: F) -> F:
     """`--config` and `--set` of verbs that are about a fish of one's own choice."""
-    option = click.option(
-        "--config",
-        "file",
-        type=click.Path(path_type=Path, readable=False),
-        help="YAML file, as for fishd; without it, the defaults.",
-    )
+    option = config_option("YAML file, as for fishd; without it, the defaults.")
     return option(set_option(function))
 
 
-service_option = click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path, readable=False),
-    help=f"YAML file of the daemon; default: ${FILE_VARIABLE}, else {SERVICE_FILE} where there is "
-    "one, else the defaults.",
+def config_option(about: str) -> Callable[[F], F]:
+    """`--config`."""
+    kind = click.Path(path_type=Path, readable=False)
+    return click.option("--config", "file", type=kind, help=about)
+
+
+service_option = config_option(
+    f"YAML file of the daemon; default: ${FILE_VARIABLE}, else {SERVICE_FILE} where there is one, "
+    "else the defaults."
 )
 """`--config` of verbs that are about the fishd of this machine; goes with `load_service`."""
 

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from fishd.cli.free_swim_options import SwimmerOptions
-from fishd.cli.lab_progress import showing
 from fishd.cli.output import echo, echo_rows, print_json, spelled
+from fishd.cli.progress import showing
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, MissingPackage

@@ -1,60 +1,39 @@
 """The verb that identifies a fish from its forces."""
 
 import shlex
-from contextlib import ExitStack
+from copy import deepcopy
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.config import set_option
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import FiniteRange, endpoint_option, json_option
+from fishd.cli.experiment_options import ChosenFish, fish_choice_and_config, keep_option, kept
+from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.recording.choice import folder_option
-from fishd.client import Fish
+from fishd.cli.progress import showing
 from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import interrupted_once
-from fishd.recording.folder import find, named
+from fishd.recording.folder import find
 
 if TYPE_CHECKING:
     from fishd.lab.identification import Identification
+
+SECONDS = 180.0
 
 
 @click.command()
 @click.argument("runs", nargs=-1, metavar="[RUN]...")
 @click.option("--experiment", is_flag=True, help="First let a fish swim what tells most about it.")
-@click.option(
-    "--on",
-    type=click.Choice(["simulation", "robot"]),
-    help="With --experiment: a fish simulated in virtual time, or that of the fishd that runs, "
-    "real or not. [default: simulation]",
+@for_option(
+    f"With --experiment: how long it takes [s]. [default: {SECONDS:g}]",
+    kind=FiniteRange(min=30.0, max=3600.0),
 )
-@click.option(
-    "--for",
-    "seconds",
-    type=FiniteRange(min=30.0, max=3600.0),
-    help="With --experiment: how long it takes. [default: 180]",
-)
-@click.option(
-    "--record",
-    metavar="RUN",
-    help="With --experiment: keep its ticks, as a recording: a path, or a name in the folder of "
-    "recordings.",
-)
-@folder_option
-@click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path, readable=False),
-    help="Configuration that a fit begins with, and of the simulated fish. [default: that of "
-    "the running fishd for --on robot, else the defaults]",
-)
-@set_option
+@keep_option
+@fish_choice_and_config
 @click.option(
     "--fit",
     metavar="NAME,...",
@@ -77,52 +56,40 @@ if TYPE_CHECKING:
     help="Write the sections plant and simulation of a configuration into this file.",
 )
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw forces, fit and residual into this file (.png, .svg, .pdf).",
-)
-@endpoint_option
-@take_option
+@plot_option("forces, fit and residual")
 @json_option
 def identify(
     runs: tuple[str, ...],
     experiment: bool,
-    on: str | None,
     seconds: float | None,
-    record: str | None,
     folder: Path | None,
-    file: Path | None,
-    overrides: tuple[str, ...],
+    fish: ChosenFish,
     fit: str | None,
     fix: str | None,
     target: Path | None,
     force: bool,
-    plot: Path | None,
-    endpoint: str | None,
+    picture: Path | None,
     as_json: bool,
 ) -> int:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. Several are fitted together, as
-    one fish. Or let --experiment swim one now.
+    one fish. Or let --experiment swim one now. --config is the configuration that a fit begins
+    with.
 
     --to writes what `fishd --config` and `fishctl simulate --config` read.
     """
     if experiment == bool(runs):
         raise click.UsageError("name recordings to identify, or use --experiment: one of the two")
-    for option, value in (("--on", on), ("--for", seconds), ("--record", record)):
+    for option, value in (("--for", seconds), ("--folder", folder)):
         if value is not None and not experiment:
             raise click.UsageError(f"{option} goes with --experiment")
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
-    kept = named(record, folder) if record else None
-    if kept and kept.exists():
-        raise FishdError(f"{kept}: exists already; --record names another")
-    if plot:
+    if picture:
         from fishd.lab.drawing import check
 
-        check(plot)
+        check(picture)
 
     from fishd.lab import identification as lab
 
@@ -130,16 +97,15 @@ def identify(
     known = _names(fix or "")
     lab.check(lab.DEFAULT if names is None else names, known)  # before minutes of swimming
     if experiment:
-        config, fish = _config(on, file, overrides, endpoint)
         try:
-            tables: list[Any] = [_swum(config, fish, seconds or 180.0, kept)]
+            config, tables = _swum(fish, seconds or SECONDS, folder, as_json)
         except KeyboardInterrupt:
-            where = f"; what it swam is in {kept}" if kept and kept.exists() else ""
-            echo(f"fishctl: stopped before its end, so nothing is fitted{where}", err=True)
+            where = f"; what it swam is in {folder}" if folder else ""
+            echo(f"fishctl: interrupted, so nothing is fitted{where}", err=True)
             return INTERRUPTED
-        origin = f"an experiment with {_swimmer(on, file, overrides)}"
+        origin = f"an experiment with {fish}"
     else:
-        config, tables = load(file, overrides), [find(run, folder) for run in runs]
+        config, tables = load(fish.file, fish.overrides), [find(run) for run in runs]
         check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
     found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names, fix=known)
@@ -147,16 +113,15 @@ def identify(
         print_json(found.to_builtins() | {"origin": origin})
     else:
         _print(found)
-        defaults = experiment and on != "robot" and not file
-        echo(f"from {origin}" + ("; --config names another" if defaults else ""))
+        echo(f"from {origin}")
     for remark in found.remarks:
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
         _write(target, found.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
-    if plot:
+    if picture:
         from fishd.lab.identification.figure import draw
 
-        draw(found, plot)
+        draw(found, picture)
     return 0
 
 
@@ -164,50 +129,28 @@ def _names(listed: str) -> tuple[str, ...]:
     return tuple(filter(None, listed.replace(" ", "").split(",")))
 
 
-def _swimmer(on: str | None, file: Path | None, overrides: tuple[str, ...]) -> str:
-    """Which fish swims an experiment, in words."""
-    if on == "robot":
-        return "the fish of fishd"
-    fish = f"the simulated fish of {file}" if file else "the default fish"
-    return f"{fish}, changed by --set" if overrides else fish
-
-
-def _config(
-    on: str | None, file: Path | None, overrides: tuple[str, ...], endpoint: str | None
-) -> tuple[Config, Fish | None]:
-    """The configuration that a fit begins with, and the fish of the fishd that runs, if that swims.
-
-    Raises `ConfigError`, and `NoDaemon`.
-    """
-    if on != "robot":
-        config = load(file, overrides)
-        check_tethered(config.robot, "identify")
-        return config, None
-    fish = Fish(endpoint)
-    return load(file, overrides) if file else adopt(fish.config(), overrides), fish
-
-
-def _swum(config: Config, fish: Fish | None, seconds: float, record: Path | None) -> Any:
-    """The ticks of an experiment, and a recording of them where one is wanted."""
+def _swum(
+    fish: ChosenFish, seconds: float, folder: Path | None, as_json: bool
+) -> tuple[Config, list[Any]]:
+    """Return the configuration that a fit begins with, and the ticks of an experiment."""
     from fishd.lab.identification import experiment
-    from fishd.lab.rig import LiveRig, Rig, VirtualRig
-    from fishd.lab.rig_recording import recorded
 
-    with ExitStack() as stack:
-        stack.enter_context(interrupted_once())
-        rig: Rig
-        rig = LiveRig(stack.enter_context(fish), *verb_lease()) if fish else VirtualRig(config)
-        stack.enter_context(rig)
-        if rig.unit != "N":
-            raise FishdError(
-                "the force sensor is not calibrated, so no force is known in newtons: "
-                "fishctl calibrate force"
-            )
-        if record:
-            stack.enter_context(recorded(rig, record, "fishctl identify --experiment"))
-        if fish:
-            echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
-        return experiment(rig, seconds)
+    with interrupted_once(), fish.session() as session:
+        if fish.on == "simulation":
+            config = fish.load()
+        elif fish.file:
+            config = load(fish.file, fish.overrides)
+        else:
+            config = adopt(deepcopy(session.config), fish.overrides)
+        session.check_calibrated()
+        with (
+            session,
+            kept(folder, fish, session, {"for": seconds}),
+            showing(seconds, "s", err=as_json) as bar,
+        ):
+            fish.announce(as_json)
+            session.progress = bar.at
+            return config, [experiment(session, seconds)]
 
 
 def _write(target: Path, text: str) -> None:

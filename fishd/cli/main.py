@@ -40,7 +40,7 @@ VERBS = {
     },
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
-        "runs": Verb("recording.runs", "runs", "List the recordings."),
+        "runs": Verb("recording.runs", "runs", "List recordings and experiments."),
         "plot": Verb("recording.plot", "plot", "Draw a recording, as a picture and a page."),
         "export": Verb("recording.export", "export", "Write a recording as CSV or Parquet."),
         "replay": Verb("recording.replay", "replay", "Publish a recording, as if it were live."),
@@ -69,7 +69,28 @@ VERBS = {
 }
 
 
-@click.group(cls=Verbs, verbs=VERBS, context_settings={"help_option_names": ["-h", "--help"]})
+DAILY = (
+    *("status", "watch", "set-controller", "stop", "measure"),
+    *("compare", "record", "runs", "plot", "simulate"),
+)
+"""Verbs for every day."""
+OTHER_WORDS = {
+    "help": "'fishctl --help' lists the verbs, 'fishctl VERB --help' explains one",
+    "list": "did you mean 'controllers', 'policies' or 'runs'?",
+    "run": "did you mean 'set-controller', 'simulate' or 'runs'?",
+    "start": "did you mean 'set-controller'? 'fishd' starts the daemon",
+    "swim": "did you mean 'set-controller', or 'simulate' for a fish in virtual time?",
+}
+"""What is meant by words that other programs have for a verb."""
+
+
+@click.group(
+    cls=Verbs,
+    verbs=VERBS,
+    daily=DAILY,
+    other_words=OTHER_WORDS,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.option("--endpoint", metavar="ADDRESS", help="Control socket of the daemon to talk to.")
 @click.version_option(__version__, prog_name="fishctl")
 @click.pass_context

@@ -1,19 +1,15 @@
 """The verb that finds a controller's thrust with its interval, on a live or a simulated fish."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.config import fish_options
-from fishd.cli.lab_progress import showing
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, json_option
+from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, kept
+from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json, spelled
-from fishd.client import Fish
-from fishd.config import load
+from fishd.cli.progress import showing
 from fishd.core.console import INTERRUPTED, power_words
 from fishd.core.process.interruption import interrupted_once
 
@@ -25,23 +21,9 @@ def measure_options(function: Any) -> Any:
     """The options of this verb."""
     for option in (
         json_option,
-        endpoint_option,
-        take_option,
-        fish_options,
-        click.option(
-            "--plot",
-            "picture",
-            type=click.Path(path_type=Path, dir_okay=False),
-            help="Draw raw force, fitted drift and corrected thrust into this file (.png, .svg).",
-        ),
-        click.option(
-            "--on",
-            "where",
-            type=click.Choice(["robot", "simulation"]),
-            default="robot",
-            show_default=True,
-            help="The fish of a running fishd, or one in virtual time.",
-        ),
+        plot_option("raw force, fitted drift and corrected thrust"),
+        keep_option,
+        fish_choice,
         click.option(
             "--settle",
             type=FiniteRange(0.0, 600.0),
@@ -49,14 +31,7 @@ def measure_options(function: Any) -> Any:
             show_default=True,
             help="How long the fin takes to swim steadily, and to come to rest [s].",
         ),
-        click.option(
-            "--for",
-            "seconds",
-            type=float,
-            default=60.0,
-            show_default=True,
-            help="Length of the whole measurement, rests included [s].",
-        ),
+        for_option("Length of the whole measurement, rests included [s].", default=60.0),
     ):
         function = option(function)
     return function
@@ -78,43 +53,40 @@ def _measure(
     parameters: dict[str, Any],
     seconds: float,
     settle: float,
-    where: str,
+    fish: ChosenFish,
+    folder: Path | None,
     picture: Path | None,
-    file: Path | None,
-    overrides: tuple[str, ...],
-    endpoint: str | None,
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
     from fishd.lab.measurement import measure as run
     from fishd.lab.measurement import summary
-    from fishd.lab.rig import LiveRig, Rig, VirtualRig
+    from fishd.lab.session import LiveSession
 
-    if where == "robot" and (file or overrides):
-        raise click.UsageError(
-            "--config and --set describe a fish in virtual time: --on simulation"
-        )
     if picture:
         drawing.check(picture)
-    with ExitStack() as stack:
-        stack.enter_context(interrupted_once())  # whatever ends it leaves the fish at rest
-        rig: Rig
-        if where == "simulation":
-            rig = stack.enter_context(VirtualRig(load(file, overrides)))
-            found = run(rig, name, parameters, seconds, settle=settle)
-        else:
-            fish = stack.enter_context(Fish(endpoint))
-            rig = stack.enter_context(LiveRig(fish, *verb_lease()))
-            try:
-                with showing(seconds, "s") as bar:
-                    found = run(rig, name, parameters, seconds, bar.at, settle)
-            except KeyboardInterrupt:
-                echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
-                return INTERRUPTED
-            if found.thrust > found.error and not found.remark:
-                fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
+    settings = {"controller": name, "parameters": parameters, "for": seconds, "settle": settle}
+    try:
+        with (
+            interrupted_once(),
+            fish.session() as session,
+            session,
+            kept(folder, fish, session, settings) as experiment,
+            showing(seconds, "s") as bar,
+        ):
+            fish.announce(as_json)
+            session.progress = bar.at
+            found = run(session, name, parameters, seconds, settle)
+            result = summary(found, session.tick)
+            if experiment:
+                experiment.write_struct("result.json", result)
+            if isinstance(session, LiveSession) and found.thrust > found.error and not found.remark:
+                session.fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
+    except KeyboardInterrupt:
+        echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
+        return INTERRUPTED
     if as_json:
-        print_json(summary(found, rig.tick))
+        print_json(result)
     else:
         echo(_line(found))
     for line in _careful(found):
@@ -122,7 +94,7 @@ def _measure(
     if picture:
         from fishd.lab.measurement_figure import draw
 
-        draw(found, rig.tick, picture)
+        draw(found, session.tick, picture)
     return 0
 
 
@@ -157,7 +129,7 @@ def _careful(found: "Measured") -> "Iterator[str]":
 def _power(found: "Measured") -> str:
     """What the servo took, where that is known, and what a watt of it gave."""
     from fishd.lab import error_budget
-    from fishd.lab.objective import per_watt
+    from fishd.lab.statistics import per_watt
 
     gave, error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
     if gave is None or error is None or not found.watts:

@@ -4,7 +4,8 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import click
 from click.shell_completion import CompletionItem
@@ -35,6 +36,75 @@ endpoint_option = click.option(
     callback=_remember,
     help="Control socket of the daemon; default: $FISHD_ENDPOINT, else the one on this machine.",
 )
+
+
+_TAKE = "fishd.take"
+
+
+def _remember_take(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+    ctx.meta[_TAKE] = value
+
+
+take_option = click.option(
+    "--take",
+    is_flag=True,
+    expose_value=False,
+    callback=_remember_take,
+    help="Take the fish from another experiment that holds it; that one ends.",
+)
+
+
+class VerbLease(NamedTuple):
+    """How the running verb takes the lease of a fish."""
+
+    experiment: str
+    """Name of the lease, such as `measure swing`."""
+    take: bool
+
+
+def verb_lease() -> VerbLease:
+    """Return how the verb of this command line, which has `take_option`, takes the lease."""
+    context = click.get_current_context()
+    _, _, words = context.command_path.partition(" ")
+    return VerbLease(words, bool(context.meta.get(_TAKE)))
+
+
+def for_option(
+    about: str, *, default: float | None = None, kind: click.ParamType[Any] | None = None
+) -> Callable[[F], F]:
+    """`--for`, a length in time; `--seconds` is another name for it."""
+    return click.option(
+        "--for",
+        "--seconds",
+        "seconds",
+        type=kind or FiniteRange(min=0.0, min_open=True),
+        metavar="SECONDS",
+        default=default,
+        show_default=default is not None,
+        help=about,
+    )
+
+
+def plot_option(about: str) -> Callable[[F], F]:
+    """`--plot`, a picture; about: what is in it."""
+    return click.option(
+        "--plot",
+        "picture",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help=f"Draw {about} into this file (.png, .svg, .pdf).",
+    )
+
+
+def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
+    """`--seed`; what: what the random numbers are for."""
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**32 - 1),
+        default=default,
+        show_default=default is not None,
+        help=f"Seed of the random number generator of {what}.",
+    )
 
 
 def daemon_options(function: F) -> F:
@@ -175,12 +245,13 @@ def _fish_of(values: dict[str, Any]) -> "Config | None":
     """
     from fishd.config import load
 
-    if "endpoint" in values and not values.get("file") and not values.get("overrides"):
+    chosen = values.get("fish")
+    if chosen.on == "live" if chosen else "endpoint" in values:
         from fishd.client import Fish  # with zmq, which simulations do without
 
-        with Fish(values["endpoint"]) as fish:
+        with Fish(chosen.endpoint if chosen else values["endpoint"]) as fish:
             return running_config(fish)
-    return load(values.get("file"), values.get("overrides", ()))
+    return chosen.load() if chosen else load(values.get("file"), values.get("overrides", ()))
 
 
 class _ControllerCommand(click.Command):
@@ -212,14 +283,19 @@ class ControllerGroup(click.Group):
         options: Callable[[F], F],
         remote: bool = False,
         several: bool = False,
+        resumable: bool = False,
         **kwargs: Any,
     ) -> None:
         """
+        resumable: the verb has `--resume`
         options: decorator that adds the verb's own options to each sub-command
         several: `square,sine` is a sub-command, too; each parameter takes several values
         """
         super().__init__(*args, **kwargs)
+        self.options_metavar = ""
+        self.subcommand_metavar = "CONTROLLER [OPTIONS]"
         self._options = options
+        self._resumable = resumable
         self._remote = remote
         self._several = several
         self._action: Callable[..., Any] = lambda: None
@@ -231,6 +307,23 @@ class ControllerGroup(click.Group):
         """
         self._action = function
         return function
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read `square:frequency=1.7,amplitude=0.3`, and what `--resume` begins with."""
+        if self._resumable:
+            from fishd.cli.experiment_options import recall
+
+            args = recall(ctx, args)
+        if args and ":" in args[0] and not args[0].startswith("-"):
+            from fishd.controllers import registry
+
+            try:
+                name, pairs = registry.split_spec(args[0])
+            except ParameterError as error:
+                raise click.UsageError(str(error), ctx) from None
+            options = [f"--{key.replace('_', '-')}={value}" for key, value in pairs]
+            args = [name, *options, *args[1:]]
+        return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The controllers installed here."""
@@ -266,6 +359,18 @@ class ControllerGroup(click.Group):
         kind = ValuesType if self._several else ParameterType
         command.params = parameter_options(fields.values(), kind) + command.params
         return command
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the options of the verb itself, which go after the controller, and the controllers.
+
+        'fishctl VERB CONTROLLER --help' has them with the parameters of that controller.
+        """
+        own = self._options(cast(Any, lambda: None))
+        params = reversed(getattr(own, "__click_params__", []))
+        records = [record for param in params if (record := param.get_help_record(ctx))]
+        with formatter.section("Options"):
+            formatter.write_dl([*records, ("-h, --help", "Show this message and exit.")])
+        self.format_commands(ctx, formatter)
 
     def _info(self, ctx: click.Context, name: str) -> ControllerInfo:
         from fishd.controllers import registry

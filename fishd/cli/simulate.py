@@ -9,7 +9,7 @@ import click
 
 from fishd.cli.config import fish_options
 from fishd.cli.free_swim_options import SETTLE, SwimmerOptions, swimmer_options
-from fishd.cli.options import ControllerGroup, json_option
+from fishd.cli.options import ControllerGroup, for_option, json_option
 from fishd.cli.output import criterion_words, echo, echo_rows, print_json, spelled, warn_of_fin
 from fishd.config import Config, load
 from fishd.core.console import power_words
@@ -32,9 +32,7 @@ def run_options(function: Any) -> Any:
             type=float,
             help="Time before figures are taken [s].  [default: 10; 8 of a swimmer]",
         ),
-        click.option(
-            "--seconds", type=float, default=60.0, show_default=True, help="Length of each run [s]."
-        ),
+        for_option("Length of the run [s].", default=60.0, kind=click.FLOAT),
     ):
         function = option(function)
     return function

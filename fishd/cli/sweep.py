@@ -1,8 +1,5 @@
 """The verb that measures thrust, or speed, over a grid of parameters, and proposes the best."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,53 +7,40 @@ import click
 import msgspec
 from msgspec.structs import replace
 
-from fishd.cli.config import set_option
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import ControllerGroup, FiniteRange, endpoint_option, json_option
-from fishd.cli.sweep_output import again, conclude, telling
-from fishd.client import Fish
-from fishd.config import Config, check_tethered, load
+from fishd.cli.experiment_options import ChosenFish, Ending, Place, fish_choice, folder_options
+from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
+from fishd.cli.output import counted, echo, print_json, warn_of_fin
+from fishd.cli.progress import showing
+from fishd.config import Config
 from fishd.controllers.base import Limits
-from fishd.core.errors import ConfigError, FishdError, NoDaemon
+from fishd.core import text
+from fishd.core.errors import ConfigError
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
-    from fishd.lab.sweep.folder import Begun, SweepFolder
+    from fishd.lab.experiment import Experiment
+    from fishd.lab.sweep.curves import Best, WholeTicks
+    from fishd.lab.sweep.folder import SweepFolder
     from fishd.lab.sweep.grid import Point
+    from fishd.lab.sweep.results import Found, Quantity
 
-ON = click.option(
-    "--on",
-    type=click.Choice(["simulation", "robot"]),
-    default="simulation",
-    show_default=True,
-    help="Fish simulated in virtual time, or that of the fishd that runs, real or not.",
-)
+SECONDS = 30.0
 
 
 def sweep_options(function: Any) -> Any:
     """The options of the verb itself."""
     for option in (
         json_option,
-        endpoint_option,
-        take_option,
+        plot_option("the curves"),
+        fish_choice,
+        folder_options,
         click.option(
             "--cluster", metavar="ADDRESS", help="In simulation: Dask scheduler that swims them."
         ),
         click.option(
             "--jobs", type=click.IntRange(min=1), help="In simulation: processes. [default: cores]"
         ),
-        click.option(
-            "--folder",
-            type=click.Path(path_type=Path),
-            help="Where table, recordings and picture go; a sweep that began there is "
-            "resumed. [default: runs/sweep-DATE-TIME]",
-        ),
-        click.option(
-            "--for",
-            "seconds",
-            type=FiniteRange(min=0.0, min_open=True),
-            help="On a robot: swimming and resting at each point [s]. [default: 30]",
-        ),
+        for_option(f"Live: swimming and resting at each point [s]. [default: {SECONDS:g}]"),
         click.option(
             "--periods",
             type=click.IntRange(min=2),
@@ -76,28 +60,20 @@ def sweep_options(function: Any) -> Any:
             help="In simulation: a key of the configuration with several values, such as "
             "plant.xi=0.6,1.2,2.4 or plant.omega0=8:14:2. Repeatable.",
         ),
-        click.option(
-            "--config",
-            "file",
-            type=click.Path(path_type=Path, readable=False),
-            help="In simulation: YAML file of the fish; without it, the defaults.",
-        ),
-        set_option,
-        ON,
     ):
         function = option(function)
     return function
 
 
-@click.group(cls=ControllerGroup, options=sweep_options, remote=True, several=True)
+@click.group(cls=ControllerGroup, options=sweep_options, remote=True, several=True, resumable=True)
 def sweep() -> None:
     """Measure thrust over a grid of parameters: table, recordings, picture, and the best.
 
     Of a fish that swims freely (robot: swimmer), the speed.
 
-    CONTROLLERS is one, or several as square,sine,triangle. Each parameter takes a value, a list
+    CONTROLLER is one, or several as square,sine,triangle. Each parameter takes a value, a list
     as 1,1.5,2, or a range as 0.4:4:0.2 (low:high:step); all combinations are measured. With
-    --folder, a sweep that was interrupted goes on, and its grid may grow.
+    --resume an interrupted sweep goes on, and its grid may grow.
     """
 
 
@@ -105,54 +81,36 @@ def sweep() -> None:
 def _sweep(
     infos: list[ControllerInfo],
     parameters: dict[str, list[Any]],
-    on: str,
-    file: Path | None,
-    overrides: tuple[str, ...],
     vary: tuple[str, ...],
     settle: float | None,
     periods: int | None,
     seconds: float | None,
-    folder: Path | None,
     jobs: int | None,
     cluster: str | None,
-    endpoint: str | None,
+    place: Place,
+    fish: ChosenFish,
+    picture: Path | None,
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
     from fishd.lab.sweep import grid
 
     drawing.check_installed()
+    if picture:
+        drawing.check(picture)
     of_simulation = {
-        "--config": file, "--set": overrides, "--vary": vary, "--settle": settle,
-        "--periods": periods, "--jobs": jobs, "--cluster": cluster,
+        "--vary": vary, "--settle": settle, "--periods": periods, "--jobs": jobs,
+        "--cluster": cluster,
     }  # fmt: skip
-    refuse_other(on, of_simulation, {"--for": seconds})
+    fish.refuse_other(of_simulation, {"--for": seconds})
     names = [info.name for info in infos]
     takes = {info.name: [field.name for field in info.parameters] for info in infos}
-    path = folder or Path("runs") / f"sweep-{datetime.now():%Y%m%d-%H%M%S}"
-    if on == "robot":
-        found = grid.points(names, parameters, takes)
-        whole, kept = _on_robot(path, found, seconds or 30.0, endpoint, as_json)
-        error_of = "the measurement"
-    else:
-        keys = dict(_varied(text) for text in vary)
-        found = grid.points(names, parameters, takes, keys)
-        lengths = {"settle": settle, "periods": periods}
-        crew = {"jobs": jobs, "cluster": cluster}
-        whole, kept = _in_simulation(path, found, file, overrides, lengths, crew, as_json)
-        error_of = "the mean over beats"
     units = {field.name: field.unit for info in infos for field in info.parameters}
-    return conclude(kept, found, units, error_of, whole, as_json)
-
-
-def refuse_other(on: str, of_simulation: dict[str, Any], of_robot: dict[str, Any]) -> None:
-    """Refuse options that mean nothing where the fish is; raises `UsageError`."""
-    for name, value in (of_simulation if on == "robot" else of_robot).items():
-        if value not in (None, ()):
-            where = "is for --on simulation: a running fishd keeps its configuration"
-            if name not in ("--config", "--set", "--vary"):
-                where = f"is for --on {'simulation' if on == 'robot' else 'robot'}"
-            raise click.UsageError(f"{name} {where}")
+    points = grid.points(names, parameters, takes, dict(_varied(text) for text in vary))
+    task = _Sweep(points, units, place, fish, picture, as_json)
+    if fish.on == "live":
+        return task.measure(SECONDS if seconds is None else seconds)
+    return task.swim({"settle": settle, "periods": periods}, {"jobs": jobs, "cluster": cluster})
 
 
 def _varied(text: str) -> tuple[str, list[Any]]:
@@ -164,83 +122,185 @@ def _varied(text: str) -> tuple[str, list[Any]]:
     return key.strip(), list(dict.fromkeys(map(typed, spread(values))))
 
 
-def _in_simulation(
-    path: Path,
-    found: "list[Point]",
-    file: Path | None,
-    overrides: tuple[str, ...],
-    given: dict[str, Any],
-    crew: dict[str, Any],
-    err: bool,
-) -> "tuple[bool, SweepFolder]":
-    from fishd.lab.sweep import grid, running
-    from fishd.lab.sweep.folder import Begun
-    from fishd.lab.sweep.grid import Lengths
+class _Sweep:
+    """One sweep, as the command line wants it."""
 
-    fish: dict[tuple[tuple[str, Any], ...], Config] = {}
-    pairs = []
-    for point in found:
-        changed = tuple(point.keys.items())
-        if changed not in fish:
-            fish[changed] = _fish_of(point, file, overrides)
-        grid.check(point, replace(fish[changed].limits, virtual=True))
-        pairs.append((point, fish[changed]))
-    config = load(file, overrides)
-    lengths = Lengths.of(config, **given)
-    begun = Begun("simulation", msgspec.to_builtins(config), msgspec.to_builtins(lengths))
-    with (
-        _opened(path, begun, found) as folder,
-        telling(folder, found, "points", 1.0, err) as count,
-    ):
-        whole = running.in_simulation(folder, pairs, lengths, count.done, **crew)
-    return whole, folder
+    def __init__(
+        self,
+        points: "list[Point]",
+        units: dict[str, str],
+        place: Place,
+        fish: ChosenFish,
+        picture: Path | None,
+        as_json: bool,
+    ) -> None:
+        """units: of the parameters"""
+        self._points = points
+        self._units = units
+        self._place = place
+        self._fish = fish
+        self._picture = picture
+        self._as_json = as_json
+        self._finished = 0
+
+    def swim(self, given: dict[str, Any], crew: dict[str, Any]) -> int:
+        """Swim simulated fish; given: lengths, crew: who computes."""
+        from fishd.lab.sweep.grid import Lengths
+        from fishd.lab.sweep.measuring import swim_all
+
+        pairs = self._fish_of_points()
+        config = self._fish.load()
+        lengths = Lengths.of(config, **given)
+        settings = {"lengths": msgspec.to_builtins(lengths)}
+        with self._place.open(self._fish, msgspec.to_builtins(config), settings) as experiment:
+            folder = self._folder(experiment)
+            ending = Ending(experiment)
+            with showing(len(pairs), "points", err=self._as_json) as show:
+                show.at(self._finished)
+
+                def done(point: "Point", result: "Found") -> None:
+                    show.done(self._line(folder, point, result), self._finished)
+
+                ending.is_interrupted = not swim_all(folder, pairs, lengths, done, **crew)
+            folder.sort(self._points)
+            return self._conclude(folder, ending, "the mean over beats")
+
+    def measure(self, seconds: float) -> int:
+        """Measure a live fish for so long at each point [s]."""
+        from fishd.lab.measurement import plan
+        from fishd.lab.sweep import grid
+        from fishd.lab.sweep.measuring import measure_all
+
+        for point in self._points:
+            plan(seconds, point.parameters)  # which says that it is too short, before it moves
+        settings = {"lengths": {"seconds": seconds}}
+        with self._fish.session() as session:
+            grid.check_remote(self._points, Limits(session.amplitude, session.tick))
+            with self._place.open(self._fish, session.config, settings, session.unit) as experiment:
+                folder = self._folder(experiment)
+                ending = Ending(experiment)
+                session.used = self._finished * seconds
+                with (
+                    ending.measuring(),
+                    session,
+                    showing(len(self._points) * seconds, "s", err=self._as_json) as show,
+                ):
+                    session.progress = show.at
+
+                    def done(point: "Point", result: "Found") -> None:
+                        show.done(self._line(folder, point, result), session.used)
+
+                    measure_all(folder, self._points, session, seconds, done)
+                folder.sort(self._points)
+                return self._conclude(folder, ending, "the measurement")
+
+    def _fish_of_points(self) -> "list[tuple[Point, Config]]":
+        """Return each point with the configuration of its fish, once all of them are possible."""
+        from fishd.lab.sweep import grid
+
+        fish: dict[tuple[tuple[str, Any], ...], Config] = {}
+        for point in self._points:
+            changed = tuple(point.keys.items())
+            if changed not in fish:
+                fish[changed] = self._fish_of(point)
+            grid.check(point, replace(fish[changed].limits, virtual=True))
+        return [(point, fish[tuple(point.keys.items())]) for point in self._points]
+
+    def _fish_of(self, point: "Point") -> Config:
+        pairs = [f"{key}={value}" for key, value in point.keys.items()]
+        try:
+            return self._fish.load(pairs)
+        except ConfigError as error:
+            message = str(error)
+            for pair in pairs:
+                message = message.replace(f"--set {pair}", f"--vary {pair}")
+            raise ConfigError(message) from None
+
+    def _folder(self, experiment: "Experiment") -> "SweepFolder":
+        """Open the table, and print what is there already."""
+        from fishd.lab.sweep.folder import SweepFolder
+
+        columns = dict.fromkeys(name for point in self._points for name in point.columns())
+        folder = SweepFolder(experiment, list(columns))
+        self._finished = sum(folder.key(point) in folder.results for point in self._points)
+        there = f", {self._finished} of them there already" if self._finished else ""
+        self._fish.announce(self._as_json)
+        echo(f"{folder.path}: {counted(len(self._points), 'point')}{there}", err=self._as_json)
+        return folder
+
+    def _line(self, folder: "SweepFolder", point: "Point", result: "Found") -> str:
+        """Return a line on a point that is done."""
+        self._finished += 1
+        return f"{point.label()}: {_figures(result, folder.quantity)}"
+
+    def _conclude(self, folder: "SweepFolder", ending: Ending, error_of: str) -> int:
+        """Print what is best, and draw what there is; return the exit status."""
+        from fishd.lab.sweep import curves, figure
+
+        points, quantity = self._points, folder.quantity
+        drawn = curves.curves(folder, points)
+        bests = [
+            (curve, replace(best, whole_ticks=curves.whole_ticks(folder, curve)))
+            for curve in drawn
+            if (best := curves.best(curve))
+        ]
+        if self._as_json:
+            print_json([curves.plain(best, quantity) for _, best in bests])
+        else:
+            for curve, best in bests:
+                unit = self._units.get(best.over, "")
+                echo(f"{curve.label}: {_proposal(best, unit, quantity.unit)}")
+                if best.whole_ticks:
+                    whole = _measured(best.whole_ticks, quantity.unit)
+                    echo(f"{curve.label}, of whole ticks: {whole}")
+            echo(f"table: {folder.path / 'rows.csv'}")
+        if any(curve.peak for curve in drawn):
+            stem = folder.path / quantity.name
+            paths = [self._picture] if self._picture else [Path(f"{stem}.png"), Path(f"{stem}.svg")]
+            figure.draw(paths, drawn, self._units, error_of=error_of, quantity=quantity)
+            if not self._as_json:
+                echo(f"picture: {', '.join(map(str, paths))}")
+        fins = [
+            (getattr(result, "fin_amplitude", None) or 0.0, point.label())
+            for point in points
+            if (result := folder.results.get(folder.key(point)))
+        ]
+        if fins:
+            widest, where = max(fins)
+            warn_of_fin(widest, f" at {where}")
+        if ending.is_interrupted:
+            done = sum(folder.key(point) in folder.results for point in points)
+            return ending.interrupted(f"{done} of {counted(len(points), 'point')} are kept")
+        return 1 if any(folder.results[folder.key(point)].trouble for point in points) else 0
 
 
-def _fish_of(point: "Point", file: Path | None, overrides: tuple[str, ...]) -> Config:
-    pairs = [f"{key}={value}" for key, value in point.keys.items()]
-    try:
-        return load(file, (*overrides, *pairs))
-    except ConfigError as error:
-        message = str(error)
-        for pair in pairs:
-            message = message.replace(f"--set {pair}", f"--vary {pair}")
-        raise ConfigError(message) from None
+def _figures(result: "Found", quantity: "Quantity") -> str:
+    if result.value is None:
+        return f"no {quantity.name}: {result.trouble}"
+    beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
+    steady = "" if getattr(result, "settled", 0.0) is not None else ", not yet steady"
+    return f"{text.format_measured(result.value, result.error, quantity.unit)}{beats}{steady}"
 
 
-def _on_robot(
-    path: Path, found: "list[Point]", seconds: float, endpoint: str | None, err: bool
-) -> "tuple[bool, SweepFolder]":
-    from fishd.lab.measurement import plan
-    from fishd.lab.rig import Disturbed, LiveRig
-    from fishd.lab.sweep import grid, running
-    from fishd.lab.sweep.folder import Begun
-
-    for point in found:
-        plan(seconds, point.parameters)  # which says that it is too short, before anything moves
-    with Fish(endpoint) as fish:
-        status = fish.status()
-        check_tethered(status.robot, "sweep --on robot")
-        grid.check_remote(found, Limits(status.amplitude_limit, status.tick))
-        rig = LiveRig(fish, *verb_lease())
-        begun = Begun("robot", fish.config(), {"seconds": seconds}, status.force_unit)
-        with (
-            _opened(path, begun, found) as folder,
-            telling(folder, found, "s", seconds, err) as count,
-        ):
-            try:
-                whole = running.on_robot(folder, found, rig, seconds, count.done, count.at)
-            except (Disturbed, NoDaemon) as error:
-                raise FishdError(f"{error}; to go on: {again(path)}") from None
-    return whole, folder
+def _proposal(best: "Best", unit: str, of: str) -> str:
+    symbol = "" if unit in ("", "1") else f" {unit}"
+    value = text.format_measured(best.value, best.error, of)
+    if best.x is None:
+        return value
+    if best.at_edge:
+        return (
+            f"best measured at {best.over} {best.x:g}{symbol}, {value}: at the edge of the grid, "
+            "so the best may lie beyond it"
+        )
+    if best.x_low is None or best.x_high is None:
+        return f"best measured at {best.over} {best.x:.4g}{symbol}: {value}"
+    interval = f"[{best.x_low:.4g}, {best.x_high:.4g}]"
+    return f"best {best.over} {best.x:.4g}{symbol} {interval}: {value}"
 
 
-@contextmanager
-def _opened(path: Path, begun: "Begun", found: "list[Point]") -> "Iterator[SweepFolder]":
-    from fishd.lab.begun import owned
-    from fishd.lab.sweep.folder import SweepFolder
-
-    columns = dict.fromkeys(name for point in found for name in point.columns())
-    with owned(path, "sweep"):
-        folder = SweepFolder(path, begun, list(columns))
-        yield folder
-        folder.sort(found)
+def _measured(found: "WholeTicks", force_unit: str) -> str:
+    thrust = text.format_measured(found.thrust, found.error, force_unit)
+    best = f"best measured at {found.frequency:.4g} Hz: {thrust}"
+    if found.nearer is None:
+        return best
+    return f"{best}; {found.nearer:.6g} Hz is nearer the best, and not in the grid"

@@ -1,7 +1,7 @@
 """Groups of verbs: each verb is imported only when it is called, help lists them by purpose."""
 
 import gc
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -51,9 +51,22 @@ class Verb(NamedTuple):
 class Verbs(click.Group):
     """So that `fishctl status` does not wait for what others need."""
 
-    def __init__(self, *args: Any, verbs: Mapping[str, Mapping[str, Verb]], **kwargs: Any) -> None:
-        """verbs: by the heading in help that they stand below, and by name"""
+    def __init__(
+        self,
+        *args: Any,
+        verbs: Mapping[str, Mapping[str, Verb]],
+        daily: Sequence[str] = (),
+        other_words: Mapping[str, str] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """
+        verbs: by the heading in help that they stand below, and by name
+        daily: those that help marks as verbs for every day
+        other_words: what is meant by words that are not verbs
+        """
         self._sections = verbs
+        self._other_words = other_words or {}
+        self._daily = daily
         self._verbs = {name: verb for section in verbs.values() for name, verb in section.items()}
         # click suggests the nearest of these for a name that is misspelled.
         stubs = {name: click.Command(name) for name in self._verbs}
@@ -96,14 +109,27 @@ class Verbs(click.Group):
         names = [item for item in names if item.value.startswith(incomplete)]
         return names + click.Command.shell_complete(self, ctx, incomplete)
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find a verb; a word that another program would have for one gets what is meant."""
+        if meant := self._other_words.get(args[0]):
+            raise click.UsageError(f"No such command '{args[0]}': {meant}", ctx)
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs below their headings, without importing any."""
         width = max(map(len, self._verbs))
         for heading, section in self._sections.items():
             with formatter.section(heading):
-                formatter.write_dl(
-                    [(f"{name:<{width}}", verb.about) for name, verb in section.items()]
-                )
+                rows = [
+                    (f"{name:<{width}}{' *' if name in self._daily else ''}", verb.about)
+                    for name, verb in section.items()
+                ]
+                formatter.write_dl(rows)
+        if self._daily:
+            formatter.write_paragraph()
+            formatter.write_text("* for every day")
 
 
 @contextmanager

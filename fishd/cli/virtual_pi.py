@@ -14,7 +14,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from fishd.cli.config import fish_options
-from fishd.cli.options import json_option
+from fishd.cli.options import for_option, json_option
 from fishd.cli.output import echo, echo_rows, print_json
 from fishd.config import Config, load
 from fishd.core.addresses import virtual_pi_socket
@@ -82,7 +82,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
 
 @virtual_pi.command()
 @click.argument("name", shell_complete=_complete)
-@click.option("--seconds", type=float, help="How long it lasts; without this, until 'clear'.")
+@for_option("How long it lasts [s]; without this, until 'clear'.", kind=click.FLOAT)
 @fish_options
 def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple[str, ...]) -> None:
     """Begin the fault NAME; 'fishctl virtual-pi faults' lists them."""

@@ -12,7 +12,7 @@ from contextlib import suppress
 import click
 
 from fishd.cli.drawing import whole_screen
-from fishd.cli.options import FiniteRange, daemon_options
+from fishd.cli.options import daemon_options, for_option
 from fishd.cli.output import echo, measured, print_json_line, time_of_day
 from fishd.client import AsyncFish
 from fishd.core import text
@@ -24,11 +24,7 @@ REDRAW = 0.1
 
 @click.command()
 @daemon_options
-@click.option(
-    "--seconds",
-    type=FiniteRange(min=0, min_open=True),
-    help="End by itself after this time; by default Ctrl-C ends it.",
-)
+@for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
 def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
     """Watch force, command and timing live, until Ctrl-C.
 

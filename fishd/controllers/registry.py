@@ -43,6 +43,21 @@ names, find = _found.names, _found.find
 """All names; and the class of one, or `UnknownController`."""
 
 
+def split_spec(spec: str) -> tuple[str, list[tuple[str, str]]]:
+    """Return name and parameters of a text such as `square:frequency=1.7,amplitude=0.3`.
+
+    Raises `ParameterError` where a parameter is not NAME=VALUE.
+    """
+    name, _, values = spec.partition(":")
+    pairs = []
+    for word in filter(None, values.split(",")):
+        key, equals, value = word.partition("=")
+        if not (key and equals and value):
+            raise ParameterError(f"{spec}: '{word}' is not valid: NAME=VALUE is needed")
+        pairs.append((key, value))
+    return name, pairs
+
+
 def describe(name: str) -> ControllerInfo:
     """Name, summary, parameters and quantities of a controller; raises `UnknownController`."""
     found = find(name)

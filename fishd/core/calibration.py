@@ -18,6 +18,8 @@ Highest = Annotated[float, unit("rad", "Soft limit: no angle above.", ge=0, le=m
 Covariance = tuple[float, float, float]
 """Variance of a row's first gain, covariance of both, and variance of the second [N²/V²]."""
 
+Z95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations of a normal distribution."""
 WORST_CONDITION = 1e5
 """A matrix of a larger condition number says the same of both forces; that of a fit is less."""
 
@@ -44,7 +46,7 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     covariance_x: Covariance | None = None
     """Covariance of xx and xy; null where the uncertainty of this calibration is unknown.
 
-    1.96 times the root of a variance is the half-width of a 95 % confidence interval.
+    `Z95` times the root of a variance is the half-width of a 95 % confidence interval.
     """
     covariance_y: Covariance | None = None
     """Covariance of yx and yy, in the same way."""
@@ -74,7 +76,7 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         vx = (self.yy * fx - self.xy * fy) / determinant
         vy = (self.xx * fy - self.yx * fx) / determinant
         first, both, second = self.covariance_x
-        return 1.96 * math.sqrt(max(0.0, first * vx**2 + 2.0 * both * vx * vy + second * vy**2))
+        return Z95 * math.sqrt(max(0.0, first * vx**2 + 2.0 * both * vx * vy + second * vy**2))
 
     @property
     def untouched(self) -> bool:

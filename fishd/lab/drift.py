@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.lab.disturbances import NAMED_ODDS, RESPONSE_TIMES_S, Disturbance, Search, candidates
+from fishd.lab.statistics import Z95
 
 Array = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ def _fit(blocks: Blocks) -> Fit:
         for candidate, size in zip(chosen, sizes.tolist(), strict=True)
         if search.odds(chosen, candidate) >= NAMED_ODDS
     ]
-    return Fit(mean, 1.96 * spread**0.5, drift, found, search.is_full(chosen))
+    return Fit(mean, Z95 * spread**0.5, drift, found, search.is_full(chosen))
 
 
 def _disturbance(candidate: int, size: float, time: Array, responses: int) -> Disturbance:

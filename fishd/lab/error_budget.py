@@ -7,7 +7,7 @@ cancels in the ratio of two thrusts.
 
 import math
 from collections.abc import Iterable, Iterator
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,10 @@ from msgspec import UNSET
 
 from fishd.control.estimators.live_thrust import SWIM_SETTLES
 from fishd.core import text
+from fishd.core.beats import upward_reversals
 from fishd.core.calibration import ForceCalibration
 from fishd.core.signals import Tick
+from fishd.lab.statistics import Z95
 
 MIN_ROTATION_RAD = 0.01
 """A smaller rotation hides less than 0.005 % of a thrust and is not counted."""
@@ -127,7 +129,7 @@ def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> fl
         return 0.0
     angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
     # The error of a principal axis: Anderson, Ann. Math. Stat. 34 (1963) 122.
-    angle_ci95 = 1.96 * math.sqrt(least * most / len(forces)) / (most - least)
+    angle_ci95 = Z95 * math.sqrt(least * most / len(forces)) / (most - least)
     return angle if abs(angle) >= max(MIN_ROTATION_RAD, angle_ci95) else 0.0
 
 
@@ -146,7 +148,7 @@ def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
     """Return the whole beats of each swim once it is steady."""
     beats = []
     for swim in _settled_phases(ticks, settles, swims=True):
-        ups = [i for i, (a, b) in enumerate(pairwise(swim), 1) if a.phi_c <= 0.0 < b.phi_c]
+        ups = upward_reversals(tick.phi_c for tick in swim)
         if len(ups) > 1:
             # A force is that of the window before its tick, an angle that of the one after it.
             beats.append(swim[ups[0] + 1 : ups[-1] + 1])

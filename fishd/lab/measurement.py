@@ -1,7 +1,7 @@
 """The thrust of a controller with its interval: the fish swims and rests in turn."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
@@ -9,13 +9,14 @@ import numpy as np
 from msgspec import UNSET, Struct
 
 from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTLES
+from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab import error_budget
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
 from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
-from fishd.lab.objective import per_watt
-from fishd.lab.rig import Rig, refuse_lost
+from fishd.lab.session import Session, refuse_lost
+from fishd.lab.statistics import Z95, per_watt
 
 SWIM, REST = 6.0, 2.75
 """How long the fish swims and rests in turn, on average [s]."""
@@ -115,40 +116,37 @@ class Step(NamedTuple):
 
 
 def measure(
-    rig: Rig,
+    session: Session,
     controller: str,
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
-    progress: Callable[[float], None] = lambda seconds: None,
     settle: float = SWIM_SETTLES,
 ) -> Measured:
-    """Let a controller swim and rest in turn for so long, and find its thrust.
+    """Swim and rest a controller in turn for `seconds`, and return its thrust.
 
-    The drift of the sensor is told apart by the rests: see `fishd.lab.drift`.
-    progress: called with the time that has passed [s]
+    The rests separate the drift of the sensor: see `fishd.lab.drift`.
     settle: how long the fin takes until it swims steadily, or hangs still as before [s]
 
     Raises `ParameterError` for a time that is too short, `Disturbed` (also where many ticks were
-    lost on their way), and what `Rig.swim` raises.
+    lost on their way), and what `Session.swim` raises.
     """
     ticks: list[Tick] = []
     phases = plan(seconds, parameters, settle)
     for swims, length in phases:
-        ticks += rig.swim(controller, parameters, length) if swims else rig.rest(length)
-        progress(len(ticks) * rig.tick)
-    refuse_lost(ticks, (length for _, length in phases), rig.tick)
+        ticks += session.swim(controller, parameters, length) if swims else session.rest(length)
+    refuse_lost(ticks, (length for _, length in phases), session.tick)
     samples = samples_of(ticks)
-    found = evaluate(samples, rig.tick, settle, _still(settle))
+    found = evaluate(samples, session.tick, settle, _still(settle))
     if not found.frequency and len({each.phi_c for each in samples if each.swims}) > 1:
         raise ParameterError("no whole beat is left of a swim; a longer --settle lengthens swims")
     rotation = error_budget.visible_rotation(ticks)
     lateral = error_budget.lateral_force(ticks)
-    budget = error_budget.budget(rig.calibration, found.thrust, found.error, lateral, rotation)
+    budget = error_budget.budget(session.calibration, found.thrust, found.error, lateral, rotation)
     return found._replace(
         controller=controller,
         parameters=dict(parameters),
         ticks=ticks,
-        unit=rig.unit,
+        unit=session.unit,
         rotation=rotation,
         lateral=lateral,
         **budget._asdict(),
@@ -376,7 +374,7 @@ def _watts(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
     mean = sum(block.watts * block.lasts for block in swimming) / lasting
     if not math.isfinite(mean):
         return {}
-    return {"watts": mean, "watts_error": 1.96 * math.sqrt(spread / lasting)}
+    return {"watts": mean, "watts_error": Z95 * math.sqrt(spread / lasting)}
 
 
 def _together(kept: Sequence[list["Block"]]) -> list[list["Block"]]:
@@ -449,7 +447,7 @@ def _blocks(phase: Sequence[Sample], tick: float, first: int, settles: float) ->
     """
     swims = phase[0].swims
     begin = round(settles / tick)
-    ups = _reversals(phase) if swims else []
+    ups = upward_reversals(each.phi_c for each in phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1
     if not beating:
@@ -474,17 +472,6 @@ def _blocks(phase: Sequence[Sample], tick: float, first: int, settles: float) ->
             swims=swims,
             watts=sum(each.watts for each in window) / len(window),
         )
-
-
-def _reversals(phase: Sequence[Sample]) -> list[int]:
-    """Where the instruction angle becomes positive."""
-    side, found = 0.0, []
-    for index, sample in enumerate(phase):
-        if sample.phi_c and math.copysign(1.0, sample.phi_c) != side:
-            if side < 0.0:
-                found.append(index)
-            side = math.copysign(1.0, sample.phi_c)
-    return found
 
 
 def _steps(found: Sequence[Block], swims: bool) -> Iterator[Step]:

@@ -7,8 +7,9 @@ is the best one. What is left is undecided, and the simplest gait is chosen from
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
 from typing import NamedTuple
+
+from fishd.lab.statistics import quantile, student95
 
 LEVEL = 0.05
 """Probability with which one of the intervals that belong together may fail."""
@@ -103,15 +104,9 @@ def half_width(candidate: Candidate, comparisons: int) -> float:
     return candidate.ci95 * widening(comparisons, candidate.freedom)
 
 
-@cache
 def widening(comparisons: int, freedom: float = math.inf) -> float:
     """Return how much wider an interval is that holds in so many comparisons together."""
-    from scipy.special import ndtri, stdtrit
-
-    def quantile(p: float) -> float:
-        return float(ndtri(p) if math.isinf(freedom) else stdtrit(freedom, p))
-
-    return quantile(1.0 - 0.5 * LEVEL / max(1, comparisons)) / quantile(1.0 - 0.5 * LEVEL)
+    return quantile(1.0 - 0.5 * LEVEL / max(1, comparisons), freedom) / student95(freedom)
 
 
 def ratio(

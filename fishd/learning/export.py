@@ -173,7 +173,7 @@ def _evaluated(
 ) -> Evaluation:
     """That of this policy on the robot, else one on the simulated fish of its training."""
     state = checkpoints.read_state(checkpoint)
-    if state.on == "robot":
+    if state.on == "live":
         for found in (state.best, state.latest):
             if found and found.policy == state.steps:
                 return found

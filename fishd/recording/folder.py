@@ -35,18 +35,14 @@ class Glance(NamedTuple):
 
 
 def runs_folder() -> Path:
-    """$FISHD_RUNS, else the service's state folder, else `fishd/runs` in that of the user's data.
+    """Return the folder of recordings and experiments; it need not exist.
 
-    It need not exist.
+    $FISHD_RUNS, else the state folder of a service, else `runs` in the current folder.
     """
-    if given := os.environ.get(FOLDER_VARIABLE):
-        return Path(given)
-    if state := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
-        return Path(state)
-    data = os.environ.get("XDG_DATA_HOME", "")
-    # Relative ones are to be ignored, says the XDG Base Directory Specification.
-    base = Path(data) if data.startswith("/") else Path.home() / ".local/share"
-    return base / "fishd/runs"
+    given = (
+        os.environ.get(FOLDER_VARIABLE) or os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    )
+    return Path(given or "runs")
 
 
 def made(folder: Path) -> Path:

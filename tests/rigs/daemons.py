@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fishd.lab import rig
+from fishd.lab import session
 from rigs.processes import Daemon, running
 
 
@@ -13,8 +13,8 @@ from rigs.processes import Daemon, running
 def unhurried_rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """A measurement may miss any of its ticks where real time is not judged."""
     if not request.node.get_closest_marker("realtime"):
-        monkeypatch.setattr(rig, "LOST", 1.0)
-        monkeypatch.setattr(rig, "IDLE_LIMIT", 60.0)
+        monkeypatch.setattr(session, "MAX_LOST_FRACTION", 1.0)
+        monkeypatch.setattr(session, "IDLE_LIMIT", 60.0)
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ from fishd.cli.camera.latency import forces_of
 from fishd.config import load
 from fishd.core.camera_frames import Frame
 from fishd.core.signals import Tick
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 
 NOISY = ("simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.drift=5e-3")
 
 
 def swum(seconds: float, *overrides: str, controller: str = "excitation") -> list[Tick]:
-    with VirtualRig(load(None, (*NOISY, *overrides))) as rig:
+    with VirtualSession(load(None, (*NOISY, *overrides))) as rig:
         return rig.swim(controller, {}, seconds)
 
 

@@ -14,7 +14,7 @@ from fishd.__main__ import fishctl, fishd
 from fishd.control import loop, supervisor
 from fishd.control.faults import FAULTS
 from fishd.hardware.servo import pigpio_link
-from fishd.lab import rig
+from fishd.lab import session
 
 
 def have_patience() -> None:
@@ -23,7 +23,7 @@ def have_patience() -> None:
     loop.STALE = 100.0
     pigpio_link.LATE_STREAK = 1_000_000
     FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
-    rig.LOST, rig.IDLE_LIMIT = 1.0, 60.0
+    session.MAX_LOST_FRACTION, session.IDLE_LIMIT = 1.0, 60.0
 
 
 if __name__ == "__main__":

@@ -3,7 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
+
+import msgspec
 
 from fishd.config import Config
 from fishd.core.errors import LeaseLost, ParameterError, Refused
@@ -13,7 +15,7 @@ from fishd.lab.simulation import KeepingPublisher, VirtualRun
 
 
 class VirtualStatus:
-    """What a `LiveRig` asks of a status."""
+    """What a `LiveSession` asks of a status."""
 
     def __init__(self, run: VirtualRun, pid: int) -> None:
         loop = run.loop
@@ -44,6 +46,9 @@ class VirtualDaemon:
 
     def status(self) -> VirtualStatus:
         return VirtualStatus(self.run, self.pid)
+
+    def config(self) -> dict[str, Any]:
+        return cast(dict[str, Any], msgspec.to_builtins(self.config_of_run))
 
     @contextmanager
     def lease(self, name: str, take: bool = False, **_: Any) -> Iterator[SimpleNamespace]:

@@ -247,7 +247,7 @@ def test_without_a_camera_it_says_how_to_start_one(daemon: Daemon, eye: str) -> 
 def test_a_live_comparison_lets_it_swim_through_the_camera(
     daemon: Daemon, camera: CameraProcess, eye: str
 ) -> None:
-    words = ("compare", "--on", "robot", "--for", "21", eye, "--camera", camera.endpoint)
+    words = ("compare", "--on", "live", "--for", "21", eye, "--camera", camera.endpoint)
     done = daemon.fishctl_apart(*words, timeout=60.0)
     assert (done.returncode, done.stderr) == (0, "")
     row = done.stdout.splitlines()[1]
@@ -263,7 +263,7 @@ def test_a_live_comparison_leaves_out_what_the_camera_does_not_suit(
 ) -> None:
     content = velocity_follower(about=seeing_card(pictures=StackSettings(size=48, frames=2)))
     path = str(write(tmp_path, content, "large"))
-    done = daemon.fishctl("compare", "--on", "robot", path, "--camera", camera.endpoint)
+    done = daemon.fishctl("compare", "--on", "live", path, "--camera", camera.endpoint)
     assert (done.returncode, done.stdout) == (1, "")
     assert f"{path}: left out: frames of 48 x 48 pixels are needed" in done.stderr
     assert daemon.status().mode == "idle"
@@ -275,7 +275,7 @@ def test_a_camera_that_dies_ends_a_live_comparison_with_the_fish_at_rest(
 ) -> None:
     with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
         camera.is_in("streaming")
-        own = ("--endpoint", daemon.endpoint, "compare", "--on", "robot", eye)
+        own = ("--endpoint", daemon.endpoint, "compare", "--on", "live", eye)
         with (
             Process(FISHCTL, *own, "--camera", camera.endpoint) as comparing,
             Subscriber(daemon.telemetry, b"tick") as ticks,

@@ -1,4 +1,4 @@
-"""`fishctl compare --on robot` and a running fishd: it may be interrupted at any time."""
+"""`fishctl compare --on live` and a running fishd: it may be interrupted at any time."""
 
 import re
 import signal
@@ -11,7 +11,7 @@ from fishd.client import Fish
 
 
 def comparing(daemon: Daemon, *arguments: str) -> subprocess.Popen[str]:
-    command = [FISHCTL, "--endpoint", daemon.endpoint, "compare", "--on", "robot", *arguments]
+    command = [FISHCTL, "--endpoint", daemon.endpoint, "compare", "--on", "live", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -41,11 +41,11 @@ def test_nobody_swims_on_where_somebody_stops_the_fish(daemon: Daemon) -> None:
 def test_a_latched_stop_and_a_wrong_option_are_one_line(daemon: Daemon) -> None:
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.estop("the net")
-        done = daemon.fishctl("compare", "--on", "robot", "swing")
+        done = daemon.fishctl("compare", "--on", "live", "swing")
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
         assert "the net" in done.stderr
         fish.clear_fault()
     for option in ("--settle=3", "--set=tick=0.02"):
-        done = daemon.fishctl("compare", "--on", "robot", "swing", option)
+        done = daemon.fishctl("compare", "--on", "live", "swing", option)
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
         assert option.partition("=")[0] in done.stderr

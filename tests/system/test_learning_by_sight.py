@@ -48,7 +48,7 @@ def rig_of(folder: Path, *settings: str, brief: str = BRIEF) -> Iterator[Rig]:
     with running(folder, *sets(*settings)) as daemon:
         fishd = f"simulated.fishd={daemon.endpoint}"
         with running_camera(folder, fishd) as camera:
-            on = ("--on", "robot", "--endpoint", daemon.endpoint, "--camera", camera.endpoint)
+            on = ("--on", "live", "--endpoint", daemon.endpoint, "--camera", camera.endpoint)
             words = ("learn", "ppo", *on, "--settings", str(file), "--folder", str(run))
             yield Rig(daemon, camera, words, run)
 

@@ -1,10 +1,10 @@
-"""`fishctl optimise --on robot` on a real fishd: what a signal leaves, and how it goes on."""
+"""`fishctl optimise --on live` on a real fishd: what a signal leaves, and how it goes on."""
 
 import signal
 from pathlib import Path
 
 import pytest
-from rigs.processes import EXPERIMENT, Daemon, Process, one_line, wait_until
+from rigs.processes import EXPERIMENT, Daemon, Process, fishctl, one_line, wait_until
 
 
 @pytest.mark.slow
@@ -12,9 +12,9 @@ def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
-    table = folder / "trials.csv"
+    table = folder / "rows.csv"
     words = ["--endpoint", daemon.endpoint, "optimise", "square", "--over", "frequency=1:3"]
-    words += ["--on", "robot", "--folder", str(folder)]
+    words += ["--on", "live", "--folder", str(folder)]
     searching = Process(*EXPERIMENT, *words)
     wait_until(lambda: table.exists() and table.read_text().count("\n") >= 2)
     wait_until(lambda: daemon.status().mode == "running")
@@ -25,8 +25,8 @@ def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
     candidates = "1 candidate" if done == 1 else f"{done} candidates"
     assert f"{candidates}, " in out
     assert "s of thinking besides" in out
-    assert err.endswith(f"to go on: fishctl {' '.join(words)}\n")
-    again = daemon.fishctl(*words[2:], "--budget", "12")
+    assert err.endswith(f"resume with: fishctl optimise --resume {folder}\n")
+    again = fishctl("optimise", "--resume", str(folder), "--budget", "12")
     assert again.returncode == 1
     assert f"{folder}: {candidates} there already" in again.stdout
     assert "the budget of 12 s is used" in again.stderr
@@ -34,7 +34,7 @@ def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
 
 def test_what_the_fish_cannot_do_is_not_begun(daemon: Daemon, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    words = ["optimise", "square", "--on", "robot", "--folder", str(folder)]
+    words = ["optimise", "square", "--on", "live", "--folder", str(folder)]
     for over, named in (("frequency=1:30", "(0, 10]"), ("amplitude=0.1:0.6", "(0, 0.42]")):
         refused = daemon.fishctl(*words, "--over", over)
         assert refused.returncode == 1

@@ -8,14 +8,13 @@ from rigs.processes import EXPERIMENT, Daemon, Process, wait_until
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
 from fishd.lab.rerun import rerun
-from fishd.lab.rig import LiveRig
-from fishd.lab.rig_recording import recorded
+from fishd.lab.session import LiveSession
 from fishd.recording import open_run
 
 
 def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with Fish(daemon.endpoint) as fish, LiveRig(fish) as rig, recorded(rig, path, "live"):
+    with Fish(daemon.endpoint) as fish, LiveSession(fish) as rig, rig.recorded(path, "live"):
         rig.rest(0.5)
         rig.swim("swing", {"C": 0.4}, 1.5)
         rig.rest(0.5)
@@ -40,15 +39,17 @@ def excited_in(part: Path) -> int:
 def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     daemon: Daemon, tmp_path: Path
 ) -> None:
-    path = tmp_path / "run.mcap"
-    words = ("identify", "--experiment", "--on", "robot", "--for", "40", "--record", str(path))
+    folder = tmp_path / "run"
+    path = folder / "identify.mcap"
+    words = ("identify", "--experiment", "--on", "live", "--for", "40", "--folder", str(folder))
     swims = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, *words)
     wait_until(lambda: daemon.status().mode == "running")
-    wait_until(lambda: excited_in(path.with_name("run.mcap.part")) >= 15)
+    wait_until(lambda: excited_in(path.with_name("identify.mcap.part")) >= 15)
     status, out, err = swims.end(signal.SIGTERM)
-    assert (status, out) == (130, "")
+    assert status == 130
+    assert out == f"fish: the fish of fishd at {daemon.endpoint}\n"
     assert err.endswith(
-        f"fishctl: stopped before its end, so nothing is fitted; what it swam is in {path}\n"
+        f"fishctl: interrupted, so nothing is fitted; what it swam is in {folder}\n"
     )
     assert daemon.status().mode == "idle"
     run = open_run(path)

@@ -1,4 +1,4 @@
-"""`fishctl sweep --on robot` and a running fishd: what it refuses, and how it ends."""
+"""`fishctl sweep --on live` and a running fishd: what it refuses, and how it ends."""
 
 import signal
 from pathlib import Path
@@ -9,7 +9,7 @@ from rigs.processes import EXPERIMENT, Daemon, Process, Subscriber, one_line, wa
 def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
     daemon: Daemon, tmp_path: Path
 ) -> None:
-    words = ("sweep", "square", "--on", "robot", "--folder", str(tmp_path / "run"))
+    words = ("sweep", "square", "--on", "live", "--folder", str(tmp_path / "run"))
     with Subscriber(daemon.telemetry, b"event") as events:
         events.connected()
         complaint = one_line(daemon.fishctl(*words, "--amplitude", "0.3,0.41,0.6"))
@@ -23,7 +23,7 @@ def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
 
 
 def test_a_closed_terminal_lets_the_fish_rest(daemon: Daemon, tmp_path: Path) -> None:
-    words = ("sweep", "square", "--on", "robot", "--folder", str(tmp_path / "run"))
+    words = ("sweep", "square", "--on", "live", "--folder", str(tmp_path / "run"))
     sweep = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, *words, "--frequency", "1,2")
     wait_until(lambda: daemon.status().mode == "running")
     status, _, err = sweep.end(signal.SIGHUP)

@@ -19,10 +19,11 @@ from msgspec.structs import replace
 from bench.swing import percent
 from common.report import Options, Report, progress, table
 from fishd.config import Start, load
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.other_fish import harsh
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.learning.adapt.adaptation import Adaptation
-from fishd.learning.adapt.state import AdaptFolder, Begun, Contender
+from fishd.learning.adapt.state import AdaptFolder, Contender
 from fishd.learning.adapt.verdict import SQUARE
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -76,10 +77,14 @@ def adapted(task: tuple[int, int, float]) -> Adapted:
     """Adapt to one fish; seed, steps of the training, tank time [s]."""
     seed, steps, tank_time = task
     config = replace(load(None, harsh(seed).overrides), start=Start())
-    with TemporaryDirectory() as folder, VirtualRig(config) as rig:
-        begun = Begun("simulation", steps, 0, msgspec.to_builtins(config))
-        run = AdaptFolder(Path(folder) / "adapt", begun)
-        state = Adaptation(rig, config, run, tank_time, steps, 0, _Silent()).run()
+    header = Header(kind="adapt", on="simulation")
+    with (
+        TemporaryDirectory() as folder,
+        VirtualSession(config) as session,
+        open_experiment(Path(folder) / "adapt", header) as experiment,
+    ):
+        run = AdaptFolder(experiment)
+        state = Adaptation(session, run, tank_time, steps, 0, _Silent()).run()
     assert state.verdict
     assert state.fitted
     contenders = {one.name: one for one in state.contenders}
@@ -124,7 +129,7 @@ OPTIONS: Options = {
     "--first": {"type": int, "default": FIRST_SEED, "help": "seed of the first fish"},
     "--fish": {"type": int, "default": FISH, "help": "how many"},
     "--steps": {"type": int, "default": 6400, "help": "of each training"},
-    "--tank-time": {"type": float, "default": 300.0, "help": "of each fish [s]"},
+    "--budget": {"type": float, "default": 300.0, "help": "of each fish [s]"},
 }
 
 

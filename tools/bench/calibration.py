@@ -18,7 +18,7 @@ from fishd.config import Config
 from fishd.core.calibration import ForceCalibration
 from fishd.hardware.force_sensor.calibration_fit import FEWEST_LOADS, Load, fit
 from fishd.lab.measurement import measure as measured
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
@@ -80,7 +80,7 @@ def calibrated(case: Case, seed: int) -> ForceCalibration:
 def run(case: Case, seed: int) -> tuple[float, float, float, float]:
     """Return the thrust, and its statistical error, that of the calibration, and of both [N]."""
     config = Config(simulation=replace(RIG, seed=FIRST_SEED + seed))
-    with VirtualRig(config, calibrated(case, seed)) as rig:
+    with VirtualSession(config, calibrated(case, seed)) as rig:
         measurement = measured(rig, "swing", {}, RUN_SECONDS)
     assert measurement.calibration_ci95 is not None
     assert measurement.total_ci95 is not None

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from common.report import Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.controllers import registry
-from fishd.lab.compare.survey import Reversals
+from fishd.lab.compare.survey import ReversalTimes
 from fishd.lab.simulation import judge
 
 DOCUMENT = "reference/policies.md"
@@ -61,7 +61,7 @@ class Swum(NamedTuple):
 
 def swim(config: Config, name: str, parameters: dict[str, str]) -> Swum:
     """Let a controller swim a fish."""
-    reversals = Reversals()
+    reversals = ReversalTimes()
     controller = registry.create(name, parameters, config.limits)
     report = judge(config, name, controller, SECONDS, SETTLE, reversals)
     return Swum(

@@ -20,7 +20,7 @@ from fishd.config import Config, load
 from fishd.lab.identification import experiment, identify
 from fishd.lab.identification.summary import SCALED
 from fishd.lab.other_fish import harsh
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -103,7 +103,7 @@ def one(run: tuple[str, int]) -> Outcome:
     """Let one fish swim, and identify it."""
     kind, seed = run
     config = fish(kind, seed)
-    with VirtualRig(config) as swum:
+    with VirtualSession(config) as swum:
         found = identify(experiment(swum, SECONDS))
     truth: dict[str, Any] = msgspec.structs.asdict(config.plant)
     truth |= msgspec.structs.asdict(config.simulation)

@@ -20,7 +20,7 @@ from common.report import Options, Report, progress, table
 from fishd.config import Config
 from fishd.core.signals import Tick
 from fishd.lab.measurement import measure as measured
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
@@ -97,7 +97,7 @@ ADDED: dict[str, Callable[[random.Random, float], Force]] = {
 }
 
 
-class DisturbedRig(VirtualRig):
+class DisturbedRig(VirtualSession):
     """A simulated fish whose F_x has a force added that fishd does not know."""
 
     def __init__(self, config: Config, force: Force) -> None:
@@ -138,7 +138,7 @@ def run(drift: str, seconds: float, seed: int) -> Run:
     """Measure once."""
     config = Config(simulation=replace(RIG, seed=seed, **DRIFTS.get(drift, {})))
     force = ADDED[drift](random.Random(f"{drift} {seed}"), seconds) if drift in ADDED else None
-    with DisturbedRig(config, force) if force else VirtualRig(config) as rig:
+    with DisturbedRig(config, force) if force else VirtualSession(config) as rig:
         found = measured(rig, "swing", {}, seconds)
     plain = float(np.mean([tick.fx for tick in found.ticks if tick.mode == "running"]))
     assert found.total_ci95 is not None

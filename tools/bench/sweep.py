@@ -22,7 +22,7 @@ from common.report import DOCS, Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials, whole_ticks
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 
 DOCUMENT = "how-to/sweeps.md"
@@ -64,7 +64,7 @@ def search(config: Config, seed: int) -> tuple[int, int, int, float, bool]:
     best = max(frequencies, key=thrust)
     found = Search([whole_ticks(Range("frequency", *RANGE), config.tick)], seed)
     swum, shares = [], []
-    with VirtualRig(config) as rig:
+    with VirtualSession(config) as rig:
         for trial in trials(rig, "square", {}, found, BUDGET):
             proposal = found.proposal()
             swum.append(trial.swum)

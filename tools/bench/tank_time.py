@@ -129,7 +129,7 @@ def trained(config: Config, seed: int, kind: type[Comparing]) -> Run:
     config = replace(config, simulation=replace(config.simulation, seed=seed))
     settings = replace(settings_of(None, STEPS), seed=seed)
     with tempfile.TemporaryDirectory() as temporary:
-        job = Job(config=config, settings=settings, folder=Path(temporary) / "run", on="robot")
+        job = Job(config=config, settings=settings, folder=Path(temporary) / "run", on="live")
         training = kind(job, SimulatedLink(config), Display(), lambda: False)
         training.truth = {}
         outcome = training.run()

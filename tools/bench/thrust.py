@@ -19,7 +19,7 @@ from fishd.config import Config, load
 from fishd.lab.measurement import measure as measured
 from fishd.lab.measurement import summary
 from fishd.lab.other_fish import OtherFish, harsh
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 
 DOCUMENT = "explanation/holding-thrust.md"
@@ -144,7 +144,7 @@ def by_measurement(
     overrides: tuple[str, ...], controller: str, parameters: dict[str, float]
 ) -> tuple[float, float] | None:
     """The factor that a minute of `fishctl measure` finds, and half of its interval."""
-    with VirtualRig(load(None, overrides)) as rig:
+    with VirtualSession(load(None, overrides)) as rig:
         found = summary(measured(rig, controller, parameters, 60.0), rig.tick)
     if not found.thrust > 0.0 or not found.factor > 0.0:
         return None

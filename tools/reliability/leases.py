@@ -48,11 +48,11 @@ QUIET = 0.3
 FREE = ("--folder", "{folder}")
 VERBS: dict[str, tuple[str, ...]] = {
     "measure": ("measure", "swing", "--for", "60"),
-    "optimise": ("optimise", "square", "--over", "frequency=1:3", "--on", "robot", *FREE),
-    "sweep": ("sweep", "square", "--frequency", "1,1.5,2", "--on", "robot", *FREE),
-    "compare": ("compare", "swing", "sine", "--on", "robot"),
-    "identify": ("identify", "--experiment", "--on", "robot"),
-    "adapt": ("adapt", "--on", "robot", *FREE),
+    "optimise": ("optimise", "square", "--over", "frequency=1:3", "--on", "live", *FREE),
+    "sweep": ("sweep", "square", "--frequency", "1,1.5,2", "--on", "live", *FREE),
+    "compare": ("compare", "swing", "sine", "--on", "live"),
+    "identify": ("identify", "--experiment", "--on", "live"),
+    "adapt": ("adapt", "--on", "live", *FREE),
 }
 MODULES = (
     "fishd.cli.adapt",
@@ -61,11 +61,11 @@ MODULES = (
     "fishd.cli.measure",
     "fishd.cli.optimise",
     "fishd.cli.sweep",
-    "fishd.lab.compare.piloted_rig",
+    "fishd.lab.compare.piloted_session",
     "fishd.lab.drawing",
     "fishd.lab.identification",
     "fishd.lab.optimise.trials",
-    "fishd.lab.sweep.running",
+    "fishd.lab.sweep.measuring",
     "fishd.learning.adapt.adaptation",
     "fishd.learning.adapt.report",
     "onnxruntime",

@@ -2,7 +2,7 @@
 
 import click
 
-from fishd.cli.options import FiniteRange, daemon_options
+from fishd.cli.options import FiniteRange, daemon_options, for_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.verbs import Verb, Verbs
 from fishd.client import Fish
@@ -22,13 +22,7 @@ def calibrate() -> None:
 
 
 @click.command()
-@click.option(
-    "--seconds",
-    type=FiniteRange(0.1, 60.0),
-    default=2.0,
-    show_default=True,
-    help="How long to measure.",
-)
+@for_option("How long to measure [s].", default=2.0, kind=FiniteRange(0.1, 60.0))
 @daemon_options
 def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     """Call the present force zero; the fish must hang still.

@@ -15,7 +15,7 @@ from fishd.cli.output import echo
 from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish
 from fishd.core import text
-from fishd.core.calibration import ForceCalibration
+from fishd.core.calibration import Z95, ForceCalibration
 from fishd.core.errors import FishError
 from fishd.hardware.force_sensor.calibration_fit import (
     Fit,
@@ -218,7 +218,7 @@ def _show(names: list[str], loads: list[Load], fitted: Fit) -> None:
         first, both, second = covariance
         correlation = both / math.sqrt(first * second) if first * second > 0.0 else 0.0
         echo(
-            f"{row[0]} ± {1.96 * math.sqrt(first):.2g}, {row[1]} ± {1.96 * math.sqrt(second):.2g} "
+            f"{row[0]} ± {Z95 * math.sqrt(first):.2g}, {row[1]} ± {Z95 * math.sqrt(second):.2g} "
             f"N/V (95 %), correlation {correlation:+.2f}"
         )
     share, load_error = found.thrust_ci95(1.0), found.load_error

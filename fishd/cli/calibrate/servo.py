@@ -12,8 +12,7 @@ import click
 from msgspec.structs import replace
 
 from fishd.cli.calibrate.servo_lease import leased
-from fishd.cli.lease_options import take_option
-from fishd.cli.options import endpoint_option
+from fishd.cli.options import endpoint_option, take_option
 from fishd.cli.output import echo
 from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from fishd.cli.lease_options import verb_lease
+from fishd.cli.options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.client.lease import LeaseRenewal

@@ -19,10 +19,9 @@ from fishd.cli.camera.options import (
     rig_of,
     yaml_of,
 )
-from fishd.cli.lab_progress import showing
-from fishd.cli.lease_options import take_option
-from fishd.cli.options import FiniteRange, endpoint_option, json_option
+from fishd.cli.options import FiniteRange, endpoint_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
+from fishd.cli.progress import showing
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, NoDaemon
 

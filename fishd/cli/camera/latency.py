@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of, yaml_of
-from fishd.cli.lab_progress import showing
-from fishd.cli.lease_options import take_option
-from fishd.cli.options import FiniteRange, endpoint_option, json_option
+from fishd.cli.options import FiniteRange, endpoint_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
+from fishd.cli.progress import showing
 from fishd.client import Fish
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError

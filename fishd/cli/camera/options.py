@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import yaml
 
-from fishd.cli.lease_options import verb_lease
+from fishd.cli.options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core.errors import FishdError, NoDaemon
@@ -19,7 +19,7 @@ from fishd.core.signals import Event, Tick
 if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
     from fishd.core.camera_frames import Frame
-    from fishd.lab.rig import LiveRig
+    from fishd.lab.session import LiveSession
 
 camera_option = click.option(
     "--camera",
@@ -80,13 +80,13 @@ class Watcher:
 
 
 @contextmanager
-def rig_of(fish: Fish, seconds: float) -> Iterator["LiveRig"]:
+def rig_of(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
     """The fish of a running fishd, at rest again afterwards; says that it swims."""
-    from fishd.lab.rig import LiveRig
+    from fishd.lab.session import LiveSession
 
     with ExitStack() as stack:
         stack.enter_context(interrupted_once())
-        rig = stack.enter_context(LiveRig(fish, *verb_lease()))
+        rig = stack.enter_context(LiveSession(fish, *verb_lease()))
         echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
         yield rig
 

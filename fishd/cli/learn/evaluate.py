@@ -10,9 +10,9 @@ import click
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
-from fishd.cli.lab_progress import showing
-from fishd.cli.options import json_option
+from fishd.cli.options import for_option, json_option
 from fishd.cli.output import echo, print_json
+from fishd.cli.progress import showing
 from fishd.config import load
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ WIDE = 1000
     help="changes: one imperfection of a rig at a time; random: twenty fish with all of them, in "
     "random sizes; harsh: both.",
 )
-@click.option(
-    "--seconds", type=float, default=60.0, show_default=True, help="Length of each run [s]."
-)
+@for_option("Length of each run [s].", default=60.0, kind=click.FLOAT)
 @click.option(
     "--settle",
     type=float,

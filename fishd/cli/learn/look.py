@@ -6,30 +6,21 @@ import click
 
 from fishd.cli.completion import complete_policy
 from fishd.cli.config import fish_options
+from fishd.cli.options import for_option, json_option, plot_option
+from fishd.cli.output import print_json
 from fishd.config import load
 
 
 @click.command()
 @click.argument("policy", metavar="NAME|FILE", shell_complete=complete_policy)
-@click.option(
-    "--png",
-    "picture",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Draw the heat map over the mean picture into this file (.png, .svg).",
-)
+@plot_option("the heat map over the mean picture")
 @click.option(
     "--camera",
     metavar="FILE",
     help="YAML file of a simulated camera, such as config/camera-web.yaml. [default: a good one]",
 )
-@click.option(
-    "--seconds",
-    type=float,
-    default=15.0,
-    show_default=True,
-    help="Length of the swim [s]; the first 5 are left out.",
-)
+@for_option("Length of the swim [s]; the first 5 are left out.", default=15.0, kind=click.FLOAT)
+@json_option
 @fish_options
 def look(
     policy: str,
@@ -38,6 +29,7 @@ def look(
     seconds: float,
     file: Path | None,
     overrides: tuple[str, ...],
+    as_json: bool,
 ) -> None:
     """Show what a policy that sees pictures looks at.
 
@@ -52,10 +44,13 @@ def look(
         drawing.check(picture)
     config, seen = load(file, overrides), cameras.simulated(camera)
     found = looking.look(policy, config, seen, seconds)
-    click.echo(
-        f"{policy}: {found.share:.0%} of the sensitivity lies where the tail moves, on "
-        f"{found.area:.0%} of the picture"
-    )
+    if as_json:
+        print_json({"policy": policy, "share": found.share, "area": found.area})
+    else:
+        click.echo(
+            f"{policy}: {found.share:.0%} of the sensitivity lies where the tail moves, on "
+            f"{found.area:.0%} of the picture"
+        )
     if picture:
         looking.draw(picture, found, f"what {Path(policy).name} looks at")
-        click.echo(f"drawn: {picture}")
+        click.echo(f"drawn: {picture}", err=as_json)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 from msgspec.structs import replace
 
-from fishd.cli.config import set_option
-from fishd.cli.lease_options import take_option, verb_lease
-from fishd.cli.options import endpoint_option
+from fishd.cli.config import config_option, set_option
+from fishd.cli.experiment_options import ChosenFish, On, default_on, on_option
+from fishd.cli.options import endpoint_option, seed_option, take_option, verb_lease
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
@@ -26,18 +26,8 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
 
 
 @click.command()
-@click.option(
-    "--on",
-    type=click.Choice(["simulation", "robot"]),
-    help="A fish simulated here in virtual time, or the one of the fishd that runs, real or not. "
-    "[default: simulation; with --resume, as before]",
-)
-@click.option(
-    "--config",
-    "file",
-    type=click.Path(path_type=Path),
-    help="Configuration of the fish. [default: the defaults; for a robot, that of its fishd]",
-)
+@on_option
+@config_option("Configuration of the fish. [default: the defaults; live, that of its fishd]")
 @set_option
 @click.option(
     "--settings",
@@ -55,7 +45,7 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
     "--camera",
     metavar="FILE|ENDPOINT",
     help="With --see: in simulation, the YAML file of a simulated camera, such as "
-    "config/camera-web.yaml; on a robot, where its fishd-camera takes requests. [default: a good "
+    "config/camera-web.yaml; live, where its fishd-camera takes requests. [default: a good "
     "simulated one; $FISHD_CAMERA, else that of this machine]",
 )
 @click.option(
@@ -65,18 +55,18 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
     "simulated training ends sooner, with a good policy, once its evaluations show no better one; "
     "evaluation.patience: null in the settings makes it do all steps.",
 )
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of the training.")
+@seed_option("the training", None)
 @click.option(
     "--folder",
     type=click.Path(path_type=Path),
-    help="Run folder, which must be new. [default: runs/ppo-DATE-TIME]",
+    help="New folder of the training. [default: ppo-DATE-TIME in $FISHD_RUNS, else runs]",
 )
 @click.option(
     "--resume",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Go on with the run in this folder, from its newest checkpoint and with its settings; of "
-    "several seeds, each has a folder of its own: runs/ten/seed-3.",
+    help="Go on with the training in this folder, from its newest checkpoint and with its "
+    "settings; of several seeds, each has a folder of its own: runs/ten/seed-3.",
 )
 @click.option(
     "--from",
@@ -102,7 +92,7 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
     "--cluster", metavar="ADDRESS", help="With --seeds: Dask scheduler that runs them instead."
 )
 def ppo(
-    on: Literal["simulation", "robot"] | None,
+    on: On | None,
     file: Path | None,
     overrides: tuple[str, ...],
     settings_file: Path | None,
@@ -130,8 +120,11 @@ def ppo(
         _refuse(AS_IT_BEGAN, {**own, **new, "--seeds": seeds})
     if seeds is None:
         _refuse("without --seeds", {"--jobs": jobs, "--cluster": cluster})
-    elif on == "robot":
-        raise click.UsageError("--seeds is for simulated fish: there is only one robot")
+    elif on == "live":
+        raise click.UsageError("--seeds is for simulated fish: there is only one live fish")
+    if not resume:
+        on = on or ("simulation" if seeds else default_on(file, overrides, endpoint))
+        ChosenFish(on, file, overrides, endpoint).announce()
     job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse(
@@ -154,7 +147,7 @@ def _refuse(why: str, options: dict[str, Any]) -> None:
 
 
 def _job(
-    on: Literal["simulation", "robot"] | None,
+    on: On | None,
     file: Path | None,
     overrides: tuple[str, ...],
     settings_file: Path | None,
@@ -167,6 +160,7 @@ def _job(
 
     Raises `ConfigError` and `CheckpointError`.
     """
+    from fishd.lab.experiment import default_folder
     from fishd.learning import settings as training
     from fishd.learning.env.fishd_link import config_of, other_plant
     from fishd.learning.run_folder import checkpoints, runs
@@ -176,7 +170,7 @@ def _job(
         checkpoints.refuse_several(resume)
         config, settings = runs.read(resume)
         on = on or checkpoints.read_state(checkpoints.newest(resume)).on
-    running = config_of(endpoint) if on == "robot" else {}
+    running = config_of(endpoint) if on == "live" else {}
     plant = dict(running.get("plant", {}))  # to adopt it changes it
     if not resume:
         of_parent = runs.read(_run_of(parent))[1] if parent else None
@@ -193,7 +187,7 @@ def _job(
     return Job(
         config=config,
         settings=settings,
-        folder=resume or folder or runs.default_folder(),
+        folder=resume or folder or default_folder("learn ppo"),
         on=on or "simulation",
         endpoint=endpoint,
         take=verb_lease().take,
@@ -212,7 +206,7 @@ def _with_camera(job: "Job", camera: str | None) -> "Job":
     if job.settings.see == "force":
         _refuse("here: this sees forces only; give --see camera, too", {"--camera": camera})
         return job
-    if job.on == "robot":
+    if job.on == "live":
         return replace(job, camera_endpoint=camera)
     if job.resume:
         return replace(job, camera=runs.read_camera(job.folder))

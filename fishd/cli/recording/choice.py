@@ -11,8 +11,8 @@ from fishd.recording.folder import FOLDER_VARIABLE, find
 folder_option = click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False),
-    help=f"Where recordings are; default: ${FOLDER_VARIABLE}, else fishd/runs in "
-    "$XDG_DATA_HOME or ~/.local/share.",
+    help="Folder with recordings, such as that of an experiment; default: "
+    f"${FOLDER_VARIABLE}, else runs in the current folder.",
 )
 
 

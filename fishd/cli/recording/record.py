@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from fishd.cli.options import FiniteRange, Words, endpoint_option
+from fishd.cli.options import Words, endpoint_option, for_option
 from fishd.cli.output import counted, echo
 from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
@@ -58,13 +58,7 @@ class Size(click.ParamType[int]):
 def recording_options(function: F) -> F:
     """RUN, and the options of every verb that records."""
     for decorate in (
-        click.option(
-            "--for",
-            "seconds",
-            type=FiniteRange(min=0, min_open=True),
-            metavar="SECONDS",
-            help="End by itself after this time; by default Ctrl-C ends it.",
-        ),
+        for_option("End by itself after this time [s]; by default Ctrl-C ends it."),
         click.option("--note", type=Words(), default="", help="What for."),
         click.option("--subject", type=Words(), default="", help="Which fish, such as its number."),
         click.option(

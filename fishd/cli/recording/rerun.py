@@ -17,7 +17,11 @@ from fishd.lab.rerun import rerun as choose_again
 @click.command()
 @click.argument("run")
 @click.argument("parameters", nargs=-1, metavar="[NAME=VALUE]...")
-@click.option("--controller", metavar="NAME", help="Who chooses; default: whoever swam.")
+@click.option(
+    "--controller",
+    metavar="NAME",
+    help="Controller that chooses, such as swing:C=0.4; default: the one that swam.",
+)
 @set_option
 @folder_option
 @json_option
@@ -38,6 +42,9 @@ def rerun(
 
     fishctl rerun latest --controller swing C=0.4
     """
+    if controller:
+        controller, pairs = registry.split_spec(controller)
+        parameters = (*(f"{key}={value}" for key, value in pairs), *parameters)
     given = _parameters(controller, parameters)
     recorded = opened(run, folder)
     result = choose_again(recorded, controller, given, overrides)

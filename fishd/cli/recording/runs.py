@@ -7,13 +7,15 @@ from typing import Any
 
 import click
 import msgspec
+from msgspec import Struct
 
 from fishd.cli.options import json_option
 from fishd.cli.output import counted, echo, print_json
 from fishd.cli.recording.choice import damage, folder_option
 from fishd.core import text
 from fishd.core.console import power_words
-from fishd.core.errors import RecordingError
+from fishd.core.errors import ConfigError, RecordingError
+from fishd.lab.experiment import Header, count_rows, list_experiments
 from fishd.recording.folder import Glance, glances, runs_folder
 from fishd.recording.summary import Summary
 
@@ -26,7 +28,7 @@ LONGEST = 1e9
 @folder_option
 @json_option
 def runs(folder: Path | None, as_json: bool) -> int:
-    """List the recordings, the oldest first.
+    """List recordings and experiments, each the oldest first.
 
     'thrust' is the mean while it swam, in mN unless another unit is shown, with its 95 % interval.
     Where the zero of the sensor was never known, it is the mean force as measured, drift
@@ -36,20 +38,63 @@ def runs(folder: Path | None, as_json: bool) -> int:
     place = folder or runs_folder()
     found = list(glances(place))
     good = [each for each in found if isinstance(each, Glance)]
+    experiments = [_Listed.read(*each) for each in list_experiments(place)]
     if as_json:
-        print_json([_as_json(each) for each in good])
-    elif good:
-        _print(good)
+        print_json([*map(_as_json, good), *experiments])
     else:
-        echo(f"there is no recording in {place} yet; see 'fishctl record --help'")
+        if good:
+            _print(good)
+        if experiments:
+            _print_experiments(experiments)
+        if not good and not experiments:
+            echo(f"there is no recording in {place} yet; see 'fishctl record --help'")
     wrong = [each for each in found if isinstance(each, RecordingError)]
-    for error in wrong:
-        echo(f"fishctl: {error}", err=True)
-    return 1 if wrong else 0
+    problems = [str(error) for error in wrong] + [e.problem for e in experiments if e.problem]
+    for problem in problems:
+        echo(f"fishctl: {problem}", err=True)
+    return 1 if problems else 0
+
+
+class _Listed(Struct):
+    """An experiment in short."""
+
+    name: str
+    path: str
+    kind: str
+    on: str
+    began: str
+    rows: int | None
+    """Rows of its table; None where it has none."""
+    problem: str = ""
+    """Why it cannot be read, where it cannot."""
+
+    @classmethod
+    def read(cls, path: Path, header: "Header | ConfigError") -> "_Listed":
+        """Return what the list shows of an experiment."""
+        if isinstance(header, ConfigError):
+            return cls(path.name, str(path), "–", "–", "", None, str(header))
+        rows = count_rows(path)
+        return cls(path.name, str(path), header.kind, header.on, header.began, rows)
+
+
+def _print_experiments(experiments: list[_Listed]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column("experiment", overflow="fold")
+    for head in ("began", "kind", "fish"):
+        table.add_column(head, no_wrap=True)
+    table.add_column("rows", justify="right", no_wrap=True)
+    for each in experiments:
+        rows = "–" if each.rows is None else str(each.rows)
+        table.add_row(text.line(each.name), _began(each.began), each.kind, each.on, rows)
+    Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(table)
 
 
 def _as_json(glance: Glance) -> dict[str, Any]:
     return {
+        "kind": "recording",
         "name": glance.name,
         "path": str(glance.path),
         "state": _state(glance),

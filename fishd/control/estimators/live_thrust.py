@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 
 from fishd.control.estimators.thrust_factor import DRIFT_LAG, Drift, Factor, Level, Wave
+from fishd.core.calibration import Z95
 from fishd.core.signals import Observation
 
 SWIM_SETTLES = 1.5
@@ -40,8 +41,6 @@ SIZE_STEP, SAME_SIZE = 0.2, 0.1
 deviation within one size."""
 CLEAR_STEP = 5.0
 """Least change of the size, in standard deviations of the size of one block."""
-Z95 = 1.96
-"""Half-width of a 95 % interval, in standard deviations."""
 JUMP = 8.0
 """Number of standard deviations by which a spike or a step of the force differs from noise."""
 MAX_CI95 = 0.1

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from itertools import count
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any, NamedTuple
 
 from msgspec import Struct
@@ -26,6 +26,7 @@ from fishd.lab.ranking import (
     ratio,
 )
 from fishd.lab.simulation import KeepingPublisher, Report, VirtualRun, check_whole_beat, judge
+from fishd.lab.statistics import mean_ci95
 
 TRACE = 3.0
 """How much of the end of a run a picture shows [s]."""
@@ -172,7 +173,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         controller=reports[0].controller,
         parameters=reports[0].parameters,
         thrust=fmean(thrusts),
-        error=error_of_mean(thrusts),
+        error=mean_ci95(thrusts),
         thrusts=thrusts,
         relative_thrust=fmean(report.relative_thrust for report in reports),
         frequency=fmean(report.frequency for report in reports),
@@ -183,7 +184,7 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         runs=reports,
         power=fmean(powers) if powers else None,
         thrust_per_watt=fmean(per_watt) if per_watt else None,
-        thrust_per_watt_error=error_of_mean(per_watt),
+        thrust_per_watt_error=mean_ci95(per_watt),
     )
 
 
@@ -231,7 +232,7 @@ def _depends_on_seed(standing: Standing, is_random: bool) -> bool:
 
 def _candidate(standing: Standing) -> Candidate:
     error = standing.error or 0.0
-    by_runs = error_of_mean(standing.thrusts)
+    by_runs = mean_ci95(standing.thrusts)
     return Candidate(
         standing.contestant,
         standing.thrust,
@@ -239,15 +240,6 @@ def _candidate(standing: Standing) -> Candidate:
         complexity(standing.controller),
         len(standing.thrusts) - 1 if by_runs is not None and error <= by_runs else math.inf,
     )
-
-
-def error_of_mean(values: Sequence[float]) -> float | None:
-    """Half of the 95 % interval of the mean, by Student's t; None for a single value."""
-    if len(values) < 2:
-        return None
-    from scipy.special import stdtrit  # of scipy.stats, which takes a second to load
-
-    return float(stdtrit(len(values) - 1, 0.975)) * stdev(values) / math.sqrt(len(values))
 
 
 class _End(KeepingPublisher):

@@ -34,7 +34,7 @@ def parse(text: str) -> Contestant:
 
     Raises `ParameterError`.
     """
-    name, _, values = text.partition(":")
+    name = text.partition(":")[0]
     if name == "remote":
         raise ParameterError(
             "remote: its agent is another program, which can swim a fishd but not be compared here"
@@ -51,10 +51,7 @@ def parse(text: str) -> Contestant:
             )
         return Contestant(text, "ppo", {"policy": text})
     parameters = {}
-    for pair in filter(None, values.split(",")):
-        key, equals, value = pair.partition("=")
-        if not (key and equals and value):
-            raise ParameterError(f"{text}: '{pair}' is not valid: NAME=VALUE is needed")
+    for key, value in registry.split_spec(text)[1]:
         try:
             parameters[key] = strict_yaml.parse(value, key).data
         except strict_yaml.YamlProblem as problem:

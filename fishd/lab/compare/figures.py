@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fishd.core import text
+from fishd.core.beats import upward_reversals
 from fishd.lab.compare.comparison import TRACE, Standing, Trace
 from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn, plain
 
@@ -63,15 +64,14 @@ def draw(
 
 def _from_upward_reversal(trace: Trace) -> Trace:
     """`TRACE` seconds of it, from where the command turns upward: contestants can be compared."""
-    command = trace.command
-    turns = [k for k in range(1, len(command)) if command[k - 1] <= 0.0 < command[k]]
+    turns = upward_reversals(trace.command)
     earliest = trace.time[0] + max(0.0, -trace.time[0] - TRACE)
     first = next((k for k in turns if trace.time[k] <= earliest + 1e-9), 0)
     begin = trace.time[first]
     last = max(k for k, time in enumerate(trace.time) if time <= begin + TRACE + 1e-9)
     chosen = slice(first, last + 1)
     times = [time - begin for time in trace.time[chosen]]
-    return Trace(times, command[chosen], trace.thrust[chosen], trace.fin[chosen])
+    return Trace(times, trace.command[chosen], trace.thrust[chosen], trace.fin[chosen])
 
 
 def _draw_angles(axis: Any, trace: Trace, amplitude: float) -> None:

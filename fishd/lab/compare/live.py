@@ -1,7 +1,7 @@
 """Policies and controllers on a fish that can only be measured: its thrust, and the interval."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 from msgspec.structs import replace
@@ -9,59 +9,48 @@ from msgspec.structs import replace
 from fishd.core.calibration import ForceCalibration
 from fishd.core.errors import FishdError
 from fishd.core.signals import Tick
-from fishd.lab.compare.comparison import Standing, Trace, error_of_mean, trace
+from fishd.lab.compare.comparison import Standing, Trace, trace
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.error_budget import budget
 from fishd.lab.measurement import Measured, measure, plan
-from fishd.lab.objective import per_watt
-from fishd.lab.rig import Rig, is_of_one
+from fishd.lab.session import Session, concerns_one_controller
+from fishd.lab.statistics import per_watt, weighted_mean
 
 
 class LiveComparison:
     """Measures contestants on one fish, one after the other; keeps what was measured."""
 
-    def __init__(self, rig: Rig, contestants: Iterable[Contestant | str]) -> None:
+    def __init__(self, session: Session, contestants: Iterable[Contestant | str]) -> None:
         """contestants: texts are parsed: see `parse`, which raises `ParameterError`"""
         self.contestants = [parse(one) if isinstance(one, str) else one for one in contestants]
         self.left_out: list[tuple[Contestant, FishdError, int]] = []
         """Who could not be measured, or no further, why, and after how many runs."""
-        self._rig = rig
+        self._session = session
         self._measured: list[list[Measured]] = [[] for _ in self.contestants]
 
-    def swim(
-        self,
-        seconds: float = 60.0,
-        runs: int = 1,
-        progress: Callable[[float], None] = lambda seconds: None,
-    ) -> None:
-        """Let each swim and rest in turn, for so long in each run.
+    def swim(self, seconds: float = 60.0, runs: int = 1) -> None:
+        """Swim and rest each contestant in turn, for `seconds` in each run.
 
-        With several runs everyone swims once, then everyone again, so that what changes slowly
-        meets all of them. Who cannot swim is left out, and the others go on; what it swam before
-        counts.
+        With several runs all contestants swim once, then all again, so that what changes slowly
+        affects all of them. One that cannot swim is left out, and the others go on; what it swam
+        before counts.
 
-        progress: called with the time that has passed, or need not pass any more [s]
         Raises `ParameterError` for a time that is too short, `Disturbed` and `NoDaemon`.
         """
         for contestant in self.contestants:
             plan(seconds, contestant.parameters)
         out = set[int]()
         turns = [index for _ in range(runs) for index in range(len(self.contestants))]
-        for turn, index in enumerate(turns):
-            begun = turn * seconds
+        for index in turns:
             if index in out:
                 continue
             contestant = self.contestants[index]
             try:
                 found = measure(
-                    self._rig,
-                    contestant.controller,
-                    contestant.parameters,
-                    seconds,
-                    lambda passed, begun=begun: progress(begun + passed),  # type: ignore[misc]
+                    self._session, contestant.controller, contestant.parameters, seconds
                 )
             except FishdError as error:
-                if not is_of_one(error):
+                if not concerns_one_controller(error):
                     raise
                 self.left_out.append((contestant, error, len(self._measured[index])))
                 out.add(index)
@@ -71,21 +60,21 @@ class LiveComparison:
     def standings(self) -> list[Standing]:
         """Of all that were measured, in the order given."""
         pairs = zip(self.contestants, self._measured, strict=True)
-        return [_standing(one.label, found, self._rig) for one, found in pairs if found]
+        return [_standing(one.label, found, self._session) for one, found in pairs if found]
 
     def traces(self) -> list[Trace]:
         """The ends of their last swims, without the drift."""
         return [_trace(found[-1]) for found in self._measured if found]
 
 
-def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
+def _standing(label: str, runs: list[Measured], session: Session) -> Standing:
     """Runs count by the inverse squares of their errors.
 
     Where they differ by more than these say, the error is that of their mean by Student's t.
     """
-    weights = [1.0 / run.error**2 for run in runs]
-    total = sum(weights)
     thrusts = [run.thrust for run in runs]
+    weights = [1.0 / run.error**2 for run in runs]
+    thrust, error = weighted_mean(thrusts, [run.error for run in runs])
     angles = [abs(tick.phi_c) for run in runs for tick in run.ticks if tick.mode == "running"]
     mean = sum(angles) / len(angles)
     rms = math.sqrt(sum(angle**2 for angle in angles) / len(angles))
@@ -93,15 +82,15 @@ def _standing(label: str, runs: list[Measured], rig: Rig) -> Standing:
         contestant=label,
         controller=runs[0].controller,
         parameters=dict(runs[0].parameters),
-        thrust=sum(w * run.thrust for w, run in zip(weights, runs, strict=True)) / total,
-        error=max(1.0 / math.sqrt(total), error_of_mean(thrusts) or 0.0),
+        thrust=thrust,
+        error=error,
         thrusts=thrusts,
-        frequency=sum(w * run.frequency for w, run in zip(weights, runs, strict=True)) / total,
-        fullness=mean / rig.amplitude,
+        frequency=float(np.average([run.frequency for run in runs], weights=weights)),
+        fullness=mean / session.amplitude,
         squareness=mean / rms if rms else 0.0,
     )
     standing = replace(standing, **_power(runs))
-    return replace(standing, **_budget(runs, weights, standing, rig.calibration))
+    return replace(standing, **_budget(runs, weights, standing, session.calibration))
 
 
 def _power(runs: list[Measured]) -> dict[str, float]:
@@ -112,13 +101,11 @@ def _power(runs: list[Measured]) -> dict[str, float]:
     known = [(watts, gave, error) for watts, gave, error in found if watts and gave and error]
     if len(known) < len(runs):
         return {}
-    weights = [1.0 / error**2 for _, _, error in known]
-    total = sum(weights)
-    gave = [each for _, each, _ in known]
+    mean, ci95 = weighted_mean([each for _, each, _ in known], [error for _, _, error in known])
     return {
         "power": sum(watts for watts, _, _ in known) / len(known),
-        "thrust_per_watt": sum(w * each for w, each in zip(weights, gave, strict=True)) / total,
-        "thrust_per_watt_error": max(1.0 / math.sqrt(total), error_of_mean(gave) or 0.0),
+        "thrust_per_watt": mean,
+        "thrust_per_watt_error": ci95,
     }
 
 

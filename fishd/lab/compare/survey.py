@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
+from fishd.core.beats import Reversals
 from fishd.core.signals import Event, Tick
 from fishd.lab.compare.comparison import swim
 from fishd.lab.compare.contestants import Contestant, refusal
@@ -54,18 +55,17 @@ class Surveyed(Struct, frozen=True, kw_only=True):
         return min(self.fish, key=lambda swum: swum.relative_thrust)
 
 
-class Reversals:
-    """A publisher that notes when the instruction angle changed its side."""
+class ReversalTimes:
+    """Publisher that notes when the instruction angle changed its side."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
-        self._side = 0.0
+        self._reversals = Reversals()
 
     def tick(self, tick: Tick) -> None:
         """Note a reversal."""
-        if tick.phi_c * self._side < 0.0:
+        if self._reversals.add(tick.phi_c):
             self.times.append(tick.t)
-        self._side = tick.phi_c or self._side
 
     def event(self, event: Event) -> None:
         """Drop."""
@@ -106,7 +106,7 @@ def survey(
             raise error
         rows = []
         for fish, config in configs:
-            reversals = Reversals()
+            reversals = ReversalTimes()
             report = swim(config, contestant, seconds, settle, reversals, seen)
             rows.append(
                 Swum(

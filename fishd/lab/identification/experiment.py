@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from fishd.core.dataframes import frame
 from fishd.core.errors import ParameterError
-from fishd.lab.rig import Rig
+from fishd.lab.session import Session
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -16,7 +16,7 @@ SHORTEST = 30.0
 """Less swimming tells too little [s]."""
 
 
-def experiment(rig: Rig, seconds: float = 180.0) -> "DataFrame":
+def experiment(session: Session, seconds: float = 180.0) -> "DataFrame":
     """Rest, then swim `excitation` at the rig's whole amplitude; a row a tick.
 
     seconds: how long all of it takes [s]
@@ -25,6 +25,6 @@ def experiment(rig: Rig, seconds: float = 180.0) -> "DataFrame":
     """
     if not SHORTEST <= seconds < math.inf:
         raise ParameterError(f"an experiment of {seconds:g} s: {SHORTEST:g} s or more are needed")
-    ticks = rig.rest(REST)
-    ticks += rig.swim("excitation", {}, seconds - REST)
+    ticks = session.rest(REST)
+    ticks += session.swim("excitation", {}, seconds - REST)
     return frame(ticks)

@@ -7,6 +7,7 @@ import numpy as np
 
 from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, drawn
 from fishd.lab.identification.result import Fit, Identification
+from fishd.lab.statistics import Z95
 
 _EXTRACT = 6.0
 """How long forces are shown in detail [s]."""
@@ -60,7 +61,7 @@ def _draw_correlation(axis: Any, left: Any) -> None:
     squares = float(known @ known)
     correlations = [float(known[lag:] @ known[:-lag]) / squares for lag in lags]
     axis.vlines(lags, 0.0, correlations, color=BLUE, linewidth=1.5)
-    for end in (-1.96, 1.96):
+    for end in (-Z95, Z95):
         axis.axhline(end / np.sqrt(len(known)), color=GREY, linewidth=0.8, linestyle="--")
     axis.axhline(0.0, color=GREY, linewidth=0.6)
     axis.set_ylim(-0.3, 0.3)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import t
 
 from fishd.lab.identification import misfit
 from fishd.lab.identification.fit import BOUNDS, FURTHER, LOGARITHMIC, QUADRATIC, SIGNED, Problem
@@ -20,8 +19,8 @@ from fishd.lab.identification.result import (
     Fit,
     Identification,
 )
+from fishd.lab.statistics import Z95, student95
 
-_Z = 1.96
 LATERAL_INERTIA_FACTOR = 2.0
 """K_y/K is within this factor of the configured one, in 95 % of cases, where no data tell it."""
 SCALED = {
@@ -103,7 +102,7 @@ def summarise(
         failed = [*(f"{name} = 0" for name, fall, _ in alike[:1] if fall > CLEAR), *failed]
     identified = not failed or all(c.explained_out_of_sample >= MIN_EXPLAINED for c in channels)
     deviations = np.sqrt(np.diag(covariance))
-    spread = dict(zip(problem.names, (_Z * deviations).tolist(), strict=True))
+    spread = dict(zip(problem.names, (Z95 * deviations).tolist(), strict=True))
     if not identified:
         spread = dict.fromkeys(spread, np.inf)
     estimates = [_estimate(name, all_values[name], spread) for name in UNITS if name in all_values]
@@ -115,10 +114,10 @@ def summarise(
     for name, of, slope, noise, mean, channel in zip(
         OFFSETS, left, slopes, problem.noise, means, channels, strict=True
     ):
-        told = _Z * np.sqrt(slope @ covariance @ slope + noise.white**2 / of.size)
+        told = Z95 * np.sqrt(slope @ covariance @ slope + noise.white**2 / of.size)
         if failed:  # a mean force may be as wrong as the rest of it, and no drift shows that
             lost = max(0.0, 1.0 - channel.explained_out_of_sample)
-            told = np.hypot(told, _Z * np.sqrt(lost) * mean)
+            told = np.hypot(told, Z95 * np.sqrt(lost) * mean)
         error = float(np.hypot(told, _wandering(of)))
         value = float(of.mean())
         estimates.append(Estimate(name, value, value - error, value + error))
@@ -186,7 +185,7 @@ def _products(
         slope = np.array([exponents.get(each, 0.0) * value for each in names])
         if "lateral_drag" in exponents and "lateral_drag" in names:  # not fitted as a logarithm
             slope[list(names).index("lateral_drag")] = scale
-        error = _Z * float(np.sqrt(slope @ covariance @ slope)) if identified else np.inf
+        error = Z95 * float(np.sqrt(slope @ covariance @ slope)) if identified else np.inf
         found.append(Estimate(name, value, max(0.0, value - error), value + error))
     return tuple(found)
 
@@ -257,7 +256,7 @@ def _wandering(residual: Array) -> float:
     for count in _STRETCHES:  # a drift whose period is one stretch is seen by the other cut
         means = [stretch.mean() for stretch in np.array_split(residual, count)]
         deviation = np.std(means, ddof=1) / np.sqrt(count)
-        halves.append(float(t.ppf(0.975, count - 1) * deviation))
+        halves.append(float(student95(count - 1) * deviation))
     return max(halves)
 
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from fishd.core.errors import ParameterError
-from fishd.lab.objective import per_watt
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import Trial
+from fishd.lab.statistics import per_watt
 
 
 class Aim(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import norm
 
 from fishd.lab.optimise.search import Array, Proposal, Range, Search
+from fishd.lab.statistics import Z95
 
 CURVES = 400
 """How many pairs of curves the interval of the best is found from."""
@@ -83,7 +84,7 @@ class LeastPower:
             self._thrust.parameters_at(low),
             self._thrust.parameters_at(high),
             watts,
-            1.96 * watts * math.sqrt(max(float(power_covariance[best, best]), 0.0)),
+            Z95 * watts * math.sqrt(max(float(power_covariance[best, best]), 0.0)),
             float(gain.max()) if reached else 1.0,
         )
 

@@ -21,6 +21,7 @@ from scipy.stats import qmc
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from fishd.core.errors import ParameterError
+from fishd.lab.statistics import Z95
 
 Array = NDArray[np.float64]
 
@@ -164,7 +165,7 @@ class Search:
     def observe(self, parameters: Mapping[str, float], value: float, error: float) -> None:
         """Take what a candidate gave, and half of its 95 % interval."""
         share = {each.name: each.share(parameters[each.name]) for each in self.ranges}
-        self._variances.append(max(error / 1.96, 1e-3 * abs(value), 1e-9) ** 2)
+        self._variances.append(max(error / Z95, 1e-3 * abs(value), 1e-9) ** 2)
         with contextlib.redirect_stdout(None):  # where it prints that a candidate came again
             self._library.register(params=share, target=value)
 
@@ -185,7 +186,7 @@ class Search:
             self.parameters_at(np.minimum(low, shares[best])),
             self.parameters_at(np.maximum(high, shares[best])),
             float(mean[best]),
-            1.96 * math.sqrt(max(float(covariance[best, best]), 1e-18)),
+            Z95 * math.sqrt(max(float(covariance[best, best]), 1e-18)),
             float(gain.max() / abs(mean[best])),
         )
 
@@ -193,7 +194,7 @@ class Search:
         """What is expected there, and half of its 95 % interval; there must have been a trial."""
         place: Array = np.array([[each.share(parameters[each.name]) for each in self.ranges]])
         mean, covariance = self.expectation(place)
-        return float(mean[0]), 1.96 * math.sqrt(max(float(covariance[0, 0]), 0.0))
+        return float(mean[0]), Z95 * math.sqrt(max(float(covariance[0, 0]), 0.0))
 
     def measured(self, name: str) -> tuple[list[float], list[float], list[float]]:
         """The values of a parameter that were tried, and their thrusts and errors [N]."""
@@ -201,14 +202,14 @@ class Search:
         shares = self._library.space.params[:, index]
         values = [self.ranges[index].value(float(share)) for share in shares]
         thrusts = [float(target) for target in self._library.space.target]
-        return values, thrusts, [1.96 * math.sqrt(each) for each in self._variances]
+        return values, thrusts, [Z95 * math.sqrt(each) for each in self._variances]
 
     def curve(self, points: int = 200) -> tuple[Array, Array, Array]:
         """Of one parameter: its values, the thrust, and half of its 95 % interval [N]."""
         shares = np.linspace(0.0, 1.0, points)
         mean, covariance = self.expectation(shares[:, None])
         values = np.array([self.ranges[0].between(float(share)) for share in shares])
-        return values, mean, 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return values, mean, Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
     def expectation(self, shares: Array) -> tuple[Array, Array]:
         """What is expected at such places, (n,), and its covariance, (n, n)."""

@@ -1,18 +1,19 @@
 """Measures the candidates of a search on a rig: the fish swims with each, and rests in between."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from fishd.control.estimators.live_thrust import SWIM_SETTLES
-from fishd.core.errors import ParameterError
+from fishd.core.errors import ConfigError, ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.error_budget import visible_rotation
+from fishd.lab.experiment import Experiment
 from fishd.lab.measurement import REST, Step, evaluate, samples_of
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.rig import Rig, refuse_lost
+from fishd.lab.session import Session, refuse_lost
 
 STEADY = 1.5
 """How long the fish swims with each candidate once it has settled, at least [s]."""
@@ -51,8 +52,35 @@ class Trial(NamedTuple):
     """Rotation of the sensor as this swim shows it; 0 for one that was read from a table [rad]."""
 
 
+COLUMNS = ("thrust", "error", "power", "power_error", "swum", "passed")
+"""Columns of a table of trials, after those of the searched parameters."""
+
+
+def read_trials(experiment: Experiment, names: Iterable[str]) -> list[Trial]:
+    """Return the trials that a search has kept so far.
+
+    names: of the searched parameters
+    Raises `ConfigError` where the table is of something else.
+    """
+    names = tuple(names)
+    trials = []
+    for row in experiment.read_rows((*names, *COLUMNS)):
+        try:
+            values = {name: float(text) for name, text in row.items()}
+        except ValueError as error:
+            raise ConfigError(f"{experiment.path}: not a table of a search: {error}") from None
+        parameters = {name: values.pop(name) for name in names}
+        trials.append(Trial(parameters, **values)._replace(swum=int(values["swum"])))  # type: ignore[arg-type]
+    return trials
+
+
+def keep_trial(experiment: Experiment, trial: Trial) -> None:
+    """Add a trial to the table of a search; raises `FishdError`."""
+    experiment.add_row({**trial.parameters, **{name: getattr(trial, name) for name in COLUMNS}})
+
+
 def trials(
-    rig: Rig,
+    session: Session,
     controller: str,
     fixed: Mapping[str, Any],
     search: Search | LeastPower,
@@ -82,12 +110,12 @@ def trials(
         if passed + length + REST > budget:
             return
         if not rest:
-            rest = rig.rest(REST)
-        swim = rig.swim(controller, parameters, length)
-        after = rig.rest(REST)
+            rest = session.rest(REST)
+        swim = session.swim(controller, parameters, length)
+        after = session.rest(REST)
         ticks = [*rest, *swim, *after]
-        refuse_lost(ticks, (REST, length, REST), rig.tick)
-        found = evaluate(samples_of(ticks), rig.tick, settles, alike=alike)
+        refuse_lost(ticks, (REST, length, REST), session.tick)
+        found = evaluate(samples_of(ticks), session.tick, settles, alike=alike)
         alike += found.steps
         swum += len(swim)
         passed += length + REST
@@ -139,7 +167,7 @@ def lengths(parameters: Mapping[str, Any]) -> tuple[float, float]:
     return SWIM_SETTLES, SWIM_SETTLES + STEADY
 
 
-def default_range(field: Field, rig: Rig) -> Range | None:
+def default_range(field: Field, session: Session) -> Range | None:
     """What is searched of a parameter unless more is said; None where its bounds leave it open.
 
     A frequency from `FREQUENCIES` to half beats of `SHORTEST` ticks, an amplitude up to that of
@@ -147,11 +175,11 @@ def default_range(field: Field, rig: Rig) -> Range | None:
     """
     low, high = _ends(field)
     if field.name == "amplitude":
-        return Range(field.name, rig.amplitude / 20.0, rig.amplitude)
+        return Range(field.name, session.amplitude / 20.0, session.amplitude)
     if math.isinf(low) or math.isinf(high):
         return None
     if field.name == "frequency":
-        return Range(field.name, max(low, FREQUENCIES), min(high, 0.5 / (SHORTEST * rig.tick)))
+        return Range(field.name, max(low, FREQUENCIES), min(high, 0.5 / (SHORTEST * session.tick)))
     margin = (high - low) / 20.0
     return Range(
         field.name,
@@ -160,11 +188,11 @@ def default_range(field: Field, rig: Rig) -> Range | None:
     )
 
 
-def check_bounds(asked: Range, field: Field, rig: Rig) -> None:
+def check_bounds(asked: Range, field: Field, session: Session) -> None:
     """Raises `ParameterError` where a parameter cannot be searched between these."""
     low, high = _ends(field)
     if field.name == "amplitude":
-        high = min(high, rig.amplitude)
+        high = min(high, session.amplitude)
     is_open = field.interval.startswith("(") and asked.low == low
     is_open |= field.interval.endswith(")") and asked.high == high
     if asked.low < low or asked.high > high or is_open:

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from fishd.core.beats import Reversals
 from fishd.virtual.plant.base import TrueWindow
 
 
@@ -21,7 +22,7 @@ class Beats:
         """The time before the first beat."""
         self.reversals = 0
         self._began = False
-        self._side = 0.0
+        self._reversals = Reversals()
         self._each: list[tuple[float, float]] = []  # impulse N s, duration s
 
     @property
@@ -31,13 +32,10 @@ class Beats:
 
     def add(self, angle: float, window: TrueWindow) -> None:
         """Add a window; angle: the instruction angle during it [rad]."""
-        side = self._side
-        if angle:
-            side = 1.0 if angle > 0.0 else -1.0
-        if side != self._side and self._side:
+        if reversal := self._reversals.add(angle):
             self._open.close_half()
             self.reversals += 1
-            if side > 0.0:
+            if reversal > 0:
                 if self._began:
                     self._whole += self._open
                     self._each.append((self._open.impulse, self._open.duration))
@@ -45,7 +43,6 @@ class Beats:
                     self._before = self._open
                 self._began = True
                 self._open = _Sums()
-        self._side = side
         self._open.add(angle, window)
 
     def means(self) -> "BeatMeans":

@@ -121,9 +121,9 @@ def plain(best: Best, quantity: Quantity) -> dict[str, Any]:
 
 def whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | None:
     """The best that was measured without dithered half beats; None where nothing was."""
-    if curve.over != "frequency" or curve.peak is None or folder.begun.quantity.name != "thrust":
+    if curve.over != "frequency" or curve.peak is None or folder.quantity.name != "thrust":
         return None
-    tick = float(curve.points[0].keys.get("tick", folder.begun.config["tick"]))
+    tick = float(curve.points[0].keys.get("tick", folder.experiment.header.config["tick"]))
     whole = {
         round(0.5 / x / tick): (thrust, x, result.error)
         for x, result in zip(curve.x, curve.results, strict=True)

@@ -19,16 +19,15 @@ frequencies; more of them are a curve of their own."""
 
 
 def draw(
-    stem: Path,
+    paths: Sequence[Path],
     found: Sequence[Curve],
     units: Mapping[str, str],
     *,
     error_of: str,
     quantity: Quantity,
-) -> list[Path]:
-    """Write the picture as PNG and as SVG; returns both paths.
+) -> None:
+    """Draw the picture into files; the suffix of each chooses its format.
 
-    stem: path without a suffix
     found: curves, one with a peak at least; those over one quantity share a panel, and those that
         are over nothing, or without a value, are left out. Where there are curves over a frequency,
         the points of those that have none are shown at the frequency at which the tail beat.
@@ -44,7 +43,6 @@ def draw(
             points.append(curve)
         elif curve.peak:
             panels.setdefault(curve.over, []).append(curve)
-    paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
     with drawn(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:
         shown = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         for axes, (over, curves) in zip(shown, panels.items(), strict=True):
@@ -59,8 +57,8 @@ def draw(
         shown[0].set_ylabel(plain(f"{quantity.name} (m{quantity.unit})"))
         note = f"bars: 95 % interval of {error_of}; cross: best, of the parabola drawn"
         shown[0].set_title(note, fontsize=8, fontweight="normal", color=GREY)
-        save(figure, paths[1])
-    return paths
+        for path in paths[1:]:
+            save(figure, path)
 
 
 def _chooses_itself(curve: Curve) -> bool:

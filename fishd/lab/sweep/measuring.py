@@ -2,7 +2,7 @@
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +13,13 @@ from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import amplitude_of
 from fishd.core.errors import FishdError
+from fishd.core.process.interruption import on_signal
 from fishd.lab.measurement import measure
-from fishd.lab.objective import per_watt
-from fishd.lab.parallel import Stop
-from fishd.lab.rig import Rig, is_of_one
+from fishd.lab.parallel import Stop, workers
+from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import Beats, VirtualRun
+from fishd.lab.statistics import per_watt, student95
+from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import Found, Result
 from fishd.recording.writer import RunWriter
@@ -25,6 +27,12 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 SLOWEST = 0.4
 """A controller without a frequency is given the time of so slow a tail beat [Hz]."""
+
+
+STOP = "stop"
+"""A file of this name in the folder ends a sweep in simulation."""
+
+Done = Callable[[Point, Found], None]
 
 
 class Task(NamedTuple):
@@ -102,7 +110,9 @@ def swim(
         return Result(seconds=seconds, trouble=trouble.message)
     means = beats.means()
     best = best_square_wave(config.plant, amplitude_of(controller.parameters, config.limits))
-    error = _half_width(means.thrust_deviation, beats.count)
+    error = None
+    if beats.count > 1:
+        error = student95(beats.count - 1) * means.thrust_deviation
     watts = means.power or math.nan
     return Result(
         thrust=means.thrust,
@@ -117,18 +127,17 @@ def swim(
     )
 
 
-def on_rig(point: Point, rig: Rig, seconds: float, progress: Callable[[float], None]) -> Result:
-    """The thrust that a rig measures at a point, freed of its drift.
+def measure_point(point: Point, session: Session, seconds: float) -> Result:
+    """Return the thrust measured at a point, without the drift of the sensor.
 
     There is trouble, and no thrust, where fishd refuses this controller, or it gives up.
 
-    progress: called with the time that has passed [s]
     Raises as `fishd.lab.measurement.measure` what concerns the other points, too.
     """
     try:
-        found = measure(rig, point.controller, point.parameters, seconds, progress)
+        found = measure(session, point.controller, point.parameters, seconds)
     except FishdError as error:
-        if not is_of_one(error):
+        if not concerns_one_controller(error):
             raise
         return Result(trouble=str(error))
     gave, gave_error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
@@ -139,12 +148,56 @@ def on_rig(point: Point, rig: Rig, seconds: float, progress: Callable[[float], N
         power=found.watts,
         thrust_per_watt=gave,
         thrust_per_watt_error=gave_error,
-        seconds=len(found.ticks) * rig.tick,
+        seconds=len(found.ticks) * session.tick,
     )
 
 
-def _half_width(deviation: float, count: int) -> float | None:
-    """Half of the 95 % interval of a mean of so many beats; None for fewer than two."""
-    from scipy.special import stdtrit
+def swim_all(
+    folder: SweepFolder,
+    found: Sequence[tuple[Point, Config]],
+    lengths: Lengths,
+    done: Done,
+    jobs: int | None = None,
+    cluster: str | None = None,
+) -> bool:
+    """Swim simulated fish at the points that are missing; False where a signal ended that before.
 
-    return float(stdtrit(count - 1, 0.975) * deviation) if count > 1 else None
+    found: points, each with the configuration of its fish
+    done: called with each point that ends
+    jobs, cluster: as for `fishd.lab.parallel.workers`
+    Raises `FishdError`; the points before are kept.
+    """
+    missing = [each for each in found if folder.key(each[0]) not in folder.results]
+    is_whole = True
+    with workers(folder.path / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
+        tasks = [Task(point, config, lengths, crew.stop) for point, config in missing]
+        for index, outcome in crew.run(simulated, tasks):
+            if outcome is None:
+                is_whole = False
+                continue
+            point = missing[index][0]
+            result, recording = outcome
+            folder.keep(point, result, recording)
+            done(point, result)
+    return is_whole
+
+
+def measure_all(
+    folder: SweepFolder, found: Sequence[Point], session: Session, seconds: float, done: Done
+) -> None:
+    """Measure the missing points in a session, which the caller has entered.
+
+    A point whose controller is refused, or gives up, has trouble, and the next one is measured.
+
+    seconds: for each point [s]
+    Raises `FishdError`; the points before are kept.
+    """
+    for point in found:
+        if folder.key(point) in folder.results:
+            continue
+        extra = {name: str(value) for name, value in point.columns().items()}
+        path = folder.recording_of(point)
+        with session.recorded(path, point.label(), extra):
+            result = measure_point(point, session, seconds)
+        folder.keep(point, result, path)
+        done(point, result)

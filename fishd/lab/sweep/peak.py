@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fishd.lab.statistics import Z95, student95
+
 UPPER = 0.85
 """The parabola goes through what is above this share of the highest value, around it."""
 FEWEST = 5
@@ -43,7 +45,7 @@ def peak(x: Sequence[float], y: Sequence[float], error: Sequence[float | None]) 
     """
     order = np.argsort(x)
     xs, ys = _array(x)[order], _array(y)[order]
-    deviations = np.array([(each or 0.0) / 1.96 for each in error])[order]
+    deviations = np.array([(each or 0.0) / Z95 for each in error])[order]
     if not len(xs):
         raise ValueError("a curve without points has no maximum")
     top = int(np.argmax(ys))
@@ -79,8 +81,6 @@ def _vertex(
     x: NDArray[np.float64], y: NDArray[np.float64], deviation: NDArray[np.float64]
 ) -> Peak | None:
     """None where the parabola has no maximum among the points."""
-    from scipy.special import stdtrit
-
     centre = float(x.mean())
     matrix = np.vander(x - centre, 3)
     degrees = len(x) - 3
@@ -97,7 +97,7 @@ def _vertex(
     at = float(-b / (2.0 * a))
     slope = np.array([b / (2.0 * a**2), -1.0 / (2.0 * a), 0.0])
     here = np.array([at**2, at, 1.0])
-    width = float(stdtrit(degrees, 0.975)) if degrees and lack > own else 1.96
+    width = student95(degrees) if degrees and lack > own else Z95
     known = degrees > 0 or own > 0.0
     x_error = width * math.sqrt(slope @ covariance @ slope)
     return Peak(

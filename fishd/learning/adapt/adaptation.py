@@ -2,16 +2,17 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from fishd.config import Config
+from fishd.config import Config, Start
 from fishd.core.errors import FishdError
 from fishd.lab import error_budget
+from fishd.lab.experiment import Progress
 from fishd.lab.identification import experiment
 from fishd.lab.measurement import REST, measure
-from fishd.lab.rig import Rig, is_of_one
+from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
 from fishd.learning.adapt import steps as do
 from fishd.learning.adapt.practice import TRIES, practise, simulated
@@ -25,21 +26,7 @@ from fishd.learning.adapt.state import (
     Trained,
     Tried,
 )
-from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import SQUARE, judge
-
-
-class Show(Protocol):
-    """What a person sees of it, as `fishd.cli.lab_progress.Lines` is."""
-
-    def done(self, line: str, amount: float) -> None:
-        """Say what was done; amount: tank time used [s]."""
-
-    def at(self, amount: float, found: str = "") -> None:
-        """Say how much tank time is used [s], and what goes on."""
-
-    def warn(self, line: str) -> None:
-        """Say a line of what is wrong."""
 
 
 class Gait(NamedTuple):
@@ -55,29 +42,28 @@ class Adaptation:
 
     def __init__(
         self,
-        rig: Rig,
-        config: Config,
+        session: Session,
         run: AdaptFolder,
         tank_time: float,
         steps: int,
         seed: int,
-        show: Show,
+        show: Progress,
     ) -> None:
         """
-        rig: the fish, which the caller has entered
-        config: its loop; of its plant and rig nothing is used
+        session: entered by the caller; nothing of the plant and rig in its configuration is used
         tank_time: for all that needs the fish, rests included [s]; `steps.LEAST` at least
         steps: of the training
         """
-        self._rig = rig
-        self._config = config
+        self._session = session
+        self._config = replace(session.read_config(), start=Start())
         self._run = run
         self._tank_time = tank_time
         self._steps = steps
         self._seed = seed
         self._show = show
         self._doing = ""
-        self._tank = Tank(rig, run.state.tank_time, lambda used: show.at(used, self._doing))
+        session.used = run.state.tank_time
+        session.progress = lambda used: show.at(used, self._doing)
 
     def run(self) -> State:
         """Do what is not done yet.
@@ -86,7 +72,7 @@ class Adaptation:
         `NoDaemon` and `ConfigError`; what was measured before is kept.
         """
         state = self._run.state
-        self._show.at(self._tank.used)
+        self._show.at(self._session.used)
         if state.excitation is None:
             self._excite(state)
         if state.fitted is None:
@@ -105,18 +91,18 @@ class Adaptation:
 
     def _excite(self, state: State) -> None:
         seconds = do.BUDGET["excitation"] * self._tank_time
-        path = self._run.recording("excitation")
-        with self._in_tank("excitation", "excitation"), self._tank.recorded(path, _NOTE):
-            experiment(self._tank, seconds)
+        path = self._run.experiment.recording("excitation")
+        with self._in_tank("excitation", "excitation"), self._session.recorded(path, _NOTE):
+            experiment(self._session, seconds)
         state.excitation = path.name
         self._done(f"excitation: {seconds:.0f} s of it are in {path.name}")
 
     def _fit(self, state: State) -> None:
         assert state.excitation
-        self._show.at(self._tank.used, "fitting a fish to it; the fish rests")
+        self._show.at(self._session.used, "fitting a fish to it; the fish rests")
         path = self._run.path / state.excitation
-        found, state.fitted = do.fit(path, self._tank.amplitude, self._seed)
-        self._run.write(FISH, found.to_yaml("fishctl adapt"))
+        found, state.fitted = do.fit(path, self._session.amplitude, self._seed)
+        self._run.experiment.write(FISH, found.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in found.channels)
         unused = "" if state.fitted.model.error is not None else ": too little to be used"
         self._done(f"fit: it explains {explained} of F_x and F_y{unused}")
@@ -125,9 +111,9 @@ class Adaptation:
 
     def _settle_swing(self, state: State) -> None:
         seconds = do.BUDGET["swing"] * self._tank_time - REST
-        path = self._run.recording("swing")
-        with self._in_tank("swing", "swing --C auto"), self._tank.recorded(path, _NOTE):
-            state.swing = do.settle_swing(self._tank, seconds)
+        path = self._run.experiment.recording("swing")
+        with self._in_tank("swing", "swing --C auto"), self._session.recorded(path, _NOTE):
+            state.swing = do.settle_swing(self._session, seconds)
         found = state.swing
         lead = f", {found.lead * 1e3:.0f} ms ahead" if found.lead else ""
         unsure = "" if found.settled else "; its search was not over"
@@ -135,18 +121,18 @@ class Adaptation:
 
     def _search(self, state: State) -> None:
         assert state.fitted
-        search = do.square_waves(state.fitted, self._tank, self._seed)
-        budget = max(do.BUDGET["search"] * self._tank_time, do.least_search(self._tank, search))
+        search = do.square_waves(state.fitted, self._session, self._seed)
+        budget = max(do.BUDGET["search"] * self._tank_time, do.least_search(self._session, search))
 
         def keep(trial: Tried) -> None:
             state.trials.append(trial)
-            state.tank_time = self._tank.used
+            state.tank_time = self._session.used
             self._keep()
 
-        path = self._run.recording("search")
-        with self._in_tank("search", "searching square waves"), self._tank.recorded(path, _NOTE):
-            do.search_square_waves(self._tank, search, budget, tuple(state.trials), keep)
-        state.square, used = do.best_of(search, state.trials, state.fitted, self._tank.amplitude)
+        path = self._run.experiment.recording("search")
+        with self._in_tank("search", "searching square waves"), self._session.recorded(path, _NOTE):
+            do.search_square_waves(self._session, search, budget, tuple(state.trials), keep)
+        state.square, used = do.best_of(search, state.trials, state.fitted, self._session.amplitude)
         state.disagrees = not used and state.fitted.model.error is not None
         tried = f"{len(state.trials)} square waves tried"
         by = "they agree with the fit" if used else "by these alone"
@@ -169,7 +155,7 @@ class Adaptation:
             again, step = divmod(done - 1, self._steps)
             more = f", once more ({again + 1} of {TRIES})" if again else ""
             doing = f"training, {step + 1} of {self._steps} steps{more}; the fish rests"
-            self._show.at(self._tank.used, doing)
+            self._show.at(self._session.used, doing)
 
         state.trained = found = practise(
             self._config, state.fitted, self._run.path, self._steps, self._seed, progress
@@ -199,29 +185,29 @@ class Adaptation:
     def _contest(self, state: State) -> None:
         known = {one.name for one in state.contenders} | set(state.left_out)
         todo = [gait for gait in self.gaits(state) if gait.name not in known]
-        left = self._tank_time - self._tank.used
+        left = self._tank_time - self._session.used
         needed = sum(do.least_measurement(gait.parameters) for gait in todo)
         if left < needed:
             raise FishdError(
                 f"{max(0.0, left):.0f} s are left of the tank time, and the comparison needs "
-                f"{needed:.0f} s: a larger --tank-time goes on with it"
+                f"{needed:.0f} s: a larger --budget is needed"
             )
         for index, gait in enumerate(todo):
             rest = sum(do.least_measurement(other.parameters) for other in todo[index + 1 :])
-            left = self._tank_time - self._tank.used
+            left = self._tank_time - self._session.used
             seconds = min(left / (len(todo) - index), left - rest)
             self._measure(state, gait, max(seconds, do.least_measurement(gait.parameters)))
 
     def _measure(self, state: State, gait: Gait, seconds: float) -> None:
-        path = self._run.recording(f"measured-{gait.name}")
+        path = self._run.experiment.recording(f"measured-{gait.name}")
         try:
             with (
                 self._in_tank("comparison", f"measuring {gait.name}"),
-                self._tank.recorded(path, _NOTE),
+                self._session.recorded(path, _NOTE),
             ):
-                found = measure(self._tank, gait.controller, gait.parameters, seconds)
+                found = measure(self._session, gait.controller, gait.parameters, seconds)
         except FishdError as error:
-            if not is_of_one(error) or gait.name == SQUARE:
+            if not concerns_one_controller(error) or gait.name == SQUARE:
                 raise
             state.left_out[gait.name] = str(error)
             self._keep()
@@ -240,7 +226,7 @@ class Adaptation:
                 seconds=seconds,
                 remark=found.remark,
                 expected=self._expected(state, gait),
-                **_truth(self._config, self._rig, gait),
+                **_truth(self._config, self._session, gait),
             )
         )
         measured = error_budget.spelled(
@@ -264,14 +250,14 @@ class Adaptation:
     @contextmanager
     def _in_tank(self, step: str, doing: str) -> Iterator[None]:
         """Whatever ends a step, the time that the fish has swum for it is written down."""
-        state, begun = self._run.state, self._tank.used
+        state, begun = self._run.state, self._session.used
         self._doing = doing
         try:
             yield
         finally:
-            spent = self._tank.used - begun
+            spent = self._session.used - begun
             state.spent[step] = state.spent.get(step, 0.0) + spent
-            state.tank_time = self._tank.used
+            state.tank_time = self._session.used
             self._keep()
 
     def _keep(self) -> None:
@@ -279,7 +265,7 @@ class Adaptation:
 
     def _done(self, line: str) -> None:
         self._keep()
-        self._show.done(line, self._tank.used)
+        self._show.done(line, self._session.used)
 
 
 _NOTE = "fishctl adapt"
@@ -287,9 +273,9 @@ _CLOUD = 8
 """Fish of the cloud on which a gait is simulated."""
 
 
-def _truth(config: Config, rig: Rig, gait: Gait) -> dict[str, float]:
+def _truth(config: Config, session: Session, gait: Gait) -> dict[str, float]:
     """What is known of a simulated fish alone."""
-    if rig.source != "simulation":
+    if session.source != "simulation":
         return {}
     swum = simulate(config, gait.controller, gait.parameters)
     return {"true_thrust": swum.mean_thrust, "true_relative_thrust": swum.relative_thrust}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from fishd.lab.identification import Identification
+from fishd.lab.statistics import Z95
 from fishd.learning.adapt.state import Model
 
 Array = NDArray[np.float64]
@@ -85,7 +86,7 @@ def combine(
     """
     at = list(places)
     prior = covariance + _UNKNOWN_FACTOR**2
-    noise = np.diag((ci95 / 1.96 / expected[at]) ** 2)
+    noise = np.diag((ci95 / Z95 / expected[at]) ** 2)
     gain = np.linalg.solve(prior[np.ix_(at, at)] + noise, prior[at]).T
     ratios = 1.0 + gain @ (measured / expected[at] - 1.0)
     left = prior - gain @ prior[at]
@@ -98,7 +99,7 @@ def is_rejected(
     """Return True where measurements disagree with the identified fish; arguments as `combine`."""
     at = list(places)
     ratios = measured / expected[at]
-    noise = np.diag((ci95 / 1.96 / expected[at]) ** 2)
+    noise = np.diag((ci95 / Z95 / expected[at]) ** 2)
     inverse = np.linalg.inv(covariance[np.ix_(at, at)] + noise)
     factor = float(inverse.sum(axis=0) @ ratios / inverse.sum())
     missed = float((ratios - factor) @ inverse @ (ratios - factor))

@@ -36,7 +36,7 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     picture = run.path / PICTURE
     trained = run.state.trained.folder if run.state.trained else ""
     draw(run.state, run.path / (trained or TRAINING), amplitude, picture)
-    run.write(PAGE, page(run.state, picture.read_bytes(), again))
+    run.experiment.write(PAGE, page(run.state, picture.read_bytes(), again))
     return picture, run.path / PAGE
 
 

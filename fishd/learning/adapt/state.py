@@ -1,34 +1,16 @@
 """What an adaptation has found so far, and the folder that keeps it from step to step."""
 
-from pathlib import Path
 from typing import Any
 
-import msgspec
 from msgspec import Struct
 
-from fishd import __version__
-from fishd.core import files
-from fishd.core.errors import ConfigError, FishdError
-from fishd.core.files import FileProblem, write_atomically
-from fishd.lab.begun import begin
+from fishd.lab.experiment import Experiment
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
-BEGUN, STATE = "begun.json", "adapt.json"
+STATE = "adapt.json"
 FISH, POLICY, TRAINING = "fish.yaml", "policy.onnx", "training"
 PICTURE, PAGE = "adapt.png", "adapt.html"
-RECORDED = ".mcap"
-
-
-class Begun(Struct, frozen=True):
-    """With what an adaptation began; a folder is resumed only with the same."""
-
-    on: str
-    steps: int
-    seed: int
-    config: dict[str, Any]
-    """The fish, as plain data."""
-    version: str = __version__
 
 
 class Model(Struct, frozen=True, kw_only=True):
@@ -172,51 +154,14 @@ class State(Struct, kw_only=True):
 
 
 class AdaptFolder:
-    """A folder in which each step is kept as it is done; `state` has those that were there."""
+    """The folder of an adaptation, in which each step is kept as it is done, in `state`."""
 
-    def __init__(self, path: Path, begun: Begun) -> None:
-        """Makes the folder, or resumes one; raises `ConfigError` if that began with another."""
-        self.path = path
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            begin(path / BEGUN, begun, "adaptation")
-        except OSError as error:
-            raise self._unwritable(error) from None
-        self.state = _read(path / STATE)
+    def __init__(self, experiment: Experiment) -> None:
+        """Raises `ConfigError` where the state cannot be read."""
+        self.path = experiment.path
+        self.experiment = experiment
+        self.state = experiment.read_struct(STATE, State) or State()
 
     def keep(self) -> None:
-        """Write the state down; raises `ConfigError`."""
-        self.write(STATE, msgspec.json.format(msgspec.json.encode(self.state), indent=2))
-
-    def write(self, name: str, content: str | bytes) -> None:
-        """Write a file of the folder; raises `ConfigError`."""
-        try:
-            write_atomically(self.path / name, content)
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def recording(self, step: str) -> Path:
-        """A new name for the recording of a step; one that was broken off keeps its own."""
-        number, path = 1, self.path / f"{step}{RECORDED}"
-        while any(path.parent.glob(f"{path.name}*")):
-            number += 1
-            path = path.with_stem(f"{step}-{number}")
-        return path
-
-    def _unwritable(self, error: OSError) -> FishdError:
-        where = error.filename or self.path
-        return FishdError(
-            f"{where}: cannot be written: {error.strerror}; what was measured before is kept"
-        )
-
-
-def _read(path: Path) -> State:
-    if not path.exists():
-        return State()
-    try:
-        data = msgspec.json.decode(files.read(path, files.SETTINGS, "an adaptation"))
-        return msgspec.convert(files.with_current_names(data), State)
-    except (FileProblem, msgspec.MsgspecError) as error:
-        raise ConfigError(
-            f"{path}: not as this fishd ({__version__}) writes it: {error}; give another --folder"
-        ) from None
+        """Write the state; raises `FishdError`."""
+        self.experiment.write_struct(STATE, self.state)

@@ -15,6 +15,7 @@ from fishd.lab.measurement import REST, SWIM
 from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import Trial, lengths, trials, whole_ticks
+from fishd.lab.session import Session
 from fishd.learning.adapt.cloud import cloud, identified
 from fishd.learning.adapt.prior import (
     combine,
@@ -24,7 +25,6 @@ from fishd.learning.adapt.prior import (
     model_of,
 )
 from fishd.learning.adapt.state import Fitted, Rung, Tried
-from fishd.learning.adapt.tank import Tank
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
@@ -72,10 +72,10 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     return found, fitted
 
 
-def settle_swing(rig: Tank, seconds: float) -> Rung:
+def settle_swing(session: Session, seconds: float) -> Rung:
     """Let `swing --C auto` search for so long; the C and the lead that it ends with."""
-    ticks = rig.swim("swing", {"C": "auto"}, seconds)
-    rig.rest(REST)
+    ticks = session.swim("swing", {"C": "auto"}, seconds)
+    session.rest(REST)
     end = ticks[len(ticks) // 2 :]
     shown = [tick.quantities for tick in end if tick.quantities]
     watching = [each for each in shown if not each["searching"]]
@@ -85,22 +85,22 @@ def settle_swing(rig: Tank, seconds: float) -> Rung:
     return Rung(criterion, lead, bool(watching))
 
 
-def square_waves(fitted: Fitted, rig: Tank, seed: int) -> Search:
+def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
     """Return a search over square waves of whole ticks around the best of the identified fish.
 
     Where that explains too little, all frequencies are searched.
     """
     low, high = SLOWEST, FASTEST
     if fitted.model.error is not None:
-        best = best_square_wave(fitted.plant, rig.amplitude).frequency
+        best = best_square_wave(fitted.plant, session.amplitude).frequency
         best = min(FASTEST / AROUND, max(SLOWEST * AROUND, best))
         low, high = best / AROUND, best * AROUND
-    high = min(high, 0.5 / rig.tick)
-    return Search([whole_ticks(Range("frequency", low, high), rig.tick)], seed)
+    high = min(high, 0.5 / session.tick)
+    return Search([whole_ticks(Range("frequency", low, high), session.tick)], seed)
 
 
 def search_square_waves(
-    rig: Tank,
+    session: Session,
     search: Search,
     budget: float,
     before: Sequence[Tried],
@@ -117,7 +117,7 @@ def search_square_waves(
             {"frequency": one.frequency}, one.thrust, one.error, *nobody, one.swum, one.passed
         )
         search.observe(last.parameters, last.thrust, last.error)
-    for each in trials(rig, "square", {}, search, budget, last):
+    for each in trials(session, "square", {}, search, budget, last):
         frequency = each.parameters["frequency"]
         keep(Tried(frequency, each.thrust, each.error, each.swum, each.passed))
 
@@ -149,9 +149,9 @@ def best_of(
     return search.proposal().parameters["frequency"], False
 
 
-def least_search(rig: Tank, search: Search) -> float:
+def least_search(session: Session, search: Search) -> float:
     """How long a search takes that tries the slowest wave once [s]."""
-    return 2.0 * REST + lengths({"frequency": search.ranges[0].values[0]})[1] + rig.tick
+    return 2.0 * REST + lengths({"frequency": search.ranges[0].values[0]})[1] + session.tick
 
 
 def least_measurement(parameters: Mapping[str, Any]) -> float:

@@ -17,6 +17,7 @@ from fishd.lab.ranking import (
     ratio,
     widening,
 )
+from fishd.lab.statistics import Z95
 from fishd.learning.adapt.prior import combine, deviations, is_rejected
 from fishd.learning.adapt.state import Contender, Model, Verdict
 
@@ -101,7 +102,7 @@ def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: M
     if is_rejected(expected[0], spread, places, measured, ci95):
         return names
     thrusts, covariance = combine(expected[0], spread, places, measured, ci95)
-    width = 1.96 * widening(len(contenders) * (len(contenders) - 1) // 2)
+    width = Z95 * widening(len(contenders) * (len(contenders) - 1) // 2)
 
     def apart(i: int, j: int) -> float:
         variance = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]

@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 from zipfile import ZipFile
 
 import msgspec
@@ -22,6 +22,7 @@ from msgspec import Meta, Struct
 from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
 from fishd.core.errors import FishdError, PolicyError
+from fishd.lab.experiment import On
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes import making as eyes
@@ -53,7 +54,7 @@ class CheckpointError(FishdError, RuntimeError):
 class State(Struct, frozen=True):
     """What is needed to resume a training, besides the networks and their optimiser."""
 
-    on: Literal["simulation", "robot"]
+    on: On
     steps: Annotated[int, Meta(ge=0)]
     """Control steps that were learned from."""
     updates: int

@@ -17,17 +17,12 @@ from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.files import write_atomically
+from fishd.lab.experiment import On, mark_folder
 from fishd.learning import settings as training
 from fishd.learning.env.evaluation import Evaluation
-from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import TrainingSettings
 
 CONFIG, SETTINGS, CAMERA = "config.yaml", "settings.yaml", "camera.yaml"
-
-
-def default_folder() -> Path:
-    """A new name under runs/, from date and time."""
-    return Path("runs") / f"ppo-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def create(
@@ -35,46 +30,19 @@ def create(
     config: Config,
     settings: TrainingSettings,
     camera: SimulatedCameraSettings | None = None,
+    on: On = "simulation",
 ) -> None:
     """Make a run folder; raises `ConfigError` where it exists already.
 
     camera: what a simulated fish is seen with
     """
-    otherwise = ""
-    if checkpoints.all_in(folder):
-        otherwise = f", or go on with --resume {folder}"
-    elif (folder / CONFIG).exists():
-        otherwise = ", or remove it: the training in it ended before its first checkpoint"
-    make_folder(folder, otherwise)
     try:
+        mark_folder(folder, "learn ppo", on)
         write_atomically(folder / CONFIG, configuration.to_yaml(config))
         write_settings(folder, settings)
         if camera:
             seen = cameras.CameraSettings(simulated=_without_address(camera))
             write_atomically(folder / CAMERA, cameras.to_yaml(seen))
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
-
-
-def make_folder(folder: Path, otherwise: str = "") -> None:
-    """Make a folder, or use an empty one.
-
-    otherwise: what else can be done where it is not empty
-
-    Raises `ConfigError`.
-    """
-    check_free(folder, otherwise)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
-
-
-def check_free(folder: Path, otherwise: str = "") -> None:
-    """Raises `ConfigError` where there is one already that is not empty."""
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ConfigError(f"{folder} exists already; give another --folder{otherwise}")
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
 

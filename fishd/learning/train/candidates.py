@@ -11,6 +11,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from fishd.core.calibration import Z95
 from fishd.learning.env.swims import Swim
 
 NEAR = 0.01
@@ -20,8 +21,6 @@ MOST = 8
 FIRST_ERROR, FIRST_DEGREES = 0.03, 3
 """Before swims of the same policies can be compared, each is taken to have this standard deviation,
 a share of the best square wave's thrust; it counts like so many comparisons."""
-INTERVAL = 1.96
-"""Half of a 95 % interval, over the standard deviation."""
 
 
 class Candidate(Struct, eq=False, kw_only=True):
@@ -85,7 +84,7 @@ class Candidates:
         if not one.swims:
             return math.inf
         variance = self._squares / (self._degrees - 2)  # as that of Student's t distribution
-        return INTERVAL * math.sqrt(variance / one.swims)
+        return Z95 * math.sqrt(variance / one.swims)
 
     @property
     def best(self) -> Candidate | None:

@@ -9,11 +9,11 @@ from msgspec import Struct
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.errors import ConfigError
+from fishd.lab.experiment import On
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.simulated_link import Camera
 from fishd.learning.settings import Randomisation, TrainingSettings
 
-On = Literal["simulation", "robot"]
 Ended = Literal["finished", "interrupted", "lost", "diverged", "failed"]
 
 
@@ -52,12 +52,12 @@ class Job(Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Refuse what a robot has nothing to learn from; raises `ConfigError`."""
-        if self.on == "robot" and self.is_begun and not self.settings.steps:
+        if self.on == "live" and self.is_begun and not self.settings.steps:
             raise ConfigError(
                 "steps: 0 is not valid on a robot, which does not imitate: it would learn nothing; "
                 "give --steps"
             )
-        if self.on == "robot" and self.settings.imitation.rounds and not self.is_begun:
+        if self.on == "live" and self.settings.imitation.rounds and not self.is_begun:
             raise ConfigError(
                 "imitation.rounds: the best beat of a robot's fish is not known: learn from "
                 "simulated ones, and go on here with --from; or set it to 0"
@@ -71,7 +71,7 @@ class Job(Struct, frozen=True, kw_only=True):
     @property
     def cleans_rewards(self) -> bool:
         """Is a sensor's drift and turn to be found? That takes more than an episode of one fish."""
-        one_fish = self.on == "robot" or self.settings.randomisation == Randomisation()
+        one_fish = self.on == "live" or self.settings.randomisation == Randomisation()
         return self.settings.ppo.clean_rewards and one_fish
 
     def last_step(self, done: int = 0) -> int:

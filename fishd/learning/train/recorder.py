@@ -82,7 +82,7 @@ class RunRecorder:
                 if job.parent:
                     self._begin_with(job.parent)
                 camera = job.camera if job.simulated_camera and job.on == "simulation" else None
-                runs.create(job.folder, job.config, job.settings, camera)
+                runs.create(job.folder, job.config, job.settings, camera, job.on)
                 self._lock_folder(lock)
             progress = self._open_table("progress.csv", tuple(PROGRESS))
             self._evaluations = self._open_table(EVALUATIONS, Evaluation.__struct_fields__)
@@ -251,7 +251,7 @@ class RunRecorder:
 
         Where the run was killed, its checkpoint is newer than the one that is resumed.
         """
-        path = checkpoints.best(self._job.folder) if state.on == "robot" else None
+        path = checkpoints.best(self._job.folder) if state.on == "live" else None
         past = checkpoints.read_state(path) if path else state
         best = self._kept = self.best = past.best
         self._plateau = best.merit if best else 0.0
@@ -267,7 +267,7 @@ class RunRecorder:
                 frequency=best.frequency,
                 fullness=best.fullness,
             )
-        elif state.on == "robot":  # it was moved away
+        elif state.on == "live":  # it was moved away
             self._kept = self.best = None
 
     def _open_table(self, name: str, columns: tuple[str, ...]) -> Table:

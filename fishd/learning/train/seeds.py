@@ -50,7 +50,7 @@ def train_seeds(
     SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
     the folder is in use, and `FishdError` where there is no scheduler.
     """
-    from fishd.learning.run_folder.runs import check_free, make_folder
+    from fishd.lab.experiment import check_free, mark_folder
     from fishd.learning.run_folder.tables import write_summary
 
     folder = job.folder.absolute()
@@ -63,7 +63,7 @@ def train_seeds(
 
     check_free(folder)  # before workers remove the file that stops them
     with workers(folder / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
-        make_folder(folder)
+        mark_folder(folder, "learn ppo", job.on)
         tasks = [_Task(each, crew.stop) for each in waiting]
         try:
             for index, found in crew.run(_train_remotely if cluster else _train_here, tasks):

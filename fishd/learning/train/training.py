@@ -59,7 +59,7 @@ def train(
     torch.set_num_threads(1)
     torch.distributions.Distribution.set_default_validate_args(False)
     link: Link
-    if job.on == "robot":
+    if job.on == "live":
         stack = job.settings.camera.stack if job.settings.see != "force" else None
         link = FishdLink(
             job.endpoint,
@@ -278,7 +278,7 @@ def _advice(job: Job) -> str:
     folder = shlex.quote(str(job.folder))
     if checkpoints.all_in(job.folder):
         return f"go on from the newest checkpoint with --resume {folder}"
-    robot = " --on robot" if job.on == "robot" else ""
+    robot = " --on live" if job.on == "live" else ""
     return (
         f"remove {job.folder}, which has no checkpoint yet, and start again with 'fishctl learn "
         f"ppo{robot} --folder {folder}' and your other options"

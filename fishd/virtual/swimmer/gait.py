@@ -8,6 +8,7 @@ from msgspec import Struct
 from scipy.special import stdtrit
 from scipy.stats import kendalltau
 
+from fishd.core.beats import upward_reversals
 from fishd.virtual.swimmer.body import build_beam
 from fishd.virtual.swimmer.grid import Array
 from fishd.virtual.swimmer.settings import SwimmerSettings
@@ -71,7 +72,7 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     swimming direction.
     """
     time, x = track["time"], track["x"]
-    begins = upward_reversals(track["command"])
+    begins = upward_reversals(track["command"].tolist())
     beats = max(0, len(begins) - 1)
     first, last = (begins[0], begins[-1]) if beats else (1, len(time))
     rows = slice(first, last)
@@ -110,16 +111,6 @@ def mass(settings: SwimmerSettings) -> float:
     """Of the fish, per metre of depth [kg/m]."""
     density = settings.water.density + settings.body.excess_density
     return density * build_beam(settings).area
-
-
-def upward_reversals(command: Array) -> list[int]:
-    """The rows, but for the first, in which the command has become positive."""
-    found, side = [], 0.0
-    for index, angle in enumerate(command.tolist()):
-        if index and side < 0.0 < angle:
-            found.append(index)
-        side = math.copysign(1.0, angle) if angle else side
-    return found
 
 
 def _tail_width(track: dict[str, Array], bounds: list[int]) -> float:

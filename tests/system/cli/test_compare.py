@@ -5,7 +5,6 @@ import subprocess
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from rigs.processes import fishctl
 
 from fishd.config import Config
 from fishd.lab.measurement import Measured, measure
-from fishd.lab.rig import Replaced, VirtualRig
+from fishd.lab.session import Replaced, VirtualSession
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -28,7 +27,8 @@ def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert "swing:C=0.5" in done.stdout
-    *table, verdict = done.stdout.splitlines()
+    fish, *table, verdict = done.stdout.splitlines()
+    assert fish == "fish: the default simulated fish"
     assert max(len(line.rstrip()) for line in table) <= 80
     assert verdict == "Verdict: none: a single run with noise has no interval; use --runs 5."
 
@@ -47,30 +47,30 @@ def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
     other = ("--set", "amplitude_limit=0.31", "--seconds", "15", "--settle", "5")
     done = run("swing", "default-fish", *other, "--json")
     assert [standing["contestant"] for standing in json.loads(done.stdout)] == ["swing"]
-    assert done.stderr.startswith("fishctl: default-fish: left out: ppo: policy: ")
+    assert "\nfishctl: default-fish: left out: ppo: policy: " in done.stderr
     assert "0.42 rad" in done.stderr
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 2)
     assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
 
 
 def test_of_one_that_gives_up_later_it_is_said_that_its_runs_before_stand_in_the_table(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    fish = SimpleNamespace(status=lambda: SimpleNamespace(force_unit="N"))
     swum: list[str] = []
 
-    def tiring(rig: VirtualRig, controller: str, *given: Any) -> Measured:
+    def tiring(rig: VirtualSession, controller: str, *given: Any) -> Measured:
         swum.append(controller)
         if swum == ["swing", "sine", "swing"]:
             raise Replaced("swing gave up")
         return measure(rig, controller, *given)
 
-    monkeypatch.setattr("fishd.cli.compare.Fish", lambda _: nullcontext(fish))
+    monkeypatch.setattr("fishd.client.Fish", nullcontext)
     monkeypatch.setattr(
-        "fishd.lab.compare.piloted_rig.PilotedRig", lambda *_, **__: VirtualRig(Config())
+        "fishd.lab.compare.piloted_session.PilotedSession",
+        lambda *_, **__: VirtualSession(Config()),
     )
     monkeypatch.setattr("fishd.lab.compare.live.measure", tiring)
-    done = run("swing", "sine", "--on", "robot", "--for", "25", "--runs", "2")
+    done = run("swing", "sine", "--on", "live", "--for", "25", "--runs", "2")
     assert done.stderr == (
         "fishctl: swing: left out after 1 of 2 runs, which stand in the table: swing gave up\n"
     )

@@ -68,7 +68,7 @@ def test_it_swims_in_simulate_and_in_a_sweep_of_its_own_key(tmp_path: Path) -> N
     out = ["--periods", "3", "--jobs", "1", "--settle", "2", "--folder", str(tmp_path / "sweep")]
     done = processes.fishctl(*sweep, *out, "--set", MODEL)
     assert done.returncode == 0, done.stderr
-    rows = (tmp_path / "sweep" / "points.csv").read_text().splitlines()
+    rows = (tmp_path / "sweep" / "rows.csv").read_text().splitlines()
     column = rows[0].split(",").index("thrust")
     stiff, soft = (float(row.split(",")[column]) for row in rows[1:])
     assert stiff > 1.2 * soft

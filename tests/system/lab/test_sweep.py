@@ -1,8 +1,6 @@
 """Sweeps: measured once, kept, resumed, and safe to interrupt."""
 
 import csv
-import os
-import signal
 from collections.abc import Iterator, Mapping, Sequence
 from errno import ENOSPC
 from pathlib import Path
@@ -17,19 +15,18 @@ from rigs.processes import fishctl, one_line
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.signals import Event, Tick
-from fishd.lab.begun import owned
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.rerun import rerun
-from fishd.lab.rig import Disturbed, VirtualRig
+from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
-from fishd.lab.sweep.folder import Begun, SweepFolder
+from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import MOST, Lengths, Point
-from fishd.lab.sweep.measuring import swim
+from fishd.lab.sweep.measuring import measure_all, swim
 from fishd.lab.sweep.results import Result, quantity_of
-from fishd.lab.sweep.running import on_robot
 from fishd.recording import open_run
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
-MEASURED = quantity_of("robot", {}, "N").measured
+MEASURED = quantity_of("live", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
 
 
@@ -45,11 +42,23 @@ def nothing(*_: object) -> None:
     pass
 
 
-def opened(path: Path, config: Config | None = None, seconds: float = 21.0) -> SweepFolder:
+def opened(
+    path: Path,
+    config: Config | None = None,
+    seconds: float = 21.0,
+    columns: Sequence[str] = ("controller", "parameters.frequency"),
+) -> SweepFolder:
+    """The folder of a sweep: begun, or resumed where it is there."""
+    settings = {"lengths": {"seconds": seconds}}
     plain = msgspec.to_builtins(config or load())
-    path.mkdir(exist_ok=True)
-    begun = Begun("robot", plain, {"seconds": seconds})
-    return SweepFolder(path, begun, ["controller", "parameters.frequency"])
+    header = Header(kind="sweep", on="live", config=plain, settings=settings)
+    with open_experiment(path, header, resume=(path / "experiment.json").exists()) as experiment:
+        return SweepFolder(experiment, columns)
+
+
+def measured(folder: SweepFolder, found: Sequence[Point], session: VirtualSession) -> None:
+    with session:
+        measure_all(folder, found, session, 21.0, nothing)
 
 
 def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
@@ -71,7 +80,8 @@ def test_half_beats_that_are_no_whole_ticks_show_in_the_error() -> None:
 def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Path) -> None:
     config = load(None, DRIFTS)
     folder = opened(tmp_path, config)
-    assert on_robot(folder, SQUARES, VirtualRig(config), 30.0, nothing)
+    with VirtualSession(config) as session:
+        measure_all(folder, SQUARES, session, 30.0, nothing)
     for point, truth in zip(SQUARES, (20.57e-3, 25.74e-3, 23.83e-3), strict=True):
         found = folder.results[folder.key(point)]
         assert found.thrust is not None
@@ -85,43 +95,7 @@ def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Pat
         assert all(part.from_start and part.equal == part.ticks for part in rerun(run).stretches)
 
 
-class Interrupted(VirtualRig):
-    """Somebody presses Ctrl-C, or the terminal closes, while it swims for the third time."""
-
-    def __init__(self, config: Config, number: int) -> None:
-        super().__init__(config)
-        self._number = number
-        self._swims = 0
-        self.was_left = False
-
-    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        self._swims += 1
-        if self._swims == 3:
-            os.kill(os.getpid(), self._number)
-        return super().swim(controller, parameters, seconds)
-
-    def __exit__(self, *what: object) -> None:
-        os.kill(os.getpid(), self._number)  # once more, impatiently
-        super().__exit__(*what)
-        self.was_left = True
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_rests_the_fish_and_keeps_what_was_measured(tmp_path: Path, number: int) -> None:
-    rig = Interrupted(Config(), number)
-    measured: list[Point] = []
-
-    def done(point: Point, _: Result) -> None:
-        measured.append(point)
-
-    assert not on_robot(opened(tmp_path), SQUARES, rig, 21.0, done)
-    assert rig.was_left
-    assert measured == SQUARES[:1]
-    assert on_robot(opened(tmp_path), SQUARES, VirtualRig(Config()), 21.0, done)
-    assert measured == SQUARES
-
-
-class Taken(VirtualRig):
+class Taken(VirtualSession):
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         if parameters["frequency"] == 2.0:
             raise Disturbed("the fish was told to let square swim, but sine swims")
@@ -130,7 +104,7 @@ class Taken(VirtualRig):
 
 def test_a_fish_that_somebody_else_takes_loses_one_point_only(tmp_path: Path) -> None:
     with pytest.raises(Disturbed):
-        on_robot(opened(tmp_path), SQUARES, Taken(Config()), 21.0, nothing)
+        measured(opened(tmp_path), SQUARES, Taken(Config()))
     assert len(opened(tmp_path).results) == 2
 
 
@@ -138,19 +112,16 @@ def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured
     tmp_path: Path,
 ) -> None:
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
-    config = Config()
-    (tmp_path / "sweep").mkdir()
     found = [
         Point("square", {"frequency": 50.0}),
         Point("ppo", {"policy": str(write(tmp_path))}),
         Point("hold", {}),
         Point("square", {"frequency": 1.5}),
     ]
-    begun = Begun("robot", msgspec.to_builtins(config), {"seconds": 21.0})
     columns = ["controller", "parameters.frequency", "parameters.policy"]
-    folder = SweepFolder(tmp_path / "sweep", begun, columns)
-    assert on_robot(folder, found, VirtualRig(config), 21.0, nothing)
-    kept = SweepFolder(tmp_path / "sweep", begun, columns).results
+    folder = opened(tmp_path / "sweep", columns=columns)
+    measured(folder, found, VirtualSession(Config()))
+    kept = opened(tmp_path / "sweep", columns=columns).results
     troubles = [kept[folder.key(point)].trouble for point in found]
     assert "frequency" in troubles[0]
     assert "ppo gave up" in troubles[1]
@@ -161,7 +132,7 @@ def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured
 @pytest.mark.parametrize("key", ["estimator.zero_drift", "a_key_of_then"])
 def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path, key: str) -> None:
     opened(tmp_path)
-    begun = tmp_path / "sweep.json"
+    begun = tmp_path / "experiment.json"
     data = msgspec.json.decode(begun.read_bytes())
     if key == "a_key_of_then":
         data["config"][key] = 1
@@ -176,15 +147,18 @@ def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path,
 @pytest.mark.parametrize(
     ("head", "named"),
     [
-        ("controller,parameters.frequency,thrust,error,recording", "it has no column beat_freq"),
-        (f"controller,parameters.C,{','.join(MEASURED)},recording", "of controller, parameters.C;"),
+        (
+            "controller,parameters.frequency,thrust,error,recording",
+            "the table has no column beat_freq",
+        ),
+        (f"controller,parameters.C,{','.join(MEASURED)},recording", "no column parameters.freq"),
     ],
 )
 def test_a_table_with_other_columns_is_refused_with_what_differs(
     tmp_path: Path, head: str, named: str
 ) -> None:
     opened(tmp_path)
-    (tmp_path / "points.csv").write_text(head + "\n")
+    (tmp_path / "rows.csv").write_text(head + "\n")
     with pytest.raises(ConfigError, match=named):
         opened(tmp_path)
 
@@ -193,7 +167,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     for point in SQUARES:
         folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
-    table = tmp_path / "points.csv"
+    table = tmp_path / "rows.csv"
     table.write_bytes(table.read_bytes()[:-30])
     assert len(opened(tmp_path).results) == 2
     assert table.read_text().count("\n") == 3
@@ -203,7 +177,7 @@ def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) 
     folder = opened(tmp_path)
     for point in SQUARES:
         folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
-    table = tmp_path / "points.csv"
+    table = tmp_path / "rows.csv"
     whole = table.read_bytes()
     table.write_bytes(whole[:-1])
     assert len(opened(tmp_path).results) == 2
@@ -213,7 +187,7 @@ def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) 
 @pytest.mark.slow
 def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Path) -> None:
     opened(tmp_path)
-    table = tmp_path / "points.csv"
+    table = tmp_path / "rows.csv"
     third = 1.0 / 3.0
     result = Result(third, third, third, third, third, third, third, third, third)
     values = ",".join(map(str, msgspec.structs.astuple(result)))
@@ -229,7 +203,7 @@ def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
-        raise OSError(ENOSPC, "No space left on device", "points.csv")
+        raise OSError(ENOSPC, "No space left on device", "rows.csv")
 
     folder = opened(tmp_path)
     monkeypatch.setattr("fishd.lab.tables.Table.add", full)
@@ -239,8 +213,8 @@ def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
 
 def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
     opened(tmp_path)
-    (tmp_path / "points.csv").unlink()
-    (tmp_path / "points.csv").mkdir()
+    (tmp_path / "rows.csv").unlink()
+    (tmp_path / "rows.csv").mkdir()
     with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
         opened(tmp_path)
 
@@ -279,8 +253,7 @@ def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing
 def test_a_value_that_is_no_number_is_a_line_of_its_own_beside_the_curve(
     tmp_path: Path, word: str | None, shown: str
 ) -> None:
-    begun = Begun("robot", msgspec.to_builtins(load()), {"seconds": 21.0})
-    folder = SweepFolder(tmp_path, begun, ["controller", "parameters.C"])
+    folder = opened(tmp_path, columns=["controller", "parameters.C"])
     found = [Point("swing", {"C": value}) for value in (word, 0.3, 0.6)]
     for point in found:
         folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
@@ -306,22 +279,6 @@ def test_a_fin_that_swings_further_than_the_equations_hold_is_told(
     assert "beyond 1 rad the equations of the fish do not hold" in done.stderr
 
 
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for folder, named in (("file", "File exists"), ("file/run", "Not a directory")):
-        with pytest.raises(FishdError, match=f"cannot be made a folder: {named}"):
-            owned(tmp_path / folder, "search").__enter__()
-
-
-def test_two_sweeps_do_not_share_a_folder(tmp_path: Path) -> None:
-    with (
-        owned(tmp_path, "sweep"),
-        pytest.raises(ConfigError, match="a sweep runs in it"),
-        owned(tmp_path, "sweep"),
-    ):
-        pass
-
-
 @pytest.fixture(scope="module")
 def _no_worker_stays() -> Iterator[None]:
     from joblib.externals.loky import get_reusable_executor
@@ -339,7 +296,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     first = fishctl(*words, "--frequency", "1.4:2:0.2")
     assert (first.returncode, first.stderr) == (0, "")
     assert "sine plant.xi=1.2: best frequency" in first.stdout
-    second = fishctl(*words, "--frequency", "1.2:2:0.2", "--json")
+    second = fishctl("sweep", "--resume", str(folder), "--frequency", "1.2:2:0.2", "--json")
     assert second.returncode == 0
     assert "20 points, 16 of them there already" in second.stderr
     best = msgspec.json.decode(second.stdout)
@@ -347,7 +304,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
         (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")
     ]
     assert all(each["x_low"] < each["x"] < each["x_high"] for each in best)
-    with (folder / "points.csv").open(newline="") as file:
+    with (folder / "rows.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["parameters.frequency"] for row in rows[:5]] == ["1.2", "1.4", "1.6", "1.8", "2.0"]
     assert all((folder / row["recording"]).is_file() for row in rows)
@@ -401,7 +358,7 @@ def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Pa
     done = swept(tmp_path / "run", "ppo", "--policy", str(write(tmp_path)), "--settle", "15")
     assert done.returncode == 1
     assert "no thrust: ppo gave up" in done.stdout
-    assert done.stdout.endswith("points.csv\n")
+    assert done.stdout.endswith("rows.csv\n")
 
 
 @pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--over=frequency")])
@@ -440,7 +397,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         done = fishctl(*there, "--cluster", cluster.scheduler_address)
     assert (done.returncode, done.stderr) == (0, "")
     assert fishctl(*words, "--folder", str(tmp_path / "here"), "--jobs", "1").returncode == 0
-    tables = [(tmp_path / each / "points.csv").read_text() for each in ("here", "there")]
+    tables = [(tmp_path / each / "rows.csv").read_text() for each in ("here", "there")]
     here, there = ([row.rpartition(",")[0] for row in text.splitlines()] for text in tables)
     assert here == there
 
@@ -457,9 +414,9 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         (["--amplitude", "0.3,0.6"], "amplitude_limit"),
         (["--vary", "plant.xj=1,2"], "--vary plant.xj=1"),
         (["--vary", "plant.xi"], "write KEY=VALUES"),
-        (["--for", "30"], "is for --on robot"),
-        (["--on", "robot", "--vary", "plant.xi=1,2"], "keeps its configuration"),
-        (["--on", "robot", "--for", "5"], "not possible"),
+        (["--for", "30", "--on", "simulation"], "is for --on live"),
+        (["--on", "live", "--vary", "plant.xi=1,2"], "is for --on simulation"),
+        (["--on", "live", "--for", "5"], "not possible"),
     ],
 )
 def test_what_cannot_be_swept_is_one_line_before_anything_is_made(

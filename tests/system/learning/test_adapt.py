@@ -8,16 +8,18 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 import pytest
-from rigs.processes import fishctl, one_line
+from rigs.processes import fishctl
 from rigs.virtual_daemon import VirtualDaemon
 
 from fishd.cli.adapt import command_of
+from fishd.cli.experiment_options import ChosenFish
 from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError, Refused
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
 from fishd.lab.ranking import format_ratio
-from fishd.lab.rig import LiveRig, VirtualRig
+from fishd.lab.session import LiveSession, VirtualSession
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.cloud import cloud
@@ -26,7 +28,6 @@ from fishd.learning.adapt.prior import MODEL_ERROR, model_of
 from fishd.learning.adapt.state import (
     TRAINING,
     AdaptFolder,
-    Begun,
     Contender,
     Fitted,
     Model,
@@ -34,7 +35,6 @@ from fishd.learning.adapt.state import (
     Trained,
     Tried,
 )
-from fishd.learning.adapt.tank import Tank
 from fishd.learning.adapt.verdict import judge
 from fishd.learning.env.simulated_link import at_edge, drawn
 from fishd.learning.settings import Randomisation
@@ -222,8 +222,8 @@ def test_a_policy_is_not_one_tick_off_the_best_wave_of_a_weakly_damped_fish(tmp_
 def test_the_fit_says_which_square_wave_is_best_by_how_well_it_explains(
     model: Model, scale: Any, used: bool
 ) -> None:
-    with VirtualRig(Config()) as rig:
-        search = steps.square_waves(fitted(model), Tank(rig, 0.0, lambda used: None), 0)
+    with VirtualSession(Config()) as rig:
+        search = steps.square_waves(fitted(model), rig, 0)
     tried = []
     for frequency in search.ranges[0].values:
         thrust = scale(frequency) * square_wave(PlantParameters(), PHI, frequency).thrust
@@ -238,8 +238,8 @@ def test_the_fit_says_which_square_wave_is_best_by_how_well_it_explains(
 
 
 def test_few_waves_with_noise_leave_the_maximum_where_a_good_fit_has_it() -> None:
-    with VirtualRig(Config()) as rig:
-        search = steps.square_waves(fitted(GOOD), Tank(rig, 0.0, lambda used: None), 0)
+    with VirtualSession(Config()) as rig:
+        search = steps.square_waves(fitted(GOOD), rig, 0)
     for frequency, luck in ((10 / 8, 1.04), (10 / 6, 0.96), (2.0, 1.0)):
         thrust = luck * square_wave(PlantParameters(), PHI, frequency).thrust
         search.observe({"frequency": frequency}, thrust, 2e-3)
@@ -267,8 +267,10 @@ def no_policy(*_: Any) -> Trained:
     return Trained(steps=0, refused="nobody trains in this test")
 
 
-def folder(path: Path, seed: int = 0) -> AdaptFolder:
-    return AdaptFolder(path, Begun("robot", 640, seed, {}))
+def folder(path: Path) -> AdaptFolder:
+    header = Header(kind="adapt", on="live", settings={"seed": 0})
+    with open_experiment(path, header, resume=path.exists()) as experiment:
+        return AdaptFolder(experiment)
 
 
 class Stopped(BaseException):
@@ -285,14 +287,14 @@ def test_what_was_measured_is_not_measured_again(
     daemon, show = VirtualDaemon(config), Quiet()
 
     def go_on() -> State:
-        with LiveRig(cast(Fish, daemon)) as rig:
-            made = Adaptation(rig, config, folder(path), 160.0, 640, 0, show)
+        with LiveSession(cast(Fish, daemon)) as rig:
+            made = Adaptation(rig, folder(path), 160.0, 640, 0, show)
             return made.run()
 
     def stop(*_: Any, **__: Any) -> None:
         raise Stopped
 
-    monkeypatch.setattr(LiveRig, "describe", lambda self, writer: None)
+    monkeypatch.setattr(LiveSession, "describe", lambda self, writer: None)
     with monkeypatch.context() as broken:
         broken.setattr(steps, "search_square_waves", stop)
         with pytest.raises(Stopped):
@@ -325,15 +327,13 @@ def test_what_was_measured_is_not_measured_again(
     assert "<td>rad/s</td>" in text
     assert "<td>–</td>" in text
     assert "e-" not in text.partition("<h2>The fish</h2>")[2]
-    with pytest.raises(ConfigError, match="begun with seed = 0, now it is 1"):
-        folder(path, seed=1)
 
 
 def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path) -> None:
     run, show = folder(tmp_path / "run"), Quiet()
     run.state.fitted = fitted(USELESS)
-    with VirtualRig(Config()) as rig:
-        made = Adaptation(rig, Config(), run, 150.0, 640, 0, show)
+    with VirtualSession(Config()) as rig:
+        made = Adaptation(rig, run, 150.0, 640, 0, show)
         made._practise(run.state)
     assert show.lines == ["no policy is trained: the fit explains too little"]
     kept = folder(run.path).state
@@ -347,10 +347,10 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> Non
     config = load(None, fish)
     run = folder(tmp_path / "run")
     with (
-        VirtualRig(config) as rig,
+        VirtualSession(config) as rig,
         pytest.raises(Unidentifiable, match=r"the best fit explains .* of F_x only"),
     ):
-        Adaptation(rig, config, run, 150.0, 640, 0, Quiet()).run()
+        Adaptation(rig, run, 150.0, 640, 0, Quiet()).run()
     assert folder(run.path).state.excitation == "excitation.mcap"
 
 
@@ -370,8 +370,8 @@ def test_an_error_ends_it_in_one_line_that_says_how_to_go_on(
     said = str(error)
     monkeypatch.setattr(Adaptation, "run", run)
     done = fishctl("adapt", "--folder", str(tmp_path / "run"))
-    again = f"fishctl adapt --folder {tmp_path / 'run'}"
-    assert one_line(done) == f"fishctl: {said}; to begin again: {again}{code}\n"
+    again = f"fishctl adapt --resume {tmp_path / 'run'}"
+    assert done.stderr == f"fishctl: {said}; resume with: {again}{code}\n"
     assert done.returncode == status
 
 
@@ -379,10 +379,12 @@ def test_the_last_line_says_what_to_type() -> None:
     one = msgspec.structs.replace(
         contender("square", 1.0, 0.1), controller="square", parameters={"frequency": 5.0 / 3.0}
     )
-    assert command_of(one, "robot") == "fishctl set-controller square --frequency 1.66667"
-    assert command_of(one, "robot", endpoint="ipc:///run/a").endswith(" --endpoint ipc:///run/a")
-    fish = command_of(one, "simulation", Path("a fish.yaml"), ("plant.xi=0.9", "tick=0.05"))
-    assert fish == (
+    live = ChosenFish("live", None, (), None)
+    assert command_of(one, live) == "fishctl set-controller square --frequency 1.66667"
+    there = command_of(one, live._replace(endpoint="ipc:///run/a"))
+    assert there.endswith(" --endpoint ipc:///run/a")
+    keys = ("plant.xi=0.9", "tick=0.05")
+    assert command_of(one, ChosenFish("simulation", Path("a fish.yaml"), keys, None)) == (
         "fishctl simulate square --frequency 1.66667 --config 'a fish.yaml' --set plant.xi=0.9 "
         "--set tick=0.05"
     )

@@ -211,7 +211,7 @@ def test_an_evaluation_takes_no_longer_than_it_may(monkeypatch: pytest.MonkeyPat
 
 def on_robot(folder: Path, **changes: Any) -> Job:
     """A training whose fish is in this process, but evaluated as in a tank."""
-    return brief_job(folder, on="robot", steps=changes.pop("steps", 192), **changes)
+    return brief_job(folder, on="live", steps=changes.pop("steps", 192), **changes)
 
 
 @pytest.fixture

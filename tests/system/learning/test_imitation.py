@@ -128,9 +128,9 @@ def test_who_begins_with_another_run_does_not_imitate_again(
 
 def test_the_best_beat_of_a_robot_is_not_known(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"imitation\.rounds: the best beat of a robot's fish"):
-        train(brief_job(tmp_path / "run", **CHANGES, on="robot"))
+        train(brief_job(tmp_path / "run", **CHANGES, on="live"))
     nothing = brief_job(
-        tmp_path / "run", **{**CHANGES, "steps": 0}, on="robot", parent=tmp_path / "step-64"
+        tmp_path / "run", **{**CHANGES, "steps": 0}, on="live", parent=tmp_path / "step-64"
     )
     with pytest.raises(ConfigError, match="steps: 0 is not valid on a robot"):
         train(nothing)

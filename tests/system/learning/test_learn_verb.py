@@ -113,7 +113,7 @@ def test_mistakes_are_one_line(tmp_path: Path, settings: str) -> None:
         status, line = complaint("ppo", "--from", str(tmp_path / name))
         assert status == 78
         assert what in line
-    status, line = complaint("ppo", "--seeds", "2", "--on", "robot")
+    status, line = complaint("ppo", "--seeds", "2", "--on", "live")
     assert status == 2
     assert "there is only one robot" in line
 
@@ -227,7 +227,7 @@ def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
 ) -> None:
     folder = tmp_path / "run"
     found = learn(
-        *("ppo", "--on", "robot", "--endpoint", daemon.endpoint),
+        *("ppo", "--on", "live", "--endpoint", daemon.endpoint),
         *("--settings", hasty, "--folder", str(folder)),
     )
     assert found.returncode == 0, found.stderr
@@ -248,7 +248,7 @@ def test_an_evaluation_on_a_running_fishd_is_soon_over_where_the_policy_does_not
     Path(hasty).write_text(text.replace("every: 0", "every: 2, on_robot: 30"), encoding="utf-8")
     with running(tmp_path, "--set", "lockstep=true") as daemon:
         found = learn(
-            *("ppo", "--on", "robot", "--endpoint", daemon.endpoint),
+            *("ppo", "--on", "live", "--endpoint", daemon.endpoint),
             *("--settings", hasty, "--folder", str(tmp_path / "run")),
         )
     assert found.returncode == 0, found.stderr
@@ -268,7 +268,7 @@ def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
         with Fish(daemon.endpoint) as fish:
             fish.estop("the tail hit the glass")
 
-    on = ("ppo", "--on", "robot", "--endpoint", daemon.endpoint)
+    on = ("ppo", "--on", "live", "--endpoint", daemon.endpoint)
     found = while_it_trains(
         lambda: updates(folder),
         press,
@@ -291,7 +291,7 @@ def test_another_plant_than_that_of_the_fishd_is_told(
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
     found = learn(
-        *("ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--steps", "16"),
+        *("ppo", "--on", "live", "--endpoint", daemon.endpoint, "--steps", "16"),
         *("--settings", hasty, "--folder", str(tmp_path / "run"), "--set", "plant.omega0=11"),
     )
     assert found.returncode == 0, found.stderr
@@ -306,7 +306,7 @@ def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
     file = tmp_path / "fish.yaml"
     file.write_text("amplitude_limit: 0.3\ntick: 0.05\n", encoding="utf-8")
     status, line = complaint(
-        "ppo", "--on", "robot", "--endpoint", daemon.endpoint, "--config", str(file)
+        "ppo", "--on", "live", "--endpoint", daemon.endpoint, "--config", str(file)
     )
     assert status == 78
     assert "amplitude_limit: 0.3 rad in this configuration, 0.42 rad in the fishd" in line
@@ -362,7 +362,7 @@ def test_a_training_on_a_robot_asks_fishd_for_its_configuration_once(
 
     monkeypatch.setattr(fishd_link, "config_of", config_of)
     endpoint = f"ipc://{tmp_path}/nobody"
-    found = learn("ppo", "--on", "robot", "--endpoint", endpoint, *changes)
+    found = learn("ppo", "--on", "live", "--endpoint", endpoint, *changes)
     assert "nobody listens there" in found.stderr
     assert asked == [endpoint]
     assert ("plant.omega0 is 11.0 here, 12.5 there" in found.stderr) is bool(changes)

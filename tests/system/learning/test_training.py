@@ -428,7 +428,7 @@ def test_in_lockstep_it_gives_the_numbers_of_a_training_in_process(tmp_path: Pat
     settings = sets("lockstep=true", "start.controller=remote", agent, *NOISY)
     with running(tmp_path, *settings) as fishd:
         job = brief_job(tmp_path / "there", steps=256, evaluation=never())
-        there = train(replace(job, on="robot", endpoint=fishd.endpoint))
+        there = train(replace(job, on="live", endpoint=fishd.endpoint))
         with Fish(fishd.endpoint) as fish:
             assert fish.status().mode == "idle"
     assert (there.steps, there.tank_time) == (256, here.tank_time)
@@ -442,7 +442,7 @@ def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
     with running(tmp_path, *settings) as fishd, Subscriber(fishd.telemetry, b"event") as events:
         events.connected()
         job = brief_job(tmp_path / "run", steps=128, evaluation=never())
-        train(replace(job, on="robot", endpoint=fishd.endpoint, agent=elsewhere))
+        train(replace(job, on="live", endpoint=fishd.endpoint, agent=elsewhere))
         taken = events.until(kind="controller")["data"]
     assert (taken["controller"], taken["parameters"]["agent"]) == ("remote", elsewhere)
 

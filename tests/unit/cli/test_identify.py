@@ -9,7 +9,7 @@ from click.testing import CliRunner, Result
 
 from fishd.cli.main import fishctl
 from fishd.config import load
-from fishd.core.errors import FishdError, RecordingError
+from fishd.core.errors import ConfigError, FishdError
 
 
 def invoke(*arguments: str) -> Result:
@@ -18,11 +18,12 @@ def invoke(*arguments: str) -> Result:
 
 @pytest.mark.slow
 def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_path: Path) -> None:
-    fish, record, picture = (tmp_path / name for name in ("fish.yaml", "run.mcap", "fit.png"))
-    swim = ("--experiment", "--for", "40", "--record", str(record), "--plot", str(picture))
+    fish, folder, picture = (tmp_path / name for name in ("fish.yaml", "run", "fit.png"))
+    record = folder / "identify.mcap"
+    swim = ("--experiment", "--for", "40", "--folder", str(folder), "--plot", str(picture))
     done = invoke(*swim, "--set", "plant.omega0=11", "--to", str(fish))
     assert done.exit_code == 0, done.output
-    assert done.stdout.startswith("identified: the model explains 9")
+    assert "\nidentified: the model explains 9" in done.stdout
     assert "omega0 ω₀" in done.stdout
     assert "if K_y/K = 1" in done.stdout
     assert f"{fish}: written; to swim it: fishctl simulate swing --config {fish}" in done.stdout
@@ -41,7 +42,7 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     )
     assert again.exit_code == 0
     told = json.loads(again.stdout)
-    assert told["origin"] == "run.mcap"
+    assert told["origin"] == "identify.mcap"
     estimates = told["estimates"]
     assert estimates["omega0"]["low"] < 11.0 < estimates["omega0"]["high"]
     assert not estimates["coupling"]["fitted"]
@@ -51,38 +52,38 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     assert "exists already; --force overwrites it, --to names another" in str(refused.exception)
 
 
-def test_a_recording_that_cannot_be_written_is_told_before_the_fish_swims(
+def test_a_folder_that_cannot_be_made_is_told_before_the_fish_swims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     swum: list[object] = []
     monkeypatch.setattr("fishd.lab.identification.experiment", lambda *_: swum.append(1))
-    done = invoke("--experiment", "--record", str(tmp_path / "nowhere/run.mcap"))
-    assert isinstance(done.exception, RecordingError)
-    assert "nowhere/run.mcap.part cannot be written: No such file" in str(done.exception)
+    (tmp_path / "file").touch()
+    done = invoke("--experiment", "--folder", str(tmp_path / "file/run"))
+    assert isinstance(done.exception, ConfigError)
+    assert "file/run: cannot be made a folder: Not a directory" in str(done.exception)
     assert swum == []
 
 
 def test_a_run_is_a_name_in_the_folder_of_recordings_or_the_latest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("FISHD_RUNS", str(tmp_path / "runs"))
+    folder = tmp_path / "first"
+    monkeypatch.setenv("FISHD_RUNS", str(folder))
     known = ("--fit", "omega0", "--set", "simulation.rotation=0.1")
-    swim = ("--experiment", "--for", "30", "--record", "first", *known)
+    swim = ("--experiment", "--for", "30", "--folder", str(folder), *known)
     assert invoke(*swim).exit_code == 0
-    assert (tmp_path / "runs" / "first.mcap").is_file()
-    told = [invoke(run, *known) for run in ("first", "first.mcap", "latest")]
-    assert told[0].stdout.endswith("\nfrom first.mcap\n")
+    told = [invoke(run, *known) for run in ("identify", "identify.mcap", "latest")]
+    assert told[0].stdout.endswith("\nfrom identify.mcap\n")
     assert {each.stdout for each in told} == {told[0].stdout}
     assert {each.stderr for each in told} == {""}  # the fish is explained, as its sensor is turned
-    again = invoke(*swim)
-    assert str(again.exception).endswith("first.mcap: exists already; --record names another")
+    assert "the folder is not empty" in str(invoke(*swim).exception)
 
 
 @pytest.mark.parametrize(
     ("words", "fish"),
     [
-        ((), "the default fish; --config names another"),
-        (("--set", "plant.xi=1"), "the default fish, changed by --set; --config names another"),
+        ((), "the default simulated fish"),
+        (("--set", "plant.xi=1"), "the default simulated fish, changed by --set"),
         (("--config", "fish.yaml"), "the simulated fish of fish.yaml"),
     ],
 )
@@ -92,6 +93,7 @@ def test_it_says_which_fish_swam(
     monkeypatch.chdir(tmp_path)
     Path("fish.yaml").write_text("plant:\n  omega0: 11\n", encoding="utf-8")
     done = invoke("--experiment", "--for", "30", "--fit", "omega0", *words)
+    assert done.stdout.startswith(f"fish: {fish}\n")
     assert done.stdout.endswith(f"\nfrom an experiment with {fish}\n")
 
 
@@ -108,6 +110,7 @@ def test_a_drift_is_told_to_either_side() -> None:
         ((), "name recordings to identify, or use --experiment: one of the two"),
         (("run.mcap", "--experiment"), "one of the two"),
         (("run.mcap", "--for", "60"), "--for goes with --experiment"),
+        (("run.mcap", "--folder", "x"), "--folder goes with --experiment"),
         (("--experiment", "--for", "5"), "5.0 is not in the range"),
         (("--experiment", "--for", "nan"), "'nan' is not valid: a finite number is needed"),
         (("--experiment", "--for", "inf"), "inf is not in the range"),
@@ -125,7 +128,6 @@ def test_a_command_line_that_makes_no_sense_is_refused(
     ("words", "complaint"),
     [
         (("nowhere.mcap",), "nowhere.mcap"),
-        (("--experiment", "--record", "/"), "'/' is no name of a recording"),
         (("--experiment", "--fit", "omega"), "did you mean 'omega0'?"),
     ],
 )

@@ -30,12 +30,12 @@ def test_what_was_measured_is_printed_though_its_picture_fails(
     monkeypatch.setattr("fishd.lab.measurement_figure.draw", full)
     done = fishctl(*SIMULATED, "--json", "--plot", str(tmp_path / "x.png"))
     assert msgspec.json.decode(done.stdout)["thrust"] == pytest.approx(25.47e-3, abs=1e-4)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 2)
     assert "No space left" in done.stderr
 
 
 def test_what_makes_a_thrust_doubtful_is_in_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fishd.lab.measurement._remark", lambda _: "the fin was not steady")
-    line = fishctl(*SIMULATED).stdout.splitlines()[0]
+    line = fishctl(*SIMULATED).stdout.splitlines()[-1]
     assert "mN" in line
     assert line.endswith("; careful: the fin was not steady")

@@ -9,14 +9,14 @@ from rigs.harness import Rig, Wrapped, fragile_rig
 
 from fishd.config import load
 from fishd.core.signals import Tick
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 
 CONFIG = load(None, ["simulation.drift=0.005", "simulation.noise=0.001"])
 TRUTH = 25.74e-3
 
 
-def rig(seed: int = 0) -> VirtualRig:
-    return VirtualRig(replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed)))
+def rig(seed: int = 0) -> VirtualSession:
+    return VirtualSession(replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed)))
 
 
 def known(ticks: Sequence[Tick]) -> tuple[float, float]:
@@ -106,7 +106,7 @@ def test_a_load_that_is_hung_on_at_rest_is_no_drift() -> None:
 @pytest.mark.parametrize("leak", [0.1, 0.3, 1.0])
 def test_a_wave_for_which_the_factor_is_another_is_known_soon(leak: float) -> None:
     config = replace(CONFIG, estimator=replace(CONFIG.estimator, leak=leak))
-    with VirtualRig(config) as fish:
+    with VirtualSession(config) as fish:
         fish.rest(3.0)
         fish.swim("square", {"frequency": 5.0 / 3.0}, 8.0)
         for frequency, truth in ((1.0, 15.23e-3), (2.0, 23.83e-3), (0.5, 7.26e-3)):
@@ -131,7 +131,7 @@ def test_at_rest_the_interval_knows_of_the_noise(noise: float) -> None:
     outside = 0
     for seed in range(8):
         config = replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed, noise=noise))
-        with VirtualRig(config) as fish:
+        with VirtualSession(config) as fish:
             ticks = fish.rest(20.0)[100:]
             outside += sum(abs(tick.thrust) > tick.thrust_error for tick in ticks)  # type: ignore[operator]
     assert outside < 0.1 * 8 * len(ticks)
@@ -141,7 +141,7 @@ def test_a_rest_that_shows_a_larger_drift_widens_what_comes_after() -> None:
     errors = []
     for drift in (0.0, 2e-3):
         config = replace(CONFIG, simulation=replace(CONFIG.simulation, drift_walk=drift))
-        with VirtualRig(config) as fish:
+        with VirtualSession(config) as fish:
             for _ in range(4):
                 fish.rest(3.0)
                 ticks = fish.swim("swing", {}, 12.0)

@@ -52,7 +52,7 @@ def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Pa
 def standing(contestant: str, controller: str, thrusts: list[float], **given: Any) -> Standing:
     return Standing(
         contestant=contestant, controller=controller, parameters={}, thrust=float(np.mean(thrusts)),
-        error=comparison.error_of_mean(thrusts), frequency=1.7, fullness=1.0, squareness=1.0,
+        error=comparison.mean_ci95(thrusts), frequency=1.7, fullness=1.0, squareness=1.0,
         thrusts=thrusts, **given,
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from fishd.lab.compare import LiveComparison
 from fishd.lab.error_budget import budget, spelled, unknown_calibration
 from fishd.lab.measurement import Measured, measure, summary
 from fishd.lab.other_fish import harsh
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 
 GAIN_ERROR = 0.02
@@ -25,7 +25,7 @@ KNOWN = ForceCalibration(
 
 
 def measured(*overrides: str, calibration: ForceCalibration | None = None) -> Measured:
-    with VirtualRig(load(None, overrides), calibration) as rig:
+    with VirtualSession(load(None, overrides), calibration) as rig:
         return measure(rig, "swing", {}, 30.0)
 
 
@@ -74,7 +74,7 @@ def test_delay_backlash_and_drift_turn_no_sensor_and_hide_no_rotation(seed: int)
 
 def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
     assert measured("simulation.noise=0.02", "simulation.drift=5e-3").rotation == 0.0
-    with VirtualRig(load()) as rig:
+    with VirtualSession(load()) as rig:
         assert measure(rig, "hold", {}, 30.0).rotation == 0.0
 
 
@@ -93,7 +93,7 @@ def test_without_a_known_calibration_no_total_is_claimed() -> None:
 
 
 def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
-    with VirtualRig(load(), KNOWN) as rig:
+    with VirtualSession(load(), KNOWN) as rig:
         live = LiveComparison(rig, ["swing"])
         live.swim(21.0, runs=3)
     (standing,) = live.standings()

@@ -23,7 +23,7 @@ from fishd.lab.identification import (
 )
 from fishd.lab.identification.passages import passages
 from fishd.lab.identification.response import Drive, response
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
@@ -42,7 +42,7 @@ NEARLY_KNOWN = ("omega0", "servo_delay", "rotation")
 
 
 def swum(*overrides: str, seconds: float = 90.0) -> pd.DataFrame:
-    with VirtualRig(load(None, overrides)) as rig:
+    with VirtualSession(load(None, overrides)) as rig:
         return experiment(rig, seconds)
 
 
@@ -143,7 +143,7 @@ def test_a_fish_of_another_kind_is_not_identified_and_the_first_line_says_so(
 
 @pytest.mark.slow
 def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> None:
-    with VirtualRig(load(None, [*REAL, "simulation.noise=0.01"])) as rig:
+    with VirtualSession(load(None, [*REAL, "simulation.noise=0.01"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
     found = identify(frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation"))
     remark = next(each for each in found.remarks if each.startswith("known to 10 % at best"))
@@ -185,7 +185,10 @@ def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(
 
 @pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])
 def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> None:
-    with VirtualRig(load()) as rig, pytest.raises(ParameterError, match="30 s or more are needed"):
+    with (
+        VirtualSession(load()) as rig,
+        pytest.raises(ParameterError, match="30 s or more are needed"),
+    ):
         experiment(rig, seconds)
 
 
@@ -248,7 +251,7 @@ def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) ->
 @pytest.mark.slow
 def test_the_reaction_of_the_servo_is_found_where_it_is_asked_for() -> None:
     change = ("plant.servo_reaction=-0.002", "plant.servo_dead_zone=0.02")
-    with VirtualRig(load(None, (*REAL, *change))) as rig:
+    with VirtualSession(load(None, (*REAL, *change))) as rig:
         table = experiment(rig, 60.0)
     found = identify(table, fit=(*DEFAULT, "servo_reaction", "servo_dead_zone"))
     assert all(channel.white for channel in found.channels)
@@ -279,7 +282,7 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
 
 @pytest.mark.slow
 def test_data_that_cannot_tell_say_so() -> None:
-    with VirtualRig(load(None, ["simulation.noise=0.003"])) as rig:
+    with VirtualSession(load(None, ["simulation.noise=0.003"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
     found = identify(frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag"))
     assert any("known to 10 % at best" in remark for remark in found.remarks)

@@ -13,14 +13,14 @@ from fishd.core.errors import ParameterError, Refused
 from fishd.core.signals import Tick
 from fishd.lab.compare import LiveComparison, compare
 from fishd.lab.measurement import measure
-from fishd.lab.rig import Disturbed, VirtualRig
+from fishd.lab.session import Disturbed, VirtualSession
 
 DRIFTS = load(None, ["simulation.drift=0.005", "simulation.noise=0.001"])
 
 
 def test_a_drifting_sensor_ranks_by_the_true_thrust_which_lies_in_each_interval() -> None:
     names = ["sine:frequency=1.7", "swing", "square:frequency=1"]
-    with VirtualRig(DRIFTS) as rig:
+    with VirtualSession(DRIFTS) as rig:
         live = LiveComparison(rig, names)
         live.swim(30.0)
     true, _ = compare(DRIFTS, names)
@@ -36,7 +36,7 @@ def test_several_runs_come_in_turn() -> None:
     told: list[str] = []
     passed: list[float] = []
 
-    class Listening(VirtualRig):
+    class Listening(VirtualSession):
         def swim(
             self, controller: str, parameters: Mapping[str, Any], seconds: float
         ) -> list[Tick]:
@@ -46,7 +46,8 @@ def test_several_runs_come_in_turn() -> None:
 
     with Listening(DRIFTS) as rig:
         live = LiveComparison(rig, ["swing", "sine"])
-        live.swim(25.0, runs=2, progress=passed.append)
+        rig.progress = passed.append
+        live.swim(25.0, runs=2)
         both = live.standings()[0]
     assert told == ["swing", "sine", "swing", "sine"]
     assert len(both.thrusts) == 2
@@ -66,7 +67,7 @@ def test_several_runs_come_in_turn() -> None:
 def test_the_error_of_several_runs_is_what_they_are_known_to_or_how_they_differ(
     monkeypatch: pytest.MonkeyPatch, thrusts: list[float], expected: float
 ) -> None:
-    with VirtualRig(DRIFTS) as rig:
+    with VirtualSession(DRIFTS) as rig:
         one = measure(rig, "swing", {}, 21.0)
         runs = [one._replace(thrust=thrust, error=0.3e-3) for thrust in thrusts]
         monkeypatch.setattr("fishd.lab.compare.live.measure", lambda *_: runs.pop(0))
@@ -80,7 +81,7 @@ def test_the_error_of_several_runs_is_what_they_are_known_to_or_how_they_differ(
 
 def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: Path) -> None:
     shaking = str(write(tmp_path))
-    with VirtualRig(Config()) as rig:
+    with VirtualSession(Config()) as rig:
         live = LiveComparison(rig, ["swing:C=7", shaking, "swing"])
         live.swim(25.0, runs=2)
     assert [standing.contestant for standing in live.standings()] == ["swing"]
@@ -90,7 +91,7 @@ def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: 
     assert "ppo gave up" in str(gave_up)
 
 
-class Disturbing(VirtualRig):
+class Disturbing(VirtualSession):
     """Somebody stops the fish in the second measurement."""
 
     swims = 0
@@ -113,7 +114,7 @@ def test_nobody_swims_on_after_somebody_interfered_and_what_was_measured_is_kept
 
 
 def test_a_time_that_is_too_short_and_a_latched_fault_end_it_before_anyone_swims() -> None:
-    class Latched(VirtualRig):
+    class Latched(VirtualSession):
         def swim(self, *_: Any) -> list[Tick]:
             raise Refused("fault", "fishd is in fault")
 

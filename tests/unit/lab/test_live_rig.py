@@ -13,11 +13,11 @@ from fishd.core.protocol import Calibrations, State
 from fishd.lab.measurement import measure
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import trials
-from fishd.lab.rig import Disturbed, LiveRig
+from fishd.lab.session import Disturbed, LiveSession
 
 
-def rig_of(daemon: VirtualDaemon) -> LiveRig:
-    return LiveRig(cast(Fish, daemon))
+def rig_of(daemon: VirtualDaemon) -> LiveSession:
+    return LiveSession(cast(Fish, daemon))
 
 
 class Late(VirtualDaemon):

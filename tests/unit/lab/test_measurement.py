@@ -21,7 +21,7 @@ from fishd.lab.measurement import (
     plan,
     samples_of,
 )
-from fishd.lab.rig import Disturbed, VirtualRig
+from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.simulation import simulate
 
 RIG = load(None, ["simulation.rotation=0.05", "simulation.offset_y=0.01"])
@@ -41,7 +41,7 @@ def truth() -> float:
 
 
 def measured(config: Config, seconds: float = 30.0, controller: str = "swing") -> Measured:
-    with VirtualRig(config) as rig:
+    with VirtualSession(config) as rig:
         return measure(rig, controller, {}, seconds)
 
 
@@ -99,7 +99,7 @@ def test_a_length_that_is_not_possible_is_told_with_what_is_needed(seconds: floa
 
 
 def test_a_fault_in_the_middle_ends_the_measurement_and_says_which() -> None:
-    with VirtualRig(RIG) as rig:
+    with VirtualSession(RIG) as rig:
         rig.rest(1.0)
         rig._run.loop.estop("somebody fell in")
         with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(somebody"):
@@ -232,7 +232,7 @@ def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() 
     slow = replace(RIG, plant=replace(RIG.plant, xi=0.05))
     found = measured(slow, 60.0)
     assert "the fin was not steady: its power changed by +" in found.remark
-    with VirtualRig(slow) as rig:
+    with VirtualSession(slow) as rig:
         found = measure(rig, "swing", {}, 240.0, settle=14.0)
     truth = simulate(slow, "swing", {}, 200.0, 60.0).mean_thrust
     assert found.remark == ""
@@ -242,7 +242,7 @@ def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() 
 
 def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
     slow = {"smaller": 1.0, "lowest": 0.15, "highest": 0.15}
-    with VirtualRig(RIG) as rig, pytest.raises(ParameterError, match="no whole beat is left"):
+    with VirtualSession(RIG) as rig, pytest.raises(ParameterError, match="no whole beat is left"):
         measure(rig, "excitation", slow, 30.0)
 
 

@@ -10,11 +10,11 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
-from fishd.lab.optimise.folder import Begun, SearchFolder
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import trials, whole_ticks
+from fishd.lab.optimise.trials import Trial, keep_trial, read_trials, trials, whole_ticks
 from fishd.lab.rerun import rerun
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import VirtualRun, simulate
 from fishd.recording import open_run, read
 from fishd.virtual.plant.base import TrueWindow
@@ -62,7 +62,7 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     config = load("config/simulated.yaml")
     search = Search([whole_ticks(Range("frequency", 0.4, 5.0), config.tick)], seed=1)
     swum = 0
-    with VirtualRig(config) as rig:
+    with VirtualSession(config) as rig:
         for trial in trials(rig, "square", {}, search, 300.0):
             swum, found = trial.swum, search.proposal()
             if search.is_warm and found.improvement < 0.01:
@@ -76,12 +76,12 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
 @pytest.mark.slow
 def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
-    done = fishctl(*words, "--budget", "22")
+    words = ["optimise", "square", "--over", "frequency=1:3"]
+    done = fishctl(*words, "--folder", str(folder), "--budget", "22")
     assert done.returncode == 1
     assert "the budget of 22 s is used" in done.stderr
     assert "true thrust there" in done.stdout
-    rows = (folder / "trials.csv").read_text().splitlines()
+    rows = (folder / "rows.csv").read_text().splitlines()
     assert rows[0] == "frequency,thrust,error,power,power_error,swum,passed"
     passed = float(rows[-1].rpartition(",")[2])
     run = open_run(folder / "search.mcap")
@@ -90,14 +90,16 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert len(again) == len(rows) - 1
     assert all(each.from_start and each.equal == each.ticks for each in again)
     assert (folder / "thrust.svg").stat().st_size > 10_000
-    assert "a larger --budget goes on" in done.stderr
-    there = (folder / "trials.csv").read_text()
-    more = fishctl(*words, "--budget", "40")
+    again = f"optimise --resume {folder} --budget"
+    assert f"a larger one: fishctl {again} SECONDS" in done.stderr
+    there = (folder / "rows.csv").read_text()
+    more = fishctl(*again.split(), "40")
     assert f"{folder}: 3 candidates there already" in more.stdout
-    assert (folder / "trials.csv").read_text().startswith(there)
+    assert (folder / "rows.csv").read_text().startswith(there)
     assert len(read(folder / "search-2.mcap")) > 100
-    refused = one_line(fishctl(*words, "--amplitude", "0.3"))
-    assert "begun with parameters.amplitude = None, now it is 0.3" in refused
+    refused = one_line(fishctl(*words, "--resume", str(folder), "--amplitude", "0.3"))
+    assert "began with parameters.amplitude = None, now it is 0.3" in refused
+    assert "--resume" in one_line(fishctl(*words, "--folder", str(folder)))
 
 
 @pytest.mark.slow
@@ -117,12 +119,13 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
 
     monkeypatch.setattr(VirtualRun, "tick", interrupted)
     folder = tmp_path / "run"
-    table = folder / "trials.csv"
+    table = folder / "rows.csv"
     words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
     kept, stops = "", 0
     while True:
         left = int(generator.integers(1, 300)) if stops < 8 else 0
         done = fishctl(*words)
+        words = ["optimise", "--resume", str(folder)]
         now = table.read_text()
         assert now.startswith(kept)
         kept = now
@@ -130,9 +133,8 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
             break
         stops += 1
         assert done.returncode == 130
-        again = f"to go on: fishctl {' '.join(words)}\n"
-        assert done.stderr.startswith("fishctl: stopped before")
-        assert done.stderr.endswith(again)
+        assert done.stderr.startswith("fishctl: interrupted, ")
+        assert done.stderr.endswith(f"; resume with: fishctl {' '.join(words)}\n")
     assert stops == 8
     assert "best frequency of square: 1.667 Hz" in done.stdout
     rows = [row.split(",") for row in kept.splitlines()[1:]]
@@ -142,13 +144,16 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
 
 
 def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
-    begun = Begun("simulation", "square", {}, {"frequency": (1.0, 3.0)}, 0, {})
-    folder = SearchFolder(tmp_path, begun)
-    table = tmp_path / "trials.csv"
-    whole = table.read_text() + "1.25,0.02,0.001,0.5,0.01,40,12.5\n"
+    header = Header(kind="optimise", on="simulation")
+    table = tmp_path / "run" / "rows.csv"
+    with open_experiment(tmp_path / "run", header) as search:
+        assert read_trials(search, ["frequency"]) == []
+        trial = Trial({"frequency": 1.25}, 0.02, 0.001, 0.5, 0.01, 40, 12.5)
+        keep_trial(search, trial)
+    whole = table.read_text()
     table.write_text(whole + "2.0,0.023,0.001,0.7,0.01,80,24.7")  # of 24.75
-    folder = SearchFolder(tmp_path, begun)
-    assert [each.parameters for each in folder.done] == [{"frequency": 1.25}]
+    with open_experiment(tmp_path / "run", header, resume=True) as search:
+        assert read_trials(search, ["frequency"]) == [trial]
     assert table.read_text() == whole
 
 

@@ -15,20 +15,20 @@ from fishd.core.errors import ParameterError
 from fishd.lab.compare.comparison import compare
 from fishd.lab.compare.live import LiveComparison
 from fishd.lab.measurement import measure, summary
-from fishd.lab.objective import per_watt
 from fishd.lab.optimise.aim import Aim
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range
 from fishd.lab.optimise.trials import Trial
-from fishd.lab.rig import VirtualRig
+from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
+from fishd.lab.statistics import per_watt
 
 DRIFTING = load("config/simulated.yaml")
 RANGE = Range("frequency", 0.5, 5.0)
 
 
 def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() -> None:
-    with VirtualRig(DRIFTING) as rig:
+    with VirtualSession(DRIFTING) as rig:
         found = summary(measure(rig, "swing", {}, 40.0), rig.tick)
     truth = simulate(DRIFTING, "swing", {})
     assert found.power == pytest.approx(truth.mean_power, rel=0.01)
@@ -41,7 +41,7 @@ def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() ->
 @pytest.mark.slow
 def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
     config = load("config/virtual-pi.yaml", ["power_meter=null"])
-    with VirtualRig(config) as rig:
+    with VirtualSession(config) as rig:
         found = summary(measure(rig, "square", {"frequency": 2.0}, 25.0), rig.tick)
     assert found.thrust > 0.0
     assert (found.power, found.power_error, found.thrust_per_watt) == (None, None, None)
@@ -128,7 +128,7 @@ def test_a_comparison_tells_what_each_watt_gave_simulated_and_measured() -> None
     assert slow.thrust_per_watt is not None
     assert fast.thrust_per_watt is not None
     assert slow.thrust_per_watt > fast.thrust_per_watt
-    with VirtualRig(calm) as rig:
+    with VirtualSession(calm) as rig:
         live = LiveComparison(rig, entries)
         live.swim(25.0)
     for truth, measured in zip((slow, fast), live.standings(), strict=True):

@@ -11,15 +11,14 @@ from fishd.core.errors import RecordingError
 from fishd.core.signals import Event, Tick
 from fishd.lab.identification import Unidentifiable, identify
 from fishd.lab.rerun import rerun
-from fishd.lab.rig import VirtualRig
-from fishd.lab.rig_recording import recorded
 from fishd.lab.run_traces import traces
+from fishd.lab.session import VirtualSession
 from fishd.recording import open_run
 
 
 def test_every_swim_of_a_rig_is_rerun_to_the_last_bit(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with VirtualRig(load("config/simulated.yaml")) as rig, recorded(rig, path, "two swims"):
+    with VirtualSession(load("config/simulated.yaml")) as rig, rig.recorded(path, "two swims"):
         rig.rest(2.0)
         for controller, parameters in (("swing", {"C": 0.4}), ("square", {"frequency": 1.3})):
             rig.swim(controller, parameters, 5.0)
@@ -50,7 +49,7 @@ class Full:
 
 
 def test_a_recording_that_fails_ends_a_swim_and_is_no_fault_of_the_fish() -> None:
-    with VirtualRig(Config()) as rig:
+    with VirtualSession(Config()) as rig:
         rig.listener = Full(50)
         with pytest.raises(RecordingError, match="no room"):
             rig.swim("swing", {}, 10.0)
@@ -60,10 +59,10 @@ def test_what_swam_before_an_interruption_or_a_kill_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.mcap"
-    monkeypatch.setattr("fishd.lab.rig_recording.FLUSH", 0.0)
+    monkeypatch.setattr("fishd.lab.session.FLUSH_INTERVAL_S", 0.0)
 
     def swim() -> None:
-        with VirtualRig(Config()) as rig, recorded(rig, path, "") as writer:
+        with VirtualSession(Config()) as rig, rig.recorded(path, "") as writer:
             rig.swim("swing", {}, 5.0)
             assert open_run(writer.part).summary.swimming == {"swing": 100}
             raise KeyboardInterrupt
@@ -78,7 +77,7 @@ def test_what_swam_before_an_interruption_or_a_kill_is_kept(
 def test_forces_in_volts_are_never_called_newtons(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     config = load("config/virtual-pi.yaml", [f"state_folder={tmp_path}"])
-    with VirtualRig(config) as rig, recorded(rig, path, ""):
+    with VirtualSession(config) as rig, rig.recorded(path, ""):
         rig.swim("swing", {}, 10.0)
     run = open_run(path)
     assert (rig.unit, run.summary.force_unit, traces(run).unit) == ("V", "V", "mV")

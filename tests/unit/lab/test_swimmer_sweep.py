@@ -12,13 +12,13 @@ from rigs.processes import fishctl, one_line
 
 from fishd.config import Config
 from fishd.core.signals import Event, Tick
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.sweep import figure, free_swimming
 from fishd.lab.sweep.curves import best, curves, plain
-from fishd.lab.sweep.folder import Begun, SweepFolder
-from fishd.lab.sweep.free_swimming import swim_freely
+from fishd.lab.sweep.folder import SweepFolder
+from fishd.lab.sweep.free_swimming import is_steady, judged_from, swim_freely
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
-from fishd.lab.sweep.settling import is_steady, judged_from
 
 WAVE = Point("square", {"frequency": 3.0})
 
@@ -76,8 +76,8 @@ def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_i
 def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fishd.lab.sweep.settling.LEAST_TIME", 0.5)
-    monkeypatch.setattr("fishd.lab.sweep.settling.STEADY", 0.5)
+    monkeypatch.setattr("fishd.lab.sweep.free_swimming.LEAST_TIME", 0.5)
+    monkeypatch.setattr("fishd.lab.sweep.free_swimming.STEADY", 0.5)
     found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
     assert found
     assert found.settled is not None
@@ -102,8 +102,9 @@ def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
 
 
 def opened(path: Path, config: Config) -> SweepFolder:
-    begun = Begun("simulation", msgspec.to_builtins(config), {})
-    return SweepFolder(path, begun, ["controller", "parameters.frequency", "parameters.C"])
+    header = Header(kind="sweep", on="simulation", config=msgspec.to_builtins(config))
+    with open_experiment(path, header, resume=(path / "experiment.json").exists()) as experiment:
+        return SweepFolder(experiment, ["controller", "parameters.frequency", "parameters.C"])
 
 
 def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
@@ -120,17 +121,18 @@ def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
     drawn = curves(folder, found)
     told = best(drawn[0])
     assert told
-    shown = plain(told, folder.begun.quantity)
+    shown = plain(told, folder.quantity)
     assert shown["speed"] == pytest.approx(0.07, abs=4e-3)
     assert "thrust" not in shown
-    picture, _ = figure.draw(
-        tmp_path / "speed",
+    picture = tmp_path / "speed.svg"
+    figure.draw(
+        [picture],
         drawn,
         {"frequency": "Hz"},
         error_of="it",
-        quantity=folder.begun.quantity,
+        quantity=folder.quantity,
     )
-    text = picture.with_suffix(".svg").read_text()
+    text = picture.read_text()
     assert all(words in text for words in ("speed (mm/s)", "swing C=0.6", "frequency (Hz)"))
     assert "<!-- C -->" not in text  # no panel of its own
 
@@ -155,7 +157,7 @@ def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
     assert done.returncode == 0
     assert "sine frequency=5 Hz: " in done.stdout
     assert " mm/s, 5.0" in done.stdout
-    with (folder / "points.csv").open(newline="") as file:
+    with (folder / "rows.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["strouhal"] or 1.0) > 0.0
     assert int(row["beats"]) >= 2

@@ -1,12 +1,18 @@
-"""A fish that an experiment tells to swim and to rest: of a running fishd, or in virtual time."""
+"""A session of an experiment on one fish: of a running fishd, or in virtual time."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any, Self
+
+import msgspec
 
 from fishd.client import Fish
 from fishd.client.lease import LeaseRenewal
-from fishd.config import Config, check_tethered
+from fishd.config import Config, adopt, check_tethered
 from fishd.control.reporting import Publisher
 from fishd.core import text
 from fishd.core.calibration import EXACT, ForceCalibration
@@ -27,25 +33,27 @@ if TYPE_CHECKING:
 
 IDLE_LIMIT = 5.0
 """Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""
-LOST = 0.02
-"""A measurement may miss this share of its ticks."""
+MAX_LOST_FRACTION = 0.02
+"""Largest fraction of its ticks that a measurement may lose."""
+FLUSH_INTERVAL_S = 0.5
+"""Interval at which a recording is handed to the kernel: a kill loses no more than this [s]."""
 
 
 class Disturbed(FishdError):
-    """The fish did not do what the experiment told it to; the message says what it did."""
+    """The fish did not do what the experiment requested; the message says what it did."""
 
 
 class Replaced(Disturbed):
-    """The controller gave up and another one took over, which the experiment did not ask for."""
+    """The controller gave up and its fallback took over, which the experiment did not request."""
 
 
-_OF_ONE = ("bad-parameter", "controller-error", "too-slow", "unknown-controller")
+_CONTROLLER_ERRORS = ("bad-parameter", "controller-error", "too-slow", "unknown-controller")
 
 
-def is_of_one(error: FishdError) -> bool:
-    """Does it concern one controller with its parameters only, so that the next one may swim?"""
+def concerns_one_controller(error: FishdError) -> bool:
+    """Return whether an error concerns one controller only, so that the next one may swim."""
     if isinstance(error, Refused):
-        return error.code in _OF_ONE
+        return error.code in _CONTROLLER_ERRORS
     return isinstance(error, Replaced | ParameterError | PolicyError | UnknownController)
 
 
@@ -56,10 +64,10 @@ def refuse_lost(ticks: Sequence[Tick], lengths: Iterable[float], tick: float) ->
     """
     expected = sum(_count(length, tick) for length in lengths)
     lost = expected - len(ticks)
-    if lost > LOST * expected:
+    if lost > MAX_LOST_FRACTION * expected:
         raise Disturbed(
-            f"{lost} of {expected} ticks were lost on their way from fishd, more than {LOST:.0%}: "
-            "this measurement is lost"
+            f"{lost} of {expected} ticks were lost on their way from fishd, more than "
+            f"{MAX_LOST_FRACTION:.0%}: this measurement is lost"
         )
 
 
@@ -67,57 +75,154 @@ def _count(seconds: float, tick: float) -> int:
     return max(1, round(seconds / tick))
 
 
-class Rig(Protocol):
-    """One fish, of which an experiment is in charge; a context manager that leaves it at rest."""
+class Session(ABC):
+    """One fish under the control of an experiment; a context manager that leaves it at rest."""
 
     name: str
-    """What it is, such as `simulated` or `pi`."""
+    """Name of the robot, such as `simulated` or `pi`."""
     tick: float
     """Period of its loop [s]."""
     amplitude: float
     """Φ [rad]"""
     unit: str
-    """Of its forces: `N`, or that of its sensor until that is calibrated."""
+    """Unit of its forces: `N`, or that of the sensor until it is calibrated."""
     calibration: ForceCalibration
     """Calibration of its force sensor, for how well the gains are known."""
     source: "Source"
-    """What a recording says of where its ticks are from."""
-    listener: Publisher | None
-    """Is given each tick and event as it comes, in order; what it raises ends a swim or a rest."""
+    """Source of the ticks, as a recording names it."""
+    config: dict[str, Any]
+    """Configuration of its loop, as plain data."""
 
-    def describe(self, writer: "RunWriter") -> None:
-        """Put what the ticks are made with into a recording; raises `RecordingError`."""
+    def __init__(self) -> None:
+        self.used = 0.0
+        """Tank time so far, that of a swim that was broken off included [s]."""
+        self.progress: Callable[[float], None] = lambda used: None
+        """Function that is called with the tank time, tick by tick [s]."""
+        self.listener: Publisher | None = None
+        """Receiver of each tick and event, in order; an exception of it ends a swim or a rest."""
+        self._passed = self._planned = 0.0
 
     def __enter__(self) -> Self:
         """Nothing moves yet."""
+        return self
 
-    def __exit__(self, *_: object) -> None:
+    def read_config(self) -> Config:
+        """Return the configuration of its loop."""
+        return adopt(deepcopy(self.config))  # which changes what it is given
+
+    def check_calibrated(self) -> None:
+        """Raise `FishdError` where its forces are not in newtons."""
+        if self.unit != "N":
+            raise FishdError(
+                "the force sensor is not calibrated, so no force is known in newtons: "
+                "fishctl calibrate force"
+            )
+
+    @abstractmethod
+    def __exit__(self, *exception: Any) -> None:
         """Leave the fish at rest."""
 
-    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """Let a controller swim from its start for so long; the ticks of that time, in order.
+    @abstractmethod
+    def describe(self, writer: "RunWriter") -> None:
+        """Write what the ticks are made with into a recording; raises `RecordingError`."""
 
-        Raises `Refused` for a controller that is not possible, and `Disturbed`.
+    @abstractmethod
+    def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
+        """Do what `swim` says."""
+
+    @abstractmethod
+    def _rest(self, seconds: float) -> list[Tick]:
+        """Do what `rest` says."""
+
+    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
+        """Swim a controller from its start for `seconds`; return the ticks of that time, in order.
+
+        Raises `Refused` for a controller that is not possible, `Disturbed`, and `NoDaemon`.
         """
+        with self._timed(seconds):
+            return self._swim(controller, parameters, seconds)
 
     def rest(self, seconds: float) -> list[Tick]:
-        """Fade to neutral and stay there for so long; the ticks of that time, in order.
+        """Fade to neutral and stay there for `seconds`; return the ticks of that time, in order.
 
-        Raises `Disturbed`.
+        Raises `Disturbed` and `NoDaemon`.
         """
+        with self._timed(seconds):
+            return self._rest(seconds)
+
+    @contextmanager
+    def recorded(
+        self, path: str | os.PathLike[str], note: str, extra: Mapping[str, str] | None = None
+    ) -> "Iterator[RunWriter]":
+        """Record every tick and event while this lasts.
+
+        Whatever ends it, what was recorded stays; a recording without a tick does not.
+
+        path: of the finished file, note, extra: as for `RunWriter`
+        Raises `RecordingError`, also later where a tick cannot be written, and `NoDaemon`.
+        """
+        from fishd.recording.writer import RunWriter
+
+        with RunWriter(os.fspath(path), source=self.source, note=note, extra=extra) as writer:
+            self.describe(writer)
+            self.listener = _Flushing(writer)
+            try:
+                yield writer
+            finally:
+                self.listener = None
+
+    @contextmanager
+    def _timed(self, seconds: float) -> Iterator[None]:
+        """Add a swim or a rest to the tank time, as far as it came."""
+        self._passed, self._planned = 0.0, seconds
+        try:
+            yield
+            self._passed = seconds
+        finally:
+            self.used += self._passed
+            self._passed = 0.0
+
+    def _hand_on(self, message: Tick | Event) -> None:
+        """Count a tick, and pass a tick or an event to the listener."""
+        if isinstance(message, Tick):
+            self._passed = min(self._planned, self._passed + self.tick)
+            self.progress(self.used + self._passed)
+            if self.listener:
+                self.listener.tick(message)
+        elif self.listener:
+            self.listener.event(message)
 
 
-class VirtualRig:
-    """A simulated fish in virtual time."""
+class _Flushing:
+    """Publisher that writes ticks and events into a recording, and flushes it."""
+
+    def __init__(self, writer: "RunWriter") -> None:
+        self._writer = writer
+        self._flushed = time.monotonic()
+
+    def tick(self, tick: Tick) -> None:
+        self._writer.tick(tick)
+        now = time.monotonic()
+        if now - self._flushed >= FLUSH_INTERVAL_S:
+            self._flushed = now
+            self._writer.flush()
+
+    def event(self, event: Event) -> None:
+        self._writer.event(event)
+
+
+class VirtualSession(Session):
+    """A session on a simulated fish in virtual time."""
 
     def __init__(self, config: Config, calibration: ForceCalibration | None = None) -> None:
         """calibration: that of its force sensor; by default what was saved, else an exact one"""
+        super().__init__()
         check_tethered(config.robot, "a measurement of thrust")
         self.name = "simulation"
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
         self.source: Source = "simulation"
-        self.listener: Publisher | None = None
+        self.config = msgspec.to_builtins(config)
         self._heard = _Heard()
         self._run = VirtualRun(config, self._heard)
         robot = self._run.loop.robot
@@ -128,22 +233,17 @@ class VirtualRig:
         self.unit = robot.force_unit
 
     def describe(self, writer: "RunWriter") -> None:
-        """As `Rig.describe`."""
+        """As `Session.describe`."""
         writer.describe(self._run.config, self._run.about())
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *exception: Any) -> None:
         self._run.close()
 
-    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """As `Rig.swim`."""
+    def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         self._run.set_controller(controller, parameters)
         return self._pass(seconds, controller)
 
-    def rest(self, seconds: float) -> list[Tick]:
-        """As `Rig.rest`."""
+    def _rest(self, seconds: float) -> list[Tick]:
         self._run.loop.stop()
         return self._pass(seconds, None)
 
@@ -152,7 +252,7 @@ class VirtualRig:
         for _ in range(_count(seconds, self.tick)):
             self._run.tick()
             for message in self._heard.taken():
-                _hand_on(message, self.listener)
+                self._hand_on(message)
                 if isinstance(message, Tick):
                     ticks.append(message)
             loop = self._run.loop
@@ -160,8 +260,8 @@ class VirtualRig:
         return ticks
 
 
-class LiveRig:
-    """The fish of a running fishd; while the rig is entered, it holds the lease of the fish.
+class LiveSession(Session):
+    """A session on the fish of a running fishd; while it is entered, it holds the lease.
 
     A few ticks that are lost on their way are missing in what it returns.
     """
@@ -174,6 +274,7 @@ class LiveRig:
         Raises `NoDaemon`, `Refused` while another experiment holds the fish, and `ConfigError`
         where it swims freely.
         """
+        super().__init__()
         status = fish.status()
         if status.lease and not take:
             raise Refused("leased", status.lease.refusal())
@@ -185,8 +286,8 @@ class LiveRig:
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self.source: Source = "fishd"
-        self.listener: Publisher | None = None
-        self._fish = fish
+        self.config = fish.config()
+        self.fish = fish
         self._messages = fish.ticks_and_events()
         self._pid = status.pid
         self._latest = 0
@@ -195,10 +296,10 @@ class LiveRig:
         self._held: LeaseRenewal
 
     def describe(self, writer: "RunWriter") -> None:
-        """As `Rig.describe`; raises `NoDaemon`, too."""
+        """As `Session.describe`; raises `NoDaemon`, too."""
         from fishd.recording.recorder import description
 
-        description(self._fish).write(writer)
+        description(self.fish).write(writer)
 
     def __enter__(self) -> Self:
         """Raises `Refused` while another experiment holds the fish."""
@@ -209,16 +310,14 @@ class LiveRig:
         """Give the fish back, at rest; one that was taken by another request swims on."""
         self._lease.__exit__(*exception)
 
-    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """As `Rig.swim`; raises `NoDaemon` where fishd goes away."""
+    def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         with _disturbed():
-            state = self._fish.set_controller(controller, **parameters)
+            state = self.fish.set_controller(controller, **parameters)
             return self._pass(state.seq, seconds, controller)
 
-    def rest(self, seconds: float) -> list[Tick]:
-        """As `Rig.rest`; raises `NoDaemon` where fishd goes away."""
+    def _rest(self, seconds: float) -> list[Tick]:
         with _disturbed():
-            return self._pass(self._fish.stop().seq, seconds, None)
+            return self._pass(self.fish.stop().seq, seconds, None)
 
     def _pass(self, first: int, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
@@ -226,10 +325,10 @@ class LiveRig:
         if first <= self._latest:
             raise _restarted()
         for tick in self._messages:
-            _hand_on(tick, self.listener)
+            self._hand_on(tick)
             if not isinstance(tick, Tick):
                 if ticks and controller and tick.kind in ("parameters", "controller"):
-                    self._fish.renew_lease(self._held.token)  # raises why it has ended
+                    self.fish.renew_lease(self._held.token)  # raises why it has ended
                     raise Disturbed(
                         f"another client changed what swims: {text.line(tick.message)}: this "
                         "measurement is lost"
@@ -239,9 +338,9 @@ class LiveRig:
             if tick.seq < first:
                 continue
             if not _as_told(tick, controller):
-                status = self._fish.status()
+                status = self.fish.status()
                 if not (status.reason or status.fallback):
-                    self._fish.renew_lease(self._held.token)  # raises why it has ended
+                    self.fish.renew_lease(self._held.token)  # raises why it has ended
                 _check(tick, controller, status.reason, status.fallback)
             if tick.seq < end:
                 ticks.append(tick)
@@ -257,7 +356,7 @@ class LiveRig:
         if tick.seq <= before:
             raise _restarted()
         # One that was restarted soon after its start may have got further meanwhile.
-        if before and tick.seq > before + 1 and self._fish.status().pid != self._pid:
+        if before and tick.seq > before + 1 and self.fish.status().pid != self._pid:
             raise _restarted()
 
 
@@ -290,15 +389,6 @@ class _Heard:
         """All of them, once."""
         messages, self._messages = self._messages, []
         return messages
-
-
-def _hand_on(message: Tick | Event, listener: Publisher | None) -> None:
-    if listener is None:
-        return
-    if isinstance(message, Tick):
-        listener.tick(message)
-    else:
-        listener.event(message)
 
 
 def _as_told(tick: Tick, controller: str | None) -> bool:

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 SHOWS = """
-from fishd.cli.lab_progress import showing
+from fishd.cli.progress import showing
 from fishd.cli.output import print_json
 with showing(2.0, "s", err={err}) as show:
     show.done("one is done", 1.0)

@@ -9,13 +9,12 @@ from msgspec.structs import replace
 
 from fishd.camera.live_sight import LiveSight
 from fishd.client import Agent, Fish
-from fishd.config import adopt
 from fishd.controllers.base import Limits
 from fishd.controllers.policy.pilot import Pilot
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.signals import Tick
 from fishd.lab.compare.seeing import sees_pictures
-from fishd.lab.rig import Disturbed, LiveRig
+from fishd.lab.session import Disturbed, LiveSession
 
 GIVE_UP = 2.0
 """After so long without frames the camera counts as lost [s]."""
@@ -25,8 +24,8 @@ _PATIENCE = 0.1
 """How long an agent waits for an observation before it looks whether it is to end [s]."""
 
 
-class PilotedRig(LiveRig):
-    """As `LiveRig`; a policy that sees pictures swims as the agent of fishd's `remote`."""
+class PilotedSession(LiveSession):
+    """As `LiveSession`; a policy that sees pictures swims as the agent of fishd's `remote`."""
 
     def __init__(
         self,
@@ -38,7 +37,7 @@ class PilotedRig(LiveRig):
         agent: str | None = None,
     ) -> None:
         """
-        experiment, take: as for `LiveRig`
+        experiment, take: as for `LiveSession`
         camera: where fishd-camera takes requests; None: as for `CameraClient`
         agent: where fishd reaches this program; None: any free port, for a fishd on this machine
 
@@ -46,7 +45,7 @@ class PilotedRig(LiveRig):
         """
         super().__init__(fish, experiment, take)
         self._endpoint, self._camera, self._address = fish.endpoint, camera, agent
-        self._limits = adopt(fish.config()).limits
+        self._limits = self.read_config().limits
         self._stack = ExitStack()
         self._policy = ""
         self._agent: _PilotThread
@@ -55,19 +54,19 @@ class PilotedRig(LiveRig):
         super().__exit__(*exception)
         self._stack.close()
 
-    def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """As `LiveRig.swim`; raises `PolicyError` for a policy that does not suit the camera.
+    def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
+        """As `LiveSession.swim`; raises `PolicyError` for a policy that does not suit the camera.
 
         Raises `CameraLost` where there is no camera, and `Disturbed` where it is lost.
         """
         policy = parameters.get("policy")
         if controller != "ppo" or not sees_pictures(policy, self._limits):
-            return super().swim(controller, parameters, seconds)
+            return super()._swim(controller, parameters, seconds)
         agent = self._agent_of(str(policy))
         dwell = self._limits.dwell
         asked = {"agent": agent.address, "dwell": dwell}
         try:
-            found = super().swim("remote", asked, seconds)
+            found = super()._swim("remote", asked, seconds)
         except Disturbed:
             if agent.problem:
                 raise Disturbed(f"{policy}: {agent.problem}") from None

@@ -1,0 +1,339 @@
+"""What all experiments share on the command line: which fish, which folder, and how one ends."""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import wraps
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import click
+from msgspec import to_builtins
+from msgspec.structs import replace
+
+from fishd.cli.config import config_option, set_option
+from fishd.cli.options import F, endpoint_option, take_option, verb_lease
+from fishd.cli.output import echo
+from fishd.config import Config, Start, load
+from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, socket_path
+from fishd.core.console import INTERRUPTED
+from fishd.core.errors import FishdError, NoDaemon
+from fishd.core.process import unix_sockets
+from fishd.core.process.interruption import interrupted_once
+
+if TYPE_CHECKING:
+    from fishd.lab.experiment import Experiment, Header
+    from fishd.lab.session import Session
+
+On = Literal["live", "simulation"]
+_NOT_KEPT = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
+"""Options that a resumed experiment does not take over, and how many words follow each."""
+_WORDS = "fishd.words"
+
+
+class ChosenFish(NamedTuple):
+    """The fish that an experiment is about."""
+
+    on: On
+    file: Path | None
+    """Configuration of a simulated fish; None for the defaults."""
+    overrides: tuple[str, ...]
+    endpoint: str | None
+
+    def __str__(self) -> str:
+        """Return which fish it is, in words."""
+        if self.on == "live":
+            return f"the fish of fishd at {self.endpoint or find_control()}"
+        fish = f"the simulated fish of {self.file}" if self.file else "the default simulated fish"
+        return f"{fish}, changed by --set" if self.overrides else fish
+
+    def load(self, overrides: Sequence[str] = ()) -> Config:
+        """Return the configuration of a simulated fish at rest; raises `ConfigError`."""
+        return replace(load(self.file, (*self.overrides, *overrides)), start=Start())
+
+    @contextmanager
+    def session(self, **piloted: Any) -> "Iterator[Session]":
+        """Open a session, which is not entered yet: nothing moves, and no lease is taken.
+
+        piloted: camera and agent of policies that see pictures, as for `PilotedSession`
+        """
+        from fishd.lab.session import LiveSession, VirtualSession
+
+        if self.on == "simulation":
+            yield VirtualSession(self.load())
+            return
+        from fishd.client import Fish
+
+        with Fish(self.endpoint) as fish:
+            if piloted:
+                from fishd.lab.compare.piloted_session import PilotedSession
+
+                yield PilotedSession(fish, *verb_lease(), **piloted)
+            else:
+                yield LiveSession(fish, *verb_lease())
+
+    def announce(self, as_json: bool = False) -> None:
+        """Print which fish it is: the first line of an experiment."""
+        echo(f"fish: {self}", err=as_json)
+
+    def refuse_other(self, of_simulation: dict[str, Any], of_live: dict[str, Any]) -> None:
+        """Raise `UsageError` for an option that means nothing for this fish."""
+        live = self.on == "live"
+        for name, value in (of_simulation if live else of_live).items():
+            if value not in (None, (), False):
+                raise click.UsageError(f"{name} is for --on {'simulation' if live else 'live'}")
+
+
+class Place(NamedTuple):
+    """The folder of an experiment, new or to be resumed."""
+
+    kind: str
+    """Verb of the experiment, such as `sweep`."""
+    path: Path
+    resume: bool
+    command: tuple[str, ...]
+    """Arguments of the verb, without those of this run alone."""
+
+    @contextmanager
+    def open(
+        self, fish: ChosenFish, config: dict[str, Any], settings: dict[str, Any], unit: str = "N"
+    ) -> "Iterator[Experiment]":
+        """Begin or resume the experiment; raises `ConfigError`.
+
+        config: of the fish; settings: what else the rows depend on; unit: of the forces
+        """
+        from fishd.lab.experiment import Header, open_experiment
+
+        where = ("--endpoint", fish.endpoint) if fish.endpoint else ()
+        header = Header(
+            kind=self.kind,
+            on=fish.on,
+            config=config,
+            settings=settings,
+            force_unit=unit,
+            command=[*self.command, "--on", fish.on, *where],
+        )
+        with open_experiment(self.path, header, resume=self.resume) as experiment:
+            yield experiment
+
+
+def fish_choice(function: F) -> F:
+    """`--on`, `--config`, `--set`, `--endpoint` and `--take`, as `fish`."""
+    return _fish_choice(function, live_config=False)
+
+
+def fish_choice_and_config(function: F) -> F:
+    """The same of a verb that has a use for `--config` with a live fish, too."""
+    return _fish_choice(function, live_config=True)
+
+
+def _fish_choice(function: F, *, live_config: bool) -> F:
+    @wraps(function)
+    def chosen(
+        *args: Any,
+        on: On | None,
+        file: Path | None,
+        overrides: tuple[str, ...],
+        endpoint: str | None,
+        **values: Any,
+    ) -> Any:
+        place: Place | None = values.get("place")
+        if on is None and place and place.resume:
+            on = _header(place.path).on
+        on = on or default_on(file, overrides, endpoint)
+        if on == "live" and (file or overrides) and not live_config:
+            what = "--config" if file else "--set"
+            raise click.UsageError(f"{what} is for --on simulation: fishd keeps its configuration")
+        return function(*args, fish=ChosenFish(on, file, overrides, endpoint), **values)
+
+    where = "" if live_config else "In simulation: "
+    for option in (
+        take_option,
+        endpoint_option,
+        set_option,
+        config_option(f"{where}YAML file of the fish, as for fishd. [default: the defaults]"),
+        on_option,
+    ):
+        chosen = option(chosen)
+    return chosen  # type: ignore[return-value]
+
+
+on_option = click.option(
+    "--on",
+    type=click.Choice(["live", "simulation"]),
+    help="The fish of the running fishd, real or simulated; or one in virtual time. [default: live "
+    "if a fishd runs and no --config is given]",
+)
+
+
+def default_on(file: Path | None, overrides: tuple[str, ...], endpoint: str | None) -> On:
+    """Return which fish is meant where `--on` is not given."""
+    if file or overrides:
+        return "simulation"
+    return "live" if endpoint or is_fishd_running() else "simulation"
+
+
+def is_fishd_running() -> bool:
+    """Return whether a client would find a fishd here; one that $FISHD_ENDPOINT names counts."""
+    path = socket_path(find_control())
+    return bool(os.environ.get(ENDPOINT_VARIABLE)) or bool(
+        path and path.exists() and not unix_sockets.is_deserted(path)
+    )
+
+
+def folder_options(function: F) -> F:
+    """`--folder` and `--resume`, as `place`."""
+
+    @wraps(function)
+    def placed(*args: Any, folder: Path | None, resume: Path | None, **values: Any) -> Any:
+        if folder and resume:
+            raise click.UsageError("--folder is for a new experiment, --resume for one: give one")
+        context = click.get_current_context()
+        place = Place(
+            kind=verb(context),
+            path=resume or folder or _default_folder(verb(context)),
+            resume=resume is not None,
+            command=tuple(context.meta.get(_WORDS, ())),
+        )
+        return function(*args, place=place, **values)
+
+    for option in (
+        click.option(
+            "--resume",
+            type=click.Path(path_type=Path),
+            metavar="FOLDER",
+            help="Go on with the experiment in this folder, with its options; nothing is measured "
+            "again.",
+        ),
+        click.option(
+            "--folder",
+            type=click.Path(path_type=Path),
+            help="New folder of the experiment. [default: VERB-DATE-TIME in $FISHD_RUNS, else "
+            "runs]",
+        ),
+    ):
+        placed = option(placed)
+    return placed  # type: ignore[return-value]
+
+
+keep_option = click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Keep recording and result in this new folder of an experiment.",
+)
+
+
+@contextmanager
+def kept(
+    folder: Path | None, fish: ChosenFish, session: "Session | None", settings: dict[str, Any]
+) -> "Iterator[Experiment | None]":
+    """Record a session into a new folder, where there is one, and yield its experiment.
+
+    session: entered; None for fish that are swum without one
+    settings: what the result depends on, besides the fish
+    """
+    if folder is None:
+        yield None
+        return
+    context = click.get_current_context()
+    place = Place(verb(context), folder, False, tuple(context.meta.get(_WORDS, ())))
+    config = session.config if session else to_builtins(fish.load())
+    unit = session.unit if session else "N"
+    with place.open(fish, config, settings, unit) as experiment:
+        if session is None:
+            yield experiment
+            return
+        with session.recorded(experiment.recording(place.kind), f"fishctl {place.kind}"):
+            yield experiment
+
+
+def verb(context: click.Context) -> str:
+    """Return the words of a verb without a controller: `sweep`, `learn ppo`."""
+    words = context.command_path.split()[1:]
+    return " ".join(words[: 2 if words[0] in ("learn",) else 1])
+
+
+def _default_folder(kind: str) -> Path:
+    from fishd.lab.experiment import default_folder
+
+    return default_folder(kind)
+
+
+def _header(folder: Path) -> "Header":
+    from fishd.lab.experiment import read_header
+
+    return read_header(folder)
+
+
+def recall(context: click.Context, args: list[str]) -> list[str]:
+    """Return the arguments of a verb, after those that the experiment of `--resume` began with.
+
+    The arguments are remembered for the header of a new experiment.
+    """
+    folder = next((b for a, b in pairwise(args) if a == "--resume"), None)
+    folder = folder or next((a[9:] for a in args if a.startswith("--resume=")), None)
+    if folder is not None and (not args or args[0].startswith("-")):
+        header = _header(Path(folder))
+        if header.kind != verb(context):
+            raise click.UsageError(
+                f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
+            )
+        args = [*header.command, *args]
+    context.meta[_WORDS] = list(_kept(args))
+    return args
+
+
+def _kept(args: Sequence[str]) -> Iterator[str]:
+    """Yield the arguments that a resumed experiment takes over."""
+    words = iter(args)
+    for word in words:
+        name, equals, _ = word.partition("=")
+        if name not in _NOT_KEPT:
+            yield word
+        elif _NOT_KEPT[name] and not equals:
+            next(words, None)
+
+
+class Resumable(click.Command):
+    """A verb whose options are those of the experiment that `--resume` names, where it is given."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Begin with the options of that experiment."""
+        return super().parse_args(ctx, recall(ctx, args))
+
+
+class Ending:
+    """How an experiment ended, so far."""
+
+    def __init__(self, experiment: "Experiment") -> None:
+        self._command = experiment.resume_command
+        self.is_interrupted = False
+
+    @contextmanager
+    def measuring(self, *errors: type[FishdError]) -> Iterator[None]:
+        """Let the first signal end this, with the fish at rest, and keep what was measured.
+
+        One of these errors, by default that the fish is lost, is raised with the command that
+        resumes the experiment.
+        """
+        from fishd.lab.session import Disturbed
+
+        try:
+            with interrupted_once():
+                yield
+        except KeyboardInterrupt:
+            self.is_interrupted = True
+        except FishdError as error:
+            if not isinstance(error, errors or (Disturbed, NoDaemon)):
+                raise
+            error.args = (f"{error}; resume with: {self._command}",)
+            raise
+
+    def interrupted(self, done: str) -> int:
+        """Print how an interrupted experiment is resumed; return the exit status.
+
+        done: how far it came
+        """
+        echo(f"fishctl: interrupted, {done}; resume with: {self._command}", err=True)
+        return INTERRUPTED

@@ -1,0 +1,135 @@
+"""The folder of an experiment: begun once, resumed with the same, used by one process."""
+
+import os
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rigs.processes import fishctl, one_line
+
+from fishd.core.errors import ConfigError
+from fishd.core.signals import Tick
+from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.session import VirtualSession
+
+HEADER = Header(kind="sweep", on="live", settings={"seed": 1}, config={"plant": {"xi": 1.2}})
+
+
+def begin(path: Path, header: Header = HEADER) -> None:
+    with open_experiment(path, header) as experiment:
+        experiment.read_rows(["x", "y"])
+        experiment.add_row({"x": 0.1, "y": True})
+
+
+def resume(path: Path, header: Header = HEADER) -> list[dict[str, str]]:
+    with open_experiment(path, header, resume=True) as experiment:
+        return experiment.read_rows(["x", "y"])
+
+
+def test_rows_are_there_again_and_one_that_a_kill_cut_off_is_not(tmp_path: Path) -> None:
+    begin(tmp_path / "run")
+    table = tmp_path / "run" / "rows.csv"
+    for cut in ("0.2,", "0.2,1", "0.2\n"):
+        whole = table.read_text()
+        table.write_text(whole + cut)
+        assert resume(tmp_path / "run") == [{"x": "0.1", "y": "1"}]
+        assert table.read_text() == whole
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"settings": {"seed": 2}}, "began with seed = 1, now it is 2"),
+        ({"config": {"plant": {"xi": 0.9}}}, "config.plant.xi = 1.2, now it is 0.9"),
+        ({"config": {"plant": {"xi": 1.2, "mass": 1}}}, "configuration has no config.plant.mass"),
+        ({"on": "simulation"}, "on = live, now it is simulation"),
+        ({"kind": "optimise"}, "kind = sweep, now it is optimise"),
+    ],
+)
+def test_it_is_resumed_with_the_same_only(
+    tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    begin(tmp_path)
+    given = {"kind": "sweep", "on": "live", "settings": HEADER.settings, "config": HEADER.config}
+    with pytest.raises(ConfigError, match=named):
+        resume(tmp_path, Header(**(given | changes)))
+    begun = {"version": "0", "command": ["--json"], "config": {"plant": {"xi": 1.2}, "name": "x"}}
+    assert resume(tmp_path, Header(**(given | begun)))  # which are no matter
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [("{}", "missing required field"), ("{", "truncated"), (None, "it has no experiment.json")],
+)
+def test_a_header_that_is_none_is_one_line(tmp_path: Path, content: str | None, named: str) -> None:
+    if content is not None:
+        (tmp_path / "experiment.json").write_text(content)
+    with pytest.raises(ConfigError, match=named):
+        resume(tmp_path)
+
+
+def test_no_folder_is_used_twice(tmp_path: Path) -> None:
+    begin(tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"run: the folder is not empty; --resume \S+ goes on"):
+        begin(tmp_path / "run")
+    (tmp_path / "file").touch()
+    for name, named in (("file", "File exists"), ("file/run", "Not a directory")):
+        with pytest.raises(ConfigError, match=f"cannot be made a folder: {named}"):
+            begin(tmp_path / name)
+    with (
+        open_experiment(tmp_path / "run", HEADER, resume=True),
+        pytest.raises(ConfigError, match="another experiment uses it"),
+    ):
+        resume(tmp_path / "run")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_rests_the_fish_and_keeps_what_was_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    swims, left = 0, 0
+    swim, leave = VirtualSession._swim, VirtualSession.__exit__
+
+    def interrupted(
+        session: VirtualSession, controller: str, parameters: Mapping[str, Any], seconds: float
+    ) -> list[Tick]:
+        nonlocal swims
+        swims += 1
+        if swims == 3:
+            os.kill(os.getpid(), number)
+        return swim(session, controller, parameters, seconds)
+
+    def impatient(session: VirtualSession, *exception: Any) -> None:
+        nonlocal left
+        os.kill(os.getpid(), number)  # again, while the fish is brought to rest
+        leave(session, *exception)
+        left += 1
+
+    monkeypatch.setattr(VirtualSession, "_swim", interrupted)
+    monkeypatch.setattr(VirtualSession, "__exit__", impatient)
+    folder = tmp_path / "run"
+    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    done = fishctl(*words)
+    assert (done.returncode, left) == (130, 1)
+    assert done.stderr == (
+        f"fishctl: interrupted, 2 candidates are kept; resume with: fishctl optimise --resume "
+        f"{folder}\n"
+    )
+    assert (folder / "rows.csv").read_text().count("\n") == 3
+
+
+def test_an_experiment_is_resumed_by_its_own_verb_with_its_own_options(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["optimise", "square:amplitude=0.3", "--over", "frequency=1:3", "--budget", "12"]
+    assert fishctl(*words, "--set", "plant.xi=1.1", "--folder", str(folder)).returncode == 1
+    refused = one_line(fishctl("sweep", "--resume", str(folder)))
+    assert f"it is of another verb: fishctl optimise --resume {folder}" in refused
+    refused = one_line(fishctl("optimise", "--resume", str(tmp_path)))
+    assert "no experiment to resume" in refused
+    refused = one_line(fishctl("optimise", "--resume", str(folder), "--amplitude", "0.2"))
+    assert "parameters.amplitude = 0.3, now it is 0.2" in refused
+    done = fishctl("optimise", "--resume", str(folder))
+    assert f"{folder}: 1 candidate there already" in done.stdout
+    assert done.stdout.startswith("fish: the default simulated fish, changed by --set\n")
