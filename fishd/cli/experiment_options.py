@@ -244,7 +244,7 @@ def kept(
         if session is None:
             yield experiment
             return
-        with session.recorded(experiment.recording(place.kind), f"fishctl {place.kind}"):
+        with session.recorded(experiment.recording(place.kind), " ".join(("fishctl", place.kind))):
             yield experiment
 
 

@@ -135,7 +135,7 @@ class Experiment:
 
     def write_struct(self, name: str, value: Struct) -> None:
         """Write a struct as JSON; raises `FishdError`."""
-        self.write(name, msgspec.json.format(msgspec.json.encode(value), indent=2))
+        self.write(name, _as_json(value))
 
     def recording(self, stem: str) -> Path:
         """Return a free name for a recording; one that was broken off keeps its own."""
@@ -188,12 +188,11 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
 def mark_folder(path: Path, kind: str, on: On) -> None:
     """Make a new folder with a header, of an experiment that keeps the rest in files of its own.
 
-    Raises `ConfigError` where it is not empty, and `FishdError` where it cannot be made.
+    Raises `ConfigError` where it is not empty, or cannot be made, and OSError.
     """
     check_free(path)
     _make_folder(path)
-    header = Header(kind=kind, on=on)
-    Experiment(path, header).write_struct(HEADER, _dated(header))
+    write_atomically(path / HEADER, _as_json(_dated(Header(kind=kind, on=on))))
 
 
 def _make_folder(path: Path) -> None:
@@ -303,3 +302,7 @@ def _read_struct(path: Path, kind: type[T]) -> T:
         raise ConfigError(
             f"{path}: not as this fishd ({__version__}) writes it: {error}; {_OTHER_FOLDER}"
         ) from None
+
+
+def _as_json(value: Struct) -> bytes:
+    return msgspec.json.format(msgspec.json.encode(value), indent=2)

@@ -28,5 +28,5 @@ def test_a_closed_terminal_lets_the_fish_rest(daemon: Daemon, tmp_path: Path) ->
     wait_until(lambda: daemon.status().mode == "running")
     status, _, err = sweep.end(signal.SIGHUP)
     assert status == 130
-    assert "stopped after 0 of 2 points; to go on: fishctl" in err
+    assert "interrupted, 0 of 2 points are kept; resume with: fishctl sweep --resume" in err
     assert daemon.status().mode == "idle"

@@ -10,7 +10,7 @@ import click
 from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
-from fishd.cli.experiment_options import ChosenFish, On, default_on, on_option
+from fishd.cli.experiment_options import On, default_on, on_option
 from fishd.cli.options import endpoint_option, seed_option, take_option, verb_lease
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
@@ -124,7 +124,6 @@ def ppo(
         raise click.UsageError("--seeds is for simulated fish: there is only one live fish")
     if not resume:
         on = on or ("simulation" if seeds else default_on(file, overrides, endpoint))
-        ChosenFish(on, file, overrides, endpoint).announce()
     job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse(

@@ -43,6 +43,9 @@ from fishd.learning.train.recorder import RunRecorder
 from fishd.learning.train.rollouts import Rollouts
 from fishd.learning.train.tank import TankEvaluations
 
+_WHERE = {"live": "on the fish of fishd", "simulation": "in simulation"}
+
+
 
 def train(
     job: Job, display: Display | None = None, stop: Callable[[], bool] = lambda: False
@@ -156,7 +159,7 @@ class Training:
         last = job.last_step(done)
         whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
         most = "at most " if job.on == "simulation" and job.settings.evaluation.patience else ""
-        text = f"{job.folder}: {most}{last} steps{whole} on {job.on}"
+        text = f"{job.folder}: {most}{last} steps{whole} {_WHERE[job.on]}"
         if self._eye:
             also = " and forces" if job.settings.see == "both" else ""
             text += f", from pictures{also} with the eye {job.settings.camera.eye}"

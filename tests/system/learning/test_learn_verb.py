@@ -115,12 +115,12 @@ def test_mistakes_are_one_line(tmp_path: Path, settings: str) -> None:
         assert what in line
     status, line = complaint("ppo", "--seeds", "2", "--on", "live")
     assert status == 2
-    assert "there is only one robot" in line
+    assert "there is only one live fish" in line
 
 
 def test_it_says_that_it_learns_from_whole_rollouts(tmp_path: Path, settings: str) -> None:
     found = learn("ppo", "--settings", settings, "--folder", str(tmp_path / "a"), "--steps", "65")
-    assert "128 steps, in whole rollouts of 64 on simulation" in found.stdout
+    assert "128 steps, in whole rollouts of 64 in simulation" in found.stdout
     assert "\n128 steps in " in found.stdout
 
 
@@ -236,7 +236,7 @@ def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
     assert found.stderr == ""
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["16", "32"]
     card = checkpoints.read_card(checkpoints.newest(folder))
-    assert (card.provenance.on, card.tick) == ("robot", 0.05)
+    assert (card.provenance.on, card.tick) == ("live", 0.05)
     with Fish(daemon.endpoint) as fish:
         assert fish.status().mode == "idle"
 

@@ -273,7 +273,7 @@ def test_a_new_run_never_overwrites_another(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     job.folder.mkdir()
     (job.folder / "notes.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(ConfigError, match="exists already; give another --folder"):
+    with pytest.raises(ConfigError, match="the folder is not empty"):
         train(job)
 
 
