@@ -46,7 +46,6 @@ from fishd.learning.train.tank import TankEvaluations
 _WHERE = {"live": "on the fish of fishd", "simulation": "in simulation"}
 
 
-
 def train(
     job: Job, display: Display | None = None, stop: Callable[[], bool] = lambda: False
 ) -> Outcome:
