@@ -11,7 +11,7 @@ import pytest
 from rigs.pigpio_rig import Bench
 from rigs.processes import PATIENCE
 
-from fishd.core.clock import SystemClock, VirtualClock
+from fishd.core.clock import SystemClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo import pigpio_link
 from fishd.hardware.servo.pigpio import PigpioSettings
@@ -52,7 +52,6 @@ HEADER = struct.pack("<IIII", 45, 0, 0, 44)
     [
         (HEADER, True, "it closed the connection"),
         (HEADER, False, "no answer within 200 ms"),
-        (HEADER + bytes(11), True, "it closed the connection"),
         (HEADER[:9], True, "it broke off in mid-answer"),
         (b"", True, "it closed the connection"),
     ],
@@ -68,12 +67,8 @@ def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, messag
         server.close()
 
 
-@pytest.mark.parametrize("host", ["no such host", "a..b"])
-def test_a_host_that_is_none_is_one_line_too(host: str) -> None:
-    with (
-        pytest.raises(ServoError, match=rf"^pigpiod at {host}:8888: [^\n]+$"),
-        opened(host, 8888),
-    ):
+def test_a_host_that_is_none_is_one_line_too() -> None:
+    with pytest.raises(ServoError, match=r"^pigpiod at a..b:8888: [^\n]+$"), opened("a..b", 8888):
         pass
 
 
@@ -92,23 +87,6 @@ def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: Bench) -> No
         attempts[0].within(PATIENCE)
         with pytest.raises(OSError, match="Bad file descriptor"):
             attempts[0].get_pigpio_version()
-
-
-def test_an_unforeseen_error_is_the_reason_why_there_is_no_connection(bench: Bench) -> None:
-    def prepare(client: Client) -> None:
-        raise IndexError("out of range")
-
-    stands_still = bench.daemon.stands_still
-    with (
-        contextlib.closing(
-            PigpioLink(
-                bench.settings(), VirtualClock(), prepare, threaded=False, standstill=stands_still
-            )
-        ) as link,
-        pytest.raises(ServoError, match="not connected: out of range"),
-        link.session(),
-    ):
-        pass
 
 
 def test_a_link_that_is_closed_while_it_connects_asks_for_nothing_more(

@@ -149,13 +149,3 @@ def test_no_write_waits_longer_than_its_limit_also_for_an_answer_that_is_owed() 
                 servo.write(0.5)
             durations.append(time.monotonic() - begun)
         assert max(durations) < 0.19  # not twice the limit
-
-
-def test_a_slow_servo_on_a_longer_countdown_is_forgiven_twice_too(bench: Bench) -> None:
-    settings = bench.settings()
-    servo = bench.servo(replace(settings, countdown=1.0))
-    servo.write(0.5)
-    late_tick(bench, servo, 0.5)
-    late_tick(bench, servo, 0.5)
-    servo.write(-0.5)
-    assert bench.width == 1200

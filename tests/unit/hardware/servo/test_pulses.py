@@ -71,12 +71,6 @@ def test_a_true_ctrl_c_passes(method: str) -> None:
         getattr(raising(KeyboardInterrupt()), method)()
 
 
-def test_trim_direction_and_scale_come_from_the_calibration() -> None:
-    made = servo(ServoCalibration(trim=20, direction=-1, scale=500))
-    made.write(0.2)
-    assert (made.driver.pulses, made.driver.neutral) == ([1420], 1520)
-
-
 def test_another_calibration_holds_from_the_next_write_on() -> None:
     made = servo()
     made.write(0.5)
@@ -179,18 +173,3 @@ def test_a_calibration_takes_precedence_and_the_settings_own_one_changes_nothing
         return
     assert calibration.lowest - 1e-9 <= angle <= calibration.highest + 1e-9
     assert width == pytest.approx(neutral + calibration.direction * calibration.scale * angle)
-
-
-@pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf])
-def test_what_is_no_angle_is_refused_with_the_limits(angle: float) -> None:
-    with pytest.raises(ServoError, match=r"soft limits, -1.2 to 1.2 rad"):
-        pulse_width(ServoSettings(), angle)
-
-
-def test_neutral_is_centre_and_trim() -> None:
-    assert pulse_width(ServoSettings(centre=1520.0, trim=-15.0), 0.0) == 1505.0
-
-
-def test_a_pulse_beyond_what_servos_take_is_refused_by_its_width() -> None:
-    with pytest.raises(ServoError, match="needs a pulse of 2700 µs, beyond 500 to 2500 µs"):
-        pulse_width(ServoSettings(scale=1000.0), 1.2)

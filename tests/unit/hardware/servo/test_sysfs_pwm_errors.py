@@ -32,12 +32,7 @@ def settled_width(bench: Bench) -> float:
 
 @pytest.mark.parametrize(
     "unwritable",
-    [
-        {("duty_cycle", NEUTRAL)},
-        {("duty_cycle", 0)},
-        {("duty_cycle", NEUTRAL), ("duty_cycle", 0)},
-        {("enable", 0)},
-    ],
+    [{("duty_cycle", NEUTRAL)}, {("duty_cycle", NEUTRAL), ("duty_cycle", 0)}, {("enable", 0)}],
 )
 def test_the_last_resort_ends_pulses_whatever_fails(
     bench: Bench, unwritable: set[tuple[str, int]]
