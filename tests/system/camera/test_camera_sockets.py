@@ -4,13 +4,11 @@ import json
 import os
 import resource
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import simplejpeg
@@ -25,7 +23,6 @@ from fishd.cli.doctor import service
 from fishd.cli.doctor.base import Context
 from fishd.config import Config
 from fishd.core import addresses
-from fishd.core.errors import Refused
 
 Both = tuple[Daemon, CameraProcess]
 
@@ -192,36 +189,6 @@ def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess
 def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(CameraLost, match=r"no camera at ipc:\S+: no answer within 0.2 s; start"):
         CameraClient(f"ipc://{tmp_path}/nobody", timeout=0.2)
-
-
-def test_the_address_of_frames_in_place_of_that_for_requests_is_told(
-    camera: CameraProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(requests, "_SECOND_LOOK", int(PATIENCE * 1e3))
-    with pytest.raises(CameraLost, match=r"publishes its frames; requests go to another address"):
-        CameraClient(camera.frames, timeout=0.2)
-
-
-def test_a_camera_of_another_version_is_refused(tmp_path: Path) -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        router = context.socket(zmq.ROUTER)
-        router.bind(f"ipc://{tmp_path}/r")
-
-        def answer() -> None:
-            name, request = router.recv_multipart()
-            identity = msgspec.json.decode(request)["id"]
-            error = {"code": "version", "message": "version 1 is not spoken here"}
-            reply = {"v": 2, "id": identity, "ok": False, "error": error}
-            router.send_multipart([name, msgspec.json.encode(reply)])
-
-        thread = threading.Thread(target=answer)
-        thread.start()
-        with pytest.raises(Refused, match="not spoken here"):
-            CameraClient(f"ipc://{tmp_path}/r")
-        thread.join()
-    finally:
-        context.destroy(linger=0)
 
 
 @pytest.mark.parametrize(

@@ -46,25 +46,6 @@ def expected(ticks: list[Tick], camera: SimulatedCameraSettings) -> dict[float, 
     return frames
 
 
-def test_frames_show_the_tail_as_it_truly_was(tmp_path: Path, daemon: Daemon) -> None:
-    bare = ("simulated.noise=0", "simulated.rate=40")
-    with running_camera(tmp_path, *settings(daemon, *bare)) as camera:
-        camera.is_in("streaming")
-        with Fish(daemon.endpoint) as fish, camera.client(fish=fish) as client:
-            ticks = []
-            for tick in fish.ticks():
-                ticks.append(tick)
-                if len(ticks) == 40:
-                    break
-            frames = client.poll()
-    truth = expected(ticks, SimulatedCameraSettings(noise=0.0, rate=40.0))
-    shared = [(frame, truth[key]) for frame in frames if (key := round(frame.time, 6)) in truth]
-    assert len(shared) > 30
-    for frame, pixels in shared:
-        difference = np.abs(frame.pixels.astype(int) - pixels.astype(int))
-        assert difference.mean() < 0.02  # the light, which has another phase, is not on
-
-
 def test_from_another_machine_the_offset_is_estimated(
     tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,7 @@ from itertools import islice, pairwise
 
 import pytest
 
-from fishd.core.clock import Slot, Ticker, TimerFd, VirtualClock, virtual_slots
+from fishd.core.clock import Slot, Ticker, VirtualClock, virtual_slots
 
 PERIOD = 0.02
 
@@ -63,23 +63,6 @@ def test_the_asyncio_loop_is_served_between_ticks_even_under_overload() -> None:
         return served
 
     assert asyncio.run(run()) >= 4
-
-
-def test_a_timer_in_the_past_expires_at_once_and_can_be_closed_twice() -> None:
-    async def run() -> None:
-        timer = TimerFd()
-        expired = asyncio.Event()
-        asyncio.get_running_loop().add_reader(timer, expired.set)
-        timer.arm(time.monotonic() - 1.0)
-        await asyncio.wait_for(expired.wait(), 10)
-        timer.clear()
-        timer.clear()
-        asyncio.get_running_loop().remove_reader(timer)
-        timer.close()
-        timer.close()
-        assert timer.closed
-
-    asyncio.run(run())
 
 
 @pytest.mark.realtime

@@ -3,11 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from fishd.assembly import build_loop, simulated_fish
-from fishd.config import load
-from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.signals import Measurement
-from fishd.lab.simulation.virtual_run import KeepingPublisher
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -70,29 +66,6 @@ def test_spikes_are_as_frequent_as_said_and_shared_by_the_samples_of_a_window() 
         assert upwards == pytest.approx(0.5 * count, abs=2.0 * math.sqrt(count))
     together = sum(1 for f in found if f.fx and f.fy)
     assert together < 60  # 0.025² of the windows by chance: 25
-
-
-def test_a_spike_leaves_the_noise_as_it_was_and_decays_in_the_fin_velocity() -> None:
-    rig = ["simulation.noise=0.001", "simulation.seed=4"]
-    spikes = ["simulation.spike_rate=0.05", "simulation.spike_size=0.5"]
-    calm, struck = (load(None, [*rig, *more]) for more in ([], spikes))
-    runs = []
-    for config in (calm, struck):
-        clock, publisher = VirtualClock(), KeepingPublisher()
-        fish = simulated_fish(config)
-        loop = build_loop(config, fish.robot(), clock, publisher)
-        for slot, _ in zip(virtual_slots(clock, config.tick), range(1200), strict=False):
-            loop.tick(slot)
-        runs.append(publisher.ticks)
-    off = [b.fy - a.fy for a, b in zip(*runs, strict=True)]
-    hits = [k for k, by in enumerate(off) if abs(by) > 1e-12]
-    assert hits
-    assert {round(abs(off[k]), 9) for k in hits} == {0.05}  # 0.5 N in one sample of ten
-    fooled = [abs(b.fin_velocity - a.fin_velocity) for a, b in zip(*runs, strict=True)]
-    first = hits[0]
-    assert max(fooled[:first], default=0.0) == 0.0
-    assert fooled[first] == pytest.approx(0.05 * TICK, rel=0.3)  # the integral of the force
-    assert fooled[first + 20] < 0.2 * fooled[first]
 
 
 def test_forces_are_told_in_whole_steps() -> None:

@@ -12,7 +12,7 @@ import pytest
 import zmq
 from rigs.harness import Rig
 from rigs.processes import PATIENCE, wait_until
-from rigs.scripted_agent import connected, remote
+from rigs.scripted_agent import connected
 
 from fishd.client import Agent, FishError, NoDaemon
 from fishd.core.errors import ParameterError
@@ -119,24 +119,6 @@ def test_in_virtual_time_the_successor_of_an_agent_that_died_is_asked_again(tmp_
     assert [tick.phi_c for tick in ticks] == [0.1, 0.2, 0.3]
 
 
-def test_whoever_asks_last_is_served(agent: Agent) -> None:
-    first, second = Rig("tick=0.02"), Rig("tick=0.02")
-    first.start("remote", agent=agent.address)
-    while not agent.poll(0.01):
-        first.run()
-    second.start("remote", agent=agent.address)
-    old, new = remote(first)._session, remote(second)._session
-    while not (agent.latest and agent.latest.session == new):
-        second.run()
-        agent.poll(0.01)
-    first.run(3)
-    while found := agent.poll(0.1):  # of the second, some may still be on their way
-        assert found.session == new != old
-    assert agent.latest.session == new
-    for rig in (first, second):
-        rig.loop.close()
-
-
 def test_a_number_that_is_none_is_refused(agent: Agent) -> None:
     rig = Rig("tick=0.02")
     rig.start("remote", agent=agent.address)
@@ -186,11 +168,6 @@ def test_what_is_no_message_of_a_fishd_is_left_aside(tmp_path: Path) -> None:
         with pytest.raises(NoDaemon, match="but what is none: JSON is malformed"):
             agent.observe()
     context.destroy(linger=0)
-
-
-def test_an_address_in_use_is_named(agent: Agent) -> None:
-    with Agent() as other, pytest.raises(FishError, match="cannot listen on 'tcp://"):
-        Agent(other.address)
 
 
 def test_a_second_agent_at_an_ipc_address_is_refused_and_the_first_goes_on(agent: Agent) -> None:

@@ -224,18 +224,6 @@ def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: Script
     assert "(9 named another session)" in reason(rig)
 
 
-def test_late_answers_from_the_session_before_do_no_harm(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent)
-    before = agent.action(0.3)
-    connect(rig, agent)
-    now = agent.action(0.2)
-    for number in range(20):
-        agent.send({**before, "seq": before["seq"] + number})
-    with agent.answering(lambda seen: {**now, "seq": seen["seq"]}):
-        assert {tick.phi_c for tick in rig.run(5)} <= {0.0, 0.2}
-    assert rig.mode == "running"
-
-
 def flip(agent: ScriptedAgent, seen: dict[str, float]) -> dict[str, object]:
     return agent.action(0.42 if seen["instruction_angle"] <= 0.0 else -0.42)
 

@@ -28,8 +28,8 @@ def test_a_virtual_pi_tells_the_power_that_its_servo_truly_takes(chip: str) -> N
     )
     publisher = KeepingPublisher()
     square = {"frequency": 1.6667}
-    truth = simulate(config, "square", square, 14.0, 8.0, publisher).mean_power
-    powers = [tick.power for tick in publisher.ticks[160:]]
+    truth = simulate(config, "square", square, 10.0, 6.0, publisher).mean_power
+    powers = [tick.power for tick in publisher.ticks[120:]]
     assert sum(powers) / len(powers) == pytest.approx(truth, rel=0.05)
 
 
@@ -38,7 +38,7 @@ def test_the_force_sensor_loses_few_samples_to_the_power_meter() -> None:
     for overrides in ([], ["power_meter=null"]):
         publisher = KeepingPublisher()
         with VirtualRun(load(VIRTUAL_PI, overrides), publisher) as run:
-            for _ in range(100):
+            for _ in range(50):
                 run.tick()
         counts.append(sum(tick.samples for tick in publisher.ticks[1:]))
     assert counts[0] > 0.94 * counts[1]
@@ -121,15 +121,9 @@ def test_a_bus_of_its_own_is_claimed_and_one_that_the_force_sensor_has_once_only
     [
         ("power_meter.shunt=0.1", "power_meter.driver: one of ina219, ina226 is needed"),
         ("power_meter.driver=ina218", "no power-meter driver is named 'ina218', did you mean"),
-        (f"{METER}5", "no power-meter driver is named 'ina2195'"),
     ],
 )
 def test_a_wrong_power_meter_is_told_in_one_line(override: str, complaint: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load(None, [override])
     assert complaint in str(caught.value)
-
-
-def test_without_the_section_there_is_no_power_meter() -> None:
-    assert load(None, ["robot=pi"]).power_meter is None
-    assert load(None, ["robot=pi", "power_meter=null"]).power_meter is None

@@ -15,12 +15,10 @@ from rigs.processes import PATIENCE
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import StartupError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampled_sensor import Sampler
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.i2c import Read, Write, kernel_error
 from fishd.virtual.pi.link import RemotePi
 from fishd.virtual.pi.link_server import LinkServer
-from fishd.virtual.pi.linux_i2c import LinuxI2c
 from fishd.virtual.pi.pins import Pins
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.virtual_pi import VirtualPi
@@ -92,19 +90,6 @@ def test_bytes_that_are_no_request_do_no_harm(pi: VirtualPi, path: Path) -> None
         raw.send(b"\xff")
         raw.close()  # without taking the reply
         assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
-
-
-def test_who_waits_keeps_nobody_else_waiting(pi: VirtualPi, path: Path) -> None:
-    with RemotePi(path) as patient, RemotePi(path) as busy:
-        found: list[object] = []
-        thread = threading.Thread(target=lambda: found.append(patient.await_levels({})))
-        thread.start()
-        busy.transfer(ADDRESS, CONFIG)
-        busy.set_level(17, 0)
-        thread.join(PATIENCE)
-        assert found[0] in ({17: 0}, {})  # {} where a slow machine let the wait run out
-        assert busy.await_levels({}) == {17: 0}
-        assert busy.state().levels == {17: 0}
 
 
 def test_a_button_reaches_the_pins_of_another_process(pi: VirtualPi, path: Path) -> None:
@@ -182,19 +167,6 @@ def test_a_virtual_pi_that_hangs_is_not_taken_for_a_bus_that_does(path: Path) ->
         with pytest.raises(StartupError, match=r"does not answer: is 'fishctl virtual-pi run'"):
             Wires(path, lambda *_: None)
     assert "check SDA and SCL" in sensor.explain(kernel_error(errno.ETIMEDOUT))
-
-
-def test_the_force_sensor_says_that_the_virtual_pi_is_gone(path: Path) -> None:
-    with LinkServer(virtual_pi(), path):
-        remote = RemotePi(path)
-    with contextlib.closing(remote), LinuxI2c(remote.transfer, {205}, remote.set_timeout):
-        sensor = Ads1115(Ads1115Settings(bus=205), VirtualClock())
-        sampler = Sampler(sensor, VirtualClock())
-        sampler.step()
-        sampler.close()
-    assert sampler.trouble == (
-        f"the virtual Pi at {path} is gone: is 'fishctl virtual-pi run' still running? (error 19)"
-    )
 
 
 def test_the_socket_file_of_a_dead_virtual_pi_is_taken_over(path: Path) -> None:

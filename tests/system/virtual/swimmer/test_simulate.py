@@ -1,6 +1,5 @@
 """`fishctl simulate` of a swimmer: what it tells, its files, and how it is cut off and goes on."""
 
-import io
 import json
 import os
 import pty
@@ -98,27 +97,6 @@ def test_a_swim_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> Non
         assert np.array_equal(whole[name], rest[name]), name
 
 
-def test_midlines_of_the_first_part_stay_where_the_swim_goes_on_into_its_file(
-    tmp_path: Path,
-) -> None:
-    saved, other, kept = (tmp_path / name for name in ("swim.npz", "other.npz", "kept"))
-    hold = ("hold", "--angle", "0.3", "--settle", "0.1")
-    simulated(*hold, "--seconds", "0.2", "--save", saved, "--checkpoint", kept)
-    first = table(saved)
-    further = (*hold, "--seconds", "0.3", "--resume", kept)
-    assert simulated(*further, "--save", saved).stderr == ""
-    both = table(saved)
-    assert both["midline_time"] == pytest.approx(0.01 * np.arange(1, 31))
-    assert np.array_equal(both["midlines"][:20], first["midlines"])
-    assert simulated(*further, "--save", other).stderr == (
-        f"fishctl: {other}: its midlines begin at 0.20 s: those before are kept where --save "
-        "names the NPZ file of the first part\n"
-    )
-    assert np.array_equal(table(other)["midlines"], both["midlines"][20:])
-    simulated("sine", "--seconds", "0.2", "--settle", "0.1", "--resume", kept, "--save", saved)
-    assert np.array_equal(table(saved)["time"], table(saved)["midline_time"])  # a track of its own
-
-
 def test_a_swim_that_is_as_long_already_leaves_its_files_alone(
     swum: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
@@ -197,13 +175,6 @@ def test_a_checkpoint_that_would_fill_the_memory_is_not_unpacked(
         # What it unpacks to is said in the directory, which is all that may be read of it.
         archive.getinfo("state.u.npy").file_size = 2**30 + 1
     with pytest.raises(checkpoint.CheckpointError, match="it would be longer than 1024 MB"):
-        checkpoint.load(bomb)
-    header = io.BytesIO()
-    shape = {"descr": "<f8", "fortran_order": False, "shape": (2**44,)}
-    np.lib.format.write_array_header_1_0(header, shape)
-    with zipfile.ZipFile(bomb, "w") as archive:
-        archive.writestr("state.u.npy", header.getvalue())
-    with pytest.raises(checkpoint.CheckpointError, match="it is no checkpoint of a swimmer"):
         checkpoint.load(bomb)
 
 

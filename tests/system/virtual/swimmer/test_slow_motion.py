@@ -51,13 +51,6 @@ def test_its_status_says_so_and_no_tick_is_late(daemon: Daemon) -> None:
     assert "0 µs" not in timing
 
 
-def test_it_takes_requests_as_every_other_fish(daemon: Daemon) -> None:
-    assert daemon.fishctl("set-controller", "square", "--frequency", "2").returncode == 0
-    assert daemon.fishctl("set-parameter", "frequency", "3").returncode == 0
-    assert daemon.fishctl("stop").returncode == 0
-    wait_until(lambda: daemon.status().phi_c == 0.0)
-
-
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

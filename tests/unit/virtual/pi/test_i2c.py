@@ -132,15 +132,3 @@ def test_each_open_device_file_has_an_address_of_its_own(board: Board) -> None:
         two.write_i2c_block_data(0x49, 0x02, b"\x22\x22")
         assert one._device.fileno() != two._device.fileno()
         assert (one._device.read(2), two._device.read(2)) == (b"\x11\x11", b"\x22\x22")
-
-
-@pytest.mark.parametrize(
-    ("request_number", "argument", "number"),
-    [(0x0703, 0x80, errno.EINVAL), (0x0720, 0, errno.ENOTTY)],
-)
-def test_a_request_that_the_stand_in_cannot_serve_fails_as_in_the_kernel(
-    pureio: smbus.SMBus, request_number: int, argument: int, number: int
-) -> None:
-    with pytest.raises(OSError, match="Errno") as caught:
-        smbus.ioctl(pureio._device.fileno(), request_number, argument)
-    assert caught.value.errno == number

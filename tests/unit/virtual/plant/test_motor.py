@@ -30,22 +30,6 @@ def test_a_wheel_at_full_speed_without_a_tail_draws_what_the_data_sheet_says() -
     assert fish.advance(1e3, 0.05, 1).power == pytest.approx(6.0 * 0.2, rel=1e-9)
 
 
-def test_bringing_the_rotor_to_speed_costs_a_steps_energy_whatever_the_resistance() -> None:
-    energies = []
-    for stall_current, stall_torque in ((2.0, 1.0), (20.0, 10.0)):
-        motor = MotorSettings(
-            stall_current=stall_current,
-            stall_torque=stall_torque,
-            no_load_current=0.0,
-            idle_current=0.0,
-            tail_inertia=0.0,
-        )
-        fish = TetheredFish(PLANT, motor=motor)
-        energies.append(fish.advance(1e3, 0.05, 1).power * 0.05)
-    # J Ω² k_e/k_t with k_e = U/Ω and k_t = 0.5 N m/A
-    assert energies == pytest.approx([1e-3 * 5.8**2 * (6.0 / 5.8) / 0.5] * 2, rel=1e-6)
-
-
 def test_the_tail_costs_what_the_water_takes_from_it() -> None:
     # A motor without losses, whose voltage is its torque: k_e = k_t. What is left is τ φ̇, and on a
     # slow ramp, where nothing comes back, that is what damping takes and what the spring keeps.

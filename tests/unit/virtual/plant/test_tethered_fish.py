@@ -5,7 +5,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fishd.virtual.plant import tethered
 from fishd.virtual.plant.base import REST, PlantState
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 from fishd.virtual.plant.tethered import AnyWindow, FinWindow, TetheredFish
@@ -154,19 +153,6 @@ def test_a_window_in_two_parts_leads_to_the_same_state_and_forces(
     assert np.abs((together - means(window)) / force_scale)[:2].max() < 1e-8
 
 
-@given(fishes, states, angles, durations)
-def test_a_mirrored_fish_makes_the_same_thrust_and_the_opposite_lateral_force(
-    p: PlantParameters, state: PlantState, command: float, duration: float
-) -> None:
-    fish = TetheredFish(p, state)
-    mirrored = TetheredFish(p, PlantState(*np.negative(state).tolist()))
-    window = fish.advance(command, duration, samples=7)
-    mirror = mirrored.advance(-command, duration, samples=7)
-    assert mirrored.state == pytest.approx(np.negative(fish.state), abs=1e-12)
-    assert mirror.thrust == pytest.approx(window.thrust, abs=1e-12)
-    assert mirror.lateral_force == pytest.approx(-window.lateral_force, abs=1e-12)
-
-
 def test_a_fish_at_rest_stays_at_rest_and_feels_nothing() -> None:
     fish = TetheredFish(PlantParameters())
     window = fish.advance(0.0, 0.05, samples=10)
@@ -213,23 +199,6 @@ def test_a_delayed_servo_does_the_same_later(delay: float) -> None:
     assert last.sampled_lateral_force == pytest.approx(
         np.mean([step.sampled_lateral_force for step in tail]), abs=1e-6
     )
-
-
-def test_the_reaction_of_the_servo_is_felt_once_the_wheel_turns_and_once_it_stops() -> None:
-    still, kicked = (
-        TetheredFish(PlantParameters()),
-        TetheredFish(PlantParameters(servo_reaction=1e-3)),
-    )
-    pushes = []
-    for command in [0.42] * 20:
-        pushes.append(
-            kicked.advance(command, 0.05, 10).lateral_force
-            - still.advance(command, 0.05, 10).lateral_force
-        )
-    assert kicked.state == pytest.approx(still.state, rel=1e-12)
-    assert pushes[0] < -0.05  # it speeds up
-    assert max(pushes[1:]) > 0.02  # it slows down
-    assert sum(pushes) == pytest.approx(0.0, abs=1e-4)
 
 
 def test_an_instruction_that_is_held_gives_what_single_windows_give() -> None:
@@ -295,27 +264,6 @@ def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
             seen.append(abs(turning_point(p, before, tail, command, duration / _STEPS)))
     assert peak == pytest.approx(max(seen), rel=2e-5, abs=1e-7)
     assert peak >= (1.0 - 1e-6) * max(seen) - 1e-12  # far below, the equations are not resolved
-
-
-def swum_with_quadratic_drag(step: float, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
-    monkeypatch.setattr(tethered, "_DRAG_STEP", step)
-    sluggish = Fish(servo_lag=2.9, quadratic_drag=20.0, lateral_quadratic_drag=0.02)
-    fish = TetheredFish(sluggish, PlantState(0.0, 0.5, 3.0))
-    forces = [means(fish.advance(0.42 * (-1) ** k, 0.31, samples=31)) for k in range(10)]
-    return np.array([*forces[-1], *fish.state])
-
-
-def test_shorter_steps_of_quadratic_drag_change_little_and_ever_less(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    exact = swum_with_quadratic_drag(0.005, monkeypatch)
-    errors = [
-        np.abs(swum_with_quadratic_drag(step, monkeypatch) / exact - 1.0).max()
-        for step in (0.2, 0.1, tethered._DRAG_STEP)
-    ]
-    assert errors[0] < 1e-6
-    assert errors[1] < 1e-2 * errors[0]
-    assert errors[2] < 1e-11
 
 
 @settings(max_examples=30)
