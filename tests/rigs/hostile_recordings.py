@@ -193,7 +193,7 @@ def an_index_of_everything_at_the_end_of_the_world(good: Good) -> bytes:
 @file
 def thousands_of_beginnings_of_chunks(good: Good) -> bytes:
     beginning = pack(Opcode.CHUNK, bytes(28) + text("zstd"), 60)
-    return join(good[:6]) + (b"\xff" + beginning) * 20_000
+    return join(good[:6]) + (b"\xff" + beginning) * 5_000
 
 
 # Configurations
@@ -409,7 +409,7 @@ def nothing_but_magic(good: Good) -> bytes:
 
 @file
 def nothing_but_records_of_nothing(good: Good) -> bytes:
-    return join([(Opcode.DATA_END, b"")] * 50_000)
+    return join([(Opcode.DATA_END, b"")] * 10_000)
 
 
 @file

@@ -16,13 +16,17 @@ from rigs.hostile_recordings import FILES
 
 MAX_ADDRESSES = 4 * 2**30
 """Limit of what the process may allocate [bytes]."""
-DRAWN = {
-    "ten-thousand-quantities",
-    "texts-that-are-commands",
-    "thousands-of-events",
-    "numbers-that-no-fish-has",
+TEXTS_AND_NUMBERS = {"texts-that-are-commands", "numbers-that-no-fish-has"}
+MANY = {"ten-thousand-quantities", "thousands-of-events"}
+FILES_OF = {
+    "export --parquet": {"aliases", "a-number-of-400-digits", "good", *TEXTS_AND_NUMBERS, *MANY},
+    "plot --html": {*TEXTS_AND_NUMBERS, *MANY},
+    "plot --png": TEXTS_AND_NUMBERS,
 }
-"""Files that are drawn, which takes a second each: the others are read by `plot` as by `export`."""
+"""Files that a verb is tried with: the others it reads as `export --csv` does.
+
+How many quantities and events are drawn is decided for page and picture at once.
+"""
 
 
 class Result(msgspec.Struct):
@@ -47,7 +51,7 @@ def main(folder: Path, *verbs: str) -> None:
     outcomes = []
     for verb in verbs:
         for file in sorted(folder.glob("*.mcap")):
-            if verb.startswith("plot") and file.stem not in DRAWN:
+            if file.stem not in FILES_OF.get(verb, (file.stem,)):
                 continue
             out = folder / verb.replace(" ", "") / file.stem
             out.mkdir(parents=True)

@@ -18,8 +18,7 @@ from common.recording_verbs import MAX_MEGABYTES, VERBS, Outcome, find_mistakes
 from reliability.mutations import try_all
 
 GROUPS = (
-    ("runs", "runs --json", "rerun", "replay", "recover"),
-    ("export --csv", "export --parquet"),
+    ("runs", "runs --json", "rerun", "replay", "recover", "export --csv", "export --parquet"),
     ("plot --html", "plot --png"),
 )
 """Verbs that share a process, each group with what it loads."""
@@ -117,7 +116,7 @@ def test_no_text_of_a_file_is_a_command_for_terminal_page_or_spreadsheet(
 
 
 def test_random_mutations_of_a_recording_are_read_or_refused_in_one_line() -> None:
-    results, wrong = try_all(range(30), seed=11, draw=False)
+    results, wrong = try_all(range(12), seed=11, draw=False)
     assert wrong == []
-    assert sum(result.files for result in results) == 30
-    assert sum(result.readable for result in results) > 10
+    assert sum(result.files for result in results) == 12
+    assert sum(result.readable for result in results) > 4
